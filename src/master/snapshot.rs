@@ -1,0 +1,44 @@
+//! A master's whole state as plain data: what a checkpoint holds.
+
+use indexmap::IndexMap;
+
+use crate::xmlrpc::Struct;
+
+/// A master's whole state in the master's own terms. The order of every map and list is the
+/// master's, because it is visible in replies.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Snapshot {
+    /// Node references by caller id, those included that no registration holds any more.
+    pub nodes: IndexMap<String, SnapshotNode>,
+    /// Topic types by topic. A type outlives its topic.
+    pub topic_types: IndexMap<String, String>,
+    /// Caller ids of the publishers of each topic.
+    pub publishers: IndexMap<String, Vec<String>>,
+    /// Caller ids of the subscribers of each topic.
+    pub subscribers: IndexMap<String, Vec<String>>,
+    /// The provider of each service.
+    pub services: IndexMap<String, ServiceEntry>,
+    /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as the master's do.
+    pub param_subscribers: IndexMap<String, Vec<String>>,
+    /// The parameter tree.
+    pub params: Struct,
+}
+
+/// A node reference.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SnapshotNode {
+    /// The node's own XML-RPC address.
+    pub api: String,
+    /// Services that this node registered and another node took over. The master never forgets
+    /// them, so such a node stays known to `lookupNode`.
+    pub taken_over_services: Vec<String>,
+}
+
+/// A service's provider.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServiceEntry {
+    /// Caller id of the provider.
+    pub node: String,
+    /// The service's own address, `rosrpc://HOST:PORT`.
+    pub api: String,
+}

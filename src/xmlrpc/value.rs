@@ -1,0 +1,169 @@
+//! The values of XML-RPC, as CPython's `xmlrpc` package understands them.
+
+use indexmap::IndexMap;
+
+/// A struct: like a Python dict, it keeps the order in which its keys came.
+pub type Struct = IndexMap<String, Value>;
+
+/// One XML-RPC value.
+///
+/// Equality is that of the wire: two doubles are equal if their bits are, so `nan` equals `nan` and
+/// `-0.0` differs from `0.0`; `1`, `1.0` and `true` all differ. Structs are equal only if the order
+/// of their keys is the same too, because that order is visible in replies.
+#[derive(Clone, Debug)]
+pub enum Value {
+    /// `<nil/>`: rosmaster takes it inside values and can never return it.
+    Nil,
+    /// `<boolean>`.
+    Bool(bool),
+    /// `<int>` or `<i4>`: what fits 32 bits.
+    Int(i32),
+    /// An integer beyond 32 bits, in canonical decimal: rosmaster takes it and can never return it.
+    BigInt(String),
+    /// `<double>`.
+    Double(f64),
+    /// `<string>`, or text without a type.
+    String(String),
+    /// `<dateTime.iso8601>`: its text, which CPython keeps without looking at it.
+    DateTime(String),
+    /// `<base64>`: the bytes.
+    Base64(Vec<u8>),
+    /// `<array>`.
+    Array(Vec<Self>),
+    /// `<struct>`.
+    Struct(Struct),
+}
+
+impl PartialEq for Value {
+    fn eq(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Nil, Self::Nil) => true,
+            (Self::Bool(a), Self::Bool(b)) => a == b,
+            (Self::Int(a), Self::Int(b)) => a == b,
+            (Self::Double(a), Self::Double(b)) => a.to_bits() == b.to_bits(),
+            (Self::BigInt(a), Self::BigInt(b))
+            | (Self::String(a), Self::String(b))
+            | (Self::DateTime(a), Self::DateTime(b)) => a == b,
+            (Self::Base64(a), Self::Base64(b)) => a == b,
+            (Self::Array(a), Self::Array(b)) => a == b,
+            (Self::Struct(a), Self::Struct(b)) => a.iter().eq(b.iter()),
+            _ => false,
+        }
+    }
+}
+
+impl Eq for Value {}
+
+impl Value {
+    /// The text, if this is a string.
+    pub fn as_str(&self) -> Option<&str> {
+        match self {
+            Self::String(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// The number, if this is an integer of 32 bits.
+    pub fn as_int(&self) -> Option<i32> {
+        match self {
+            Self::Int(number) => Some(*number),
+            _ => None,
+        }
+    }
+
+    /// The elements, if this is an array.
+    pub fn as_array(&self) -> Option<&[Self]> {
+        match self {
+            Self::Array(elements) => Some(elements),
+            _ => None,
+        }
+    }
+
+    /// The members, if this is a struct.
+    pub fn as_struct(&self) -> Option<&Struct> {
+        match self {
+            Self::Struct(members) => Some(members),
+            _ => None,
+        }
+    }
+}
+
+impl From<&str> for Value {
+    fn from(text: &str) -> Self {
+        Self::String(text.to_owned())
+    }
+}
+
+impl From<String> for Value {
+    fn from(text: String) -> Self {
+        Self::String(text)
+    }
+}
+
+impl From<i32> for Value {
+    fn from(number: i32) -> Self {
+        Self::Int(number)
+    }
+}
+
+impl From<bool> for Value {
+    fn from(truth: bool) -> Self {
+        Self::Bool(truth)
+    }
+}
+
+impl From<f64> for Value {
+    fn from(number: f64) -> Self {
+        Self::Double(number)
+    }
+}
+
+impl<T: Into<Self>> From<Vec<T>> for Value {
+    fn from(elements: Vec<T>) -> Self {
+        Self::Array(elements.into_iter().map(Into::into).collect())
+    }
+}
+
+/// One request: a method and its parameters.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Call {
+    /// The method's name, such as `registerPublisher`.
+    pub method: String,
+    /// The parameters in order. In the Master API the first one is the caller id.
+    pub params: Vec<Value>,
+}
+
+impl Call {
+    /// A call of `method` with `params`.
+    pub fn new(method: impl Into<String>, params: Vec<Value>) -> Self {
+        Self {
+            method: method.into(),
+            params,
+        }
+    }
+
+    /// `system.multicall` of `calls`, in order.
+    pub fn multicall(calls: impl IntoIterator<Item = Self>) -> Self {
+        let entries = calls.into_iter().map(|call| {
+            Value::Struct(Struct::from([
+                ("methodName".to_owned(), Value::String(call.method)),
+                ("params".to_owned(), Value::Array(call.params)),
+            ]))
+        });
+        Self::new("system.multicall", vec![Value::Array(entries.collect())])
+    }
+}
+
+/// One answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Reply {
+    /// What the method returned.
+    Value(Value),
+    /// The method, or the server, raised an error.
+    Fault {
+        /// CPython's server always says 1.
+        code: i32,
+        /// CPython's server says `<class 'NAME'>:TEXT`.
+        text: String,
+    },
+}
