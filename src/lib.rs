@@ -5,8 +5,10 @@
 //! The *core* is pure: no runtime, no sockets, no files, no clock. Time comes in as an argument and
 //! work goes out as values.
 //!
+//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
 //! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
 
+pub mod lifecycle;
 pub mod master;
 pub mod xmlrpc;

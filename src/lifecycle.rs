@@ -1,0 +1,549 @@
+//! When to connect, examine, probe, spawn, kill, and when the gate opens and shuts.
+//!
+//! A state machine without IO: the shell feeds it what happened, with the time, and carries out
+//! what it answers. It owns every deadline, so that each can be tested without waiting for it.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+/// Deaths older than this no longer count towards a crash loop.
+const DEATH_MEMORY: Duration = Duration::from_secs(60);
+/// So many deaths within [`DEATH_MEMORY`] are answered by a new master at once.
+const DEATHS_AT_ONCE: usize = 5;
+/// The first pause of a crash loop; it doubles with each further death.
+const FIRST_PAUSE: Duration = Duration::from_millis(500);
+/// The longest pause of a crash loop.
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
+/// seconds; a rosmaster whose port was taken stays alive without ever listening.
+const START_LIMIT: Duration = Duration::from_secs(30);
+/// Pause before asking again something that is not a master.
+const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
+
+/// Who starts masters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Supervision {
+    /// rosrescue does.
+    Ours,
+    /// Somebody else does; rosrescue waits.
+    Theirs,
+}
+
+/// How a hung master is told from a slow one.
+#[derive(Clone, Copy, Debug)]
+pub struct Probing {
+    /// Pause between an answered probe and the next.
+    pub interval: Duration,
+    /// So many missed probes in a row mean that the master hangs.
+    pub count: u32,
+}
+
+/// What happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Input {
+    /// rosrescue starts; `remembered`: the checkpoint names a master that may still be there.
+    Start {
+        /// Whether to try a remembered master before a new one is spawned.
+        remembered: bool,
+    },
+    /// The connection to the master is there.
+    Connected,
+    /// Nothing listens at the master's address.
+    Refused,
+    /// The master's address cannot be reached, or does not answer in time.
+    Unreachable,
+    /// The connection to the master has ended.
+    ConnectionLost,
+    /// The master holds the whole state.
+    Examined,
+    /// What listens there does not answer as a master does.
+    NotAMaster,
+    /// The master answered a probe in time.
+    ProbeAnswered,
+    /// The master did not answer a probe in time.
+    ProbeMissed,
+    /// A master was spawned.
+    Spawned,
+    /// No master could be spawned.
+    SpawnFailed,
+    /// The spawned master has ended.
+    Exited,
+    /// The time of [`Lifecycle::deadline`] has come.
+    Wake,
+    /// rosrescue is to stop.
+    Stop,
+}
+
+/// Why the gate is shut.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cause {
+    /// The master's connection ended: it died, or it closed an idle connection.
+    ConnectionLost,
+    /// The master's process ended.
+    Exited,
+    /// The master no longer answers.
+    Hung,
+    /// rosrescue stops.
+    Stopping,
+}
+
+impl Cause {
+    /// The cause in words, for reports.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::ConnectionLost => "the master's connection ended",
+            Self::Exited => "the master's process ended",
+            Self::Hung => "the master stopped answering",
+            Self::Stopping => "rosrescue stops",
+        }
+    }
+}
+
+/// What the shell is to do, in order. `Connect`, `Examine` and `Probe` replace one another: a new
+/// one cancels the one under way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Action {
+    /// Connect to the master; answer `Connected`, `Refused` or `Unreachable`.
+    Connect,
+    /// Bring the connected master to the mirror's state, or the mirror to its; answer `Examined`,
+    /// `NotAMaster` or `Unreachable`.
+    Examine,
+    /// Let no call pass.
+    ShutGate(Cause),
+    /// Let calls pass.
+    OpenGate,
+    /// Ask the master for a sign of life; answer `ProbeAnswered` or `ProbeMissed`.
+    Probe,
+    /// Start a master; answer `Spawned` or `SpawnFailed`.
+    Spawn,
+    /// End the master at once.
+    Kill,
+    /// Say that the master dies again and again; so many deaths within a minute.
+    ReportCrashLoop(usize),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// No master is connected.
+    Seeking,
+    /// A master is connected and not yet known to hold the state.
+    Examining,
+    /// The gate is open.
+    Serving,
+    Stopped,
+}
+
+/// What a deadline is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Timer {
+    Connect,
+    Probe,
+    Spawn,
+}
+
+/// The state machine.
+#[derive(Debug)]
+pub struct Lifecycle {
+    supervision: Supervision,
+    probing: Probing,
+    phase: Phase,
+    /// When our child was spawned; none while it is known to be gone or was never ours.
+    child: Option<Instant>,
+    /// Since when no master has been connected.
+    seeking_since: Option<Instant>,
+    /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
+    deaths: VecDeque<Instant>,
+    missed: u32,
+    timer: Option<(Instant, Timer)>,
+}
+
+impl Lifecycle {
+    /// A machine at rest; feed it [`Input::Start`].
+    pub fn new(supervision: Supervision, probing: Probing) -> Self {
+        Self {
+            supervision,
+            probing,
+            phase: Phase::Seeking,
+            child: None,
+            seeking_since: None,
+            deaths: VecDeque::new(),
+            missed: 0,
+            timer: None,
+        }
+    }
+
+    /// When to feed [`Input::Wake`]; ask again after every input.
+    pub fn deadline(&self) -> Option<Instant> {
+        self.timer.map(|(at, _)| at)
+    }
+
+    /// Deaths within the last minute.
+    pub fn recent_deaths(&self) -> usize {
+        self.deaths.len()
+    }
+
+    /// Takes in what happened at `now`; answers what is to be done, in order.
+    pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
+        if self.phase == Phase::Stopped {
+            return Vec::new();
+        }
+        match input {
+            Input::Start { remembered } => self.start(now, remembered),
+            Input::Connected => {
+                self.phase = Phase::Examining;
+                self.timer = None;
+                vec![Action::Examine]
+            }
+            Input::Refused => self.refused(now),
+            Input::Unreachable => self.unreachable(now),
+            Input::NotAMaster => {
+                self.seek(now);
+                self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
+                Vec::new()
+            }
+            Input::ConnectionLost => self.lost(now, Cause::ConnectionLost, vec![Action::Connect]),
+            Input::Examined => {
+                self.phase = Phase::Serving;
+                self.seeking_since = None;
+                self.missed = 0;
+                self.timer = Some((now + self.probing.interval, Timer::Probe));
+                vec![Action::OpenGate]
+            }
+            Input::ProbeAnswered => {
+                self.missed = 0;
+                self.timer = Some((now + self.probing.interval, Timer::Probe));
+                Vec::new()
+            }
+            Input::ProbeMissed => self.probe_missed(now),
+            Input::Spawned => {
+                self.child = Some(now);
+                self.seeking_since = Some(now);
+                vec![Action::Connect]
+            }
+            Input::SpawnFailed => {
+                self.timer = Some((now + self.pause_before_spawn(), Timer::Spawn));
+                Vec::new()
+            }
+            Input::Exited => {
+                self.child = None;
+                let spawn = self.spawn(now);
+                self.lost(now, Cause::Exited, spawn)
+            }
+            Input::Wake => match self.timer.take() {
+                Some((at, timer)) if at > now => {
+                    self.timer = Some((at, timer));
+                    Vec::new()
+                }
+                Some((_, Timer::Connect)) => vec![Action::Connect],
+                Some((_, Timer::Probe)) => vec![Action::Probe],
+                Some((_, Timer::Spawn)) => vec![Action::Spawn],
+                None => Vec::new(),
+            },
+            Input::Stop => {
+                self.phase = Phase::Stopped;
+                self.timer = None;
+                vec![Action::ShutGate(Cause::Stopping)]
+            }
+        }
+    }
+
+    fn start(&mut self, now: Instant, remembered: bool) -> Vec<Action> {
+        self.seek(now);
+        match self.supervision {
+            Supervision::Ours if !remembered => vec![Action::Spawn],
+            _ => vec![Action::Connect],
+        }
+    }
+
+    fn seek(&mut self, now: Instant) {
+        self.phase = Phase::Seeking;
+        self.timer = None;
+        self.seeking_since.get_or_insert(now);
+    }
+
+    /// The master is gone, whatever was under way. `then` follows the shutting of the gate.
+    fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
+        let timer = self.timer;
+        let was_serving = self.phase == Phase::Serving;
+        self.seek(now);
+        if cause == Cause::Exited {
+            // `spawn` has set it.
+            self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
+        }
+        let shut = was_serving.then_some(Action::ShutGate(cause));
+        shut.into_iter().chain(then).collect()
+    }
+
+    fn refused(&mut self, now: Instant) -> Vec<Action> {
+        match (self.supervision, self.child) {
+            (Supervision::Ours, None) => {
+                self.seek(now);
+                // Not our child: a master of an earlier rosrescue, and it is dead.
+                self.spawn(now)
+            }
+            (Supervision::Ours, Some(since)) if now.duration_since(since) > START_LIMIT => {
+                // Its end is reported as `Exited`, which spawns the next one.
+                vec![Action::Kill]
+            }
+            _ => self.connect_later(now, false),
+        }
+    }
+
+    fn unreachable(&mut self, now: Instant) -> Vec<Action> {
+        match self.supervision {
+            // On this computer, silence at an accepting port is a hung process.
+            Supervision::Ours if self.phase == Phase::Examining => {
+                self.seek(now);
+                self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
+                vec![Action::Kill]
+            }
+            _ => self.connect_later(now, true),
+        }
+    }
+
+    fn connect_later(&mut self, now: Instant, far: bool) -> Vec<Action> {
+        self.seek(now);
+        let waited = self.seeking_since.map_or(Duration::ZERO, |since| now.duration_since(since));
+        self.timer = Some((now + pause_before_connect(waited, far), Timer::Connect));
+        Vec::new()
+    }
+
+    fn probe_missed(&mut self, now: Instant) -> Vec<Action> {
+        self.missed += 1;
+        if self.missed < self.probing.count {
+            return vec![Action::Probe];
+        }
+        let then = match self.supervision {
+            Supervision::Ours => vec![Action::Kill],
+            Supervision::Theirs => Vec::new(),
+        };
+        let actions = self.lost(now, Cause::Hung, then);
+        // The killed one's end comes as `Exited` or, if it was not our child, as `Refused`.
+        self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
+        actions
+    }
+
+    /// A master has died and is ours to replace.
+    fn spawn(&mut self, now: Instant) -> Vec<Action> {
+        self.deaths.push_back(now);
+        while self.deaths.front().is_some_and(|at| now.duration_since(*at) > DEATH_MEMORY) {
+            self.deaths.pop_front();
+        }
+        let pause = self.pause_before_spawn();
+        if pause.is_zero() {
+            self.timer = None;
+            return vec![Action::Spawn];
+        }
+        self.timer = Some((now + pause, Timer::Spawn));
+        vec![Action::ReportCrashLoop(self.deaths.len())]
+    }
+
+    fn pause_before_spawn(&self) -> Duration {
+        match self.deaths.len().checked_sub(DEATHS_AT_ONCE + 1) {
+            None => Duration::ZERO,
+            Some(further) => {
+                let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
+                (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
+            }
+        }
+    }
+}
+
+/// Eager at first, when a restart is a matter of milliseconds, and cheap later. A refused connect
+/// on one computer costs some 20 us; `far` ones have already waited for an answer.
+fn pause_before_connect(waited: Duration, far: bool) -> Duration {
+    let pause = match waited.as_millis() {
+        0..2_000 => Duration::from_millis(1),
+        2_000..30_000 => Duration::from_millis(20),
+        _ => Duration::from_millis(200),
+    };
+    if far { pause.max(Duration::from_millis(200)) } else { pause }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PROBING: Probing = Probing { interval: Duration::from_secs(1), count: 3 };
+
+    /// Drives the machine along a virtual clock.
+    struct Script {
+        machine: Lifecycle,
+        now: Instant,
+    }
+
+    impl Script {
+        fn new(supervision: Supervision) -> Self {
+            Self { machine: Lifecycle::new(supervision, PROBING), now: Instant::now() }
+        }
+
+        fn feed(&mut self, input: Input, expected: &[Action]) -> &mut Self {
+            assert_eq!(self.machine.on(self.now, input), expected, "after {input:?}");
+            self
+        }
+
+        /// Jumps to the next deadline, which must lie `pause` ahead.
+        fn wake(&mut self, pause: Duration, expected: &[Action]) -> &mut Self {
+            let deadline = self.machine.deadline().expect("a deadline");
+            assert_eq!(deadline - self.now, pause);
+            self.now = deadline;
+            self.feed(Input::Wake, expected)
+        }
+
+        fn serving(supervision: Supervision) -> Self {
+            let mut script = Self::new(supervision);
+            match supervision {
+                Supervision::Ours => script
+                    .feed(Input::Start { remembered: false }, &[Action::Spawn])
+                    .feed(Input::Spawned, &[Action::Connect]),
+                Supervision::Theirs => {
+                    script.feed(Input::Start { remembered: false }, &[Action::Connect])
+                }
+            };
+            script
+                .feed(Input::Connected, &[Action::Examine])
+                .feed(Input::Examined, &[Action::OpenGate]);
+            script
+        }
+    }
+
+    #[test]
+    fn a_killed_child_is_replaced_at_once() {
+        let mut script = Script::serving(Supervision::Ours);
+        script
+            .feed(
+                Input::ConnectionLost,
+                &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
+            )
+            .feed(Input::Refused, &[])
+            .feed(Input::Exited, &[Action::Spawn])
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::Refused, &[])
+            .wake(Duration::from_millis(1), &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Examined, &[Action::OpenGate]);
+    }
+
+    #[test]
+    fn a_child_whose_end_is_seen_first_shuts_the_gate_too() {
+        let mut script = Script::serving(Supervision::Ours);
+        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        assert_eq!(script.machine.deadline(), None);
+    }
+
+    #[test]
+    fn an_idle_connection_that_the_master_closed_is_no_death() {
+        let mut script = Script::serving(Supervision::Ours);
+        script
+            .feed(
+                Input::ConnectionLost,
+                &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
+            )
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Examined, &[Action::OpenGate]);
+        assert_eq!(script.machine.recent_deaths(), 0);
+    }
+
+    #[test]
+    fn a_remembered_master_is_tried_first_and_replaced_when_it_is_gone() {
+        let mut script = Script::new(Supervision::Ours);
+        script
+            .feed(Input::Start { remembered: true }, &[Action::Connect])
+            .feed(Input::Refused, &[Action::Spawn]);
+    }
+
+    #[test]
+    fn an_external_master_is_waited_for_with_growing_pauses() {
+        let mut script = Script::serving(Supervision::Theirs);
+        script
+            .feed(
+                Input::ConnectionLost,
+                &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
+            )
+            .feed(Input::Refused, &[])
+            .wake(Duration::from_millis(1), &[Action::Connect]);
+        script.now += Duration::from_secs(3);
+        script.feed(Input::Refused, &[]).wake(Duration::from_millis(20), &[Action::Connect]);
+        script.now += Duration::from_secs(60);
+        script.feed(Input::Refused, &[]).wake(Duration::from_millis(200), &[Action::Connect]);
+    }
+
+    #[test]
+    fn a_crash_loop_is_slowed_down_and_reported_but_never_given_up() {
+        let mut script = Script::serving(Supervision::Ours);
+        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        for _ in 1..DEATHS_AT_ONCE {
+            script
+                .feed(Input::Spawned, &[Action::Connect])
+                .feed(Input::Exited, &[Action::Spawn]);
+        }
+        for (deaths, pause_ms) in [(6, 500), (7, 1_000), (8, 2_000), (9, 4_000), (10, 8_000)] {
+            script
+                .feed(Input::Spawned, &[Action::Connect])
+                .feed(Input::Exited, &[Action::ReportCrashLoop(deaths)])
+                .wake(Duration::from_millis(pause_ms), &[Action::Spawn]);
+        }
+        script
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::Exited, &[Action::ReportCrashLoop(11)])
+            .wake(LONGEST_PAUSE, &[Action::Spawn])
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Examined, &[Action::OpenGate]);
+        script.now += DEATH_MEMORY * 2;
+        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        assert_eq!(script.machine.recent_deaths(), 1);
+    }
+
+    #[test]
+    fn a_hung_child_is_killed_after_so_many_missed_probes() {
+        let mut script = Script::serving(Supervision::Ours);
+        script
+            .wake(PROBING.interval, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::Probe])
+            .feed(Input::ProbeAnswered, &[])
+            .wake(PROBING.interval, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::ShutGate(Cause::Hung), Action::Kill])
+            .feed(Input::Exited, &[Action::Spawn]);
+    }
+
+    #[test]
+    fn a_hung_external_master_is_asked_again_and_never_killed() {
+        let mut script = Script::serving(Supervision::Theirs);
+        script
+            .wake(PROBING.interval, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::Probe])
+            .feed(Input::ProbeMissed, &[Action::ShutGate(Cause::Hung)])
+            .wake(FIRST_PAUSE, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Unreachable, &[])
+            .wake(Duration::from_millis(200), &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Examined, &[Action::OpenGate]);
+    }
+
+    #[test]
+    fn a_child_that_never_listens_is_killed() {
+        let mut script = Script::new(Supervision::Ours);
+        script
+            .feed(Input::Start { remembered: false }, &[Action::Spawn])
+            .feed(Input::Spawned, &[Action::Connect]);
+        script.now += START_LIMIT + Duration::from_secs(1);
+        script.feed(Input::Refused, &[Action::Kill]).feed(Input::Exited, &[Action::Spawn]);
+    }
+
+    #[test]
+    fn nothing_happens_after_a_stop() {
+        let mut script = Script::serving(Supervision::Ours);
+        script
+            .feed(Input::Stop, &[Action::ShutGate(Cause::Stopping)])
+            .feed(Input::Exited, &[])
+            .feed(Input::ConnectionLost, &[]);
+        assert_eq!(script.machine.deadline(), None);
+    }
+}
