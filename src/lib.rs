@@ -9,6 +9,9 @@
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
 //! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
 
+pub mod cli;
+pub mod config;
 pub mod lifecycle;
 pub mod master;
+pub mod ros_env;
 pub mod xmlrpc;

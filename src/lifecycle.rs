@@ -305,7 +305,9 @@ impl Lifecycle {
 
     fn connect_later(&mut self, now: Instant, far: bool) -> Vec<Action> {
         self.seek(now);
-        let waited = self.seeking_since.map_or(Duration::ZERO, |since| now.duration_since(since));
+        let waited = self
+            .seeking_since
+            .map_or(Duration::ZERO, |since| now.duration_since(since));
         self.timer = Some((now + pause_before_connect(waited, far), Timer::Connect));
         Vec::new()
     }
@@ -328,7 +330,11 @@ impl Lifecycle {
     /// A master has died and is ours to replace.
     fn spawn(&mut self, now: Instant) -> Vec<Action> {
         self.deaths.push_back(now);
-        while self.deaths.front().is_some_and(|at| now.duration_since(*at) > DEATH_MEMORY) {
+        while self
+            .deaths
+            .front()
+            .is_some_and(|at| now.duration_since(*at) > DEATH_MEMORY)
+        {
             self.deaths.pop_front();
         }
         let pause = self.pause_before_spawn();
@@ -359,14 +365,21 @@ fn pause_before_connect(waited: Duration, far: bool) -> Duration {
         2_000..30_000 => Duration::from_millis(20),
         _ => Duration::from_millis(200),
     };
-    if far { pause.max(Duration::from_millis(200)) } else { pause }
+    if far {
+        pause.max(Duration::from_millis(200))
+    } else {
+        pause
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const PROBING: Probing = Probing { interval: Duration::from_secs(1), count: 3 };
+    const PROBING: Probing = Probing {
+        interval: Duration::from_secs(1),
+        count: 3,
+    };
 
     /// Drives the machine along a virtual clock.
     struct Script {
@@ -376,11 +389,18 @@ mod tests {
 
     impl Script {
         fn new(supervision: Supervision) -> Self {
-            Self { machine: Lifecycle::new(supervision, PROBING), now: Instant::now() }
+            Self {
+                machine: Lifecycle::new(supervision, PROBING),
+                now: Instant::now(),
+            }
         }
 
         fn feed(&mut self, input: Input, expected: &[Action]) -> &mut Self {
-            assert_eq!(self.machine.on(self.now, input), expected, "after {input:?}");
+            assert_eq!(
+                self.machine.on(self.now, input),
+                expected,
+                "after {input:?}"
+            );
             self
         }
 
@@ -429,7 +449,10 @@ mod tests {
     #[test]
     fn a_child_whose_end_is_seen_first_shuts_the_gate_too() {
         let mut script = Script::serving(Supervision::Ours);
-        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        script.feed(
+            Input::Exited,
+            &[Action::ShutGate(Cause::Exited), Action::Spawn],
+        );
         assert_eq!(script.machine.deadline(), None);
     }
 
@@ -465,15 +488,22 @@ mod tests {
             .feed(Input::Refused, &[])
             .wake(Duration::from_millis(1), &[Action::Connect]);
         script.now += Duration::from_secs(3);
-        script.feed(Input::Refused, &[]).wake(Duration::from_millis(20), &[Action::Connect]);
+        script
+            .feed(Input::Refused, &[])
+            .wake(Duration::from_millis(20), &[Action::Connect]);
         script.now += Duration::from_secs(60);
-        script.feed(Input::Refused, &[]).wake(Duration::from_millis(200), &[Action::Connect]);
+        script
+            .feed(Input::Refused, &[])
+            .wake(Duration::from_millis(200), &[Action::Connect]);
     }
 
     #[test]
     fn a_crash_loop_is_slowed_down_and_reported_but_never_given_up() {
         let mut script = Script::serving(Supervision::Ours);
-        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        script.feed(
+            Input::Exited,
+            &[Action::ShutGate(Cause::Exited), Action::Spawn],
+        );
         for _ in 1..DEATHS_AT_ONCE {
             script
                 .feed(Input::Spawned, &[Action::Connect])
@@ -493,7 +523,10 @@ mod tests {
             .feed(Input::Connected, &[Action::Examine])
             .feed(Input::Examined, &[Action::OpenGate]);
         script.now += DEATH_MEMORY * 2;
-        script.feed(Input::Exited, &[Action::ShutGate(Cause::Exited), Action::Spawn]);
+        script.feed(
+            Input::Exited,
+            &[Action::ShutGate(Cause::Exited), Action::Spawn],
+        );
         assert_eq!(script.machine.recent_deaths(), 1);
     }
 
@@ -507,7 +540,10 @@ mod tests {
             .wake(PROBING.interval, &[Action::Probe])
             .feed(Input::ProbeMissed, &[Action::Probe])
             .feed(Input::ProbeMissed, &[Action::Probe])
-            .feed(Input::ProbeMissed, &[Action::ShutGate(Cause::Hung), Action::Kill])
+            .feed(
+                Input::ProbeMissed,
+                &[Action::ShutGate(Cause::Hung), Action::Kill],
+            )
             .feed(Input::Exited, &[Action::Spawn]);
     }
 
@@ -534,7 +570,9 @@ mod tests {
             .feed(Input::Start { remembered: false }, &[Action::Spawn])
             .feed(Input::Spawned, &[Action::Connect]);
         script.now += START_LIMIT + Duration::from_secs(1);
-        script.feed(Input::Refused, &[Action::Kill]).feed(Input::Exited, &[Action::Spawn]);
+        script
+            .feed(Input::Refused, &[Action::Kill])
+            .feed(Input::Exited, &[Action::Spawn]);
     }
 
     #[test]

@@ -1,0 +1,267 @@
+//! The command line. Every option has an environment variable, a default and a unit in its help.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Keeps a ROS 1 robot running when its master dies.
+///
+/// Nodes point ROS_MASTER_URI at rosrescue; it forwards their calls to the real rosmaster, records
+/// what changes, and brings a restarted master back to the same state before it lets calls through.
+/// Without a command it is `rosrescue core`.
+#[derive(Debug, Parser)]
+#[command(name = "rosrescue", version, max_term_width = 100)]
+#[command(args_conflicts_with_subcommands = true, disable_help_subcommand = true)]
+pub struct Cli {
+    /// What to run; `core` if it is left out.
+    #[command(subcommand)]
+    pub command: Option<Command>,
+    /// The options of `core`, for the bare `rosrescue`.
+    #[command(flatten)]
+    pub core: CoreArgs,
+}
+
+/// What to run.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Stand in for roscore: start, supervise and restore a rosmaster and rosout
+    Core(CoreArgs),
+    /// Stand in front of a master that somebody else starts
+    Proxy(ProxyArgs),
+}
+
+/// Options of `rosrescue core`. The short ones are roscore's.
+#[derive(Args, Clone, Debug)]
+pub struct CoreArgs {
+    /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
+    #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
+    #[arg(value_parser = clap::value_parser!(u16).range(1..))]
+    pub port: Option<u16>,
+    /// Print more: rosrescue's own log at level debug
+    #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
+    pub verbose: bool,
+    /// Threads with which rosmaster tells nodes of changes; more than roscore's 3, so that nodes
+    /// that cannot be reached do not hold up the others
+    #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT")]
+    #[arg(default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub numworkers: u32,
+    /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none
+    #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS")]
+    #[arg(default_value_t = 5.0)]
+    pub timeout: f64,
+    /// Port of the rosmaster behind the proxy, on loopback [default: a free one]
+    #[arg(long, env = "ROSRESCUE_MASTER_PORT", value_name = "PORT")]
+    #[arg(value_parser = clap::value_parser!(u16).range(1..))]
+    pub master_port: Option<u16>,
+    /// The rosmaster program [default: the one on the PATH, else in /opt/ros/*/bin]
+    #[arg(long, env = "ROSRESCUE_ROSMASTER", value_name = "FILE")]
+    pub rosmaster: Option<PathBuf>,
+    /// Do not run rosout
+    #[arg(long, env = "ROSRESCUE_NO_ROSOUT")]
+    pub no_rosout: bool,
+    /// Address to serve, instead of all addresses (loopback only if ROS_IP or ROS_HOSTNAME is)
+    #[arg(long, env = "ROSRESCUE_LISTEN", value_name = "ADDR")]
+    pub listen: Option<String>,
+    /// What both commands have.
+    #[command(flatten)]
+    pub common: CommonArgs,
+}
+
+/// Options of `rosrescue proxy`.
+#[derive(Args, Clone, Debug)]
+pub struct ProxyArgs {
+    /// The real master, http://HOST:PORT
+    #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
+    pub master: String,
+    /// Address and port to serve, ADDR:PORT, :PORT or PORT [default: all addresses, port of
+    /// ROS_MASTER_URI, else 11311]
+    #[arg(short, long, env = "ROSRESCUE_LISTEN", value_name = "ADDR:PORT")]
+    pub listen: Option<String>,
+    /// Print more: rosrescue's own log at level debug
+    #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
+    pub verbose: bool,
+    /// What both commands have.
+    #[command(flatten)]
+    pub common: CommonArgs,
+}
+
+/// Options of both commands.
+#[derive(Args, Clone, Debug)]
+pub struct CommonArgs {
+    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
+    #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
+    pub checkpoint: Option<PathBuf>,
+    /// When to restore the state of the checkpoint at the start of rosrescue
+    #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = Restore::Auto)]
+    pub restore: Restore,
+    /// When the journal is forced to the disk; it survives kill -9 in any case
+    #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = Sync::Interval)]
+    pub sync: Sync,
+    /// How often `--sync interval` does so, in milliseconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_SYNC_INTERVAL",
+        value_name = "MS",
+        default_value_t = 200
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..=60_000))]
+    pub sync_interval: u64,
+    /// How long a call waits for the master to come back before its connection is closed, in seconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_HOLD",
+        allow_negative_numbers = true,
+        value_name = "SECONDS",
+        default_value_t = 8.0
+    )]
+    pub hold: f64,
+    /// Number of calls that may wait for the master at the same time
+    #[arg(
+        long,
+        env = "ROSRESCUE_MAX_PARKED",
+        value_name = "COUNT",
+        default_value_t = 4096
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub max_parked: u32,
+    /// Pause between two probes of the master, in milliseconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_PROBE_INTERVAL",
+        value_name = "MS",
+        default_value_t = 1000
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
+    pub probe_interval: u64,
+    /// Time in which the master must answer a probe, in milliseconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_PROBE_TIMEOUT",
+        value_name = "MS",
+        default_value_t = 3000
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
+    pub probe_timeout: u64,
+    /// Number of unanswered probes in a row after which the master is taken for hung
+    #[arg(
+        long,
+        env = "ROSRESCUE_PROBE_COUNT",
+        value_name = "COUNT",
+        default_value_t = 3
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub probe_count: u32,
+    /// Time in which a node must answer the census after a recovery, in milliseconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_CENSUS_TIMEOUT",
+        value_name = "MS",
+        default_value_t = 3000
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
+    pub census_timeout: u64,
+    /// Connections to the master for calls that only read
+    #[arg(
+        long,
+        env = "ROSRESCUE_MASTER_CONNECTIONS",
+        value_name = "COUNT",
+        default_value_t = 4
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub master_connections: u32,
+    /// Connections that clients may hold at the same time; more wait
+    #[arg(
+        long,
+        env = "ROSRESCUE_MAX_CONNECTIONS",
+        value_name = "COUNT",
+        default_value_t = 10_000
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub max_connections: u32,
+    /// Largest request body, in MiB
+    #[arg(
+        long,
+        env = "ROSRESCUE_MAX_BODY",
+        value_name = "MIB",
+        default_value_t = 64
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
+    pub max_body: u64,
+    /// Form of the log on stderr
+    #[arg(long, env = "ROSRESCUE_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
+    pub log_format: LogFormat,
+    /// What to log, in the syntax of tracing's EnvFilter [default: warn,rosrescue=info]
+    #[arg(long, env = "ROSRESCUE_LOG", value_name = "FILTER")]
+    pub log: Option<String>,
+}
+
+/// When a checkpoint is restored at start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Restore {
+    /// If the session goes on: same boot and no orderly stop, or a registered node still lives
+    Auto,
+    /// Always
+    Always,
+    /// Never: the old file is kept under another name
+    Never,
+}
+
+/// When the journal is forced to the disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Sync {
+    /// Before a call is answered: survives a power cut whole
+    Always,
+    /// Every --sync-interval: a power cut may cost that much
+    Interval,
+    /// When the system likes
+    Never,
+}
+
+/// Form of the log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// A line a message
+    Text,
+    /// A JSON object a message
+    Json,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_definition_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_option_has_an_environment_variable_and_a_help_text() {
+        let cli = Cli::command();
+        for command in std::iter::once(&cli).chain(cli.get_subcommands()) {
+            for option in command
+                .get_arguments()
+                .filter(|a| !["help", "version"].contains(&a.get_id().as_str()))
+            {
+                let name = option.get_id();
+                let variable = option
+                    .get_env()
+                    .unwrap_or_else(|| panic!("{name} has no variable"));
+                assert!(
+                    variable.to_string_lossy().starts_with("ROSRESCUE_"),
+                    "{name}"
+                );
+                assert!(option.get_help().is_some(), "{name} has no help");
+            }
+        }
+    }
+
+    #[test]
+    fn bare_rosrescue_is_core() {
+        let cli = Cli::parse_from(["rosrescue", "-p", "12000"]);
+        assert!(cli.command.is_none());
+        assert_eq!(cli.core.port, Some(12_000));
+    }
+}

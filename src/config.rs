@@ -1,0 +1,323 @@
+//! Validated configuration: what the command line and the environment come to.
+
+use std::{
+    net::{IpAddr, SocketAddr},
+    path::PathBuf,
+    time::Duration,
+};
+
+use thiserror::Error;
+
+use crate::{
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Restore, Sync},
+    lifecycle::Probing,
+    ros_env::{self, Lookup, MasterUri, UriError},
+};
+
+/// Name of the checkpoint in the log folder; the paper's tool uses it too.
+pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
+
+/// A command line that is well formed and still cannot be meant. Exit status 2.
+#[derive(Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum UsageError {
+    /// `--master` is not a URI.
+    #[error("--master: {0}")]
+    Master(UriError),
+    /// `ROS_MASTER_URI` is not a URI.
+    #[error("ROS_MASTER_URI: {0}")]
+    MasterUri(UriError),
+    /// `--listen` is not an address.
+    #[error("--listen: `{given}` is not an address; write {form}")]
+    Listen {
+        /// What was given.
+        given: String,
+        /// What the option takes.
+        form: &'static str,
+    },
+    /// A number of seconds that is no duration.
+    #[error("{option}: `{given}` is not a number of seconds between 0 and {most}")]
+    Seconds {
+        /// The option.
+        option: &'static str,
+        /// What was given.
+        given: f64,
+        /// The largest value.
+        most: f64,
+    },
+    /// The proxy and the master would have the same port on loopback.
+    #[error(
+        "--master-port {port} is the port that nodes use; the real master needs one of its own"
+    )]
+    SamePort {
+        /// The port.
+        port: u16,
+    },
+}
+
+/// What rosrescue runs with.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// The addresses to serve; the first must be had, the others when the computer can.
+    pub listen: Vec<SocketAddr>,
+    /// What others use as `ROS_MASTER_URI`.
+    pub advertised: MasterUri,
+    /// Where the master is, or how to run it.
+    pub master: MasterConfig,
+    /// The checkpoint file.
+    pub checkpoint: PathBuf,
+    /// When to restore it at start.
+    pub restore: Restore,
+    /// When the journal is forced to the disk.
+    pub sync: Sync,
+    /// Pause between two such times with [`Sync::Interval`].
+    pub sync_interval: Duration,
+    /// How long a call may be parked.
+    pub hold: Duration,
+    /// How many calls may be parked.
+    pub max_parked: usize,
+    /// When a master counts as hung.
+    pub probing: Probing,
+    /// How long the master may take to answer a probe.
+    pub probe_timeout: Duration,
+    /// How long a node may take to answer the census.
+    pub census_timeout: Duration,
+    /// Connections to the master for reads.
+    pub master_connections: usize,
+    /// Connections of clients.
+    pub max_connections: usize,
+    /// Largest request body in bytes.
+    pub max_body: usize,
+}
+
+/// Where the master is, or how to run it.
+#[derive(Clone, Debug)]
+pub enum MasterConfig {
+    /// Somebody else runs it here.
+    External(MasterUri),
+    /// rosrescue runs it.
+    Supervised(SupervisedConfig),
+}
+
+/// How to run a rosmaster and rosout.
+#[derive(Clone, Debug)]
+pub struct SupervisedConfig {
+    /// Its port, if it is not to be a free one.
+    pub port: Option<u16>,
+    /// The program, if it is not to be searched for.
+    pub rosmaster: Option<PathBuf>,
+    /// Its notifier threads.
+    pub numworkers: u32,
+    /// Its socket timeout in seconds; none if 0.
+    pub timeout: f64,
+    /// Whether to run rosout.
+    pub rosout: bool,
+    /// Where it keeps its log, and we the log configuration that it is given.
+    pub log_dir: PathBuf,
+}
+
+impl Config {
+    /// What `rosrescue core` with `args` means in the environment `env` on the computer `hostname`.
+    pub fn core(
+        args: &CoreArgs,
+        env: Lookup<'_>,
+        hostname: &str,
+        local_address: Option<IpAddr>,
+    ) -> Result<Self, UsageError> {
+        let port = match args.port {
+            Some(port) => port,
+            None => ros_env::master_port(env).map_err(UsageError::MasterUri)?,
+        };
+        if args.master_port == Some(port) {
+            return Err(UsageError::SamePort { port });
+        }
+        let addresses = match &args.listen {
+            None => ros_env::bind_addresses(env),
+            Some(text) => vec![parse_address(text, "an IP address such as 10.0.0.7 or ::")?],
+        };
+        let listen = addresses
+            .into_iter()
+            .map(|address| SocketAddr::new(address, port))
+            .collect();
+        let master = MasterConfig::Supervised(SupervisedConfig {
+            port: args.master_port,
+            rosmaster: args.rosmaster.clone(),
+            numworkers: args.numworkers,
+            timeout: seconds("--timeout", args.timeout, 3600.0)?.as_secs_f64(),
+            rosout: !args.no_rosout,
+            log_dir: ros_env::log_dir(env),
+        });
+        let host = ros_env::advertised_host(env, hostname, local_address);
+        Self::common(&args.common, env, listen, MasterUri { host, port }, master)
+    }
+
+    /// What `rosrescue proxy` with `args` means in the environment `env` on the computer `hostname`.
+    pub fn proxy(
+        args: &ProxyArgs,
+        env: Lookup<'_>,
+        hostname: &str,
+        local_address: Option<IpAddr>,
+    ) -> Result<Self, UsageError> {
+        let master = MasterUri::parse(&args.master).map_err(UsageError::Master)?;
+        let listen = listen_addresses(args.listen.as_deref(), env)?;
+        let port = listen
+            .first()
+            .map_or(ros_env::DEFAULT_MASTER_PORT, SocketAddr::port);
+        let host = ros_env::advertised_host(env, hostname, local_address);
+        let advertised = MasterUri { host, port };
+        Self::common(
+            &args.common,
+            env,
+            listen,
+            advertised,
+            MasterConfig::External(master),
+        )
+    }
+
+    fn common(
+        args: &CommonArgs,
+        env: Lookup<'_>,
+        listen: Vec<SocketAddr>,
+        advertised: MasterUri,
+        master: MasterConfig,
+    ) -> Result<Self, UsageError> {
+        let checkpoint = args.checkpoint.clone();
+        Ok(Self {
+            listen,
+            advertised,
+            master,
+            checkpoint: checkpoint.unwrap_or_else(|| ros_env::log_dir(env).join(CHECKPOINT_NAME)),
+            restore: args.restore,
+            sync: args.sync,
+            sync_interval: Duration::from_millis(args.sync_interval),
+            hold: seconds("--hold", args.hold, 3600.0)?,
+            max_parked: usize_of(args.max_parked),
+            probing: Probing {
+                interval: Duration::from_millis(args.probe_interval),
+                count: args.probe_count,
+            },
+            probe_timeout: Duration::from_millis(args.probe_timeout),
+            census_timeout: Duration::from_millis(args.census_timeout),
+            master_connections: usize_of(args.master_connections),
+            max_connections: usize_of(args.max_connections),
+            max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),
+        })
+    }
+}
+
+fn usize_of(number: u32) -> usize {
+    usize::try_from(number).unwrap_or(usize::MAX)
+}
+
+fn seconds(option: &'static str, given: f64, most: f64) -> Result<Duration, UsageError> {
+    let error = UsageError::Seconds {
+        option,
+        given,
+        most,
+    };
+    if !(0.0..=most).contains(&given) {
+        return Err(error);
+    }
+    Duration::try_from_secs_f64(given).map_err(|_| error)
+}
+
+fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, UsageError> {
+    let bare = text.trim_start_matches('[').trim_end_matches(']');
+    match bare {
+        "localhost" => Ok(IpAddr::V4(std::net::Ipv4Addr::LOCALHOST)),
+        _ => bare.parse().map_err(|_| UsageError::Listen {
+            given: text.to_owned(),
+            form,
+        }),
+    }
+}
+
+/// `ADDR:PORT`, `:PORT`, `PORT` or nothing.
+fn listen_addresses(given: Option<&str>, env: Lookup<'_>) -> Result<Vec<SocketAddr>, UsageError> {
+    const FORM: &str = "ADDR:PORT, :PORT or PORT, as in 127.0.0.1:11311";
+    let Some(text) = given else {
+        let port = ros_env::master_port(env).map_err(UsageError::MasterUri)?;
+        let addresses = ros_env::bind_addresses(env).into_iter();
+        return Ok(addresses
+            .map(|address| SocketAddr::new(address, port))
+            .collect());
+    };
+    let (address, port) = text.rsplit_once(':').unwrap_or(("", text));
+    let port = port.parse().map_err(|_| UsageError::Listen {
+        given: text.to_owned(),
+        form: FORM,
+    })?;
+    let addresses = match address {
+        "" => ros_env::bind_addresses(env),
+        _ => vec![parse_address(address, FORM)?],
+    };
+    Ok(addresses
+        .into_iter()
+        .map(|address| SocketAddr::new(address, port))
+        .collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::{Cli, Command};
+
+    fn config(args: &[&str]) -> Result<Config, UsageError> {
+        let env = |name: &str| match name {
+            "ROS_MASTER_URI" => Some("http://robot:12345/".to_owned()),
+            "HOME" => Some("/home/r".to_owned()),
+            _ => None,
+        };
+        let cli = Cli::parse_from(std::iter::once(&"rosrescue").chain(args));
+        match cli.command {
+            Some(Command::Proxy(args)) => Config::proxy(&args, &env, "robot", None),
+            Some(Command::Core(args)) => Config::core(&args, &env, "robot", None),
+            None => Config::core(&cli.core, &env, "robot", None),
+        }
+    }
+
+    #[test]
+    fn core_takes_its_port_from_ros_master_uri() {
+        let config = config(&[]).unwrap();
+        assert_eq!(config.advertised.to_string(), "http://robot:12345/");
+        assert!(config.listen.iter().all(|address| address.port() == 12_345));
+        assert_eq!(
+            config.checkpoint,
+            PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml")
+        );
+    }
+
+    #[test]
+    fn listen_takes_an_address_or_a_port() {
+        for (given, first) in [
+            ("127.0.0.1:4000", "127.0.0.1:4000"),
+            ("[::1]:4000", "[::1]:4000"),
+            (":4000", "0.0.0.0:4000"),
+            ("4000", "0.0.0.0:4000"),
+            ("localhost:0", "127.0.0.1:0"),
+        ] {
+            let config = config(&["proxy", "--master", "http://m:1", "--listen", given]).unwrap();
+            assert_eq!(config.listen.first().unwrap().to_string(), first, "{given}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_meant_is_refused_with_its_operand() {
+        for (args, said) in [
+            (&["proxy", "--master", "m:1"][..], "`m:1`"),
+            (
+                &["proxy", "--master", "http://m:1", "--listen", "here"],
+                "`here`",
+            ),
+            (&["core", "--master-port", "12345"], "12345"),
+            (&["core", "--hold", "-1"], "`-1`"),
+            (&["core", "--timeout", "nan"], "`NaN`"),
+            (&["core", "--listen", "robot"], "`robot`"),
+        ] {
+            let error = config(args).map(|_| ()).expect_err("refused").to_string();
+            assert!(error.contains(said), "{error}");
+        }
+    }
+}

@@ -1,0 +1,261 @@
+//! What the ROS environment variables mean, as rosgraph and rospkg read them.
+//!
+//! Sources: `rosgraph/network.py`, `rosgraph/rosenv.py`, `rospkg/environment.py` of Noetic.
+
+use std::{
+    net::{IpAddr, Ipv4Addr, Ipv6Addr},
+    path::PathBuf,
+};
+
+use thiserror::Error;
+
+/// The port of a master when `ROS_MASTER_URI` names none.
+pub const DEFAULT_MASTER_PORT: u16 = 11311;
+
+/// Looks up an environment variable; a parameter, so that no test touches the environment.
+pub type Lookup<'a> = &'a dyn Fn(&str) -> Option<String>;
+
+/// A `ROS_MASTER_URI` or `--master` that cannot be used.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum UriError {
+    /// Not of the form `http://HOST:PORT/`.
+    #[error(
+        "`{uri}` is not the URI of a master; write http://HOST:PORT/, as in http://localhost:11311/"
+    )]
+    Malformed {
+        /// What was given.
+        uri: String,
+    },
+}
+
+/// The address of a master.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MasterUri {
+    /// Name or address, without the brackets of IPv6.
+    pub host: String,
+    /// TCP port.
+    pub port: u16,
+}
+
+impl MasterUri {
+    /// Reads `http://HOST[:PORT][/]`; without a port it is 11311.
+    pub fn parse(uri: &str) -> Result<Self, UriError> {
+        let malformed = || UriError::Malformed {
+            uri: uri.to_owned(),
+        };
+        let rest = uri.trim().strip_prefix("http://").ok_or_else(malformed)?;
+        let authority = rest.split('/').next().unwrap_or_default();
+        let (host, port) = if let Some(rest) = authority.strip_prefix('[') {
+            let (host, port) = rest.split_once(']').ok_or_else(malformed)?;
+            let port = match port {
+                "" => None,
+                _ => Some(port.strip_prefix(':').ok_or_else(malformed)?),
+            };
+            (host, port)
+        } else {
+            match authority.split_once(':') {
+                Some((host, port)) => (host, Some(port)),
+                None => (authority, None),
+            }
+        };
+        let port = match port {
+            None => DEFAULT_MASTER_PORT,
+            Some(port) => port
+                .parse()
+                .ok()
+                .filter(|port| *port != 0)
+                .ok_or_else(malformed)?,
+        };
+        if host.is_empty() || host.contains(['@', ' ', '?', '#']) {
+            return Err(malformed());
+        }
+        Ok(Self {
+            host: host.to_owned(),
+            port,
+        })
+    }
+
+    /// `HOST:PORT`, with brackets around an IPv6 address: the value of an HTTP `Host` header.
+    pub fn authority(&self) -> String {
+        if self.host.contains(':') {
+            format!("[{}]:{}", self.host, self.port)
+        } else {
+            format!("{}:{}", self.host, self.port)
+        }
+    }
+}
+
+impl std::fmt::Display for MasterUri {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "http://{}/", self.authority())
+    }
+}
+
+/// The port that `ROS_MASTER_URI` names, else 11311.
+pub fn master_port(env: Lookup<'_>) -> Result<u16, UriError> {
+    match env("ROS_MASTER_URI").filter(|uri| !uri.is_empty()) {
+        Some(uri) => Ok(MasterUri::parse(&uri)?.port),
+        None => Ok(DEFAULT_MASTER_PORT),
+    }
+}
+
+/// What `ROS_HOSTNAME`, else `ROS_IP`, says of this computer's own address.
+pub fn address_override(env: Lookup<'_>) -> Option<String> {
+    env("ROS_HOSTNAME")
+        .or_else(|| env("ROS_IP"))
+        .filter(|address| !address.is_empty())
+}
+
+/// The addresses a master listens on: all, or only loopback when its own address is a loopback one.
+/// The first is tried first; an address family that the computer lacks may be left out.
+pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
+    match address_override(env) {
+        Some(address) if address.starts_with("127.") => {
+            let v4 = address.parse().unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
+            vec![v4, IpAddr::V6(Ipv6Addr::LOCALHOST)]
+        }
+        Some(address) if address == "localhost" || address == "::1" => {
+            vec![
+                IpAddr::V4(Ipv4Addr::LOCALHOST),
+                IpAddr::V6(Ipv6Addr::LOCALHOST),
+            ]
+        }
+        _ => vec![
+            IpAddr::V4(Ipv4Addr::UNSPECIFIED),
+            IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+        ],
+    }
+}
+
+/// The host by which others reach this computer, as rosgraph chooses it: the override, else the
+/// host name unless it is a loopback one, else `local_address`.
+pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<IpAddr>) -> String {
+    if let Some(address) = address_override(env) {
+        return address;
+    }
+    if !hostname.is_empty() && hostname != "localhost" && !hostname.starts_with("127.") {
+        return hostname.to_owned();
+    }
+    local_address
+        .unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST))
+        .to_string()
+}
+
+/// `$ROS_HOME`, else `~/.ros`.
+pub fn ros_home(env: Lookup<'_>) -> PathBuf {
+    match env("ROS_HOME").filter(|home| !home.is_empty()) {
+        Some(home) => PathBuf::from(home),
+        None => PathBuf::from(env("HOME").unwrap_or_else(|| "/".to_owned())).join(".ros"),
+    }
+}
+
+/// `$ROS_LOG_DIR`, else `log` in [`ros_home`].
+pub fn log_dir(env: Lookup<'_>) -> PathBuf {
+    match env("ROS_LOG_DIR").filter(|dir| !dir.is_empty()) {
+        Some(dir) => PathBuf::from(dir),
+        None => ros_home(env).join("log"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn uri(host: &str, port: u16) -> MasterUri {
+        MasterUri {
+            host: host.to_owned(),
+            port,
+        }
+    }
+
+    fn env<'a>(pairs: &'a [(&'a str, &'a str)]) -> impl Fn(&str) -> Option<String> + 'a {
+        |name| {
+            pairs
+                .iter()
+                .find(|(key, _)| *key == name)
+                .map(|(_, value)| (*value).to_owned())
+        }
+    }
+
+    #[test]
+    fn uris() {
+        for (text, expected) in [
+            ("http://localhost:11311", uri("localhost", 11311)),
+            ("http://10.0.0.7:4242/", uri("10.0.0.7", 4242)),
+            ("http://robot", uri("robot", 11311)),
+            ("http://[::1]:5/RPC2", uri("::1", 5)),
+            ("http://[fe80::1]", uri("fe80::1", 11311)),
+        ] {
+            assert_eq!(MasterUri::parse(text), Ok(expected), "{text}");
+        }
+        for text in [
+            "",
+            "localhost:11311",
+            "https://a:1",
+            "http://",
+            "http://a:0",
+            "http://a:b",
+            "http://a:70000",
+            "http://[::1",
+            "http://u@a:1",
+        ] {
+            assert_eq!(
+                MasterUri::parse(text),
+                Err(UriError::Malformed {
+                    uri: text.to_owned()
+                }),
+                "{text}"
+            );
+        }
+        assert_eq!(uri("::1", 5).to_string(), "http://[::1]:5/");
+    }
+
+    #[test]
+    fn the_port_comes_from_ros_master_uri() {
+        assert_eq!(master_port(&env(&[])), Ok(11311));
+        assert_eq!(
+            master_port(&env(&[("ROS_MASTER_URI", "http://other:1234/")])),
+            Ok(1234)
+        );
+        assert!(master_port(&env(&[("ROS_MASTER_URI", "nonsense")])).is_err());
+    }
+
+    #[test]
+    fn a_loopback_override_binds_loopback_only() {
+        let any = bind_addresses(&env(&[("ROS_IP", "10.0.0.7")]));
+        assert!(any.iter().all(IpAddr::is_unspecified));
+        for own in ["localhost", "127.0.0.1", "127.0.1.1", "::1"] {
+            let bound = bind_addresses(&env(&[("ROS_HOSTNAME", own), ("ROS_IP", "10.0.0.7")]));
+            assert!(bound.iter().all(IpAddr::is_loopback), "{own}");
+        }
+    }
+
+    #[test]
+    fn the_advertised_host_is_rosgraphs_choice() {
+        let local = Some(IpAddr::V4(Ipv4Addr::new(10, 0, 0, 7)));
+        assert_eq!(
+            advertised_host(&env(&[("ROS_IP", "1.2.3.4")]), "robot", local),
+            "1.2.3.4"
+        );
+        assert_eq!(advertised_host(&env(&[]), "robot", local), "robot");
+        assert_eq!(advertised_host(&env(&[]), "localhost", local), "10.0.0.7");
+        assert_eq!(advertised_host(&env(&[]), "", None), "127.0.0.1");
+    }
+
+    #[test]
+    fn the_log_folder_is_rospkgs_choice() {
+        assert_eq!(
+            log_dir(&env(&[("HOME", "/home/r")])),
+            PathBuf::from("/home/r/.ros/log")
+        );
+        assert_eq!(
+            log_dir(&env(&[("ROS_HOME", "/h")])),
+            PathBuf::from("/h/log")
+        );
+        assert_eq!(
+            log_dir(&env(&[("ROS_HOME", "/h"), ("ROS_LOG_DIR", "/l")])),
+            PathBuf::from("/l")
+        );
+    }
+}
