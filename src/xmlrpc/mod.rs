@@ -1,5 +1,14 @@
 //! XML-RPC: values, and their way from text and to text. Nothing here knows of ROS.
 
+mod decode;
+mod encode;
+mod error;
+mod number;
+mod prolog;
+mod scan;
 mod value;
 
+pub use decode::{MAX_DEPTH, decode_call, decode_reply};
+pub use encode::{encode_call, encode_reply};
+pub use error::DecodeError;
 pub use value::{Call, Reply, Struct, Value};

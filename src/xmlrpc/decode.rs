@@ -1,0 +1,323 @@
+//! From text to values, as CPython's `xmlrpc.client.Unmarshaller` under expat does it.
+//!
+//! The unmarshaller there is a stack machine that looks at tags one by one and hardly at how they
+//! lie inside each other. Clients live off that leniency, so this is the same machine.
+
+use super::error::DecodeError;
+use super::number;
+use super::prolog::text_of;
+use super::scan::{Event, Scanner};
+use super::value::{Call, Reply, Struct, Value};
+
+/// How deep arrays and structs may lie inside each other.
+///
+/// rosmaster takes any depth (measured: 20,000), but returns at most 492 levels, its own
+/// `[code, message, value]` included; for anything deeper it answers a fault. So this keeps all
+/// that can be read back, and bounds recursion over values, their drop included.
+pub const MAX_DEPTH: usize = 512;
+
+/// How many elements may be open: a level of a struct takes four (value, struct, member, value),
+/// one of an array three; the frame around the parameters a handful.
+const MAX_OPEN: usize = 4 * MAX_DEPTH;
+
+/// Reads a request.
+///
+/// # Errors
+///
+/// Where CPython raises, and in the few cases that are named at [`DecodeError`].
+pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
+    let wanted = "call";
+    let document = unmarshal(body, wanted)?;
+    if document.is_fault {
+        let what = "it is a fault";
+        return Err(DecodeError::Shape { wanted, what });
+    }
+    let Some(method) = document.method else {
+        let what = "it names no method";
+        return Err(DecodeError::Shape { wanted, what });
+    };
+    Ok(Call::new(method, document.values))
+}
+
+/// Reads an answer.
+///
+/// # Errors
+///
+/// Where CPython raises, where there is not exactly one value, and in the few cases that are named
+/// at [`DecodeError`].
+pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
+    let wanted = "reply";
+    let document = unmarshal(body, wanted)?;
+    let mut values = document.values.into_iter();
+    let (Some(value), None) = (values.next(), values.next()) else {
+        let what = "it does not hold one value";
+        return Err(DecodeError::Shape { wanted, what });
+    };
+    if !document.is_fault {
+        return Ok(Reply::Value(value));
+    }
+    let members = value.as_struct();
+    let member = |name| members.and_then(|members| members.get(name));
+    match (member("faultCode"), member("faultString")) {
+        (Some(Value::Int(code)), Some(Value::String(text)))
+            if members.map(Struct::len) == Some(2) =>
+        {
+            let (code, text) = (*code, text.clone());
+            Ok(Reply::Fault { code, text })
+        }
+        (Some(_), Some(_)) => {
+            let what = "a fault with more than a number and a text";
+            let at = body.len();
+            Err(DecodeError::Unsupported { at, what })
+        }
+        _ => {
+            let what = "its fault lacks faultCode or faultString";
+            Err(DecodeError::Shape { wanted, what })
+        }
+    }
+}
+
+/// What the machine has found at the end.
+struct Document {
+    values: Vec<Value>,
+    method: Option<String>,
+    is_fault: bool,
+}
+
+fn unmarshal(body: &[u8], wanted: &'static str) -> Result<Document, DecodeError> {
+    let (text, start) = text_of(body)?;
+    let mut scanner = Scanner::new(&text, start, MAX_OPEN);
+    let mut machine = Unmarshaller::default();
+    while let Some(event) = scanner.next()? {
+        match event {
+            Event::Start(tag) => machine.start(tag, scanner.at())?,
+            Event::End(tag) => machine.end(tag, scanner.at())?,
+            Event::Text(piece) => machine.text.push(piece),
+            Event::Char(c) => machine.text.push_char(c),
+        }
+    }
+    let Some(kind) = machine.kind else {
+        let what = "it has no params, fault or methodName";
+        return Err(DecodeError::Shape { wanted, what });
+    };
+    Ok(Document {
+        values: machine.stack,
+        method: machine.method,
+        is_fault: kind == Kind::Fault,
+    })
+}
+
+/// What the last of these elements was; CPython lets it decide.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Call,
+    Fault,
+}
+
+/// Character data since the last start tag. Mostly that is one piece of the document.
+#[derive(Default)]
+struct Run<'a> {
+    first: &'a str,
+    /// Everything, `first` included, once there is more than one piece.
+    all: String,
+}
+
+impl<'a> Run<'a> {
+    fn clear(&mut self) {
+        self.first = "";
+        self.all.clear();
+    }
+
+    fn push(&mut self, piece: &'a str) {
+        if !self.all.is_empty() {
+            self.all.push_str(piece);
+        } else if self.first.is_empty() {
+            self.first = piece;
+        } else {
+            self.all.push_str(self.first);
+            self.all.push_str(piece);
+        }
+    }
+
+    fn push_char(&mut self, character: char) {
+        if self.all.is_empty() {
+            self.all.push_str(self.first);
+        }
+        self.all.push(character);
+    }
+
+    fn as_str(&self) -> &str {
+        if self.all.is_empty() {
+            self.first
+        } else {
+            &self.all
+        }
+    }
+}
+
+/// The elements that CPython's unmarshaller knows; it passes over all others.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Tag {
+    Value,
+    Text,
+    Int,
+    Boolean,
+    Double,
+    Nil,
+    DateTime,
+    Base64,
+    BigDecimal,
+    Array,
+    Struct,
+    Params,
+    Fault,
+    MethodName,
+}
+
+impl Tag {
+    /// By the name without its prefix.
+    fn named(name: &str) -> Option<Self> {
+        Some(match name {
+            "value" => Self::Value,
+            "string" | "name" => Self::Text,
+            "i1" | "i2" | "i4" | "i8" | "int" | "biginteger" => Self::Int,
+            "boolean" => Self::Boolean,
+            "double" | "float" => Self::Double,
+            "nil" => Self::Nil,
+            "dateTime.iso8601" => Self::DateTime,
+            "base64" => Self::Base64,
+            "bigdecimal" => Self::BigDecimal,
+            "array" => Self::Array,
+            "struct" => Self::Struct,
+            "params" => Self::Params,
+            "fault" => Self::Fault,
+            "methodName" => Self::MethodName,
+            _ => return None,
+        })
+    }
+}
+
+/// The name without its prefix.
+fn local(name: &str) -> &str {
+    name.rsplit_once(':').map_or(name, |(_, local)| local)
+}
+
+#[derive(Default)]
+struct Unmarshaller<'a> {
+    kind: Option<Kind>,
+    method: Option<String>,
+    stack: Vec<Value>,
+    /// How long the stack was at the start of each open array and struct.
+    marks: Vec<usize>,
+    text: Run<'a>,
+    /// A `<value>` has begun and no element in it: so far it is an untyped string.
+    is_bare: bool,
+}
+
+impl Unmarshaller<'_> {
+    fn start(&mut self, name: &str, at: usize) -> Result<(), DecodeError> {
+        let name = local(name);
+        let tag = Tag::named(name);
+        if matches!(tag, Some(Tag::Array | Tag::Struct)) {
+            if self.marks.len() >= MAX_DEPTH {
+                let limit = MAX_DEPTH;
+                return Err(DecodeError::TooDeep { at, limit });
+            }
+            self.marks.push(self.stack.len());
+        }
+        self.text.clear();
+        if self.is_bare && tag.is_none() {
+            let tag = name.to_owned();
+            return Err(DecodeError::UnknownType { at, tag });
+        }
+        self.is_bare = tag == Some(Tag::Value);
+        Ok(())
+    }
+
+    fn end(&mut self, name: &str, at: usize) -> Result<(), DecodeError> {
+        let Some(tag) = Tag::named(local(name)) else {
+            return Ok(());
+        };
+        let value = match tag {
+            Tag::Value if self.is_bare => Value::String(self.text.as_str().to_owned()),
+            Tag::Value => return Ok(()),
+            Tag::Params => {
+                self.kind = Some(Kind::Call);
+                return Ok(());
+            }
+            Tag::Fault => {
+                self.kind = Some(Kind::Fault);
+                return Ok(());
+            }
+            Tag::MethodName => {
+                self.kind = Some(Kind::Call);
+                self.method = Some(self.text.as_str().to_owned());
+                return Ok(());
+            }
+            Tag::Array => {
+                let mark = self.marks.pop().unwrap_or_default();
+                Value::Array(self.stack.split_off(mark))
+            }
+            Tag::Struct => self.end_struct(at)?,
+            _ => scalar(tag, self.text.as_str(), at)?,
+        };
+        self.stack.push(value);
+        self.is_bare = false;
+        Ok(())
+    }
+
+    /// Names and values take turns on the stack.
+    fn end_struct(&mut self, at: usize) -> Result<Value, DecodeError> {
+        let mark = self.marks.pop().unwrap_or_default();
+        let mut members = Struct::with_capacity((self.stack.len() - mark) / 2);
+        let mut items = self.stack.drain(mark..);
+        while let Some(name) = items.next() {
+            let Value::String(name) = name else {
+                let what = "a struct with a name that is no string";
+                return Err(DecodeError::Unsupported { at, what });
+            };
+            let Some(value) = items.next() else {
+                let tag = "struct";
+                return Err(bad_text(tag, &name, at));
+            };
+            // A name that comes again keeps its place and takes the new value, as in a dict.
+            members.insert(name, value);
+        }
+        Ok(Value::Struct(members))
+    }
+}
+
+/// The value of a leaf with this text.
+fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
+    let (value, tag) = match tag {
+        Tag::Text => return Ok(Value::String(text.to_owned())),
+        Tag::DateTime => return Ok(Value::DateTime(text.trim().to_owned())),
+        Tag::Nil => return Ok(Value::Nil),
+        Tag::Boolean => {
+            let value = match text {
+                "0" => Some(Value::Bool(false)),
+                "1" => Some(Value::Bool(true)),
+                _ => None,
+            };
+            (value, "boolean")
+        }
+        Tag::Base64 if text.is_ascii() => (number::base64_bytes(text).map(Value::Base64), "base64"),
+        Tag::Int | Tag::Double if !text.is_ascii() => {
+            let what = "a number beyond ASCII";
+            return Err(DecodeError::Unsupported { at, what });
+        }
+        Tag::Int => (number::int(text), "int"),
+        Tag::Double => (number::float(text).map(Value::Double), "double"),
+        Tag::BigDecimal => {
+            let what = "a bigdecimal";
+            return Err(DecodeError::Unsupported { at, what });
+        }
+        _ => (None, "base64"),
+    };
+    value.ok_or_else(|| bad_text(tag, text, at))
+}
+
+fn bad_text(tag: &'static str, text: &str, at: usize) -> DecodeError {
+    let text = text.chars().take(40).collect();
+    DecodeError::BadText { at, tag, text }
+}

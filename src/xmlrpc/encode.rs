@@ -1,0 +1,256 @@
+//! From values to text: the compact form that we send, and the form of CPython's server.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use indexmap::map;
+use std::slice;
+
+use super::number::repr;
+use super::value::{Call, Reply, Struct, Value};
+
+/// How many arrays and structs inside each other rosmaster can still return. Its Python may go
+/// 1000 calls deep, and marshalling takes two a level. Measured with Python 3.11 on the real one,
+/// which marshals every reply from the same depth.
+const MAX_REPLY_DEPTH: usize = 492;
+
+/// Bytes in one line of base64: 76 characters.
+const BASE64_LINE: usize = 57;
+
+/// Writes a request in few bytes.
+///
+/// Its forms are those that CPython, and roscpp's much pickier xmlrpcpp, both take: untyped strings
+/// and `i4`, nothing self-closing but nil, no white space between tags. A carriage return goes as a
+/// reference, because a bare one would arrive as a line feed. Characters that XML does not have
+/// (they cannot come out of a decoded document) go as they are, and the other side refuses them.
+pub fn encode_call(call: &Call) -> Vec<u8> {
+    let mut writer = Writer::new(Form::Compact);
+    writer.raw("<?xml version=\"1.0\"?><methodCall><methodName>");
+    writer.escaped(&call.method);
+    writer.raw("</methodName><params>");
+    for param in &call.params {
+        writer.raw("<param>");
+        writer.value(param);
+        writer.raw("</param>");
+    }
+    writer.raw("</params></methodCall>");
+    writer.out.into_bytes()
+}
+
+/// Writes an answer as rosmaster does, byte for byte: as `_marshaled_dispatch` of CPython's
+/// `SimpleXMLRPCServer`.
+///
+/// A value that it cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes the
+/// fault that it answers then. Like there, a date's text is not escaped.
+pub fn encode_reply(reply: &Reply) -> Vec<u8> {
+    const OPEN: &str = "<?xml version='1.0'?>\n<methodResponse>\n";
+    let (code, text) = match reply {
+        Reply::Value(value) => {
+            let mut writer = Writer::new(Form::Python);
+            writer.raw(OPEN);
+            writer.raw("<params>\n<param>\n");
+            writer.value(value);
+            writer.raw("</param>\n</params>\n</methodResponse>\n");
+            match writer.refusal {
+                None => return writer.out.into_bytes(),
+                Some(text) => (1, text),
+            }
+        }
+        Reply::Fault { code, text } => (*code, text.as_str()),
+    };
+    let members = Value::Struct(Struct::from([
+        ("faultCode".to_owned(), Value::Int(code)),
+        ("faultString".to_owned(), Value::from(text)),
+    ]));
+    let mut writer = Writer::new(Form::Python);
+    writer.raw(OPEN);
+    writer.raw("<fault>\n");
+    writer.value(&members);
+    writer.raw("</fault>\n</methodResponse>\n");
+    writer.out.into_bytes()
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Form {
+    Compact,
+    Python,
+}
+
+/// An array or struct that is being written.
+enum Open<'v> {
+    Array(slice::Iter<'v, Value>),
+    Struct {
+        members: map::Iter<'v, String, Value>,
+        in_member: bool,
+    },
+}
+
+struct Writer {
+    form: Form,
+    out: String,
+    /// Why CPython would have raised, the first time. What is written after that is of no use.
+    refusal: Option<&'static str>,
+}
+
+impl Writer {
+    fn new(form: Form) -> Self {
+        Self {
+            form,
+            out: String::new(),
+            refusal: None,
+        }
+    }
+
+    fn raw(&mut self, text: &str) {
+        self.out.push_str(text);
+    }
+
+    /// A tag at whose end CPython breaks the line.
+    fn line(&mut self, text: &str) {
+        self.out.push_str(text);
+        if self.form == Form::Python {
+            self.out.push('\n');
+        }
+    }
+
+    fn escaped(&mut self, text: &str) {
+        let mut from = 0;
+        for (at, byte) in text.bytes().enumerate() {
+            let escape = match byte {
+                b'&' => "&amp;",
+                b'<' => "&lt;",
+                b'>' => "&gt;",
+                b'\r' if self.form == Form::Compact => "&#13;",
+                _ => continue,
+            };
+            self.out.push_str(text.get(from..at).unwrap_or_default());
+            self.out.push_str(escape);
+            from = at + 1;
+        }
+        self.out.push_str(text.get(from..).unwrap_or_default());
+    }
+
+    fn leaf(&mut self, tag: &str, text: &str) {
+        for piece in ["<value><", tag, ">", text, "</", tag] {
+            self.out.push_str(piece);
+        }
+        self.line("></value>");
+    }
+
+    /// One value, of any depth and without recursion.
+    fn value(&mut self, value: &Value) {
+        let mut open: Vec<Open<'_>> = Vec::new();
+        let mut next = Some(value);
+        loop {
+            if let Some(value) = next.take() {
+                if self.form == Form::Python && self.refusal.is_none() {
+                    self.refusal = refusal(value, open.len());
+                }
+                if self.refusal.is_some() {
+                    return;
+                }
+                match value {
+                    Value::Array(elements) => {
+                        self.line("<value><array><data>");
+                        open.push(Open::Array(elements.iter()));
+                    }
+                    Value::Struct(members) => {
+                        self.line("<value><struct>");
+                        open.push(Open::Struct {
+                            members: members.iter(),
+                            in_member: false,
+                        });
+                    }
+                    leaf => self.scalar(leaf),
+                }
+            }
+            match open.last_mut() {
+                None => return,
+                Some(Open::Array(elements)) => {
+                    next = elements.next();
+                    if next.is_none() {
+                        self.line("</data></array></value>");
+                        open.pop();
+                    }
+                }
+                Some(Open::Struct { members, in_member }) => {
+                    if std::mem::replace(in_member, true) {
+                        self.line("</member>");
+                    }
+                    if let Some((name, member)) = members.next() {
+                        self.line("<member>");
+                        self.raw("<name>");
+                        self.escaped(name);
+                        self.line("</name>");
+                        next = Some(member);
+                    } else {
+                        self.line("</struct></value>");
+                        open.pop();
+                    }
+                }
+            }
+        }
+    }
+
+    fn scalar(&mut self, value: &Value) {
+        let compact = self.form == Form::Compact;
+        match value {
+            Value::Nil => self.raw("<value><nil/></value>"),
+            Value::Bool(truth) => self.leaf("boolean", if *truth { "1" } else { "0" }),
+            Value::Int(number) => {
+                self.leaf(if compact { "i4" } else { "int" }, &number.to_string());
+            }
+            Value::BigInt(digits) => self.leaf("i8", digits),
+            Value::Double(number) => self.leaf("double", &repr(*number)),
+            Value::String(text) if compact => {
+                self.raw("<value>");
+                self.escaped(text);
+                self.raw("</value>");
+            }
+            Value::String(text) => {
+                self.raw("<value><string>");
+                self.escaped(text);
+                self.line("</string></value>");
+            }
+            Value::DateTime(text) if compact => {
+                self.raw("<value><dateTime.iso8601>");
+                self.escaped(text);
+                self.raw("</dateTime.iso8601></value>");
+            }
+            Value::DateTime(text) => self.leaf("dateTime.iso8601", text),
+            Value::Base64(bytes) => {
+                self.line("<value><base64>");
+                if compact {
+                    STANDARD.encode_string(bytes, &mut self.out);
+                } else {
+                    for line in bytes.chunks(BASE64_LINE) {
+                        STANDARD.encode_string(line, &mut self.out);
+                        self.out.push('\n');
+                    }
+                }
+                self.line("</base64></value>");
+            }
+            Value::Array(_) | Value::Struct(_) => {}
+        }
+    }
+}
+
+/// The text of the fault that rosmaster answers if this value is inside `depth` arrays and structs
+/// of a reply; the texts at the limit depend on what Python was doing when it was reached.
+fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
+    match value {
+        _ if depth > MAX_REPLY_DEPTH => {
+            Some("<class 'RecursionError'>:maximum recursion depth exceeded")
+        }
+        Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
+        Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
+        Value::Double(_) if depth == MAX_REPLY_DEPTH => Some(
+            "<class 'RecursionError'>:maximum recursion depth exceeded while getting the repr of an object",
+        ),
+        Value::DateTime(_) if depth == MAX_REPLY_DEPTH => Some(CALLING),
+        Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(CALLING),
+        _ => None,
+    }
+}
+
+const CALLING: &str =
+    "<class 'RecursionError'>:maximum recursion depth exceeded while calling a Python object";

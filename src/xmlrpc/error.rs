@@ -1,0 +1,77 @@
+//! Why a document was not decoded.
+
+use thiserror::Error;
+
+/// Why a document was not decoded: CPython would raise too, or it would take something that is
+/// deliberately not decoded here (see [`DecodeError::Unsupported`]).
+///
+/// Never a reason to fail a call: the bytes can still be forwarded as they came, and whoever gets
+/// them judges them.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum DecodeError {
+    /// Expat refuses it too.
+    #[error("not well-formed XML at byte {at}: {what}; forward the body as it came")]
+    Syntax {
+        /// Where in the body, after a byte order mark.
+        at: usize,
+        /// What is wrong there.
+        what: &'static str,
+    },
+    /// CPython would take it, but no known ROS client sends it; not decoding beats decoding wrongly.
+    #[error("not decoded here: {what} at byte {at}; forward the body as it came")]
+    Unsupported {
+        /// Where in the body, after a byte order mark.
+        at: usize,
+        /// What it is.
+        what: &'static str,
+    },
+    /// The XML declaration names another encoding than UTF-8, US-ASCII or ISO-8859-1.
+    #[error("encoding {name:?} is not decoded here; forward the body as it came")]
+    Encoding {
+        /// The name in the declaration.
+        name: String,
+    },
+    /// The bytes are not in the document's encoding.
+    #[error("byte {at} is not {encoding}; forward the body as it came")]
+    NotText {
+        /// Where in the body, after a byte order mark.
+        at: usize,
+        /// The document's encoding.
+        encoding: &'static str,
+    },
+    /// Arrays and structs, or elements, lie inside each other beyond the limit.
+    #[error("nested deeper than {limit} levels at byte {at}; forward the body as it came")]
+    TooDeep {
+        /// Where in the body, after a byte order mark.
+        at: usize,
+        /// The limit.
+        limit: usize,
+    },
+    /// A `<value>` holds an element that is no type.
+    #[error("unknown type <{tag}> at byte {at}; forward the body as it came")]
+    UnknownType {
+        /// Behind the tag.
+        at: usize,
+        /// Its name without a prefix.
+        tag: String,
+    },
+    /// The text of a value does not fit its type.
+    #[error("{text:?} is no {tag} (before byte {at}); forward the body as it came")]
+    BadText {
+        /// Behind the end of the element.
+        at: usize,
+        /// The type.
+        tag: &'static str,
+        /// The text, cut to a few characters.
+        text: String,
+    },
+    /// Well-formed, but not the call or reply that was asked for.
+    #[error("not a {wanted}: {what}; forward the body as it came")]
+    Shape {
+        /// `call` or `reply`.
+        wanted: &'static str,
+        /// What is missing or too much.
+        what: &'static str,
+    },
+}

@@ -1,0 +1,160 @@
+//! Numbers and binaries as Python reads and writes them.
+
+use super::value::Value;
+
+/// How many digits Python's `int()` takes from text (`sys.int_info.default_max_str_digits`, since
+/// 3.11.0; leading zeros count).
+const MAX_DIGITS: usize = 4300;
+
+/// The characters that Python strips off a number, as far as they are ASCII and in XML.
+const SPACE: [char; 4] = [' ', '\t', '\n', '\r'];
+
+/// Python's `int(text)`, for text in ASCII.
+pub(super) fn int(text: &str) -> Option<Value> {
+    if text.len() <= MAX_DIGITS
+        && let Ok(number) = text.parse()
+    {
+        return Some(Value::Int(number));
+    }
+    let text = text.trim_matches(SPACE);
+    let (negative, digits) = match text.strip_prefix('-') {
+        Some(digits) => (true, digits),
+        None => (false, text.strip_prefix('+').unwrap_or(text)),
+    };
+    let digits = without_underscores(digits)?;
+    if digits.is_empty() || digits.len() > MAX_DIGITS || !digits.bytes().all(|b| b.is_ascii_digit())
+    {
+        return None;
+    }
+    let digits = digits.trim_start_matches('0');
+    let canonical = match (negative, digits.is_empty()) {
+        (_, true) => return Some(Value::Int(0)),
+        (true, _) => format!("-{digits}"),
+        (false, _) => digits.to_owned(),
+    };
+    Some(match canonical.parse() {
+        Ok(number) => Value::Int(number),
+        Err(_) => Value::BigInt(canonical),
+    })
+}
+
+/// Python's `float(text)`, for text in ASCII. Every `nan` becomes the same one, as their signs and
+/// payloads are not in Python's text for them.
+pub(super) fn float(text: &str) -> Option<f64> {
+    // Without blanks and underscores, Rust takes exactly what Python takes.
+    let number: f64 = match text.parse() {
+        Ok(number) => number,
+        Err(_) => without_underscores(text.trim_matches(SPACE))?
+            .parse()
+            .ok()?,
+    };
+    Some(if number.is_nan() { f64::NAN } else { number })
+}
+
+/// `text` without its underscores; nothing if one of them is not between two digits.
+fn without_underscores(text: &str) -> Option<String> {
+    let mut plain = String::with_capacity(text.len());
+    let mut parts = text.split('_').peekable();
+    let mut first = true;
+    while let Some(part) = parts.next() {
+        let starts = first || part.starts_with(|c: char| c.is_ascii_digit());
+        let ends = parts.peek().is_none() || part.ends_with(|c: char| c.is_ascii_digit());
+        if !starts || !ends {
+            return None;
+        }
+        first = false;
+        plain.push_str(part);
+    }
+    Some(plain)
+}
+
+/// Python's `repr(number)`: the fewest digits that mean this number, with an exponent below 1e-4
+/// and from 1e16 on.
+pub(super) fn repr(number: f64) -> String {
+    if number.is_nan() {
+        return "nan".to_owned();
+    }
+    if number.is_infinite() {
+        return if number > 0.0 { "inf" } else { "-inf" }.to_owned();
+    }
+    let shortest = shortest(number);
+    let Some((mantissa, exponent)) = shortest.split_once('e') else {
+        return shortest;
+    };
+    let exponent: i32 = exponent.parse().unwrap_or_default();
+    if !(-4..16).contains(&exponent) {
+        let sign = if exponent < 0 { '-' } else { '+' };
+        return format!("{mantissa}e{sign}{:02}", exponent.unsigned_abs());
+    }
+    let (sign, mantissa) = match mantissa.strip_prefix('-') {
+        Some(mantissa) => ("-", mantissa),
+        None => ("", mantissa),
+    };
+    let mut digits = mantissa.replace('.', "");
+    let Ok(whole) = usize::try_from(exponent) else {
+        let zeros = exponent.unsigned_abs() as usize - 1;
+        return format!("{sign}0.{:0<zeros$}{digits}", "");
+    };
+    while digits.len() < whole + 2 {
+        digits.push('0');
+    }
+    digits.insert(whole + 1, '.');
+    format!("{sign}{digits}")
+}
+
+/// The fewest digits that mean this number, as `d.ddde-7`.
+///
+/// Where two texts of that length are equally near, Rust takes the upper and Python the even one
+/// (-823967287502993.25 is `…993.3` and `…993.2`); rounding to so many digits settles it as Python does.
+fn shortest(number: f64) -> String {
+    let shortest = format!("{number:e}");
+    let mantissa = shortest.split('e').next().unwrap_or_default();
+    let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
+    let rounded = format!("{number:.*e}", digits.saturating_sub(1));
+    if rounded != shortest && rounded.parse() == Ok(number) {
+        rounded
+    } else {
+        shortest
+    }
+}
+
+/// Python's `binascii.a2b_base64(text)`, lenient as `base64.decodebytes` uses it: characters that
+/// are not in the alphabet are passed over, and what follows a complete padding is not read.
+pub(super) fn base64_bytes(text: &str) -> Option<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(text.len() / 4 * 3);
+    let mut place = 0_u8;
+    let mut pads = 0;
+    let mut left = 0_u8;
+    for byte in text.bytes() {
+        let bits = match byte {
+            b'A'..=b'Z' => byte - b'A',
+            b'a'..=b'z' => byte - b'a' + 26,
+            b'0'..=b'9' => byte - b'0' + 52,
+            b'+' => 62,
+            b'/' => 63,
+            b'=' if place >= 2 => {
+                pads += 1;
+                if place + pads >= 4 {
+                    return Some(bytes);
+                }
+                continue;
+            }
+            _ => continue,
+        };
+        pads = 0;
+        match place {
+            0 => left = bits,
+            1 => {
+                bytes.push(left << 2 | bits >> 4);
+                left = bits & 0x0f;
+            }
+            2 => {
+                bytes.push(left << 4 | bits >> 2);
+                left = bits & 0x03;
+            }
+            _ => bytes.push(left << 6 | bits),
+        }
+        place = (place + 1) % 4;
+    }
+    (place == 0).then_some(bytes)
+}

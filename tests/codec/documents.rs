@@ -1,0 +1,301 @@
+//! Documents written by hand.
+
+/// What is inside one `<value>`.
+#[rustfmt::skip]
+const VALUES: &[&str] = &[
+    // Untyped and typed text.
+    "", " ", "\n\t ", " a b ", "a\r\nb\rc\n\rd\r\r\ne", "&#13;", "&#xD;&#xA;&#9;",
+    "a&#0000000065;b", "&lt;&gt;&amp;&apos;&quot;", "&#38;lt;", "<![CDATA[<&>]]>",
+    "a<![CDATA[]]]]><![CDATA[>b]]>c", "<![CDATA[a\r\nb\r]]>", "<![CDATA[]]>", "a<!-- c -->b",
+    "a<!---->b", "a<?pi x?>b", "a<?pi?>b", "é € 𝄞 \u{fffd} \u{1fffe} \u{7f} \u{85}",
+    "&#x10FFFF;&#xE000;&#x85;", "]]", "a]]b]>", "] ]>", "<string/>", "<string></string>",
+    "<string> a </string>", "<string>a</string>b", "x<string>a</string>",
+    "<string>a<b>c</b>d</string>", "<string>a<b/>d</string>", "<string>a<!-- x -->b&amp;c</string>",
+    "<string a='1' b=\"2\">x</string>", "<string a = '&lt;&#10;>\n'  >x</string >", "<string\n/>",
+    "<string a=''/>", "<string>&#xFFFD;</string>", "<name>n</name>",
+    // Not well-formed.
+    "&", "& ", "&amp", "&#;", "&#x;", "&#-5;", "&#+5;", "&#0;", "&#8;", "&#x1F;", "&#xD800;",
+    "&#xFFFE;", "&#xFFFF;", "&#x110000;", "&#99999999999999999999;", "&nbsp;", "&LT;", "&a b;",
+    "]]>", "a]]]>b", "<![CDATA[", "<![CDATA[a]]", "<![cdata[a]]>", "<!-- -- -->", "<!--->", "<!-->",
+    "<!--x--->", "<!x>", "<!DOCTYPE a>", "<? x?>", "<?xml version='1.0'?>", "<?XML x?>", "<?xMl?>",
+    "<?pi", "<?pi/?>", "<?1?>", "<?pi ??>", "<?pi?x?>", "<1>", "<>", "< string>a</string>",
+    "<string", "<string a>x</string>", "<string a=1>x</string>", "<string a='1'b='2'>x</string>",
+    "<string a='1' a='2'>x</string>", "<string a='<'>x</string>", "<string a='&'>x</string>",
+    "<string a='&no;'>x</string>", "<string a='x>y</string>", "<string / >", "<string/ >",
+    "</string>", "<string>x</strin>", "<string>x</ string>", "<string>x</string x='1'>",
+    "<a><b></a></b>", "<a:b>x</a:c>", "\u{1}", "\u{b}", "\u{1f}", "\u{fffe}", "\u{ffff}",
+    "<!-- \u{1} -->", "<!-- \u{ffff} -->", "<?pi \u{2}?>", "<string a='\u{3}'/>",
+    "<string a='\u{fffe}'/>", "<![CDATA[\u{0}]]>", "<![CDATA[\u{ffff}]]>", "\0",
+    // Numbers.
+    "<int>5</int>", "<int> 5 </int>", "<int>\n+5\t</int>", "<int>-0</int>", "<int>007</int>",
+    "<int></int>", "<int/>", "<int> </int>", "<int>+</int>", "<int>- 5</int>", "<int>1 2</int>",
+    "<int>--5</int>", "<int>1_000</int>", "<int>1__0</int>", "<int>_1</int>", "<int>1_</int>",
+    "<int>-_1</int>", "<int>0x10</int>", "<int>1e3</int>", "<int>1.0</int>", "<int>1L</int>",
+    "<int>2147483647</int>", "<int>2147483648</int>", "<int>-2147483648</int>",
+    "<int>-2147483649</int>", "<int>-00002147483649</int>", "<int>0_0</int>",
+    "<int>5<!-- x -->6</int>", "<int>&#53;</int>", "<i1>300</i1>", "<i2>70000</i2>", "<i4>-1</i4>",
+    "<i8>9223372036854775808</i8>", "<biginteger>123456789012345678901234567890</biginteger>",
+    "<i16>1</i16>", "<I4>1</I4>", "<double>1</double>", "<double> 1.5 </double>",
+    "<double>1.</double>", "<double>.5</double>", "<double>.</double>", "<double></double>",
+    "<double>1e5</double>", "<double>1E+05</double>", "<double>e5</double>", "<double>1e</double>",
+    "<double>1_0.0_1e1_0</double>", "<double>1_.0</double>", "<double>1._0</double>",
+    "<double>1_e5</double>", "<double>_1</double>", "<double>nan</double>", "<double>-NaN</double>",
+    "<double>+nan</double>", "<double>inf</double>", "<double>-Infinity</double>",
+    "<double>infinit</double>", "<double>n_an</double>", "<double>1e999</double>",
+    "<double>-1e999</double>", "<double>1e-999</double>", "<double>-0</double>",
+    "<double>-0.0e-99999999999</double>", "<double>0x1p3</double>", "<double>1,5</double>",
+    "<double>1d5</double>", "<double>+ 1</double>", "<double>2.2250738585072011e-308</double>",
+    "<double>4.9e-324</double>", "<double>2e-324</double>",
+    "<double>1.7976931348623159e308</double>", "<double>9007199254740993</double>",
+    "<double>0.1e1e1</double>", "<float>2.5</float>", "<double>nan(1)</double>",
+    // Truth, nothing, dates, bytes.
+    "<boolean>0</boolean>", "<boolean>1</boolean>", "<boolean> 1 </boolean>",
+    "<boolean>true</boolean>", "<boolean></boolean>", "<boolean>01</boolean>",
+    "<boolean>2</boolean>", "<nil/>", "<nil></nil>", "<nil>x</nil>", "<ex:nil/>",
+    "<ex:i4>5</ex:i4>", "<a:b:int>5</a:b:int>", "<:int>5</:int>", "<int:>5</int:>",
+    "<dateTime.iso8601>20240101T00:00:00</dateTime.iso8601>", "<dateTime.iso8601/>",
+    "<dateTime.iso8601> \n x &lt; y \u{a0}\u{3000}\u{85}</dateTime.iso8601>",
+    "<datetime.iso8601>x</datetime.iso8601>", "<base64>QUJD</base64>",
+    "<base64>\nQU\n JD\n</base64>", "<base64/>", "<base64>QQ==</base64>", "<base64>QQ=</base64>",
+    "<base64>QQ</base64>", "<base64>Q</base64>", "<base64>QUI=</base64>", "<base64>QUI</base64>",
+    "<base64>Q=Q=</base64>", "<base64>QQ==QUJD</base64>", "<base64>QQ=Q=</base64>",
+    "<base64>QQ=QQ</base64>", "<base64>=QUJD</base64>", "<base64>====</base64>",
+    "<base64>Q===</base64>", "<base64>QU=J=D=</base64>", "<base64>QUI=QUI=</base64>",
+    "<base64>QUJD*-_!</base64>", "<base64>é</base64>", "<base64>QUJDQ</base64>",
+    "<base64>QUJDQ=</base64>",
+    // Arrays and structs, and what is neither.
+    "<array/>", "<array><data/></array>", "<array><data></data></array>",
+    "<array><value>a</value></array>", "<array> a <data> b <value>c</value> d </data> e </array>",
+    "<array><int>1</int><string>x</string></array>",
+    "<array><data><value/><value> </value></data></array>",
+    "<x:array><data><value>a</value></data></x:array>", "<data><value>1</value></data>",
+    "<foo>1</foo>", "<foo/>", "<param/>", "<params/>", "<member/>", "<array><foo>1</foo></array>",
+    "<array><foo><value>1</value></foo></array>", "<value>x</value>",
+    "<value><value><int>1</int></value></value>", "<value/>", "<int>1</int><int>2</int>",
+    "<string><int>1</int></string>", "<int><string>1</string></int>",
+    "<int>1<string>x</string></int>", "<struct/>", "<struct></struct>",
+    "<struct><member><name>a</name><value>1</value></member></struct>",
+    "<struct><member><name>b</name><value>1</value></member><member><name>a</name><value>2</value></member><member><name>b</name><value>3</value></member></struct>",
+    "<struct><member><name>a</name></member></struct>",
+    "<struct><member><value>1</value></member></struct>",
+    "<struct><member><value>1</value><name>a</name></member></struct>",
+    "<struct><name>a</name><value>1</value></struct>",
+    "<struct><member><name/><value/></member></struct>",
+    "<struct><member><name> a </name><value>1</value></member></struct>",
+    "<struct><member><name>a</name><value>1</value><value>2</value></member></struct>",
+    "<struct><member><name>a/b</name><value><array><data><value>1</value></data></array></value></member></struct>",
+    "<struct><value>k</value><value>v</value></struct>",
+    "<struct><member><name>a&amp;<![CDATA[<]]></name><value/></member></struct>",
+    "<struct><member><name>a</name><value><nil/></value></member></struct>",
+    "<struct><array/><value>1</value></struct>", "<struct><struct/><value>1</value></struct>",
+    "<bigdecimal>x</bigdecimal>", "<methodName>other</methodName>", "<fault/>",
+];
+
+/// What is inside `<params>`.
+#[rustfmt::skip]
+const PARAMS: &[&str] = &[
+    "", "<param/>", "<param><value/></param><param><value><int>1</int></value></param>",
+    "<int>1</int>", "text", "<value>a</value>", "<param>text</param>",
+    "<param><value>a</value><value>b</value></param>", "<params/>", "<param><int>1</int></param>",
+    "<foo><bar/></foo>", "<string>a</string>b<string>c</string>",
+];
+
+/// Whole documents.
+#[rustfmt::skip]
+const DOCUMENTS: &[&str] = &[
+    "", " ", "x", "<", "<a", "<a>", "<a/>", "<?xml version='1.0'?>", "<methodCall/>",
+    "<methodName/>", "<methodName>m</methodName>",
+    "<methodCall><methodName>m</methodName></methodCall>",
+    "<methodCall><methodName> m\n</methodName><params/></methodCall>",
+    "<methodCall><params/></methodCall>",
+    "<methodCall><params/><methodName>m</methodName></methodCall>",
+    "<methodCall><methodName>a</methodName><methodName>b</methodName><params/></methodCall>",
+    "<methodCall><methodName>m<x/>n</methodName></methodCall>",
+    "<methodCall><methodName><x>m</x>n</methodName></methodCall>",
+    "<methodCall><methodName>m</methodName><params><param><value>1</value></param></params><params><param><value>2</value></param></params></methodCall>",
+    "<methodCall><methodName>m</methodName><params/><fault/></methodCall>",
+    "<methodCall><methodName>m</methodName><fault/><params/></methodCall>",
+    "<methodCall><methodName>m</methodName><params/></methodCall>x",
+    "<methodCall><methodName>m</methodName><params/></methodCall><a/>",
+    "<methodCall><methodName>m</methodName><params/></methodCall> \r\n\t",
+    "<methodCall><methodName>m</methodName><params/></methodCall>\0",
+    "<methodCall><methodName>m</methodName><params/></methodCall><!-- x --><?y z?>",
+    "<methodCall><methodName>m</methodName><params/></methodCall>&#32;",
+    "<methodCall><methodName>m</methodName><params/></methodCall><![CDATA[]]>",
+    "<methodCall><methodName>m</methodName><params/></methodCall><!DOCTYPE a>",
+    " \n<methodCall><methodName>m</methodName></methodCall>",
+    "<!-- x --><?y?><methodCall><methodName>m</methodName></methodCall>",
+    "x<methodCall><methodName>m</methodName></methodCall>", "&#32;<methodName>m</methodName>",
+    "<![CDATA[]]><methodName>m</methodName>", " <?xml version='1.0'?><methodName>m</methodName>",
+    "\n<?xml version='1.0'?><methodName>m</methodName>",
+    "<?xml version='1.0'?><?xml version='1.0'?><methodName>m</methodName>",
+    "\u{feff}<?xml version='1.0'?><methodName>m</methodName>", "\u{feff}<methodName>m</methodName>",
+    "\u{feff}\u{feff}<methodName>m</methodName>", "<methodName>\u{feff}m</methodName>",
+    "<?xml version=\"1.0\"?>\r\n<methodName>m</methodName>",
+    "<?xml version='1.1'?><methodName>m</methodName>",
+    "<?xml version='9.z-_'?><methodName>m</methodName>",
+    "<?xml version=''?><methodName>m</methodName>",
+    "<?xml version='1 0'?><methodName>m</methodName>",
+    "<?xml version='1+0'?><methodName>m</methodName>", "<?xml?><methodName>m</methodName>",
+    "<?xml ?><methodName>m</methodName>", "<?xml version='1.0' ?><methodName>m</methodName>",
+    "<?xml version='1.0'encoding='utf-8'?><methodName>m</methodName>",
+    "<?xml\nversion = '1.0'\tencoding\r=\n\"utf-8\" standalone='yes' ?><methodName>m</methodName>",
+    "<?xml encoding='utf-8'?><methodName>m</methodName>",
+    "<?xml encoding='utf-8' version='1.0'?><methodName>m</methodName>",
+    "<?xml version='1.0' standalone='no'?><methodName>m</methodName>",
+    "<?xml version='1.0' standalone='maybe'?><methodName>m</methodName>",
+    "<?xml version='1.0' standalone='yes' encoding='utf-8'?><methodName>m</methodName>",
+    "<?xml version='1.0' x='y'?><methodName>m</methodName>",
+    "<?xml version='1.0' version='1.0'?><methodName>m</methodName>",
+    "<?xml version='1.0\"?><methodName>m</methodName>",
+    "<?xml version='1.0'><methodName>m</methodName>",
+    "<?xml version='1.0' encoding=''?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='1'?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='-'?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='UTF-8'?><methodName>é</methodName>",
+    "<?xml version='1.0' encoding='uTf-8'?><methodName>é</methodName>",
+    "<?xml version='1.0' encoding='US-ASCII'?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='us-ascii'?><methodName>é</methodName>",
+    "<?xml version='1.0' encoding='ISO-8859-1'?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='no-such'?><methodName>m</methodName>",
+    "<?xml version='1.0' encoding='utf-16'?><methodName>m</methodName>",
+    "<?xml version='1.0' encodinG='utf-8'?><methodName>m</methodName>",
+    "<?xml-stylesheet x?><methodName>m</methodName>", "<?xmlx?><methodName>m</methodName>",
+    "<?xml version='1.0' é='1'?><methodName>m</methodName>",
+    "<x:methodCall><x:methodName>m</x:methodName><x:params/></x:methodCall>",
+    "<methodCall xmlns='u' xmlns:x='v' x:y='z'><methodName>m</methodName></methodCall>",
+    "<!DOCTYPE a [<!ENTITY b 'c'>]><methodName>&b;</methodName>",
+    "<!DOCTYPE><methodName>m</methodName>", "<!doctype a><methodName>m</methodName>",
+    "<html><body>503</body></html>", "{\"a\": 1}", "<methodName>m</methodName >",
+    "<methodName>m</methodName", "<a><methodName>m</methodName>",
+];
+
+/// A request with this inside `<params>`.
+pub(crate) fn params(inside: &str) -> Vec<u8> {
+    format!("<?xml version='1.0'?><methodCall><methodName>m</methodName><params>{inside}</params></methodCall>")
+        .into_bytes()
+}
+
+/// A request with one parameter, this inside `<value>`.
+pub(crate) fn value(inside: &str) -> Vec<u8> {
+    params(&format!("<param><value>{inside}</value></param>"))
+}
+
+/// Documents on which both must agree.
+pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
+    let mut documents = Vec::new();
+    for inside in VALUES {
+        documents.push(value(inside));
+    }
+    for inside in PARAMS {
+        documents.push(params(inside));
+    }
+    for document in DOCUMENTS {
+        documents.push(document.as_bytes().to_vec());
+    }
+    for bytes in [
+        &b"<?xml version='1.0' encoding='iso-8859-1'?><methodName>\xe9\x80\xff\x85</methodName>"[..],
+        b"<methodName>\xe9</methodName>",
+        b"<methodName>\xc0\x80</methodName>",
+        b"<methodName>\xed\xa0\x80</methodName>",
+        b"<methodName>\xf4\x90\x80\x80</methodName>",
+        b"<methodName>\xf0\x9d\x84</methodName>",
+        b"<methodName>m</methodName>\xff",
+        b"<?xml version='1.0' encoding='us-ascii'?><methodName>\x80</methodName>",
+        b"<?xml version='1.0' encoding='utf-8'?><!-- \xff --><methodName>m</methodName>",
+        b"<methodName>m</methodName\x00>",
+        b"\xff\xfe",
+    ] {
+        documents.push(bytes.to_vec());
+    }
+    let digits = |n: usize| format!("<int>{}</int>", "9".repeat(n));
+    documents.push(value(&digits(4300)));
+    documents.push(value(&digits(4301)));
+    documents.push(value(&format!("<int>{}1</int>", "0".repeat(4299))));
+    documents.push(value(&format!("<int>{}1</int>", "0".repeat(4300))));
+    documents.push(value(&format!("<int>-{}1</int>", "1_".repeat(4299))));
+    documents.push(value(&format!("<int>-{}1</int>", "1_".repeat(4300))));
+    documents.push(value(&format!("<double>{}</double>", "9".repeat(5000))));
+    documents.push(value(&format!("<double>0.{}1</double>", "0".repeat(5000))));
+    documents.push(value(&format!(
+        "<double>{}e-5000</double>",
+        "9".repeat(5000)
+    )));
+    for depth in [100, 511, 512] {
+        let (open, close) = ("<array><data><value>", "</value></data></array>");
+        documents.push(value(&(open.repeat(depth) + "x" + &close.repeat(depth))));
+        let open = "<struct><member><name>k</name><value>";
+        let close = "</value></member></struct>";
+        documents.push(value(&(open.repeat(depth) + "x" + &close.repeat(depth))));
+    }
+    documents
+}
+
+/// Everything that CPython takes and the codec refuses, so that the bytes are only forwarded.
+pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
+    let utf16 = |mark: bool| {
+        let text = "<?xml version='1.0'?><methodName>m</methodName>".encode_utf16();
+        let mark = mark.then_some([0xff, 0xfe]).into_iter().flatten();
+        mark.chain(text.flat_map(u16::to_le_bytes))
+            .collect::<Vec<u8>>()
+    };
+    let many: String = (0..17).map(|n| format!(" a{n}='x'")).collect();
+    let declared = |name: &str| {
+        format!("<?xml version='1.0' encoding='{name}'?><methodName>m</methodName>").into_bytes()
+    };
+    vec![
+        (
+            "a document type",
+            b"<!DOCTYPE methodCall><methodName>m</methodName>".to_vec(),
+        ),
+        (
+            "a document type",
+            b"<!DOCTYPE a SYSTEM 'x'><methodName>m</methodName>".to_vec(),
+        ),
+        ("UTF-16", utf16(true)),
+        ("UTF-16", utf16(false)),
+        ("an encoding with 8 bits", declared("windows-1252")),
+        ("an encoding with 8 bits", declared("latin-1")),
+        ("an encoding with 8 bits", declared("utf8")),
+        (
+            "a mark, yet another encoding",
+            [b"\xef\xbb\xbf".to_vec(), declared("ISO-8859-1")].concat(),
+        ),
+        (
+            "a mark, yet another encoding",
+            [b"\xef\xbb\xbf".to_vec(), declared("US-ASCII")].concat(),
+        ),
+        ("a name beyond ASCII", params("<é/>")),
+        ("a name beyond ASCII", params("<aé/>")),
+        ("a name beyond ASCII", params("<a é='1'/>")),
+        ("a name beyond ASCII", params("<?é x?>")),
+        ("a number beyond ASCII", value("<int>٣</int>")),
+        ("a number beyond ASCII", value("<int>5\u{a0}</int>")),
+        ("a number beyond ASCII", value("<double>٣.٥</double>")),
+        ("a bigdecimal", value("<bigdecimal>1.5</bigdecimal>")),
+        (
+            "a name that is no string",
+            value("<struct><int>1</int><value>x</value></struct>"),
+        ),
+        (
+            "a name that is no string",
+            value("<struct><nil/><value>x</value></struct>"),
+        ),
+        (
+            "more than 16 attributes",
+            params(&format!("<param{many}/>")),
+        ),
+        (
+            "deeper than 512",
+            value(&("<array>".repeat(513) + &"</array>".repeat(513))),
+        ),
+        (
+            "deeper than 2048 elements",
+            params(&("<x>".repeat(2050) + &"</x>".repeat(2050))),
+        ),
+        (
+            "a reference with many zeros",
+            value("&#000000000000000000000065;"),
+        ),
+    ]
+}

@@ -1,0 +1,286 @@
+//! The codec against CPython's: the same verdict and value for every document, the same bytes for
+//! every answer.
+
+#![allow(
+    clippy::unwrap_used,
+    reason = "a failed test panics, in its helpers too"
+)]
+
+mod cases;
+mod documents;
+mod peer;
+
+use std::fmt::Write;
+
+use proptest::prelude::*;
+use rosrescue::xmlrpc::{
+    Call, DecodeError, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
+};
+
+use cases::{any_value, double, mess, returnable, text, with_line_feeds};
+use documents::{odd_documents, params, refused_documents};
+use peer::{Peer, hex};
+
+/// A value in the notation of the peer.
+fn notation(value: &Value) -> String {
+    match value {
+        Value::Nil => "nil".to_owned(),
+        Value::Bool(truth) => format!("bool:{}", i32::from(*truth)),
+        Value::Int(number) => format!("int:{number}"),
+        Value::BigInt(digits) => format!("int:{digits}"),
+        Value::Double(number) if number.is_nan() => "double:nan".to_owned(),
+        Value::Double(number) => format!("double:{:016x}", number.to_bits()),
+        Value::String(text) => format!("string:{}", hex(text.as_bytes())),
+        Value::DateTime(text) => format!("date:{}", hex(text.as_bytes())),
+        Value::Base64(bytes) => format!("base64:{}", hex(bytes)),
+        Value::Array(elements) => {
+            let inside: String = elements.iter().map(|e| notation(e) + " ").collect();
+            format!("[ {inside}]")
+        }
+        Value::Struct(members) => {
+            let inside: String = members
+                .iter()
+                .map(|(name, member)| {
+                    format!("string:{} {} ", hex(name.as_bytes()), notation(member))
+                })
+                .collect();
+            format!("{{ {inside}}}")
+        }
+    }
+}
+
+/// Our verdict, in the words of the peer.
+fn verdict(verb: &str, document: &[u8]) -> Result<String, DecodeError> {
+    if verb == "call" {
+        let call = decode_call(document)?;
+        let method = notation(&Value::from(call.method));
+        return Ok(format!(
+            "ok {method} {}",
+            notation(&Value::Array(call.params))
+        ));
+    }
+    Ok(match decode_reply(document)? {
+        Reply::Value(value) => format!("ok {}", notation(&value)),
+        Reply::Fault { code, text } => format!(
+            "fault {} {}",
+            notation(&Value::from(code)),
+            notation(&Value::from(text))
+        ),
+    })
+}
+
+/// The same verdict on both sides, or a refusal of the kinds that we allow ourselves.
+fn compare(peer: &mut Peer, verb: &str, document: &[u8]) -> Result<(), String> {
+    let theirs = peer.ask(verb, document);
+    let shown = String::from_utf8_lossy(document);
+    match verdict(verb, document) {
+        Ok(ours) if ours == theirs => Ok(()),
+        Ok(ours) => Err(format!("{shown}\nours:   {ours}\ntheirs: {theirs}")),
+        Err(
+            DecodeError::Unsupported { .. }
+            | DecodeError::Encoding { .. }
+            | DecodeError::TooDeep { .. },
+        ) => Ok(()),
+        Err(_) if theirs.starts_with("raise ") => Ok(()),
+        Err(ours) => Err(format!("{shown}\nours:   {ours}\ntheirs: {theirs}")),
+    }
+}
+
+#[test]
+fn odd_calls_are_taken_as_cpython_takes_them() {
+    let mut peer = Peer::start();
+    let mut failures = String::new();
+    for document in odd_documents() {
+        let theirs = peer.ask("call", &document);
+        let ours = verdict("call", &document);
+        let same = match &ours {
+            Ok(ours) => *ours == theirs,
+            Err(_) => theirs.starts_with("raise "),
+        };
+        if !same {
+            let shown = String::from_utf8_lossy(&document);
+            let shown: String = shown.chars().take(300).collect();
+            let theirs: String = theirs.chars().take(300).collect();
+            writeln!(failures, "{shown}\n ours   {ours:?}\n theirs {theirs}").unwrap();
+        }
+    }
+    assert!(failures.is_empty(), "{failures}");
+}
+
+#[test]
+fn the_list_of_what_is_refused_here_and_taken_there_is_true() {
+    let mut peer = Peer::start();
+    for (why, document) in refused_documents() {
+        let theirs = peer.ask("call", &document);
+        assert!(theirs.starts_with("ok "), "{why}: CPython says {theirs}");
+        let ours = verdict("call", &document);
+        assert!(ours.is_err(), "{why}: is taken as {ours:?}");
+    }
+}
+
+#[test]
+fn odd_replies_are_taken_as_a_python_client_takes_them() {
+    let fault = |members: &str| {
+        format!(
+            "<methodResponse><fault><value><struct>{members}</struct></value></fault></methodResponse>"
+        )
+    };
+    let member = |name: &str, value: &str| {
+        format!("<member><name>{name}</name><value>{value}</value></member>")
+    };
+    let code = member("faultCode", "<int>4</int>");
+    let text = member("faultString", "no &lt;");
+    let mut peer = Peer::start();
+    for document in [
+        "<methodResponse><params><param><value>x</value></param></params></methodResponse>"
+            .to_owned(),
+        "<methodResponse><params/></methodResponse>".to_owned(),
+        "<methodResponse><params><value>a</value><value>b</value></params></methodResponse>"
+            .to_owned(),
+        "<methodResponse><value>a</value></methodResponse>".to_owned(),
+        "<methodCall><methodName>m</methodName><value>a</value></methodCall>".to_owned(),
+        "<params><value>a</value></params>".to_owned(),
+        fault(""),
+        fault(&code),
+        fault(&text),
+        fault(&[code.as_str(), &text].concat()),
+        fault(&[text.as_str(), &code].concat()),
+        fault(&[code.as_str(), &text, &code].concat()),
+        fault(&[code.as_str(), &text, &member("more", "x")].concat()),
+        fault(&[member("faultCode", "4").as_str(), &text].concat()),
+        "<fault><value>x</value></fault>".to_owned(),
+        "<fault/>".to_owned(),
+        "<a><value>x</value><fault/></a>".to_owned(),
+        "<a><fault/><params><value>x</value></params></a>".to_owned(),
+    ] {
+        compare(&mut peer, "reply", document.as_bytes()).unwrap();
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_call_comes_back(method in text(), params in proptest::collection::vec(any_value(), 0..4)) {
+        let call = Call::new(method, params);
+        prop_assert_eq!(decode_call(&encode_call(&call)).unwrap(), call);
+    }
+
+    #[test]
+    fn a_reply_comes_back(value in returnable()) {
+        let reply = decode_reply(&encode_reply(&Reply::Value(value.clone()))).unwrap();
+        prop_assert_eq!(reply, Reply::Value(with_line_feeds(&value)));
+    }
+
+    #[test]
+    fn a_fault_comes_back(code in any::<i32>(), text in "[ -~\n]{0,40}") {
+        let fault = Reply::Fault { code, text };
+        prop_assert_eq!(decode_reply(&encode_reply(&fault)).unwrap(), fault);
+    }
+}
+
+/// Runs a property with one peer for all of its cases.
+fn with_peer<S: Strategy>(
+    cases: &S,
+    property: impl Fn(&mut Peer, S::Value) -> Result<(), TestCaseError>,
+) {
+    let peer = std::cell::RefCell::new(Peer::start());
+    let config = ProptestConfig {
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    };
+    let mut runner = proptest::test_runner::TestRunner::new(config);
+    runner
+        .run(cases, |case| property(&mut peer.borrow_mut(), case))
+        .unwrap();
+}
+
+#[test]
+fn cpython_understands_our_calls_and_answers_with_our_bytes() {
+    with_peer(&any_value(), |peer, value| {
+        let ours = encode_reply(&Reply::Value(value.clone()));
+        let theirs = peer.echo(&value);
+        prop_assert_eq!(String::from_utf8(ours), String::from_utf8(theirs));
+        Ok(())
+    });
+}
+
+#[test]
+fn doubles_are_written_as_python_writes_them() {
+    with_peer(
+        &proptest::collection::vec(double(), 100),
+        |peer, numbers| {
+            let value = Value::from(numbers);
+            let ours = encode_reply(&Reply::Value(value.clone()));
+            let theirs = peer.echo(&value);
+            prop_assert_eq!(String::from_utf8(ours), String::from_utf8(theirs));
+            Ok(())
+        },
+    );
+}
+
+#[test]
+fn senseless_documents_are_taken_as_cpython_takes_them() {
+    with_peer(&proptest::collection::vec(mess(), 1..4), |peer, inside| {
+        let document = params(&inside.concat());
+        for verb in ["call", "reply"] {
+            compare(peer, verb, &document).map_err(TestCaseError::fail)?;
+        }
+        Ok(())
+    });
+}
+
+#[test]
+fn damaged_documents_are_taken_as_cpython_takes_them() {
+    let damage = (
+        any::<proptest::sample::Index>(),
+        0..4_usize,
+        proptest::sample::select(vec![
+            "",
+            "<",
+            ">",
+            "/",
+            "&",
+            ";",
+            "'",
+            "=",
+            " ",
+            "\n",
+            "]]>",
+            "<!--",
+            "-->",
+            "--",
+            "<?",
+            "?>",
+            "<![CDATA[",
+            "x",
+            "\u{1}",
+            "é",
+            "</value>",
+            "<value>",
+            "<array>",
+            "</array>",
+            "<a/>",
+            "\u{ffff}",
+            ":",
+        ]),
+    );
+    let cases = (any_value(), proptest::collection::vec(damage, 1..4));
+    with_peer(&cases, |peer, (value, damages)| {
+        let call = Call::new("m", vec![value]);
+        let mut document = String::from_utf8(encode_call(&call)).unwrap();
+        for (place, cut, put) in damages {
+            let mut at = place.index(document.len());
+            while !document.is_char_boundary(at) {
+                at -= 1;
+            }
+            let until = document
+                .char_indices()
+                .map(|(index, _)| index)
+                .find(|&index| index >= at + cut)
+                .unwrap_or(document.len());
+            document.replace_range(at..until, put);
+        }
+        compare(peer, "call", document.as_bytes()).map_err(TestCaseError::fail)
+    });
+}
