@@ -8,17 +8,19 @@
 
 mod cases;
 mod documents;
+mod master;
 mod peer;
 
 use std::fmt::Write;
 
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{
-    Call, DecodeError, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
+    Call, DecodeError, Reply, Struct, Value, decode_call, decode_reply, encode_call, encode_reply,
 };
 
 use cases::{any_value, double, mess, returnable, text, with_line_feeds};
 use documents::{odd_documents, params, refused_documents};
+use master::Master;
 use peer::{Peer, hex};
 
 /// A value in the notation of the peer.
@@ -283,4 +285,70 @@ fn damaged_documents_are_taken_as_cpython_takes_them() {
         }
         compare(peer, "call", document.as_bytes()).map_err(TestCaseError::fail)
     });
+}
+
+/// What rosmaster does at the limit of Python's recursion depends on how deep its own calls are
+/// already, so only the real one can tell.
+#[test]
+fn what_rosmaster_cannot_return_becomes_its_fault() {
+    let leaves = [
+        Value::Int(1),
+        Value::Bool(true),
+        Value::Double(1.5),
+        Value::from("<a>"),
+        Value::DateTime("20240101T00:00:00".to_owned()),
+        Value::Base64(b"abc".to_vec()),
+        Value::Nil,
+        Value::BigInt("2147483648".to_owned()),
+        Value::Array(Vec::new()),
+        Value::Struct(Struct::new()),
+    ];
+    let in_array = |value| Value::Array(vec![value]);
+    let in_struct = |value| Value::Struct(Struct::from([("k".to_owned(), value)]));
+    let wraps: [fn(Value) -> Value; 2] = [in_array, in_struct];
+    let master = Master::start();
+    for (leaf, wrap) in leaves
+        .iter()
+        .flat_map(|leaf| wraps.map(|wrap| (leaf, wrap)))
+    {
+        for depth in [1, 300, 489, 490, 491, 492, 493, 510] {
+            let value = (0..depth).fold(leaf.clone(), |value, _| wrap(value));
+            let caller = Value::from("/n");
+            master.call("setParam", vec![caller.clone(), "/p".into(), value.clone()]);
+            let theirs = master.call("getParam", vec![caller, "/p".into()]);
+            let reply = Value::Array(vec![1.into(), "Parameter [/p]".into(), value]);
+            let ours = encode_reply(&Reply::Value(reply));
+            let [ours, theirs] = [ours, theirs].map(|bytes| String::from_utf8(bytes).unwrap());
+            assert!(ours == theirs, "{leaf:?} at {depth}\n{ours}\n{theirs}");
+        }
+    }
+}
+
+/// Of several things that cannot be marshalled, the first one decides.
+#[test]
+fn the_first_refusal_decides() {
+    let mut peer = Peer::start();
+    for value in [
+        Value::Array(vec![Value::Nil, Value::BigInt("2147483648".to_owned())]),
+        Value::Array(vec![Value::BigInt("2147483648".to_owned()), Value::Nil]),
+        Value::Array(vec![Value::Array(vec![Value::from("x")]), Value::Nil]),
+    ] {
+        let ours = encode_reply(&Reply::Value(value.clone()));
+        assert_eq!(
+            String::from_utf8(ours),
+            String::from_utf8(peer.echo(&value))
+        );
+    }
+}
+
+/// A body that is nothing but depth must neither overflow the stack nor take long.
+#[test]
+fn a_tower_is_refused() {
+    for tag in ["array", "struct", "value", "x"] {
+        let document = params(&format!("<{tag}>").repeat(1_000_000));
+        assert!(matches!(
+            decode_call(&document),
+            Err(DecodeError::TooDeep { .. })
+        ));
+    }
 }
