@@ -16,8 +16,8 @@ use super::value::{Call, Reply, Struct, Value};
 /// that can be read back, and bounds recursion over values, their drop included.
 pub const MAX_DEPTH: usize = 512;
 
-/// How many elements may be open: a level of a struct takes four (value, struct, member, value),
-/// one of an array three; the frame around the parameters a handful.
+/// How many elements may be open. A level takes three (`value`, `struct`, `member` or `value`,
+/// `array`, `data`); there is room for the frame, and for clients that wrap a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Reads a request.

@@ -6,6 +6,8 @@ mod error;
 mod number;
 mod prolog;
 mod scan;
+#[cfg(test)]
+mod tests;
 mod value;
 
 pub use decode::{MAX_DEPTH, decode_call, decode_reply};

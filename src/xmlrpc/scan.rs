@@ -191,8 +191,10 @@ impl<'a> Scanner<'a> {
     /// Behind `&`.
     fn reference(&mut self) -> Result<char, DecodeError> {
         let rest = self.rest();
-        // The longest that means anything has leading zeros; ten digits of them are plenty.
-        let Some(length) = rest.bytes().take(20).position(|b| b == b';') else {
+        let end = rest
+            .bytes()
+            .position(|b| !b.is_ascii_alphanumeric() && b != b'#');
+        let Some(length) = end.filter(|&end| rest.as_bytes().get(end) == Some(&b';')) else {
             return Err(self.syntax("a reference without its semicolon"));
         };
         let name = rest.get(..length).unwrap_or_default();
