@@ -110,8 +110,13 @@ fn shortest(number: f64) -> String {
     let shortest = format!("{number:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
     let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
-    let rounded = format!("{number:.*e}", digits.saturating_sub(1));
-    if rounded != shortest && rounded.parse() == Ok(number) {
+    // Two texts of up to 15 digits mean the same number only below 1e-307, and the numbers there have
+    // far too many digits to lie halfway.
+    if digits <= 15 {
+        return shortest;
+    }
+    let rounded = format!("{number:.*e}", digits - 1);
+    if rounded.parse() == Ok(number) {
         rounded
     } else {
         shortest

@@ -20,6 +20,7 @@ pub(crate) fn double() -> impl Strategy<Value = f64> {
         any::<u64>()
             .prop_map(f64::from_bits)
             .prop_filter("one nan", |n| !n.is_nan()),
+        (1..1_u64 << 52).prop_map(f64::from_bits),
         (any::<i64>(), -40..10).prop_map(decimal),
         (-9999..9999_i64, -30..30).prop_map(decimal),
         proptest::sample::select(vec![
