@@ -1,5 +1,41 @@
 //! The Master and Parameter API as a pure state machine.
+//!
+//! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
+//! * [`kind`] and [`accepted`]: what a call may do, and what of it a master has done.
+//! * [`Mark`] and [`FirstLook`]: recognising a master, and learning the state of an unknown one.
+//! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
+//! * [`difference`]: what two states do not have in common, for people.
+//!
+//! Everything follows rosmaster 1.15.15 under Python 3.11, function by function; its quirks are
+//! kept, because clients see them.
 
+mod accepted;
+mod api;
+mod checks;
+mod difference;
+mod kind;
+mod look;
+mod mark;
+mod methods;
+mod multicall;
+mod names;
+mod params;
+mod plan;
+mod python;
+mod registry;
+mod restore;
 mod snapshot;
+mod state;
+#[cfg(test)]
+mod tests;
 
+pub use accepted::{Accepted, accepted};
+pub use api::Outcome;
+pub use difference::difference;
+pub use kind::{Kind, kind};
+pub use look::{FirstLook, NotAMaster};
+pub use mark::Mark;
+pub use names::CALLER_ID;
+pub use plan::{Mismatch, Plan, Skipped};
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
+pub use state::{Counts, InvalidSnapshot, Master, Notice};

@@ -1,0 +1,81 @@
+//! The checks on parameters: `rosmaster/validators.py`, with its texts.
+
+use super::api::Failure;
+use super::{names, python};
+use crate::xmlrpc::Value;
+
+type Checked<T> = Result<T, Failure>;
+
+fn refuse<T>(what: &str, complaint: &str) -> Checked<T> {
+    Err(Failure::Refused(format!(
+        "ERROR: parameter [{what}] {complaint}"
+    )))
+}
+
+/// `non_empty_str('key')`.
+pub(super) fn key(value: &Value) -> Checked<&str> {
+    if !python::is_true(value) {
+        return refuse("key", "must be specified and non-empty");
+    }
+    match value.as_str() {
+        Some(text) => Ok(text),
+        None => refuse("key", "must be a string"),
+    }
+}
+
+/// `not_none('value')`.
+pub(super) fn param_value(value: &Value) -> Checked<&Value> {
+    match value {
+        Value::Nil => refuse("value", "must be specified"),
+        _ => Ok(value),
+    }
+}
+
+/// `is_api`.
+pub(super) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
+    match value.as_str() {
+        None | Some("") => refuse(what, "is not an XMLRPC URI"),
+        Some(text) if text.starts_with("http://") || text.starts_with("rosrpc://") => Ok(text),
+        Some(_) => refuse(what, "is not an RPC URI"),
+    }
+}
+
+/// `valid_name`.
+pub(super) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+    match value.as_str() {
+        None | Some("") => refuse(what, "must be a non-empty string"),
+        Some(text) if names::has_illegal_chars(text) => refuse(what, "contains illegal chars"),
+        Some(text) => Ok(names::resolve(text, caller_id)),
+    }
+}
+
+/// `is_topic` and `is_service`.
+pub(super) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+    let resolved = name(what, value, caller_id)?;
+    match value.as_str() {
+        Some("/") => refuse(what, "cannot be the global namespace"),
+        _ => Ok(resolved),
+    }
+}
+
+/// `valid_type_name('topic_type')`. A date that reads `*` passes there too, as what it is; here it
+/// becomes the string.
+pub(super) fn topic_type(value: &Value) -> Checked<&str> {
+    match value {
+        Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),
+        Value::String(text) if text.matches('/').count() == 1 => Ok(text),
+        Value::String(text) if !text.is_empty() => {
+            refuse("topic_type", "is not a valid package resource name")
+        }
+        _ => refuse("topic_type", "must be a non-empty string"),
+    }
+}
+
+/// `empty_or_valid_name('subgraph')`.
+pub(super) fn subgraph(value: &Value, caller_id: &str) -> Checked<String> {
+    match value.as_str() {
+        None => refuse("subgraph", "must be a string"),
+        Some("") => Ok(String::new()),
+        Some(text) => Ok(names::resolve(text, caller_id)),
+    }
+}

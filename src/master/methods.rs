@@ -1,0 +1,362 @@
+//! The methods of the Master API, one by one: the body of `rosmaster/master_api.py`.
+
+use super::api::{Answer, Failure, bad_arity, strings};
+use super::registry::Shared;
+use super::{Master, Notice, checks, names};
+use crate::xmlrpc::{Struct, Value};
+
+impl Master {
+    pub(super) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        Ok((1, String::new(), self.pid.into()))
+    }
+
+    pub(super) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        Ok((1, String::new(), self.uri.as_str().into()))
+    }
+
+    pub(super) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        Ok((1, "shutdown".to_owned(), 0.into()))
+    }
+
+    pub(super) fn register_publisher(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let (topic, topic_type, api) = topic_params(params, caller_id)?;
+        let bumped = self
+            .registry
+            .register(Shared::Publishers, &topic, caller_id, api);
+        notices.extend(shutdown_notice(caller_id, bumped));
+        if topic_type != "*" || !self.topic_types.contains_key(&topic) {
+            self.topic_types
+                .insert(topic.clone(), topic_type.to_owned());
+        }
+        let subscribers = self.notify_publishers(&topic, notices);
+        let message = format!("Registered [{caller_id}] as publisher of [{topic}]");
+        Ok((1, message, strings(subscribers)))
+    }
+
+    pub(super) fn register_subscriber(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let (topic, topic_type, api) = topic_params(params, caller_id)?;
+        let bumped = self
+            .registry
+            .register(Shared::Subscribers, &topic, caller_id, api);
+        notices.extend(shutdown_notice(caller_id, bumped));
+        if topic_type != "*" && !self.topic_types.contains_key(&topic) {
+            self.topic_types
+                .insert(topic.clone(), topic_type.to_owned());
+        }
+        let publishers = self.registry.apis(Shared::Publishers, &topic);
+        Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
+    }
+
+    pub(super) fn register_service(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let [service, service_api, api] = exactly(params)?;
+        let service = checks::resource("service", service, caller_id)?;
+        let service_api = checks::api("service_api", service_api)?;
+        let api = checks::api("caller_api", api)?;
+        let bumped = self
+            .registry
+            .register_service(&service, caller_id, api, service_api);
+        notices.extend(shutdown_notice(caller_id, bumped));
+        let message = format!("Registered [{caller_id}] as provider of [{service}]");
+        Ok((1, message, 1.into()))
+    }
+
+    pub(super) fn unregister_publisher(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let [topic, api] = exactly(params)?;
+        let topic = checks::resource("topic", topic, caller_id)?;
+        let api = checks::api("caller_api", api)?;
+        let (message, done) = self
+            .registry
+            .unregister(Shared::Publishers, &topic, caller_id, api);
+        if done {
+            self.notify_publishers(&topic, notices);
+        }
+        Ok((1, message, i32::from(done).into()))
+    }
+
+    pub(super) fn unregister_subscriber(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [topic, api] = exactly(params)?;
+        let topic = checks::resource("topic", topic, caller_id)?;
+        let api = checks::api("caller_api", api)?;
+        let (message, done) = self
+            .registry
+            .unregister(Shared::Subscribers, &topic, caller_id, api);
+        Ok((1, message, i32::from(done).into()))
+    }
+
+    pub(super) fn unregister_service(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [service, service_api] = exactly(params)?;
+        let service = checks::resource("service", service, caller_id)?;
+        let service_api = checks::api("service_api", service_api)?;
+        let (message, done) = self
+            .registry
+            .unregister_service(&service, caller_id, service_api);
+        Ok((1, message, i32::from(done).into()))
+    }
+
+    pub(super) fn lookup_service(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [service] = exactly(params)?;
+        let service = checks::resource("service", service, caller_id)?;
+        Ok(match self.registry.services.get(&service) {
+            Some(entry) => {
+                let message = format!("rosrpc URI: [{}]", entry.api);
+                (1, message, entry.api.as_str().into())
+            }
+            None => (-1, "no provider".to_owned(), "".into()),
+        })
+    }
+
+    pub(super) fn lookup_node(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [node] = exactly(params)?;
+        let node = checks::name("node", node, caller_id)?;
+        Ok(match self.registry.nodes.get(&node) {
+            Some(found) => (1, "node api".to_owned(), found.api.as_str().into()),
+            None => (-1, format!("unknown node [{node}]"), "".into()),
+        })
+    }
+
+    pub(super) fn get_published_topics(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [subgraph] = exactly(params)?;
+        let mut subgraph = checks::subgraph(subgraph, caller_id)?;
+        if !subgraph.is_empty() && !subgraph.ends_with('/') {
+            subgraph.push('/');
+        }
+        let topics = self.registry.publishers.keys();
+        let topics = topics.filter(|topic| topic.starts_with(&subgraph));
+        let pairs = topics.filter_map(|topic| Some(pair(topic, self.topic_types.get(topic)?)));
+        Ok((
+            1,
+            "current topics".to_owned(),
+            Value::Array(pairs.collect()),
+        ))
+    }
+
+    pub(super) fn get_topic_types(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        let pairs = self.topic_types.iter();
+        let pairs = pairs.map(|(topic, topic_type)| pair(topic, topic_type));
+        let message = "current system state".to_owned();
+        Ok((1, message, Value::Array(pairs.collect())))
+    }
+
+    pub(super) fn get_system_state(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        let shared = |kind| {
+            let keys = self.registry.shared(kind).iter();
+            let keys = keys.map(|(key, callers)| {
+                Value::Array(vec![key.as_str().into(), strings(callers.iter().cloned())])
+            });
+            Value::Array(keys.collect())
+        };
+        let services = self.registry.services.iter().map(|(service, entry)| {
+            let provider = strings([entry.node.clone()]);
+            Value::Array(vec![service.as_str().into(), provider])
+        });
+        let state = vec![
+            shared(Shared::Publishers),
+            shared(Shared::Subscribers),
+            Value::Array(services.collect()),
+        ];
+        Ok((1, "current system state".to_owned(), Value::Array(state)))
+    }
+
+    pub(super) fn set_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let [key, value] = exactly(params)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        let value = checks::param_value(value)?.clone();
+        let subscribers = &self.registry.param_subscribers;
+        let updates = self.params.set(&key, value, caller_id, subscribers)?;
+        notices.extend(self.registry.param_notices(updates));
+        Ok((1, format!("parameter {key} set"), 0.into()))
+    }
+
+    pub(super) fn delete_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let [key] = exactly(params)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        let subscribers = &self.registry.param_subscribers;
+        Ok(match self.params.delete(&key, subscribers)? {
+            Some(updates) => {
+                notices.extend(self.registry.param_notices(updates));
+                (1, format!("parameter {key} deleted"), 0.into())
+            }
+            None => (-1, format!("parameter [{key}] is not set"), 0.into()),
+        })
+    }
+
+    pub(super) fn get_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [key] = exactly(params)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        Ok(match self.params.get(&key) {
+            Some(value) => (1, format!("Parameter [{key}]"), value),
+            None => (-1, format!("Parameter [{key}] is not set"), 0.into()),
+        })
+    }
+
+    pub(super) fn has_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [key] = exactly(params)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        let has = self.params.has(&key);
+        Ok((1, key, has.into()))
+    }
+
+    pub(super) fn search_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [key] = exactly(params)?;
+        let key = checks::key(key)?;
+        Ok(match self.params.search(caller_id, key)? {
+            Some(found) => (1, format!("Found [{found}]"), found.into()),
+            None => {
+                let text = format!("Cannot find parameter [{key}] in an upwards search");
+                (-1, text, "".into())
+            }
+        })
+    }
+
+    pub(super) fn get_param_names(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+        Ok((
+            1,
+            "Parameter names".to_owned(),
+            strings(self.params.names()),
+        ))
+    }
+
+    pub(super) fn subscribe_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Answer {
+        let [api, key] = exactly(params)?;
+        let api = checks::api("caller_api", api)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        let subscribed = names::param_key(&key);
+        let value = self.params.get(&subscribed);
+        let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
+        let kind = Shared::ParamSubscribers;
+        let bumped = self.registry.register(kind, &subscribed, caller_id, api);
+        notices.extend(shutdown_notice(caller_id, bumped));
+        Ok((1, format!("Subscribed to parameter [{key}]"), value))
+    }
+
+    pub(super) fn unsubscribe_param(
+        &mut self,
+        caller_id: &str,
+        params: &[Value],
+        _: &mut Vec<Notice>,
+    ) -> Answer {
+        let [api, key] = exactly(params)?;
+        let api = checks::api("caller_api", api)?;
+        let key = names::resolve(checks::key(key)?, caller_id);
+        let subscribed = names::param_key(&key);
+        let kind = Shared::ParamSubscribers;
+        self.registry.unregister(kind, &subscribed, caller_id, api);
+        Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
+    }
+
+    /// Queues the list of the topic's publishers for its subscribers, whose addresses it gives.
+    fn notify_publishers(&self, topic: &str, notices: &mut Vec<Notice>) -> Vec<String> {
+        let subscribers = self.registry.apis(Shared::Subscribers, topic);
+        if !subscribers.is_empty() {
+            let publishers = self.registry.apis(Shared::Publishers, topic);
+            notices.extend(subscribers.iter().map(|to| Notice::PublisherUpdate {
+                to: to.clone(),
+                topic: topic.to_owned(),
+                publishers: publishers.clone(),
+            }));
+        }
+        subscribers
+    }
+}
+
+fn topic_params<'a>(
+    params: &'a [Value],
+    caller_id: &str,
+) -> Result<(String, &'a str, &'a str), Failure> {
+    let [topic, topic_type, api] = exactly(params)?;
+    Ok((
+        checks::resource("topic", topic, caller_id)?,
+        checks::topic_type(topic_type)?,
+        checks::api("caller_api", api)?,
+    ))
+}
+
+fn exactly<const N: usize>(params: &[Value]) -> Result<&[Value; N], Failure> {
+    params.try_into().map_err(|_| bad_arity())
+}
+
+fn pair(topic: &str, topic_type: &str) -> Value {
+    vec![topic, topic_type].into()
+}
+
+fn shutdown_notice(caller_id: &str, bumped: Option<String>) -> Option<Notice> {
+    bumped.map(|to| Notice::Shutdown {
+        to,
+        reason: format!("[{caller_id}] Reason: new node registered with same name"),
+    })
+}

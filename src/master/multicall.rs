@@ -1,0 +1,209 @@
+//! `system.multicall`, which CPython's `xmlrpc.server` brings along.
+
+use std::borrow::Cow;
+
+use super::api::{fault, method, unsupported};
+use super::{Master, Notice, python};
+use crate::xmlrpc::{Reply, Struct, Value};
+
+/// The name of the method.
+pub(super) const METHOD: &str = "system.multicall";
+
+/// Multicalls within multicalls that Python's recursion limit allows, and no more than our stack does.
+pub(super) const DEEPEST: usize = 480;
+
+/// One entry of a multicall.
+pub(super) enum Entry<'a> {
+    /// Something that is run.
+    Call {
+        method: &'a str,
+        params: Cow<'a, [Value]>,
+    },
+    /// Something that gets a fault of its own.
+    Refused(String),
+    /// Something that ends the whole multicall with a fault. What came before it has run.
+    Malformed(String),
+}
+
+/// The entries of a multicall with these parameters, or the fault if there are none to find.
+pub(super) fn entries(params: &[Value]) -> Result<Cow<'_, [Value]>, String> {
+    match params {
+        [] => Err("<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() missing 1 required positional argument: 'call_list'".to_owned()),
+        [list] => python::items(list).ok_or_else(|| {
+            format!("<class 'TypeError'>:'{}' object is not iterable", python::type_name(list))
+        }),
+        more => Err(format!(
+            "<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() takes 2 positional arguments but {} were given",
+            more.len() + 1
+        )),
+    }
+}
+
+impl<'a> Entry<'a> {
+    /// What the dispatcher makes of an element of the list.
+    pub(super) fn new(element: &'a Value) -> Self {
+        let Some(members) = element.as_struct() else {
+            return Self::Malformed(format!(
+                "<class 'TypeError'>:{}",
+                python::subscript_error(element)
+            ));
+        };
+        let (Some(name), Some(params)) = (members.get("methodName"), members.get("params")) else {
+            let missing = if members.contains_key("methodName") {
+                "params"
+            } else {
+                "methodName"
+            };
+            return Self::Malformed(format!("<class 'KeyError'>:'{missing}'"));
+        };
+        let Value::String(method) = name else {
+            return Self::Refused(match python::text(name) {
+                Some(text) => format!("<class 'Exception'>:method \"{text}\" is not supported"),
+                None => format!(
+                    "<class 'TypeError'>:unhashable type: '{}'",
+                    python::type_name(name)
+                ),
+            });
+        };
+        match python::items(params) {
+            Some(params) => Self::Call { method, params },
+            None => Self::Refused(not_iterable(method, params)),
+        }
+    }
+}
+
+/// The fault of parameters that are no list.
+fn not_iterable(name: &str, params: &Value) -> String {
+    let function = if name == METHOD {
+        "xmlrpc.server.SimpleXMLRPCDispatcher.system_multicall()"
+    } else if method(name).is_some() {
+        "rosmaster.master_api.apivalidate.<locals>.check_validates.<locals>.validated_f()"
+    } else if name == "param_update_task" {
+        "rosmaster.master_api.ROSMasterHandler.param_update_task()"
+    } else {
+        return unsupported(name, 0);
+    };
+    format!(
+        "<class 'TypeError'>:{function} argument after * must be an iterable, not {}",
+        python::type_name(params)
+    )
+}
+
+impl Master {
+    /// Runs a whole multicall: what it returns, or the text of its fault.
+    pub(super) fn run_multicall(
+        &mut self,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+    ) -> Result<Value, String> {
+        let result = self.run_entries(params, notices, &mut Vec::new());
+        let watched = self.params.take_watched();
+        let mut result = result?;
+        for (at, value) in watched {
+            if let Some(place) = place(&mut result, &at) {
+                *place = value;
+            }
+        }
+        Ok(result)
+    }
+
+    fn run_entries(
+        &mut self,
+        params: &[Value],
+        notices: &mut Vec<Notice>,
+        at: &mut Vec<usize>,
+    ) -> Result<Value, String> {
+        let entries = entries(params)?;
+        let mut results = Vec::with_capacity(entries.len());
+        for (index, element) in entries.iter().enumerate() {
+            // The result of entry `index` is the only element of a list.
+            at.extend([index, 0]);
+            let result = match Entry::new(element) {
+                Entry::Malformed(text) => return Err(text),
+                Entry::Refused(text) => Err(text),
+                Entry::Call { method, .. } if method == METHOD && at.len() / 2 > DEEPEST => {
+                    Err("<class 'RecursionError'>:maximum recursion depth exceeded".to_owned())
+                }
+                Entry::Call { method, params } if method == METHOD => {
+                    let depth = at.len();
+                    let result = self.run_entries(&params, notices, at);
+                    at.truncate(depth);
+                    result
+                }
+                Entry::Call { method, params } => {
+                    let result = self.dispatch(method, &params, notices);
+                    self.watch(method, &params, result.as_ref().ok(), at);
+                    result
+                }
+            };
+            at.truncate(at.len().saturating_sub(2));
+            results.push(match result {
+                Ok(value) => Value::Array(vec![value]),
+                Err(text) => fault_entry(text),
+            });
+        }
+        Ok(Value::Array(results))
+    }
+
+    /// Remembers where a dict of the parameter tree is part of the result.
+    fn watch(&mut self, method: &str, params: &[Value], result: Option<&Value>, at: &[usize]) {
+        let (key, subscribes) = match (method, params) {
+            ("getParam", [_, key]) => (key, false),
+            ("subscribeParam", [_, _, key]) => (key, true),
+            _ => return,
+        };
+        let (Some(Value::Array(answer)), Some(key)) = (result, key.as_str()) else {
+            return;
+        };
+        let ([Value::Int(1), _, Value::Struct(_)], Some(caller_id)) =
+            (answer.as_slice(), params.first().and_then(Value::as_str))
+        else {
+            return;
+        };
+        let mut key = super::names::resolve(key, caller_id);
+        if subscribes {
+            key = super::names::param_key(&key);
+        }
+        // A subscription to what is not set gets a dict of its own.
+        if self.params.has(&key) {
+            let at = at.iter().copied().chain([2]).collect();
+            self.params.watch(&key, at);
+        }
+    }
+}
+
+fn place<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
+    at.iter().try_fold(value, |value, index| match value {
+        Value::Array(elements) => elements.get_mut(*index),
+        _ => None,
+    })
+}
+
+/// A fault as an entry of a multicall's result.
+fn fault_entry(text: String) -> Value {
+    Value::Struct(Struct::from([
+        ("faultCode".to_owned(), 1.into()),
+        ("faultString".to_owned(), text.into()),
+    ]))
+}
+
+/// The reply that an entry of a multicall's result stands for.
+pub(super) fn entry_reply(result: &Value) -> Option<Reply> {
+    match result {
+        Value::Array(only) => match only.as_slice() {
+            [value] => Some(Reply::Value(value.clone())),
+            _ => None,
+        },
+        Value::Struct(members) => {
+            let text = members.get("faultString")?.as_str()?;
+            Some(match members.get("faultCode")?.as_int()? {
+                1 => fault(text),
+                code => Reply::Fault {
+                    code,
+                    text: text.to_owned(),
+                },
+            })
+        }
+        _ => None,
+    }
+}

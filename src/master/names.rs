@@ -1,0 +1,195 @@
+//! Graph resource names as `rosgraph/names.py` resolves them.
+//!
+//! rosmaster resolves more than it validates: a caller id such as `a/b` makes topics such as `a/t`,
+//! `/a//b` makes `/a//t`. They are stored as they come out, so everything here takes any text.
+
+use std::borrow::Cow;
+
+/// The name by which rosrescue itself calls a master.
+pub const CALLER_ID: &str = "/rosrescue";
+
+/// `canonicalize_name`: without doubled and trailing slashes.
+pub(super) fn canonicalize(name: &str) -> Cow<'_, str> {
+    let global = name.starts_with('/');
+    if name.len() < 2 || !(name.contains("//") || name.ends_with('/')) {
+        return Cow::Borrowed(name);
+    }
+    let mut canonical = String::with_capacity(name.len());
+    for part in parts(name) {
+        if global || !canonical.is_empty() {
+            canonical.push('/');
+        }
+        canonical.push_str(part);
+    }
+    if global && canonical.is_empty() {
+        canonical.push('/');
+    }
+    Cow::Owned(canonical)
+}
+
+/// The non-empty parts of a name.
+pub(super) fn parts(name: &str) -> impl Iterator<Item = &str> {
+    name.split('/').filter(|part| !part.is_empty())
+}
+
+/// `namespace`: up to and with the last slash, one trailing slash not counted.
+pub(super) fn namespace(name: &str) -> &str {
+    let name = name.strip_suffix('/').unwrap_or(name);
+    match name.rfind('/') {
+        Some(slash) => name.get(..=slash).unwrap_or("/"),
+        None => "/",
+    }
+}
+
+/// `resolve_name` of a name that is not empty.
+pub(super) fn resolve(name: &str, caller_id: &str) -> String {
+    let name = canonicalize(name);
+    if name.starts_with('/') {
+        name.into_owned()
+    } else if let Some(rest) = name.strip_prefix('~') {
+        canonicalize(&format!("{caller_id}/{rest}")).into_owned()
+    } else {
+        format!("{}{name}", namespace(caller_id))
+    }
+}
+
+/// `ns_join`, which leaves alone a name that starts with `/` or `~`.
+pub(super) fn join(namespace: &str, name: &str) -> String {
+    if name.starts_with(['/', '~']) || namespace.is_empty() {
+        name.to_owned()
+    } else if namespace.ends_with('/') {
+        format!("{namespace}{name}")
+    } else {
+        format!("{namespace}/{name}")
+    }
+}
+
+/// The form in which parameter subscriptions are kept and announced: with a trailing slash.
+pub(super) fn param_key(key: &str) -> String {
+    let mut key = canonicalize(key).into_owned();
+    if key != "/" {
+        key.push('/');
+    }
+    key
+}
+
+/// What validators refuse in the name of a topic, service or node.
+pub(super) fn has_illegal_chars(name: &str) -> bool {
+    name.contains([':', ' '])
+}
+
+/// A name that the master resolves to `key` when `caller_id` says it. Each key that a caller has
+/// ever registered has one.
+pub(super) fn name_for(key: &str, caller_id: &str) -> Option<String> {
+    let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
+    if plain && canonicalize(key) == key {
+        return Some(key.to_owned());
+    }
+    spell(key, caller_id, |name| {
+        !has_illegal_chars(name) && name != "/" && resolve(name, caller_id) == key
+    })
+}
+
+/// Like [`name_for`] for a key of a parameter subscription.
+pub(super) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
+    let trimmed = if key == "/" {
+        key
+    } else {
+        key.strip_suffix('/')?
+    };
+    spell(trimmed, caller_id, |name| {
+        param_key(&resolve(name, caller_id)) == key
+    })
+}
+
+fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<String> {
+    // The global namespace is refused as `/` and taken as `//`.
+    let absolute = if key == "/" { "//" } else { key };
+    if names(absolute) {
+        return Some(absolute.to_owned());
+    }
+    let relative = key.strip_prefix(namespace(caller_id)).map(str::to_owned);
+    let private = key
+        .strip_prefix(caller_id)
+        .map(|rest| format!("~{}", rest.trim_start_matches('/')));
+    [relative, private]
+        .into_iter()
+        .flatten()
+        .find(|name| !name.is_empty() && names(name))
+}
+
+/// A caller id and a name that the master resolves to `key`, where the caller id may be chosen:
+/// `preferred` wherever that can be. None for what no call can name, such as a node that calls
+/// itself `/a/`.
+pub(super) fn reach(key: &str, preferred: &str) -> Option<(String, String)> {
+    let base = key.rfind('/').map_or(0, |slash| slash + 1);
+    let neighbour = format!("{}rosrescue", key.get(..base).unwrap_or_default());
+    [preferred, &neighbour, key]
+        .into_iter()
+        .find_map(|caller_id| Some((caller_id.to_owned(), name_for(key, caller_id)?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn canonical_form_is_rosgraphs() {
+        for (name, canonical) in [
+            ("", ""),
+            ("/", "/"),
+            ("//", "/"),
+            ("/a", "/a"),
+            ("//a//b/", "/a/b"),
+            ("a/", "a"),
+            ("a//b", "a/b"),
+            ("~a//b/", "~a/b"),
+        ] {
+            assert_eq!(canonicalize(name), canonical, "{name}");
+        }
+    }
+
+    #[test]
+    fn names_resolve_as_rosgraph_resolves_them() {
+        for (name, caller_id, resolved) in [
+            ("t", "/talker", "/t"),
+            ("t", "/ns/talker", "/ns/t"),
+            ("t", "/ns/talker/", "/ns/t"),
+            ("t", "talker", "/t"),
+            ("t", "a/b", "a/t"),
+            ("t", "/a//b", "/a//t"),
+            ("t", "", "/t"),
+            ("t/", "/x", "/t"),
+            ("//t//u/", "/x", "/t/u"),
+            ("~t", "/x", "/x/t"),
+            ("~", "talker", "talker"),
+            ("~/t", "/x/", "/x/t"),
+            ("~", "", "/"),
+            ("a~", "/x", "/a~"),
+        ] {
+            assert_eq!(resolve(name, caller_id), resolved, "{name} by {caller_id}");
+        }
+    }
+
+    #[test]
+    fn every_key_can_be_said_by_the_caller_that_made_it() {
+        let callers = ["/x", "/ns/x", "x", "a/b", "/a//b", "", "/a b/c", "/x/", "/"];
+        let names = ["t", "/t", "//", "~", "~t", "t/u", "~//t/"];
+        for caller in callers {
+            for name in names {
+                let key = resolve(name, caller);
+                let again = name_for(&key, caller).map(|name| resolve(&name, caller));
+                assert_eq!(again.as_deref(), Some(key.as_str()), "{name} by {caller}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_node_with_a_strange_name_can_be_looked_up() {
+        for node in ["/x", "x", "a/b", "/a//b", "/a b", "/a:b/c"] {
+            let (caller, name) = reach(node, CALLER_ID).expect(node);
+            assert_eq!(resolve(&name, &caller), node);
+        }
+        assert_eq!(reach("/a/", CALLER_ID), None);
+    }
+}

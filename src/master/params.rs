@@ -1,0 +1,337 @@
+//! The parameter server: `rosmaster/paramserver.py`.
+
+use std::collections::HashSet;
+
+use indexmap::IndexMap;
+
+use super::api::Failure;
+use super::{names, python};
+use crate::xmlrpc::{Struct, Value};
+
+/// The parameter tree.
+#[derive(Clone, Default)]
+pub(super) struct Params {
+    tree: Struct,
+    /// Results of a multicall under way that are dicts of the tree itself: see [`Live`].
+    live: Vec<Live>,
+}
+
+/// `getParam` returns the tree's own dict, and a multicall writes its results only after its last
+/// entry has run: a later `setParam` below that dict shows in the earlier result.
+#[derive(Clone)]
+struct Live {
+    /// Where in the multicall's result the value goes.
+    at: Vec<usize>,
+    path: Vec<String>,
+    /// The value once the dict is no longer part of the tree.
+    detached: Option<Value>,
+}
+
+/// A `paramUpdate` to the subscribers of one key.
+pub(super) struct Update<'a> {
+    pub(super) subscribers: Vec<&'a str>,
+    pub(super) key: String,
+    pub(super) value: Value,
+}
+
+/// Caller ids of the subscribers by key.
+pub(super) type Subscribers = IndexMap<String, Vec<String>>;
+
+/// What is found under a key.
+enum Found<'a> {
+    Tree(&'a Struct),
+    Value(&'a Value),
+}
+
+impl Found<'_> {
+    fn to_value(&self) -> Value {
+        match self {
+            Self::Tree(tree) => Value::Struct((*tree).clone()),
+            Self::Value(value) => (*value).clone(),
+        }
+    }
+}
+
+impl Params {
+    pub(super) fn new(tree: Struct) -> Self {
+        Self {
+            tree,
+            live: Vec::new(),
+        }
+    }
+
+    pub(super) fn tree(&self) -> &Struct {
+        &self.tree
+    }
+
+    pub(super) fn get(&self, key: &str) -> Option<Value> {
+        Some(self.find(read_path(key))?.to_value())
+    }
+
+    pub(super) fn has(&self, key: &str) -> bool {
+        self.find(read_path(key)).is_some()
+    }
+
+    fn find<'k>(&self, path: impl Iterator<Item = &'k str>) -> Option<Found<'_>> {
+        let mut found = Found::Tree(&self.tree);
+        for part in path {
+            let members = match found {
+                Found::Tree(tree) => tree,
+                Found::Value(value) => value.as_struct()?,
+            };
+            found = Found::Value(members.get(part)?);
+        }
+        Some(found)
+    }
+
+    /// `set_param`. The tree changes even where working out the updates fails.
+    pub(super) fn set<'a>(
+        &mut self,
+        key: &str,
+        value: Value,
+        caller_id: &str,
+        subscribers: &'a Subscribers,
+    ) -> Result<Vec<Update<'a>>, Failure> {
+        if key == "/" {
+            let Value::Struct(_) = value else {
+                return Err(Failure::Type(
+                    "cannot set root of parameter tree to non-dictionary".to_owned(),
+                ));
+            };
+        }
+        let updates = updates(subscribers, key, &value, Some(caller_id));
+        let path: Vec<&str> = names::parts(key).collect();
+        self.detach(&path);
+        match (path.split_last(), value) {
+            (None, Value::Struct(tree)) => self.tree = tree,
+            (None, _) => return Err(Failure::Internal("list index out of range".to_owned())),
+            (Some((last, namespaces)), value) => {
+                let tree = Some(&mut self.tree);
+                let members = namespaces
+                    .iter()
+                    .fold(tree, |members, name| namespace(members?, name));
+                if let Some(members) = members {
+                    members.insert((*last).to_owned(), value);
+                }
+            }
+        }
+        updates
+    }
+
+    /// `delete_param`; none if the parameter is not set.
+    pub(super) fn delete<'a>(
+        &mut self,
+        key: &str,
+        subscribers: &'a Subscribers,
+    ) -> Result<Option<Vec<Update<'a>>>, Failure> {
+        let path: Vec<&str> = names::parts(key).collect();
+        let Some((last, namespaces)) = path.split_last() else {
+            return Ok(None);
+        };
+        let holds = match self.find(namespaces.iter().copied()) {
+            None => false,
+            Some(Found::Tree(members) | Found::Value(Value::Struct(members))) => {
+                members.contains_key(*last)
+            }
+            Some(Found::Value(value)) => match python::delete_error(value, last) {
+                Some(text) => return Err(Failure::Type(text)),
+                None => false,
+            },
+        };
+        if !holds {
+            return Ok(None);
+        }
+        self.detach(&path);
+        let mut members = &mut self.tree;
+        for namespace in namespaces {
+            let Some(Value::Struct(inner)) = members.get_mut(*namespace) else {
+                return Ok(None);
+            };
+            members = inner;
+        }
+        members.shift_remove(*last);
+        updates(subscribers, key, &Value::Struct(Struct::new()), None).map(Some)
+    }
+
+    /// `search_param`.
+    pub(super) fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, Failure> {
+        if key.starts_with('~') {
+            return Err(Failure::Internal("invalid key".to_owned()));
+        }
+        if !namespace.starts_with('/') {
+            return Err(Failure::Internal("namespace must be global".to_owned()));
+        }
+        if key.starts_with('/') {
+            return Ok(self.has(key).then(|| key.to_owned()));
+        }
+        // Only the first part of the key has to exist.
+        let Some(first) = names::parts(key).next() else {
+            return Ok(None);
+        };
+        if self.has(&names::join(namespace, first)) {
+            return Ok(Some(names::join(namespace, key)));
+        }
+        let mut upwards: Vec<&str> = names::parts(namespace).collect();
+        while upwards.pop().is_some() {
+            let prefix: String = upwards.iter().flat_map(|part| ["/", part]).collect();
+            if self.has(&format!("{prefix}/{first}")) {
+                return Ok(Some(format!("{prefix}/{key}")));
+            }
+        }
+        Ok(None)
+    }
+
+    /// `get_param_names`: every key that is no dict.
+    pub(super) fn names(&self) -> Vec<String> {
+        fn collect(key: &str, members: &Struct, found: &mut Vec<String>) {
+            for (name, value) in members {
+                let key = names::join(key, name);
+                match value {
+                    Value::Struct(inner) => collect(&key, inner, found),
+                    _ => found.push(key),
+                }
+            }
+        }
+        let mut found = Vec::new();
+        collect("/", &self.tree, &mut found);
+        found
+    }
+
+    /// How many parameters are no dicts.
+    pub(super) fn leaves(&self) -> usize {
+        fn count(members: &Struct) -> usize {
+            let leaves = members.values().map(|value| match value {
+                Value::Struct(inner) => count(inner),
+                _ => 1,
+            });
+            leaves.sum()
+        }
+        count(&self.tree)
+    }
+
+    /// Notes that the dict under `key` is part of a multicall's result.
+    pub(super) fn watch(&mut self, key: &str, at: Vec<usize>) {
+        self.live.push(Live {
+            at,
+            path: read_path(key).map(str::to_owned).collect(),
+            detached: None,
+        });
+    }
+
+    /// The values of the dicts watched since the multicall began, and where they go.
+    pub(super) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
+        let live = std::mem::take(&mut self.live);
+        live.into_iter()
+            .filter_map(|live| {
+                let value = live.detached.or_else(|| {
+                    let found = self.find(live.path.iter().map(String::as_str))?;
+                    Some(found.to_value())
+                })?;
+                Some((live.at, value))
+            })
+            .collect()
+    }
+
+    /// The dicts at `path` and below are about to leave the tree.
+    fn detach(&mut self, path: &[&str]) {
+        let mut live = std::mem::take(&mut self.live);
+        for entry in &mut live {
+            let below =
+                entry.path.len() >= path.len() && path.iter().zip(&entry.path).all(|(a, b)| a == b);
+            if below && entry.detached.is_none() {
+                let found = self.find(entry.path.iter().map(String::as_str));
+                entry.detached = found.map(|found| found.to_value());
+            }
+        }
+        self.live = live;
+    }
+}
+
+/// The namespace of that name, made if need be. A value in its way is silently lost.
+fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> {
+    let value = members.entry(name.to_owned()).or_insert(Value::Nil);
+    if !matches!(value, Value::Struct(_)) {
+        *value = Value::Struct(Struct::new());
+    }
+    match value {
+        Value::Struct(inner) => Some(inner),
+        _ => None,
+    }
+}
+
+/// The path that `get_param` takes. It ignores what comes before the first slash.
+fn read_path(key: &str) -> impl Iterator<Item = &str> {
+    key.split('/').skip(1).filter(|part| !part.is_empty())
+}
+
+/// `compute_param_updates`.
+fn updates<'a>(
+    subscribers: &'a Subscribers,
+    key: &str,
+    value: &Value,
+    ignored: Option<&str>,
+) -> Result<Vec<Update<'a>>, Failure> {
+    if subscribers.is_empty() {
+        return Ok(Vec::new());
+    }
+    let key = names::param_key(key);
+    let mut below = Vec::new();
+    let members = value.as_struct();
+    if let Some(members) = members {
+        keys_below(&key, members, &mut below);
+    }
+    let set: HashSet<&str> = below.iter().map(String::as_str).collect();
+    let mut updates = Vec::new();
+    for (subscribed, nodes) in subscribers {
+        if key.starts_with(subscribed.as_str()) {
+            let nodes = nodes.iter().map(String::as_str);
+            updates.push(Update {
+                subscribers: nodes.filter(|node| Some(*node) != ignored).collect(),
+                key: key.clone(),
+                value: value.clone(),
+            });
+        } else if members.is_some()
+            && subscribed.starts_with(&key)
+            && !set.contains(subscribed.as_str())
+        {
+            updates.push(Update {
+                subscribers: nodes.iter().map(String::as_str).collect(),
+                key: subscribed.clone(),
+                value: Value::Struct(Struct::new()),
+            });
+        }
+    }
+    for changed in &below {
+        if let Some(nodes) = subscribers.get(changed) {
+            // Sliced by the length of the key that was set, even if it does not start with it.
+            let rest: String = changed.chars().skip(key.chars().count()).collect();
+            updates.push(Update {
+                subscribers: nodes.iter().map(String::as_str).collect(),
+                key: changed.clone(),
+                value: descend(value, &rest)?.clone(),
+            });
+        }
+    }
+    Ok(updates)
+}
+
+/// `_compute_all_keys`.
+fn keys_below(key: &str, members: &Struct, keys: &mut Vec<String>) {
+    for (name, value) in members {
+        let key = names::join(key, name) + "/";
+        keys.push(key.clone());
+        if let Value::Struct(inner) = value {
+            keys_below(&key, inner, keys);
+        }
+    }
+}
+
+/// Members whose names hold a slash are announced, and then not found.
+fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
+    names::parts(path).try_fold(value, |value, part| match value {
+        Value::Struct(members) => members
+            .get(part)
+            .ok_or_else(|| Failure::Internal(python::repr(part))),
+        _ => Err(Failure::Type(python::subscript_error(value))),
+    })
+}

@@ -1,0 +1,267 @@
+//! Bringing a new master to a state: one call, and what it must answer.
+
+use std::fmt;
+
+use super::restore::{Restore, reads};
+use super::{Mark, Master};
+use crate::xmlrpc::{Call, Reply, Value};
+
+/// Most mismatches that are told apart.
+const MOST_MISMATCHES: usize = 20;
+
+/// One multicall that brings a master to a state, reads it back and leaves a mark.
+///
+/// # Order
+///
+/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, who are not told then.
+/// 2. Publishers, before there is anybody to be told of them. Types of topics that have neither
+///    publishers nor subscribers left, and those that the natural order of calls would put too late
+///    in `getTopicTypes`, are brought in silently: a subscription by a helper, undone at once. These
+///    are the fewest that give the order.
+/// 3. Services, each after the nodes that it was taken from.
+/// 4. Subscribers, then subscribers of parameters.
+/// 5. Reads of everything, for [`Plan::verify`].
+/// 6. The mark: a master that bears it has been brought to the state as a whole.
+///
+/// On an empty master no callback is sent at all, and every read is answered afterwards as it was
+/// before.
+///
+/// # A master that is not empty
+///
+/// What it holds is newer, and stays: a node that is there under another address is left out, so
+/// that the master bumps nobody, and so is a service that has a provider. Parameters are merged, and
+/// ours win. Where the new master has subscribers of a topic that lacks several publishers, they
+/// are taken out first and put back before the last publisher: they are told once, with the complete
+/// list, while every partial list would make a roscpp node drop its live connections.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    call: Call,
+    /// What the call's entries must answer, the mark's last.
+    predicted: Vec<Reply>,
+    expected: Master,
+    skipped: Vec<Skipped>,
+}
+
+/// Something of the state that is not brought into a master.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Skipped {
+    /// A node that is there under another address.
+    Node {
+        /// The node.
+        caller_id: String,
+        /// Its address in the state.
+        api: String,
+        /// Its address in the new master, which stays.
+        found_api: String,
+    },
+    /// A service that has a provider.
+    Service {
+        /// The service.
+        service: String,
+        /// The provider in the state.
+        caller_id: String,
+        /// The provider in the new master, which stays.
+        found: String,
+    },
+    /// The reference of a node by a service that another node took over.
+    Reference {
+        /// The node.
+        caller_id: String,
+        /// The service.
+        service: String,
+    },
+    /// The type `*` of a topic without publishers that has subscribers in the new master.
+    Type {
+        /// The topic.
+        topic: String,
+    },
+    /// A parameter that the master would take and could never return, alone or with its parents.
+    Param {
+        /// The parameter.
+        key: String,
+    },
+    /// A registration whose key no name leads to.
+    Unnameable {
+        /// The key.
+        key: String,
+        /// The node.
+        caller_id: String,
+    },
+}
+
+impl fmt::Display for Skipped {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Node {
+                caller_id,
+                api,
+                found_api,
+            } => write!(
+                f,
+                "the node `{caller_id}` at {api}: the new master has it at {found_api}"
+            ),
+            Self::Service {
+                service,
+                caller_id,
+                found,
+            } => write!(
+                f,
+                "the service `{service}` of `{caller_id}`: the new master has it from `{found}`"
+            ),
+            Self::Reference { caller_id, service } => write!(
+                f,
+                "the reference of `{caller_id}` by the service `{service}` that it lost: the new \
+                 master has that service"
+            ),
+            Self::Type { topic } => write!(
+                f,
+                "the type `*` of the topic `{topic}`: its subscribers would be told"
+            ),
+            Self::Param { key } => write!(
+                f,
+                "the parameter `{key}`: rosmaster could never return it, nor any namespace around it"
+            ),
+            Self::Unnameable { key, caller_id } => {
+                write!(f, "`{key}` of `{caller_id}`: no name leads to it")
+            }
+        }
+    }
+}
+
+/// An answer that is not what the model predicted. Holds no values.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Mismatch {
+    /// The call as a whole was answered with a fault, or with another number of results.
+    Whole {
+        /// The fault's text, or what is wrong with the results.
+        text: String,
+    },
+    /// One entry.
+    Entry {
+        /// The method.
+        method: String,
+        /// Topic, service, parameter or node, if the method has one.
+        subject: Option<String>,
+        /// The caller id.
+        caller_id: String,
+    },
+}
+
+impl fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Whole { text } => write!(f, "the injection as a whole was answered: {text}"),
+            Self::Entry {
+                method,
+                subject: None,
+                ..
+            } => {
+                write!(f, "{method} was answered otherwise than predicted")
+            }
+            Self::Entry {
+                method,
+                subject: Some(subject),
+                caller_id,
+            } => write!(
+                f,
+                "{method} of `{subject}` by `{caller_id}` was answered otherwise than predicted"
+            ),
+        }
+    }
+}
+
+impl Plan {
+    /// The plan that brings a master that holds `found` to `target` and leaves `mark`.
+    ///
+    /// Marks that `target` or `found` hold themselves are not brought over.
+    pub fn new(target: &Master, found: &Master, mark: &Mark) -> Self {
+        let Restore {
+            mut calls,
+            mut predicted,
+            mut model,
+            skipped,
+            ..
+        } = Restore::run(target, found);
+        for call in reads(&model) {
+            predicted.push(model.apply(&call).reply);
+            calls.push(call);
+        }
+        // The mark is no part of the mirror. It subscribes to what is not set.
+        calls.push(mark.call());
+        predicted.push(Master::default().apply(&mark.call()).reply);
+        Self {
+            call: Call::multicall(calls),
+            predicted,
+            expected: model,
+            skipped,
+        }
+    }
+
+    /// The multicall to send.
+    pub fn call(&self) -> &Call {
+        &self.call
+    }
+
+    /// What the master holds afterwards, the mark apart.
+    pub fn expected(&self) -> &Master {
+        &self.expected
+    }
+
+    /// What of the target is not brought over.
+    pub fn skipped(&self) -> &[Skipped] {
+        &self.skipped
+    }
+
+    /// Whether every entry was answered as the model predicted.
+    ///
+    /// # Errors
+    ///
+    /// The entries that were not, up to 20 of them.
+    pub fn verify(&self, reply: &Reply) -> Result<(), Vec<Mismatch>> {
+        let whole = |text: String| Err(vec![Mismatch::Whole { text }]);
+        let results = match reply {
+            Reply::Value(Value::Array(results)) if results.len() == self.predicted.len() => results,
+            Reply::Value(_) => return whole("another number of results than of calls".to_owned()),
+            Reply::Fault { text, .. } => return whole(text.clone()),
+        };
+        let same = |result: &Value, predicted: &Reply| match (result, predicted) {
+            (Value::Array(only), Reply::Value(value)) => {
+                matches!(only.as_slice(), [result] if result == value)
+            }
+            _ => super::multicall::entry_reply(result).as_ref() == Some(predicted),
+        };
+        let entries = self
+            .call
+            .params
+            .first()
+            .and_then(Value::as_array)
+            .unwrap_or_default();
+        let mismatches: Vec<_> = (results.iter().zip(&self.predicted).zip(entries))
+            .filter(|((result, predicted), _)| !same(result, predicted))
+            .map(|(_, entry)| mismatch(entry))
+            .take(MOST_MISMATCHES)
+            .collect();
+        if mismatches.is_empty() {
+            Ok(())
+        } else {
+            Err(mismatches)
+        }
+    }
+}
+
+fn mismatch(entry: &Value) -> Mismatch {
+    let member = |name| entry.as_struct().and_then(|members| members.get(name));
+    let text = |value: Option<&Value>| value.and_then(Value::as_str).map(str::to_owned);
+    let params = member("params")
+        .and_then(Value::as_array)
+        .unwrap_or_default();
+    let method = text(member("methodName")).unwrap_or_default();
+    let subject = if method == "subscribeParam" { 2 } else { 1 };
+    Mismatch::Entry {
+        subject: text(params.get(subject)),
+        caller_id: text(params.first()).unwrap_or_default(),
+        method,
+    }
+}

@@ -1,0 +1,268 @@
+//! What Python makes of a value: its type's name, its truth, its items, its text in an error, and
+//! whether `xmlrpc.client.dumps` can write it.
+
+use std::borrow::Cow;
+
+use crate::xmlrpc::{Struct, Value};
+
+/// Deepest nesting of arrays and structs in a reply, the reply's own array counted, that rosmaster
+/// can write before Python's recursion limit ends it. Measured with Python 3.11.
+const DEEPEST_REPLY: usize = 492;
+
+/// The name of the Python type.
+pub(super) fn type_name(value: &Value) -> &'static str {
+    match value {
+        Value::Nil => "NoneType",
+        Value::Bool(_) => "bool",
+        Value::Int(_) | Value::BigInt(_) => "int",
+        Value::Double(_) => "float",
+        Value::String(_) => "str",
+        Value::DateTime(_) => "DateTime",
+        Value::Base64(_) => "Binary",
+        Value::Array(_) => "list",
+        Value::Struct(_) => "dict",
+    }
+}
+
+/// `bool(value)`.
+pub(super) fn is_true(value: &Value) -> bool {
+    match value {
+        Value::Nil => false,
+        Value::Bool(truth) => *truth,
+        Value::Int(number) => *number != 0,
+        Value::Double(number) => *number != 0.0,
+        Value::String(text) => !text.is_empty(),
+        Value::Array(elements) => !elements.is_empty(),
+        Value::Struct(members) => !members.is_empty(),
+        Value::BigInt(_) | Value::DateTime(_) | Value::Base64(_) => true,
+    }
+}
+
+/// The items that `for x in value` or `f(*value)` sees, if it is iterable.
+pub(super) fn items(value: &Value) -> Option<Cow<'_, [Value]>> {
+    match value {
+        Value::Array(elements) => Some(Cow::Borrowed(elements)),
+        Value::Struct(members) => Some(members.keys().map(|key| key.as_str().into()).collect()),
+        Value::String(text) => Some(text.chars().map(|c| Value::String(c.into())).collect()),
+        _ => None,
+    }
+}
+
+/// What `value["name"]` raises for a value that is no dict.
+pub(super) fn subscript_error(value: &Value) -> String {
+    match value {
+        Value::String(_) => "string indices must be integers, not 'str'".to_owned(),
+        Value::Array(_) => "list indices must be integers or slices, not str".to_owned(),
+        _ => format!("'{}' object is not subscriptable", type_name(value)),
+    }
+}
+
+/// What `del value[name]` after `name in value` raises for a value that is no dict; none if `name`
+/// is not in it.
+pub(super) fn delete_error(value: &Value, name: &str) -> Option<String> {
+    match value {
+        Value::String(text) => text
+            .contains(name)
+            .then(|| "'str' object does not support item deletion".to_owned()),
+        Value::Array(elements) => elements
+            .iter()
+            .any(|element| match element {
+                Value::String(text) | Value::DateTime(text) => text == name,
+                _ => false,
+            })
+            .then(|| "list indices must be integers or slices, not str".to_owned()),
+        _ => Some(format!(
+            "argument of type '{}' is not iterable",
+            type_name(value)
+        )),
+    }
+}
+
+/// `repr` of a string.
+pub(super) fn repr(text: &str) -> String {
+    let quote = if text.contains('\'') && !text.contains('"') {
+        '"'
+    } else {
+        '\''
+    };
+    let mut out = String::from(quote);
+    for c in text.chars() {
+        match c {
+            '\\' => out.push_str("\\\\"),
+            '\n' => out.push_str("\\n"),
+            '\r' => out.push_str("\\r"),
+            '\t' => out.push_str("\\t"),
+            _ if c == quote => out.extend(['\\', c]),
+            _ if is_printable(c) => out.push(c),
+            _ => out.push_str(&match u32::from(c) {
+                code @ 0..=0xff => format!("\\x{code:02x}"),
+                code @ 0x100..=0xffff => format!("\\u{code:04x}"),
+                code => format!("\\U{code:08x}"),
+            }),
+        }
+    }
+    out.push(quote);
+    out
+}
+
+/// Nearly `str.isprintable`: without the table of unassigned characters.
+fn is_printable(c: char) -> bool {
+    !(c.is_control()
+        || (c.is_whitespace() && c != ' ')
+        || matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{e000}'..='\u{f8ff}'))
+}
+
+/// `str` of a number, truth or None: what an unknown method's name looks like in the fault.
+pub(super) fn text(value: &Value) -> Option<String> {
+    match value {
+        Value::Nil => Some("None".to_owned()),
+        Value::Bool(true) => Some("True".to_owned()),
+        Value::Bool(false) => Some("False".to_owned()),
+        Value::Int(number) => Some(number.to_string()),
+        Value::BigInt(text) | Value::String(text) => Some(text.clone()),
+        Value::Double(number) => Some(float(*number)),
+        _ => None,
+    }
+}
+
+/// `repr` of a float: as short as it can be read back, with an exponent below 1e-4 and from 1e16 on.
+fn float(number: f64) -> String {
+    if !number.is_finite() {
+        return number.to_string().to_lowercase();
+    }
+    let magnitude = number.abs();
+    if magnitude != 0.0 && !(1e-4..1e16).contains(&magnitude) {
+        let text = format!("{number:e}");
+        let (digits, exponent) = text.split_once('e').unwrap_or((&text, "0"));
+        let (sign, exponent) = match exponent.strip_prefix('-') {
+            Some(exponent) => ('-', exponent),
+            None => ('+', exponent),
+        };
+        format!("{digits}e{sign}{exponent:0>2}")
+    } else {
+        format!("{number:?}")
+    }
+}
+
+/// What rosmaster answers instead of a reply that it cannot write, if it cannot write it.
+pub(super) fn write_error(reply: &Value) -> Option<&'static str> {
+    error_within(reply, DEEPEST_REPLY)
+}
+
+/// Like [`write_error`] for a parameter's value, which travels in `[code, message, value]`.
+pub(super) fn param_error(value: &Value) -> Option<&'static str> {
+    error_within(value, DEEPEST_REPLY - 1)
+}
+
+fn error_within(value: &Value, levels: usize) -> Option<&'static str> {
+    let deeper = |value| match levels.checked_sub(1) {
+        Some(levels) => error_within(value, levels),
+        None => None,
+    };
+    match value {
+        Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
+        Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
+        Value::Array(_) | Value::Struct(_) if levels == 0 => {
+            Some("<class 'RecursionError'>:maximum recursion depth exceeded")
+        }
+        Value::Array(elements) => elements.iter().find_map(deeper),
+        Value::Struct(members) => members.values().find_map(deeper),
+        _ => None,
+    }
+}
+
+/// The tree without what a master could take but never return, and the keys of what was left out.
+/// The verification of an injection reads the tree inside a multicall, two arrays further down.
+pub(super) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
+    let mut left_out = Vec::new();
+    let kept = keep_writable(tree, "", DEEPEST_REPLY - 4, &mut left_out);
+    (kept, left_out)
+}
+
+fn keep_writable(tree: &Struct, path: &str, levels: usize, left_out: &mut Vec<String>) -> Struct {
+    let mut kept = Struct::with_capacity(tree.len());
+    for (key, value) in tree {
+        let path = format!("{path}/{key}");
+        let kept_value = match value {
+            _ if error_within(value, levels).is_none() => Some(value.clone()),
+            Value::Struct(members) if levels > 1 => Some(Value::Struct(keep_writable(
+                members,
+                &path,
+                levels - 1,
+                left_out,
+            ))),
+            _ => None,
+        };
+        match kept_value {
+            Some(value) => {
+                kept.insert(key.clone(), value);
+            }
+            None => left_out.push(path),
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn nested(depth: usize) -> Value {
+        (0..depth).fold(Value::Int(1), |value, _| Value::Array(vec![value]))
+    }
+
+    #[test]
+    fn repr_is_pythons() {
+        assert_eq!(repr("x"), "'x'");
+        assert_eq!(repr("it's"), "\"it's\"");
+        assert_eq!(repr("é\"'"), "'é\"\\''");
+        assert_eq!(
+            repr("\t\u{7f}\u{a0}\u{3000}\u{200b}\u{1F600}"),
+            "'\\t\\x7f\\xa0\\u3000\\u200b\u{1F600}'"
+        );
+    }
+
+    #[test]
+    fn floats_are_written_as_python_writes_them() {
+        for (number, text) in [
+            (1.5, "1.5"),
+            (1e20, "1e+20"),
+            (1e16, "1e+16"),
+            (1e15, "1000000000000000.0"),
+            (0.0001, "0.0001"),
+            (0.00001, "1e-05"),
+            (-0.0, "-0.0"),
+            (f64::NAN, "nan"),
+            (f64::NEG_INFINITY, "-inf"),
+        ] {
+            assert_eq!(float(number), text);
+        }
+    }
+
+    #[test]
+    fn a_parameter_of_491_levels_can_be_returned_and_one_of_492_cannot() {
+        assert_eq!(param_error(&nested(491)), None);
+        assert!(param_error(&nested(492)).is_some());
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_left_out_by_its_smallest_key() {
+        let poisoned = Struct::from([
+            (
+                "a".into(),
+                Value::Struct(Struct::from([
+                    ("big".into(), Value::BigInt("5000000000".into())),
+                    ("good".into(), Value::Int(1)),
+                ])),
+            ),
+            ("nil".into(), Value::Array(vec![Value::Nil])),
+        ]);
+        let (kept, left_out) = writable(&poisoned);
+        assert_eq!(left_out, ["/a/big", "/nil"]);
+        let good = Struct::from([("good".into(), Value::Int(1))]);
+        assert_eq!(
+            Value::Struct(kept),
+            Value::Struct(Struct::from([("a".into(), Value::Struct(good))]))
+        );
+    }
+}

@@ -1,0 +1,228 @@
+//! Who publishes, subscribes and provides: `rosmaster/registrations.py`.
+
+use indexmap::{IndexMap, IndexSet};
+
+use super::snapshot::ServiceEntry;
+
+/// Caller ids by topic or parameter key, in the order in which they registered.
+pub(super) type Registrations = IndexMap<String, Vec<String>>;
+
+/// The kinds of registration that many nodes may share.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Shared {
+    Publishers,
+    Subscribers,
+    ParamSubscribers,
+}
+
+/// A node reference: what rosmaster counts before it forgets a node.
+#[derive(Clone, Default, PartialEq)]
+pub(super) struct Node {
+    pub(super) api: String,
+    pub(super) publications: IndexSet<String>,
+    pub(super) subscriptions: IndexSet<String>,
+    pub(super) param_subscriptions: IndexSet<String>,
+    /// Services that this node registered, those included that another one has taken over since.
+    pub(super) services: IndexSet<String>,
+}
+
+impl Node {
+    pub(super) fn is_empty(&self) -> bool {
+        self.publications.is_empty()
+            && self.subscriptions.is_empty()
+            && self.param_subscriptions.is_empty()
+            && self.services.is_empty()
+    }
+
+    pub(super) fn keys(&mut self, kind: Shared) -> &mut IndexSet<String> {
+        match kind {
+            Shared::Publishers => &mut self.publications,
+            Shared::Subscribers => &mut self.subscriptions,
+            Shared::ParamSubscribers => &mut self.param_subscriptions,
+        }
+    }
+}
+
+/// rosmaster's `RegistrationManager`.
+#[derive(Clone, Default)]
+pub(super) struct Registry {
+    /// Node references. No reply shows their order.
+    pub(super) nodes: IndexMap<String, Node>,
+    pub(super) publishers: Registrations,
+    pub(super) subscribers: Registrations,
+    pub(super) param_subscribers: Registrations,
+    pub(super) services: IndexMap<String, ServiceEntry>,
+    /// Whether any service was ever registered: shows only in a message of `unregisterService`.
+    pub(super) had_services: bool,
+}
+
+impl Registry {
+    pub(super) fn shared(&self, kind: Shared) -> &Registrations {
+        match kind {
+            Shared::Publishers => &self.publishers,
+            Shared::Subscribers => &self.subscribers,
+            Shared::ParamSubscribers => &self.param_subscribers,
+        }
+    }
+
+    fn shared_mut(&mut self, kind: Shared) -> &mut Registrations {
+        match kind {
+            Shared::Publishers => &mut self.publishers,
+            Shared::Subscribers => &mut self.subscribers,
+            Shared::ParamSubscribers => &mut self.param_subscribers,
+        }
+    }
+
+    /// The addresses of the nodes registered under `key`, in order.
+    pub(super) fn apis(&self, kind: Shared, key: &str) -> Vec<String> {
+        let callers = self.shared(kind).get(key).map_or(&[][..], Vec::as_slice);
+        callers
+            .iter()
+            .filter_map(|caller_id| Some(self.nodes.get(caller_id)?.api.clone()))
+            .collect()
+    }
+
+    /// Registers; gives the address of the node that this bumps.
+    pub(super) fn register(
+        &mut self,
+        kind: Shared,
+        key: &str,
+        caller_id: &str,
+        caller_api: &str,
+    ) -> Option<String> {
+        let (node, bumped) = self.node(caller_id, caller_api);
+        if node.keys(kind).insert(key.to_owned()) {
+            let callers = self.shared_mut(kind).entry(key.to_owned()).or_default();
+            callers.push(caller_id.to_owned());
+        }
+        bumped
+    }
+
+    /// Like [`Registry::register`]: takes the service from whoever has it, who keeps a reference.
+    pub(super) fn register_service(
+        &mut self,
+        service: &str,
+        caller_id: &str,
+        caller_api: &str,
+        service_api: &str,
+    ) -> Option<String> {
+        let (node, bumped) = self.node(caller_id, caller_api);
+        node.services.insert(service.to_owned());
+        let entry = ServiceEntry {
+            node: caller_id.to_owned(),
+            api: service_api.to_owned(),
+        };
+        self.services.insert(service.to_owned(), entry);
+        self.had_services = true;
+        bumped
+    }
+
+    /// The node's reference. Under another address it is a new node of the same name: the old
+    /// one's registrations go.
+    fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
+        let mut bumped = None;
+        if let Some(node) = self.nodes.get_mut(caller_id)
+            && node.api != caller_api
+        {
+            let node = std::mem::take(node);
+            self.drop_registrations(caller_id, &node);
+            bumped = Some(node.api);
+        }
+        let node = self.nodes.entry(caller_id.to_owned()).or_default();
+        if node.api.is_empty() {
+            caller_api.clone_into(&mut node.api);
+        }
+        (node, bumped)
+    }
+
+    fn drop_registrations(&mut self, caller_id: &str, node: &Node) {
+        for topic in &node.publications {
+            drop_caller(&mut self.publishers, topic, caller_id);
+        }
+        for topic in &node.subscriptions {
+            drop_caller(&mut self.subscribers, topic, caller_id);
+        }
+        for key in &node.param_subscriptions {
+            drop_caller(&mut self.param_subscribers, key, caller_id);
+        }
+        for service in &node.services {
+            if self
+                .services
+                .get(service)
+                .is_some_and(|entry| entry.node == caller_id)
+            {
+                self.services.shift_remove(service);
+            }
+        }
+    }
+
+    /// Unregisters; gives the message and whether there was something to unregister.
+    pub(super) fn unregister(
+        &mut self,
+        kind: Shared,
+        key: &str,
+        caller_id: &str,
+        caller_api: &str,
+    ) -> (String, bool) {
+        let Some(node) = self.nodes.get_mut(caller_id) else {
+            return (not_registered(caller_id), false);
+        };
+        if node.api != caller_api || !node.keys(kind).swap_remove(key) {
+            let text = format!("[{caller_id}] is not a known provider of [{key}]");
+            return (text, false);
+        }
+        drop_caller(self.shared_mut(kind), key, caller_id);
+        self.forget_if_empty(caller_id);
+        (unregistered(caller_id, key), true)
+    }
+
+    /// Like [`Registry::unregister`].
+    pub(super) fn unregister_service(
+        &mut self,
+        service: &str,
+        caller_id: &str,
+        service_api: &str,
+    ) -> (String, bool) {
+        let Some(node) = self.nodes.get_mut(caller_id) else {
+            return (not_registered(caller_id), false);
+        };
+        if !self.had_services {
+            let text = format!("[{caller_id}] is not a provider of [{service}]");
+            return (text, false);
+        }
+        let current = self.services.get(service);
+        if current.is_none_or(|entry| entry.node != caller_id || entry.api != service_api) {
+            let text = format!(
+                "[{service_api}] is no longer the current service api handle for [{service}]"
+            );
+            return (text, false);
+        }
+        node.services.swap_remove(service);
+        self.services.shift_remove(service);
+        self.forget_if_empty(caller_id);
+        (unregistered(caller_id, service), true)
+    }
+
+    fn forget_if_empty(&mut self, caller_id: &str) {
+        if self.nodes.get(caller_id).is_some_and(Node::is_empty) {
+            self.nodes.swap_remove(caller_id);
+        }
+    }
+}
+
+fn drop_caller(registrations: &mut Registrations, key: &str, caller_id: &str) {
+    if let Some(callers) = registrations.get_mut(key) {
+        callers.retain(|caller| caller != caller_id);
+        if callers.is_empty() {
+            registrations.shift_remove(key);
+        }
+    }
+}
+
+fn not_registered(caller_id: &str) -> String {
+    format!("[{caller_id}] is not a registered node")
+}
+
+fn unregistered(caller_id: &str, key: &str) -> String {
+    format!("Unregistered [{caller_id}] as provider of [{key}]")
+}

@@ -1,0 +1,400 @@
+//! The model's state, and its way to and from a [`Snapshot`].
+
+use std::fmt;
+
+use indexmap::IndexMap;
+use thiserror::Error;
+
+use super::names;
+use super::params::{Params, Update};
+use super::registry::{Node, Registry, Shared};
+use super::snapshot::{Snapshot, SnapshotNode};
+use crate::xmlrpc::{Call, Struct, Value};
+
+/// A complete master without IO: rosmaster's state, and its answers through [`Master::apply`].
+///
+/// Two are equal if no read tells them apart, orders included, and the same node references and
+/// parameter subscriptions are behind them. The identity is not compared.
+#[derive(Clone, Default)]
+pub struct Master {
+    pub(super) registry: Registry,
+    pub(super) topic_types: IndexMap<String, String>,
+    pub(super) params: Params,
+    pub(super) pid: i32,
+    pub(super) uri: String,
+}
+
+/// A callback that the master sends to a node.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Notice {
+    /// `publisherUpdate('/master', topic, publishers)`.
+    PublisherUpdate {
+        /// Address of the subscriber.
+        to: String,
+        /// The topic.
+        topic: String,
+        /// Addresses of all its publishers.
+        publishers: Vec<String>,
+    },
+    /// `paramUpdate('/master', key, value)`.
+    ParamUpdate {
+        /// Address of the subscriber.
+        to: String,
+        /// What changed, with a trailing slash.
+        key: String,
+        /// The new value; an empty struct for what is gone.
+        value: Value,
+    },
+    /// `shutdown('/master', reason)`, to a node whose name another one took.
+    Shutdown {
+        /// The old node's address.
+        to: String,
+        /// The reason given.
+        reason: String,
+    },
+}
+
+/// How much a master holds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Node references.
+    pub nodes: usize,
+    /// Publishers of topics, each topic counted.
+    pub publishers: usize,
+    /// Subscribers of topics, each topic counted.
+    pub subscribers: usize,
+    /// Services.
+    pub services: usize,
+    /// Parameters that are no namespaces.
+    pub params: usize,
+    /// Subscriptions to parameters, each key counted.
+    pub param_subscribers: usize,
+}
+
+/// Why a snapshot cannot be the state of a master.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum InvalidSnapshot {
+    /// A registration of a node that is not among the nodes.
+    #[error(
+        "`{key}` is registered by `{caller_id}`, which is not among the nodes: add the node with its api, or remove the registration"
+    )]
+    UnknownNode {
+        /// Topic, service or parameter key.
+        key: String,
+        /// The node.
+        caller_id: String,
+    },
+    /// A node twice in one list.
+    #[error("`{caller_id}` is listed twice for `{key}`: remove one of the two")]
+    Twice {
+        /// Topic or parameter key.
+        key: String,
+        /// The node.
+        caller_id: String,
+    },
+    /// A list without nodes.
+    #[error("`{key}` is listed without a node: remove it")]
+    NoNodes {
+        /// Topic or parameter key.
+        key: String,
+    },
+    /// A node that nothing refers to.
+    #[error("the node `{caller_id}` has no registration: remove it")]
+    EmptyNode {
+        /// The node.
+        caller_id: String,
+    },
+    /// A node without an address.
+    #[error("the node `{caller_id}` has no api: add it, or remove the node and its registrations")]
+    NoApi {
+        /// The node.
+        caller_id: String,
+    },
+    /// A topic with publishers and no type.
+    #[error("the published topic `{topic}` has no type: add one, `*` if it is not known")]
+    NoType {
+        /// The topic.
+        topic: String,
+    },
+    /// A service that was taken from the node that has it.
+    #[error(
+        "the service `{service}` is listed as taken over from its own provider `{caller_id}`: remove it there"
+    )]
+    NotTakenOver {
+        /// The service.
+        service: String,
+        /// The node.
+        caller_id: String,
+    },
+}
+
+impl Master {
+    /// What `getPid` and `getUri` answer.
+    pub fn set_identity(&mut self, pid: i32, uri: String) {
+        self.pid = pid;
+        self.uri = uri;
+    }
+
+    /// The nodes by caller id, with their addresses.
+    pub fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
+        let nodes = self.registry.nodes.iter();
+        nodes.map(|(caller_id, node)| (caller_id.as_str(), node.api.as_str()))
+    }
+
+    /// The address of a node.
+    pub fn api_of(&self, caller_id: &str) -> Option<&str> {
+        Some(self.registry.nodes.get(caller_id)?.api.as_str())
+    }
+
+    /// Addresses of a topic's publishers, in order.
+    pub fn publishers_of(&self, topic: &str) -> Vec<String> {
+        self.registry.apis(Shared::Publishers, topic)
+    }
+
+    /// Addresses of a topic's subscribers, in order.
+    pub fn subscribers_of(&self, topic: &str) -> Vec<String> {
+        self.registry.apis(Shared::Subscribers, topic)
+    }
+
+    /// The topics that have subscribers.
+    pub fn subscribed_topics(&self) -> impl Iterator<Item = &str> {
+        self.registry.subscribers.keys().map(String::as_str)
+    }
+
+    /// The type of a topic, kept after its last publisher has gone.
+    pub fn type_of(&self, topic: &str) -> Option<&str> {
+        self.topic_types.get(topic).map(String::as_str)
+    }
+
+    /// The topics that a node publishes.
+    pub fn publications(&self, caller_id: &str) -> impl Iterator<Item = &str> {
+        let node = self.registry.nodes.get(caller_id);
+        node.into_iter()
+            .flat_map(|node| &node.publications)
+            .map(String::as_str)
+    }
+
+    /// The topics that a node subscribes.
+    pub fn subscriptions(&self, caller_id: &str) -> impl Iterator<Item = &str> {
+        let node = self.registry.nodes.get(caller_id);
+        node.into_iter()
+            .flat_map(|node| &node.subscriptions)
+            .map(String::as_str)
+    }
+
+    /// How much there is. Walks everything.
+    pub fn counts(&self) -> Counts {
+        let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();
+        Counts {
+            nodes: self.registry.nodes.len(),
+            publishers: sum(Shared::Publishers),
+            subscribers: sum(Shared::Subscribers),
+            services: self.registry.services.len(),
+            params: self.params.leaves(),
+            param_subscribers: sum(Shared::ParamSubscribers),
+        }
+    }
+
+    /// Whether there is nothing: no nodes, no topic types, no parameters.
+    pub fn is_empty(&self) -> bool {
+        self.registry.nodes.is_empty()
+            && self.topic_types.is_empty()
+            && self.params.tree().is_empty()
+    }
+
+    /// The calls that take a node out, as the node itself would send them at its end.
+    ///
+    /// A reference that it keeps by a service that another node took over cannot be taken back;
+    /// rosmaster has no call for it.
+    pub fn unregister_calls(&self, caller_id: &str) -> Vec<Call> {
+        let Some(node) = self.registry.nodes.get(caller_id) else {
+            return Vec::new();
+        };
+        let api = node.api.as_str();
+        let shared = |method: &'static str, topics: &indexmap::IndexSet<String>| {
+            let names = topics
+                .iter()
+                .filter_map(|topic| names::name_for(topic, caller_id));
+            names
+                .map(|name| Call::new(method, vec![caller_id.into(), name.into(), api.into()]))
+                .collect::<Vec<_>>()
+        };
+        let mut calls = shared("unregisterPublisher", &node.publications);
+        calls.extend(shared("unregisterSubscriber", &node.subscriptions));
+        calls.extend(node.services.iter().filter_map(|service| {
+            let entry = self.registry.services.get(service)?;
+            let name = names::name_for(service, caller_id).filter(|_| entry.node == caller_id)?;
+            let params = vec![caller_id.into(), name.into(), entry.api.as_str().into()];
+            Some(Call::new("unregisterService", params))
+        }));
+        calls.extend(node.param_subscriptions.iter().filter_map(|key| {
+            let name = names::param_name_for(key, caller_id)?;
+            let params = vec![caller_id.into(), api.into(), name.into()];
+            Some(Call::new("unsubscribeParam", params))
+        }));
+        calls
+    }
+
+    /// The whole state as plain data.
+    pub fn snapshot(&self) -> Snapshot {
+        let registry = &self.registry;
+        let nodes = registry.nodes.iter().map(|(caller_id, node)| {
+            let taken_over_services = self.taken_over(caller_id, node).cloned().collect();
+            let node = SnapshotNode {
+                api: node.api.clone(),
+                taken_over_services,
+            };
+            (caller_id.clone(), node)
+        });
+        Snapshot {
+            nodes: nodes.collect(),
+            topic_types: self.topic_types.clone(),
+            publishers: registry.publishers.clone(),
+            subscribers: registry.subscribers.clone(),
+            services: registry.services.clone(),
+            param_subscribers: registry.param_subscribers.clone(),
+            params: self.params.tree().clone(),
+        }
+    }
+
+    /// The services that the node registered and no longer provides.
+    pub(super) fn taken_over<'a>(
+        &'a self,
+        caller_id: &'a str,
+        node: &'a Node,
+    ) -> impl Iterator<Item = &'a String> {
+        node.services.iter().filter(move |service| {
+            let entry = self.registry.services.get(*service);
+            entry.is_none_or(|entry| entry.node != caller_id)
+        })
+    }
+
+    /// The master with that state.
+    ///
+    /// # Errors
+    ///
+    /// Says what in the snapshot cannot be: no sequence of calls leads a master there.
+    pub fn from_snapshot(snapshot: Snapshot) -> Result<Self, InvalidSnapshot> {
+        let mut nodes: IndexMap<String, Node> = IndexMap::with_capacity(snapshot.nodes.len());
+        for (caller_id, node) in snapshot.nodes {
+            if node.api.is_empty() {
+                return Err(InvalidSnapshot::NoApi { caller_id });
+            }
+            let node = Node {
+                api: node.api,
+                services: node.taken_over_services.into_iter().collect(),
+                ..Node::default()
+            };
+            nodes.insert(caller_id, node);
+        }
+        let had_services =
+            !snapshot.services.is_empty() || nodes.values().any(|node| !node.services.is_empty());
+        for (kind, registrations) in [
+            (Shared::Publishers, &snapshot.publishers),
+            (Shared::Subscribers, &snapshot.subscribers),
+            (Shared::ParamSubscribers, &snapshot.param_subscribers),
+        ] {
+            for (key, callers) in registrations {
+                if callers.is_empty() {
+                    return Err(InvalidSnapshot::NoNodes { key: key.clone() });
+                }
+                for caller_id in callers {
+                    let node = nodes.get_mut(caller_id);
+                    let node = node.ok_or_else(|| unknown_node(key, caller_id))?;
+                    if !node.keys(kind).insert(key.clone()) {
+                        return Err(InvalidSnapshot::Twice {
+                            key: key.clone(),
+                            caller_id: caller_id.clone(),
+                        });
+                    }
+                }
+            }
+        }
+        for (service, entry) in &snapshot.services {
+            let node = nodes.get_mut(&entry.node);
+            let node = node.ok_or_else(|| unknown_node(service, &entry.node))?;
+            if !node.services.insert(service.clone()) {
+                return Err(InvalidSnapshot::NotTakenOver {
+                    service: service.clone(),
+                    caller_id: entry.node.clone(),
+                });
+            }
+        }
+        if let Some((caller_id, _)) = nodes.iter().find(|(_, node)| node.is_empty()) {
+            let caller_id = caller_id.clone();
+            return Err(InvalidSnapshot::EmptyNode { caller_id });
+        }
+        let mut topics = snapshot.publishers.keys();
+        if let Some(topic) = topics.find(|topic| !snapshot.topic_types.contains_key(*topic)) {
+            let topic = topic.clone();
+            return Err(InvalidSnapshot::NoType { topic });
+        }
+        Ok(Self {
+            registry: Registry {
+                nodes,
+                publishers: snapshot.publishers,
+                subscribers: snapshot.subscribers,
+                param_subscribers: snapshot.param_subscribers,
+                services: snapshot.services,
+                had_services,
+            },
+            topic_types: snapshot.topic_types,
+            params: Params::new(snapshot.params),
+            ..Self::default()
+        })
+    }
+
+    /// The parameter tree.
+    pub fn params(&self) -> &Struct {
+        self.params.tree()
+    }
+}
+
+fn unknown_node(key: &str, caller_id: &str) -> InvalidSnapshot {
+    InvalidSnapshot::UnknownNode {
+        key: key.to_owned(),
+        caller_id: caller_id.to_owned(),
+    }
+}
+
+impl Registry {
+    /// The callbacks for changed parameters. A value that cannot be written is never sent.
+    pub(super) fn param_notices(&self, updates: Vec<Update<'_>>) -> Vec<Notice> {
+        let mut notices = Vec::new();
+        for update in updates {
+            if super::python::param_error(&update.value).is_some() {
+                continue;
+            }
+            let nodes = update.subscribers.iter();
+            notices.extend(nodes.filter_map(|caller_id| {
+                Some(Notice::ParamUpdate {
+                    to: self.nodes.get(*caller_id)?.api.clone(),
+                    key: update.key.clone(),
+                    value: update.value.clone(),
+                })
+            }));
+        }
+        notices
+    }
+}
+
+impl PartialEq for Master {
+    fn eq(&self, other: &Self) -> bool {
+        let (a, b) = (&self.registry, &other.registry);
+        a.nodes == b.nodes
+            && a.publishers.iter().eq(&b.publishers)
+            && a.subscribers.iter().eq(&b.subscribers)
+            && a.services.iter().eq(&b.services)
+            && a.param_subscribers.iter().eq(&b.param_subscribers)
+            && self.topic_types.iter().eq(&other.topic_types)
+            && self.params.tree().iter().eq(other.params.tree())
+    }
+}
+
+/// Counts alone: values of parameters have no place in a log.
+impl fmt::Debug for Master {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Master").field(&self.counts()).finish()
+    }
+}

@@ -1,0 +1,134 @@
+use super::*;
+use crate::master::{FirstLook, Mark, NotAMaster, difference};
+
+/// Looks at `master` as rosrescue does over the wire.
+fn look(master: &mut Master, previous: &Master) -> Master {
+    let mark = Mark::new("m");
+    let reply = master.apply(&FirstLook::call(&mark)).reply;
+    let look = match FirstLook::decode(&reply) {
+        Err(NotAMaster::ParamsUnreadable { .. }) => {
+            let reply = master.apply(&FirstLook::call_without_params(&mark)).reply;
+            FirstLook::decode(&reply).unwrap()
+        }
+        look => look.unwrap(),
+    };
+    let second = look
+        .second_call(previous)
+        .map(|call| master.apply(&call).reply);
+    look.into_master(second.as_ref(), previous).unwrap()
+}
+
+fn busy() -> Master {
+    after([
+        publish("/p", "/t", "a/B"),
+        publish("/q", "/t", "a/B"),
+        subscribe("/s", "/t", "a/B"),
+        subscribe("plain", "/u", "*"),
+        provide("/p", "/srv"),
+        provide("/p", "/lost"),
+        provide("/q", "/lost"),
+        provide("/gone", "/srv2"),
+        provide("/q", "/srv2"),
+        watch("/w", "/k"),
+        watch("/s", "/k"),
+        set("/k/x", 1),
+    ])
+}
+
+#[test]
+fn a_look_shows_everything_but_what_only_the_previous_state_knows() {
+    let mut master = busy();
+    let found = look(&mut master.clone(), &Master::default());
+    let mut blind = master.snapshot();
+    blind.param_subscribers.clear();
+    blind.nodes.shift_remove("/w");
+    blind.nodes.shift_remove("/gone");
+    blind.nodes["/p"].taken_over_services.clear();
+    assert_eq!(found.snapshot().publishers, blind.publishers);
+    assert_eq!(
+        difference(&Master::from_snapshot(blind).unwrap(), &found),
+        Vec::<String>::new()
+    );
+    let previous = master.clone();
+    assert_eq!(look(&mut master, &previous), previous);
+}
+
+#[test]
+fn what_changed_since_is_believed_to_the_master() {
+    let previous = busy();
+    let mut master = busy();
+    for call in [
+        watch("/w", "/k"),
+        call(
+            "registerPublisher",
+            &["/s", "/t", "a/B", "http://restarted"],
+        ),
+        provide("/x", "/new"),
+        set("/k/x", 2),
+    ] {
+        master.apply(&call);
+    }
+    let found = look(&mut master.clone(), &previous);
+    // `/s` is another process now: its subscriptions of old are not its own.
+    assert_eq!(found, master);
+}
+
+#[test]
+fn an_empty_master_is_empty_and_bears_no_mark() {
+    let mark = Mark::new("m");
+    let mut master = Master::default();
+    master.set_identity(42, "http://h/".to_owned());
+    let look = |master: &mut Master| {
+        FirstLook::decode(&master.apply(&FirstLook::call(&mark)).reply).unwrap()
+    };
+    let first = look(&mut master);
+    assert_eq!(
+        (first.pid(), first.marked(), first.is_empty()),
+        (42, false, true)
+    );
+    assert_eq!(first.second_call(&Master::default()), None);
+    master.apply(&mark.call());
+    let second = look(&mut master);
+    assert_eq!((second.marked(), second.is_empty()), (true, true));
+    master.apply(&set("/a", 1));
+    assert!(!look(&mut master).is_empty());
+}
+
+#[test]
+fn poisoned_params_come_from_the_previous_state() {
+    let mut master = busy();
+    master.apply(&set("/bad", vec![Value::Nil]));
+    let previous = master.clone();
+    assert_eq!(look(&mut master, &previous), previous);
+}
+
+#[test]
+fn what_vanishes_between_the_looks_is_left_out() {
+    let mut master = busy();
+    let mark = Mark::new("m");
+    let first = FirstLook::decode(&master.apply(&FirstLook::call(&mark)).reply).unwrap();
+    for call in master.unregister_calls("/q") {
+        master.apply(&call);
+    }
+    let second = first.second_call(&Master::default()).unwrap();
+    let reply = master.apply(&second).reply;
+    let found = first.into_master(Some(&reply), &Master::default()).unwrap();
+    assert_eq!(found.api_of("/q"), None);
+    assert_eq!(found.publishers_of("/t"), [api("/p")]);
+}
+
+#[test]
+fn what_is_no_master_is_said_to_be_none() {
+    let form = |reply| FirstLook::decode(&reply).unwrap_err();
+    assert!(matches!(
+        form(Reply::Value(1.into())),
+        NotAMaster::Form { .. }
+    ));
+    assert!(matches!(
+        form(Reply::Value(Value::Array(vec![]))),
+        NotAMaster::Form { .. }
+    ));
+    let text = "<class 'Exception'>:method \"system.multicall\" is not supported".to_owned();
+    let fault = Reply::Fault { code: 1, text };
+    assert!(matches!(form(fault), NotAMaster::Fault { .. }));
+}

@@ -1,0 +1,312 @@
+use super::*;
+use crate::master::{Kind, Mark, Mismatch, Plan, Skipped, difference, kind};
+
+fn mark() -> Mark {
+    Mark::new("m")
+}
+
+/// Runs the plan on a model of the new master: what that holds then, and what it has sent.
+fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
+    let mut master = found.clone();
+    let outcome = master.apply(plan.call());
+    assert_eq!(plan.verify(&outcome.reply), Ok(()));
+    assert!(Mark::is_found(&master.apply(&mark().lookup()).reply));
+    let gone = call(
+        "unsubscribeParam",
+        &[mark().name(), "rosrpc://rosrescue:0", "~"],
+    );
+    master.apply(&gone);
+    assert_eq!(&master, plan.expected());
+    (master, outcome.notices)
+}
+
+/// Brings the state to an empty master, which must hold it then and have sent nothing.
+fn restores(target: &Master) -> Plan {
+    let plan = Plan::new(target, &Master::default(), &mark());
+    let (master, notices) = run(&plan, &Master::default());
+    assert_eq!(difference(target, &master), Vec::<String>::new());
+    assert_eq!(&master, target);
+    assert_eq!(notices, []);
+    assert_eq!(plan.skipped(), []);
+    plan
+}
+
+fn entries(plan: &Plan) -> Vec<&str> {
+    let entries = plan.call().params[0].as_array().unwrap();
+    entries
+        .iter()
+        .map(|entry| entry.as_struct().unwrap()["methodName"].as_str().unwrap())
+        .collect()
+}
+
+fn count(plan: &Plan, method: &str) -> usize {
+    entries(plan).iter().filter(|name| **name == method).count()
+}
+
+#[test]
+fn an_empty_state_needs_only_reads_and_the_mark() {
+    let plan = restores(&Master::default());
+    let names = [
+        "getSystemState",
+        "getTopicTypes",
+        "getParam",
+        "subscribeParam",
+    ];
+    assert_eq!(entries(&plan), names);
+    assert_eq!(kind(plan.call()), Kind::Mutate);
+}
+
+#[test]
+fn a_whole_state_comes_back_to_the_last_order() {
+    let master = after([
+        subscribe("/late", "/x", "a/B"),
+        publish("/one", "/t", "a/B"),
+        publish("/two", "/t", "a/B"),
+        publish("/one", "/x", "a/B"),
+        subscribe("/one", "/any", "*"),
+        provide("/one", "/s"),
+        provide("/two", "/s"),
+        provide("/two", "/r"),
+        watch("/one", "/p"),
+        watch("/root", "/"),
+        set(
+            "/p",
+            tree([("a/b", 1.into()), ("", 2.into()), ("empty", tree([]))]),
+        ),
+        set("/q", Value::DateTime("20200101T00:00:00".into())),
+    ]);
+    restores(&master);
+}
+
+#[test]
+fn types_out_of_their_natural_order_cost_one_helper_each() {
+    // `/late` was subscribed before anything was published: its type stands first.
+    let master = after([
+        subscribe("/s", "/late", "a/B"),
+        publish("/p", "/early", "a/B"),
+        publish("/p", "/late", "a/B"),
+    ]);
+    let plan = restores(&master);
+    assert_eq!(count(&plan, "unregisterSubscriber"), 1);
+    let natural = after([publish("/p", "/a", "a/B"), subscribe("/s", "/b", "a/B")]);
+    assert_eq!(count(&restores(&natural), "unregisterSubscriber"), 0);
+}
+
+#[test]
+fn types_without_a_topic_come_back_the_star_too() {
+    let mut master = after([
+        publish("/p", "/gone", "a/B"),
+        publish("/p", "/star", "*"),
+        subscribe("/s", "/star", "*"),
+        subscribe("/s", "/first", "a/B"),
+    ]);
+    for call in master.unregister_calls("/p") {
+        master.apply(&call);
+    }
+    restores(&master);
+}
+
+#[test]
+fn nodes_that_lost_their_services_stay_known() {
+    let mut master = after([
+        provide("/a", "/s"),
+        provide("/b", "/s"),
+        provide("/c", "/s"),
+        provide("/a", "/r"),
+        provide("/b", "/r"),
+    ]);
+    master.apply(&call("unregisterService", &["/b", "/r", "rosrpc://h/b"]));
+    restores(&master);
+}
+
+#[test]
+fn names_that_no_node_should_have_come_back() {
+    let master = after([
+        publish("/n", "//", "a/B"),
+        publish("/a b/c", "t", "a/B"),
+        publish("a/n", "t", "a/B"),
+        subscribe("/a//n", "t", "a/B"),
+        subscribe("plain", "~", "a/B"),
+        provide("a/n", "s"),
+        watch("a/n", "k"),
+        watch("/a//n", "k/"),
+    ]);
+    restores(&master);
+}
+
+#[test]
+fn poison_stays_behind_and_is_named_by_key() {
+    let master = after([
+        set("/good", 1),
+        set("/ns/nil", vec![Value::Nil]),
+        set("/ns/big", Value::BigInt("5000000000".into())),
+        set("/ns/fine", 2),
+    ]);
+    let plan = Plan::new(&master, &Master::default(), &mark());
+    let skipped: Vec<_> = plan.skipped().iter().map(ToString::to_string).collect();
+    assert_eq!(skipped.len(), 2);
+    assert!(skipped[0].contains("`/ns/nil`") && skipped[1].contains("`/ns/big`"));
+    let (restored, _) = run(&plan, &Master::default());
+    assert_eq!(restored, after([set("/good", 1), set("/ns/fine", 2)]));
+}
+
+#[test]
+fn marks_are_not_brought_over() {
+    let mut master = after([publish("/p", "/t", "a/B")]);
+    let bare = master.clone();
+    master.apply(&Mark::new("old").call());
+    let plan = Plan::new(&master, &Master::default(), &mark());
+    assert_eq!(run(&plan, &Master::default()).0, bare);
+    assert_eq!(plan.skipped(), []);
+}
+
+/// A roscore that came back by itself, with a `/rosout` of its own.
+fn roscore() -> Master {
+    after([
+        set("/run_id", "new"),
+        set("/rosversion", "1.17"),
+        call(
+            "registerSubscriber",
+            &["/rosout", "/rosout", "rosgraph_msgs/Log", "http://new"],
+        ),
+        call(
+            "registerPublisher",
+            &["/rosout", "/rosout_agg", "rosgraph_msgs/Log", "http://new"],
+        ),
+        call(
+            "registerService",
+            &[
+                "/rosout",
+                "/rosout/get_loggers",
+                "rosrpc://new",
+                "http://new",
+            ],
+        ),
+    ])
+}
+
+#[test]
+fn what_the_new_master_holds_stays_and_nobody_is_bumped() {
+    let nodes = ["/a", "/b", "/c"];
+    let mut target = after([
+        set("/run_id", "old"),
+        set("/mine", 1),
+        subscribe("/rosout", "/rosout", "rosgraph_msgs/Log"),
+        provide("/rosout", "/rosout/get_loggers"),
+    ]);
+    for node in nodes {
+        target.apply(&publish(node, "/rosout", "rosgraph_msgs/Log"));
+    }
+    let plan = Plan::new(&target, &roscore(), &mark());
+    let (master, notices) = run(&plan, &roscore());
+    assert_eq!(master.api_of("/rosout"), Some("http://new"));
+    assert!(matches!(plan.skipped(), [Skipped::Node { caller_id, .. }] if caller_id == "/rosout"));
+    // One complete list for the new subscriber, and nothing else.
+    let complete = Notice::PublisherUpdate {
+        to: "http://new".to_owned(),
+        topic: "/rosout".to_owned(),
+        publishers: nodes.map(api).to_vec(),
+    };
+    assert_eq!(notices, [complete]);
+    let params = tree([
+        ("run_id", "old".into()),
+        ("mine", 1.into()),
+        ("rosversion", "1.17".into()),
+    ]);
+    assert_eq!(Value::Struct(master.params().clone()), params);
+}
+
+#[test]
+fn a_state_that_is_there_already_is_not_registered_again() {
+    let target = after([
+        publish("/p", "/t", "a/B"),
+        subscribe("/s", "/t", "a/B"),
+        provide("/p", "/srv"),
+        watch("/s", "/k"),
+        set("/k", 1),
+    ]);
+    let plan = Plan::new(&target, &target, &mark());
+    let (master, notices) = run(&plan, &target);
+    assert_eq!((master, notices), (target, vec![]));
+    for method in [
+        "registerPublisher",
+        "registerSubscriber",
+        "registerService",
+        "setParam",
+    ] {
+        assert_eq!(count(&plan, method), 0, "{method}");
+    }
+}
+
+#[test]
+fn a_service_that_somebody_has_in_the_new_master_stays_with_him() {
+    let target = after([provide("/lost", "/s"), provide("/old", "/s")]);
+    let found = after([provide("/new", "/s")]);
+    let plan = Plan::new(&target, &found, &mark());
+    assert_eq!(run(&plan, &found).0, found);
+    assert!(matches!(
+        plan.skipped(),
+        [Skipped::Service { .. }, Skipped::Reference { .. }]
+    ));
+}
+
+#[test]
+fn params_are_merged_namespace_by_namespace() {
+    let target = after([
+        set("/ns/ours", 1),
+        set("/both", 1),
+        set("/ns/clash", tree([("x", 1.into())])),
+    ]);
+    let found = after([set("/ns/theirs", 2), set("/both", 2), set("/ns/clash", 2)]);
+    let (master, _) = run(&Plan::new(&target, &found, &mark()), &found);
+    let ns = tree([
+        ("ours", 1.into()),
+        ("clash", tree([("x", 1.into())])),
+        ("theirs", 2.into()),
+    ]);
+    let expected = tree([("ns", ns), ("both", 1.into())]);
+    assert_eq!(Value::Struct(master.params().clone()), expected);
+}
+
+#[test]
+fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
+    let target = after([publish("/p", "/t", "a/B"), set("/secret", "s3cret")]);
+    let plan = Plan::new(&target, &Master::default(), &mark());
+    let mut other = after([publish("/q", "/t", "a/B")]);
+    let mismatches = plan.verify(&other.apply(plan.call()).reply).unwrap_err();
+    let text: String = mismatches.iter().map(ToString::to_string).collect();
+    assert!(
+        text.contains("getSystemState") && !text.contains("s3cret"),
+        "{text}"
+    );
+    let fault = Reply::Fault {
+        code: 1,
+        text: "boom".to_owned(),
+    };
+    let whole = Mismatch::Whole {
+        text: "boom".to_owned(),
+    };
+    assert_eq!(plan.verify(&fault), Err(vec![whole]));
+    assert!(plan.verify(&Reply::Value(Value::Array(vec![]))).is_err());
+}
+
+#[test]
+fn a_difference_is_told_in_words_without_values() {
+    let a = after([
+        publish("/p", "/t", "a/B"),
+        set("/k", "s3cret"),
+        provide("/p", "/s"),
+    ]);
+    let b = after([publish("/q", "/t", "a/C"), set("/k", "other"), set("/l", 1)]);
+    let words = difference(&a, &b);
+    assert!(
+        words
+            .iter()
+            .any(|words| words.contains("`/k` has another value")),
+        "{words:?}"
+    );
+    assert!(words.iter().all(|words| !words.contains("s3cret")));
+    assert_eq!(difference(&a, &a), Vec::<String>::new());
+    let many = after((0..100).map(|i| set(&format!("/p{i}"), 1)));
+    assert_eq!(difference(&many, &a).len(), 20);
+}

@@ -1,0 +1,430 @@
+//! One test for each thing that is not as one would think.
+
+use super::*;
+
+#[test]
+fn checks_complain_in_rosmasters_words_and_order() {
+    let mut master = Master::default();
+    for (call, text) in [
+        (call("getPid", &[]), "missing required caller_id parameter"),
+        (call("getPid", &["/n", "x"]), "Error: bad call arity"),
+        (
+            Call::new("getPid", vec![1.into()]),
+            "caller_id must be a string",
+        ),
+        (
+            call("getParam", &["/n", ""]),
+            "ERROR: parameter [key] must be specified and non-empty",
+        ),
+        (
+            Call::new("getParam", vec!["/n".into(), 1.into()]),
+            "ERROR: parameter [key] must be a string",
+        ),
+        (
+            publish("/n", "", "a/B"),
+            "ERROR: parameter [topic] must be a non-empty string",
+        ),
+        (
+            publish("/n", "a b", "a/B"),
+            "ERROR: parameter [topic] contains illegal chars",
+        ),
+        (
+            publish("/n", "/", "a/B"),
+            "ERROR: parameter [topic] cannot be the global namespace",
+        ),
+        (
+            publish("/n", "t", ""),
+            "ERROR: parameter [topic_type] must be a non-empty string",
+        ),
+        (
+            publish("/n", "t", "a/b/C"),
+            "ERROR: parameter [topic_type] is not a valid package resource name",
+        ),
+        (
+            call("registerPublisher", &["/n", "t", "a/B", ""]),
+            "ERROR: parameter [caller_api] is not an XMLRPC URI",
+        ),
+        (
+            call("registerPublisher", &["/n", "t", "a/B", "https://h"]),
+            "ERROR: parameter [caller_api] is not an RPC URI",
+        ),
+        (
+            call("registerPublisher", &["/n", "/", "x", "x"]),
+            "ERROR: parameter [topic] cannot be the global namespace",
+        ),
+        (
+            set("/a", Value::Nil),
+            "ERROR: parameter [value] must be specified",
+        ),
+    ] {
+        assert_eq!(
+            message(&mut master, &call),
+            (-1, text.to_owned()),
+            "{call:?}"
+        );
+    }
+    assert!(master.is_empty());
+}
+
+#[test]
+fn errors_carry_the_methods_own_value() {
+    let mut master = Master::default();
+    let mut value = |method: &str| answer(&mut master, &call(method, &[])).2;
+    assert_eq!(value("getPid"), Value::Int(-1));
+    assert_eq!(value("getUri"), Value::from(""));
+    assert_eq!(value("hasParam"), Value::Bool(false));
+    assert_eq!(value("registerPublisher"), Value::Array(vec![]));
+    assert_eq!(
+        value("getSystemState"),
+        vec![Value::Array(vec![]); 3].into()
+    );
+}
+
+#[test]
+fn a_node_with_another_address_bumps_the_old_one_without_telling_subscribers() {
+    let mut master = after([
+        publish("/n", "/t", "a/B"),
+        subscribe("/n", "/u", "a/B"),
+        provide("/n", "/s"),
+        watch("/n", "/p"),
+        subscribe("/listener", "/t", "a/B"),
+    ]);
+    let again = call("subscribeParam", &["/n", "http://new", "/q"]);
+    let shutdown = Notice::Shutdown {
+        to: api("/n"),
+        reason: "[/n] Reason: new node registered with same name".to_owned(),
+    };
+    assert_eq!(notices(&mut master, &again), [shutdown]);
+    let counts = master.counts();
+    assert_eq!((counts.publishers, counts.subscribers), (0, 1));
+    assert_eq!((counts.services, counts.param_subscribers), (0, 1));
+    assert_eq!(master.type_of("/t"), Some("a/B"));
+}
+
+#[test]
+fn a_node_whose_service_was_taken_stays_known_for_ever() {
+    let mut master = after([provide("/a", "/s"), provide("/b", "/s")]);
+    assert_eq!(
+        message(
+            &mut master,
+            &call("unregisterService", &["/a", "/s", "rosrpc://h/a"])
+        )
+        .1,
+        "[rosrpc://h/a] is no longer the current service api handle for [/s]"
+    );
+    master.apply(&call("unregisterService", &["/b", "/s", "rosrpc://h/b"]));
+    assert_eq!(master.api_of("/b"), None);
+    assert_eq!(master.api_of("/a"), Some("http://h/a"));
+    assert_eq!(master.snapshot().nodes["/a"].taken_over_services, ["/s"]);
+}
+
+#[test]
+fn a_service_keeps_its_place_when_it_changes_hands() {
+    let master = after([
+        provide("/a", "/s"),
+        provide("/a", "/r"),
+        provide("/b", "/s"),
+    ]);
+    let services: Vec<_> = master.snapshot().services.into_keys().collect();
+    assert_eq!(services, ["/s", "/r"]);
+}
+
+#[test]
+fn unregistering_from_a_master_that_never_had_a_service_says_so() {
+    let mut master = after([publish("/n", "/t", "a/B")]);
+    let unregister = call("unregisterService", &["/n", "/s", "rosrpc://h"]);
+    assert_eq!(
+        message(&mut master, &unregister).1,
+        "[/n] is not a provider of [/s]"
+    );
+    master.apply(&provide("/m", "/s"));
+    assert_eq!(
+        message(&mut master, &unregister).1,
+        "[rosrpc://h] is no longer the current service api handle for [/s]"
+    );
+}
+
+#[test]
+fn topic_types_outlive_topics_and_only_publishers_change_them() {
+    let mut master = after([subscribe("/s", "/t", "*")]);
+    assert_eq!(master.type_of("/t"), None);
+    master.apply(&publish("/p", "/t", "*"));
+    assert_eq!(master.type_of("/t"), Some("*"));
+    master.apply(&subscribe("/s", "/t", "a/B"));
+    assert_eq!(master.type_of("/t"), Some("*"));
+    master.apply(&publish("/p", "/t", "a/B"));
+    master.apply(&publish("/p", "/t", "*"));
+    assert_eq!(master.type_of("/t"), Some("a/B"));
+    for call in master
+        .unregister_calls("/p")
+        .iter()
+        .chain(&master.unregister_calls("/s"))
+    {
+        master.apply(call);
+    }
+    assert_eq!(master.counts().nodes, 0);
+    assert_eq!(master.type_of("/t"), Some("a/B"));
+}
+
+#[test]
+fn subscribers_are_told_at_every_registration_and_only_at_real_unregistrations() {
+    let mut master = after([subscribe("/s", "/t", "a/B")]);
+    let told = |publishers: &[&str]| {
+        [Notice::PublisherUpdate {
+            to: api("/s"),
+            topic: "/t".to_owned(),
+            publishers: publishers.iter().map(|node| api(node)).collect(),
+        }]
+    };
+    assert_eq!(
+        notices(&mut master, &publish("/p", "/t", "a/B")),
+        told(&["/p"])
+    );
+    assert_eq!(
+        notices(&mut master, &publish("/p", "/t", "a/B")),
+        told(&["/p"])
+    );
+    let other = call("unregisterPublisher", &["/p", "/t", "http://other"]);
+    assert_eq!(notices(&mut master, &other), []);
+    let real = call("unregisterPublisher", &["/p", "/t", &api("/p")]);
+    assert_eq!(notices(&mut master, &real), told(&[]));
+}
+
+#[test]
+fn a_parameter_in_the_way_becomes_a_namespace_and_empty_ones_stay() {
+    let mut master = after([set("/a", 1), set("/a/b/c", 2)]);
+    master.apply(&call("deleteParam", &["/n", "/a/b/c"]));
+    let names = answer(&mut master, &call("getParamNames", &["/n"])).2;
+    assert_eq!(names, Value::Array(vec![]));
+    let (code, _, value) = answer(&mut master, &call("getParam", &["/n", "/a"]));
+    assert_eq!((code, value), (1, tree([("b", tree([]))])));
+}
+
+#[test]
+fn deleting_below_a_value_fails_as_python_does() {
+    let list: Value = vec!["x"].into();
+    for (value, text) in [
+        (
+            1.into(),
+            "Error: invalid arguments: argument of type 'int' is not iterable",
+        ),
+        (
+            "axb".into(),
+            "Error: invalid arguments: 'str' object does not support item deletion",
+        ),
+        ("ab".into(), "parameter [/k/x] is not set"),
+        (
+            list,
+            "Error: invalid arguments: list indices must be integers or slices, not str",
+        ),
+    ] {
+        let mut master = after([set("/k", value)]);
+        assert_eq!(
+            message(&mut master, &call("deleteParam", &["/n", "/k/x"])),
+            (-1, text.into())
+        );
+    }
+}
+
+#[test]
+fn reading_a_relative_key_forgets_its_first_part() {
+    // Only a caller without a leading slash can resolve to such a key.
+    let mut master = Master::default();
+    master.apply(&Call::new(
+        "setParam",
+        vec!["a/n".into(), "k".into(), 1.into()],
+    ));
+    assert_eq!(
+        message(&mut master, &call("getParam", &["/n", "/a/k"])).0,
+        1
+    );
+    assert_eq!(message(&mut master, &call("getParam", &["a/n", "k"])).0, -1);
+    master.apply(&set("/k", 1));
+    assert_eq!(message(&mut master, &call("getParam", &["a/n", "k"])).0, 1);
+}
+
+#[test]
+fn a_search_looks_for_the_first_part_only() {
+    let mut master = after([set("/pr2/robot/base", 1), set("/robot/arm", 1)]);
+    let mut search =
+        |caller: &str, key: &str| answer(&mut master, &call("searchParam", &[caller, key]));
+    assert_eq!(
+        search("/pr2/n", "robot/arm").2,
+        Value::from("/pr2/robot/arm")
+    );
+    assert_eq!(search("/n", "robot/arm").2, Value::from("/robot/arm"));
+    assert_eq!(search("/n", "nothing").0, -1);
+    assert_eq!(search("/n", "~robot").1, "Internal failure: invalid key");
+    assert_eq!(
+        search("n", "robot").1,
+        "Internal failure: namespace must be global"
+    );
+    assert_eq!(search("/n", "/robot//arm/").2, Value::from("/robot//arm/"));
+}
+
+#[test]
+fn param_updates_reach_those_above_below_and_at_the_key() {
+    let mut master = after([
+        watch("/root", "/"),
+        watch("/exact", "/a"),
+        watch("/set", "/a"),
+        watch("/leaf", "/a/b"),
+        watch("/gone", "/a/c"),
+        watch("/other", "/ab"),
+    ]);
+    let value = tree([("b", 2.into())]);
+    let told = notices(&mut master, &set("/a", value.clone()));
+    let update = |node: &str, key: &str, value: &Value| Notice::ParamUpdate {
+        to: api(node),
+        key: key.to_owned(),
+        value: value.clone(),
+    };
+    // The setter, `/set`, is left out; the root and exact ones come first.
+    assert_eq!(
+        told,
+        [
+            update("/root", "/a/", &value),
+            update("/exact", "/a/", &value),
+            update("/gone", "/a/c/", &tree([])),
+            update("/leaf", "/a/b/", &2.into()),
+        ]
+    );
+    // A scalar over the parent of a subscribed key tells nobody below.
+    assert_eq!(notices(&mut master, &set("/a", 1)).len(), 2);
+    let told = notices(&mut master, &call("deleteParam", &["/set", "/a"]));
+    assert_eq!(told.len(), 5);
+}
+
+#[test]
+fn what_cannot_be_returned_poisons_its_parents() {
+    let mut master = after([
+        set("/a", vec![Value::Nil]),
+        set("/b", Value::BigInt("-5000000000".into())),
+    ]);
+    let mut fault = |key: &str| match master.apply(&call("getParam", &["/n", key])).reply {
+        Reply::Fault { text, .. } => text,
+        other => panic!("{other:?}"),
+    };
+    let nil = "<class 'TypeError'>:cannot marshal None unless allow_none is enabled";
+    assert_eq!(fault("/a"), nil);
+    assert_eq!(
+        fault("/b"),
+        "<class 'OverflowError'>:int exceeds XML-RPC limits"
+    );
+    assert_eq!(fault("/"), nil);
+}
+
+#[test]
+fn a_multicall_shows_a_namespace_as_it_is_at_the_end() {
+    let mut master = after([set("/a", tree([("x", 1.into())]))]);
+    let get = call("getParam", &["/n", "/a"]);
+    let calls = [
+        get.clone(),
+        set("/a/y", 2),
+        get.clone(),
+        set("/a", tree([("z", 3.into())])),
+        get,
+    ];
+    let Reply::Value(Value::Array(results)) = master.apply(&Call::multicall(calls)).reply else {
+        panic!("no results")
+    };
+    let value = |index: usize| match results[index].as_array() {
+        Some([Value::Array(answer)]) => answer[2].clone(),
+        _ => panic!("no answer"),
+    };
+    let first = tree([("x", 1.into()), ("y", 2.into())]);
+    assert_eq!((value(0), value(2)), (first.clone(), first));
+    assert_eq!(value(4), tree([("z", 3.into())]));
+}
+
+#[test]
+fn a_malformed_entry_faults_the_whole_multicall_after_the_ones_before_it_ran() {
+    let mut master = Master::default();
+    let entry = |members: [(&str, Value); 1]| tree(members);
+    let mut good = Call::multicall([set("/a", 1)]);
+    if let Some(Value::Array(entries)) = good.params.first_mut() {
+        entries.push(entry([("params", Value::Array(vec![]))]));
+        entries.push(Value::Int(1));
+    }
+    let Reply::Fault { text, .. } = master.apply(&good).reply else {
+        panic!("no fault")
+    };
+    assert_eq!(text, "<class 'KeyError'>:'methodName'");
+    assert_eq!(master.counts().params, 1);
+}
+
+#[test]
+fn methods_that_are_none_fault() {
+    let mut master = Master::default();
+    let mut fault = |method: &str| match master.apply(&call(method, &["/n"])).reply {
+        Reply::Fault { text, .. } => text,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(
+        fault("nope"),
+        "<class 'Exception'>:method \"nope\" is not supported"
+    );
+    assert_eq!(
+        fault("uri"),
+        "<class 'TypeError'>:'str' object is not callable"
+    );
+    assert_eq!(
+        fault("param_update_task"),
+        "<class 'TypeError'>:ROSMasterHandler.param_update_task() missing 3 required positional arguments: 'caller_api', 'param_key', and 'param_value'"
+    );
+}
+
+#[test]
+fn a_snapshot_brings_back_the_whole_state_and_refuses_what_cannot_be() {
+    use crate::master::InvalidSnapshot;
+    let master = after([
+        provide("/a", "/s"),
+        provide("/b", "/s"),
+        publish("/b", "/t", "a/B"),
+        subscribe("/a", "/u", "*"),
+        watch("/c", "/p"),
+        set("/p", 1),
+    ]);
+    let snapshot = master.snapshot();
+    assert_eq!(
+        Master::from_snapshot(snapshot.clone()).as_ref(),
+        Ok(&master)
+    );
+    let mut broken = snapshot.clone();
+    broken.nodes.shift_remove("/b");
+    assert!(matches!(
+        Master::from_snapshot(broken),
+        Err(InvalidSnapshot::UnknownNode { caller_id, .. }) if caller_id == "/b"
+    ));
+    let mut broken = snapshot.clone();
+    broken.topic_types.clear();
+    let no_type = InvalidSnapshot::NoType {
+        topic: "/t".to_owned(),
+    };
+    assert_eq!(Master::from_snapshot(broken), Err(no_type));
+    let mut broken = snapshot;
+    broken.param_subscribers.clear();
+    let empty = InvalidSnapshot::EmptyNode {
+        caller_id: "/c".to_owned(),
+    };
+    assert_eq!(Master::from_snapshot(broken), Err(empty));
+}
+
+#[test]
+fn unregistering_everything_a_node_has_makes_the_master_forget_it() {
+    let calls = [
+        publish("/ns/n", "t", "a/B"),
+        subscribe("/ns/n", "~u", "a/B"),
+        provide("/ns/n", "//"),
+        watch("/ns/n", "~"),
+        watch("/ns/n", "/"),
+    ];
+    let mut master = after(calls);
+    let unregister = master.unregister_calls("/ns/n");
+    assert_eq!(unregister.len(), 5);
+    for call in &unregister {
+        assert_eq!(message(&mut master, call).0, 1);
+    }
+    assert_eq!(master.counts().nodes, 0);
+    assert_eq!(master.unregister_calls("/nobody"), []);
+}
