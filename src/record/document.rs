@@ -1,0 +1,293 @@
+//! Which value stands under which key of the document.
+
+use indexmap::IndexMap;
+
+use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
+use super::{Checkpoint, EncodeError, Entry, Session, yaml};
+use crate::master::{ServiceEntry, Snapshot, SnapshotNode};
+use crate::xmlrpc::{Call, Struct, Value};
+
+/// The document up to and including the line `journal:`.
+pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeError> {
+    let Checkpoint {
+        seq,
+        session,
+        snapshot,
+    } = checkpoint;
+    let mut out = Vec::with_capacity(64 * 1024);
+    let out = &mut out;
+    out.extend_from_slice(
+        b"# The state of a ROS master: a snapshot, then a journal of what came after it.\n\
+          # Any YAML reader reads it. Do not edit: the check sums would no longer hold.\n\
+          seq: ",
+    );
+    decimal(out, seq);
+    out.extend_from_slice(b"\nsession:\n");
+    for (name, value) in session_members(session) {
+        out.extend_from_slice(b"  ");
+        out.extend_from_slice(name.as_bytes());
+        out.extend_from_slice(b": ");
+        flow(out, &value, 0)?;
+        out.push(b'\n');
+    }
+    section(out, "nodes", &snapshot.nodes, |out, node| {
+        text_line(out, "    api: ", &node.api);
+        if !node.taken_over_services.is_empty() {
+            out.extend_from_slice(b"    taken_over_services: ");
+            names(out, &node.taken_over_services);
+        }
+    });
+    section_of_lines(out, "topic_types", &snapshot.topic_types, |out, kind| {
+        text_line(out, "", kind);
+    });
+    section_of_lines(out, "publishers", &snapshot.publishers, |out, ids| {
+        names(out, ids)
+    });
+    section_of_lines(out, "subscribers", &snapshot.subscribers, |out, ids| {
+        names(out, ids)
+    });
+    section(out, "services", &snapshot.services, |out, service| {
+        text_line(out, "    node: ", &service.node);
+        text_line(out, "    api: ", &service.api);
+    });
+    section_of_lines(
+        out,
+        "param_subscribers",
+        &snapshot.param_subscribers,
+        |out, ids| {
+            names(out, ids);
+        },
+    );
+    if snapshot.params.is_empty() {
+        out.extend_from_slice(b"parameters: {}\n");
+    } else {
+        out.extend_from_slice(b"parameters:\n");
+        block(out, &snapshot.params, 2, 0)?;
+    }
+    out.extend_from_slice(b"journal:\n");
+    Ok(std::mem::take(out))
+}
+
+/// A key whose entries have lines of their own.
+fn section<T>(
+    out: &mut Vec<u8>,
+    title: &str,
+    entries: &IndexMap<String, T>,
+    mut write: impl FnMut(&mut Vec<u8>, &T),
+) {
+    section_of_lines(out, title, entries, |out, entry| {
+        // Instead of the blank after the key.
+        out.pop();
+        out.push(b'\n');
+        write(out, entry);
+    });
+}
+
+/// A key whose entries have one line each; `write` ends the line.
+fn section_of_lines<T>(
+    out: &mut Vec<u8>,
+    title: &str,
+    entries: &IndexMap<String, T>,
+    mut write: impl FnMut(&mut Vec<u8>, &T),
+) {
+    out.extend_from_slice(title.as_bytes());
+    out.extend_from_slice(if entries.is_empty() {
+        b": {}\n"
+    } else {
+        b":\n"
+    });
+    for (name, entry) in entries {
+        block_key(out, name, 2);
+        out.push(b' ');
+        write(out, entry);
+    }
+}
+
+fn text_line(out: &mut Vec<u8>, key: &str, text: &str) {
+    out.extend_from_slice(key.as_bytes());
+    quoted(out, text);
+    out.push(b'\n');
+}
+
+fn names(out: &mut Vec<u8>, ids: &[String]) {
+    // Texts nest nothing, so this cannot fail.
+    let _ = flow_list(out, ids, |out, id| {
+        quoted(out, id);
+        Ok(())
+    });
+    out.push(b'\n');
+}
+
+fn session_members(session: &Session) -> [(&'static str, Value); 6] {
+    [
+        ("id", session.id.as_str().into()),
+        ("boot_id", session.boot_id.as_str().into()),
+        ("closed", session.closed.into()),
+        ("mark", session.mark.as_str().into()),
+        (
+            "master_uri",
+            session
+                .master_uri
+                .as_deref()
+                .map_or(Value::Nil, Value::from),
+        ),
+        ("started", session.started.as_str().into()),
+    ]
+}
+
+/// A record's line without its check.
+pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
+    out.extend_from_slice(b"- {seq: ");
+    decimal(out, seq);
+    match entry {
+        Entry::Call(call) => {
+            out.extend_from_slice(b", call: ");
+            quoted(out, &call.method);
+            out.extend_from_slice(b", params: ");
+            flow_list(out, &call.params, |out, value| flow(out, value, 0))?;
+        }
+        Entry::Session(session) => {
+            out.extend_from_slice(b", session: {");
+            for (nth, (name, value)) in session_members(session).iter().enumerate() {
+                if nth > 0 {
+                    out.extend_from_slice(b", ");
+                }
+                out.extend_from_slice(name.as_bytes());
+                out.extend_from_slice(b": ");
+                flow(out, value, 0)?;
+            }
+            out.push(b'}');
+        }
+    }
+    out.push(b'}');
+    Ok(())
+}
+
+/// The way back of [`write_snapshot`].
+pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
+    let Value::Struct(mut document) = yaml::read(yaml)? else {
+        return Err("it is no mapping".to_owned());
+    };
+    let document = &mut document;
+    let seq = seq(document)?;
+    let session = read_session(members(document, "session")?)?;
+    let snapshot = Snapshot {
+        nodes: entries(document, "nodes", |value| {
+            let mut node = structure(value)?;
+            Some(SnapshotNode {
+                api: text(&mut node, "api").ok()?,
+                taken_over_services: match node.shift_remove("taken_over_services") {
+                    Some(ids) => texts(ids)?,
+                    None => Vec::new(),
+                },
+            })
+        })?,
+        topic_types: entries(document, "topic_types", string)?,
+        publishers: entries(document, "publishers", texts)?,
+        subscribers: entries(document, "subscribers", texts)?,
+        services: entries(document, "services", |value| {
+            let mut service = structure(value)?;
+            Some(ServiceEntry {
+                node: text(&mut service, "node").ok()?,
+                api: text(&mut service, "api").ok()?,
+            })
+        })?,
+        param_subscribers: entries(document, "param_subscribers", texts)?,
+        params: members(document, "parameters")?,
+    };
+    Ok(Checkpoint {
+        seq,
+        session,
+        snapshot,
+    })
+}
+
+/// The way back of [`write_record`], whose number the caller has read already.
+pub(super) fn read_record(line: &str) -> Result<Entry, String> {
+    let entries = match yaml::read(line)? {
+        Value::Array(entries) => entries,
+        _ => Vec::new(),
+    };
+    let Ok([Value::Struct(mut entry)]) = <[Value; 1]>::try_from(entries) else {
+        return Err("it is no record".to_owned());
+    };
+    if entry.contains_key("session") {
+        return read_session(members(&mut entry, "session")?).map(Entry::Session);
+    }
+    let method = text(&mut entry, "call")?;
+    match entry.shift_remove("params") {
+        Some(Value::Array(params)) => Ok(Entry::Call(Call { method, params })),
+        _ => Err("`params` is no list".to_owned()),
+    }
+}
+
+fn read_session(mut session: Struct) -> Result<Session, String> {
+    let session = &mut session;
+    Ok(Session {
+        id: text(session, "id")?,
+        boot_id: text(session, "boot_id")?,
+        closed: session.get("closed") == Some(&Value::Bool(true)),
+        mark: text(session, "mark")?,
+        master_uri: session.shift_remove("master_uri").and_then(string),
+        started: text(session, "started")?,
+    })
+}
+
+fn seq(document: &Struct) -> Result<u64, String> {
+    match document.get("seq") {
+        Some(Value::Int(number)) => u64::try_from(*number).ok(),
+        Some(Value::BigInt(digits)) => digits.parse().ok(),
+        _ => None,
+    }
+    .ok_or_else(|| "`seq` is no number".to_owned())
+}
+
+fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
+    // Moved out, not cloned; the order of what stays behind does not matter.
+    document
+        .swap_remove(key)
+        .and_then(structure)
+        .ok_or_else(|| format!("`{key}` is no mapping"))
+}
+
+fn entries<T>(
+    document: &mut Struct,
+    key: &str,
+    read: impl Fn(Value) -> Option<T>,
+) -> Result<IndexMap<String, T>, String> {
+    members(document, key)?
+        .into_iter()
+        .map(|(name, value)| {
+            let entry = read(value).ok_or_else(|| format!("`{key}` has a malformed entry"))?;
+            Ok((name, entry))
+        })
+        .collect()
+}
+
+fn text(members: &mut Struct, key: &str) -> Result<String, String> {
+    members
+        .shift_remove(key)
+        .and_then(string)
+        .ok_or_else(|| format!("`{key}` is no text"))
+}
+
+fn string(value: Value) -> Option<String> {
+    match value {
+        Value::String(text) => Some(text),
+        _ => None,
+    }
+}
+
+fn structure(value: Value) -> Option<Struct> {
+    match value {
+        Value::Struct(members) => Some(members),
+        _ => None,
+    }
+}
+
+fn texts(value: Value) -> Option<Vec<String>> {
+    match value {
+        Value::Array(elements) => elements.into_iter().map(string).collect(),
+        _ => None,
+    }
+}

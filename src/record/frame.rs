@@ -1,0 +1,378 @@
+//! What guards the bytes, and what of a damaged file is whole.
+//!
+//! ```text
+//! # rosrescue checkpoint v1 generation=G seq=S snapshot=LENGTH crc32c=C header=H
+//! ...LENGTH bytes, the last line of which is `journal:`...
+//! - {seq: 8, call: "setParam", params: [...]} #H R
+//! ```
+//!
+//! S is the number of the last record that the snapshot contains. C is of the snapshot, H of the first line before it, R of the record's line before it. All are
+//! CRC-32C in eight lower-case hexadecimal digits. Every record repeats H, the *stamp*: a whole
+//! line that a disk brings back from another life of the file is told by it.
+
+use std::io::{BufRead, Write};
+use std::ops::Range;
+
+use super::{
+    Checkpoint, Damage, DecodeError, Decoded, EncodeError, Encoded, Entry, Record, SnapshotError,
+    document,
+};
+
+/// The format written by this version.
+pub const FORMAT_VERSION: u32 = 1;
+
+const MAGIC: &str = "# rosrescue checkpoint v";
+/// The first line is shorter than this, whatever its numbers.
+const HEADER_BYTES_MAX: usize = 256;
+/// A record's check: ` #` and eight digits, a blank and eight digits.
+const CHECK_BYTES: usize = 19;
+const RECORD_START: &[u8] = b"- {seq: ";
+
+/// Ties the records of a file to its snapshot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stamp(u32);
+
+/// Puts the first line before a snapshot.
+pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
+    let crc = crc32c::crc32c(snapshot);
+    let length = snapshot.len();
+    let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
+    // Writing to a vector cannot fail.
+    let _ = write!(
+        bytes,
+        "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
+         crc32c={crc:08x} header="
+    );
+    let stamp = Stamp(crc32c::crc32c(&bytes));
+    let _ = writeln!(bytes, "{:08x}", stamp.0);
+    bytes.extend_from_slice(snapshot);
+    Encoded { bytes, stamp }
+}
+
+/// Appends a record's line without its check.
+pub(crate) fn push_body(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
+    let start = out.len();
+    let written = document::write_record(out, seq, entry);
+    if written.is_err() {
+        out.truncate(start);
+    }
+    written
+}
+
+/// Appends the check to the body that starts at `start`, and ends the line.
+pub(crate) fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
+    out.extend_from_slice(b" #");
+    push_hex(out, stamp.0);
+    let crc = crc32c::crc32c(out.get(start..).unwrap_or_default());
+    out.push(b' ');
+    push_hex(out, crc);
+    out.push(b'\n');
+}
+
+fn push_hex(out: &mut Vec<u8>, number: u32) {
+    out.extend(
+        (0..8)
+            .rev()
+            .map(|nibble| match (number >> (4 * nibble)) as u8 & 15 {
+                digit @ 0..=9 => b'0' + digit,
+                digit => b'a' + digit - 10,
+            }),
+    );
+}
+
+/// Eight lower-case digits, and nothing else that a number could be written with.
+fn hex(digits: &[u8]) -> Option<u32> {
+    let digits = <[u8; 8]>::try_from(digits).ok()?;
+    digits.iter().try_fold(0, |number: u32, digit| {
+        let digit = match digit {
+            b'0'..=b'9' => digit - b'0',
+            b'a'..=b'f' => digit - b'a' + 10,
+            _ => return None,
+        };
+        Some(number << 4 | u32::from(digit))
+    })
+}
+
+/// What the first line says.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Header {
+    pub(crate) generation: u64,
+    /// Number of the last record that the snapshot contains.
+    pub(crate) seq: u64,
+    /// Bytes of the snapshot.
+    snapshot: u64,
+    crc: u32,
+    stamp: Stamp,
+    /// Bytes of the line with its line feed.
+    length: usize,
+}
+
+/// A line whose check holds.
+#[derive(Debug)]
+pub(crate) struct Line<'a> {
+    pub(crate) seq: u64,
+    offset: usize,
+    body: &'a [u8],
+}
+
+/// A file taken apart, its YAML not read yet.
+#[derive(Debug)]
+pub(crate) struct Framed<'a> {
+    pub(crate) header: Option<Header>,
+    bytes: &'a [u8],
+    pub(crate) lines: Vec<Line<'a>>,
+    pub(crate) torn: Option<Range<usize>>,
+    pub(crate) damaged: Vec<Damage>,
+    /// Whether damage follows the last whole line, so that nobody knows what is missing.
+    pub(crate) end_lost: bool,
+}
+
+/// Reads a file as far as it is whole.
+///
+/// # Errors
+///
+/// If it is not ours to read.
+pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
+    let framed = scan(bytes)?;
+    let checkpoint = framed.checkpoint();
+    let mut damaged = framed.damaged.clone();
+    let records = framed.records(0, &mut damaged);
+    Ok(Decoded {
+        generation: framed.header.map_or(0, |header| header.generation),
+        checkpoint,
+        records,
+        torn: framed.torn,
+        damaged,
+    })
+}
+
+/// Takes a file apart and checks every sum.
+///
+/// # Errors
+///
+/// If it is not ours to read.
+pub(crate) fn scan(bytes: &[u8]) -> Result<Framed<'_>, DecodeError> {
+    let header = read_header(bytes)?;
+    let mut framed = Framed {
+        header,
+        end_lost: false,
+        ..Framed::unreadable(bytes)
+    };
+    framed.scan_lines();
+    if header.is_none() && framed.lines.is_empty() && !resembles(bytes) {
+        return Err(DecodeError::NotACheckpoint);
+    }
+    Ok(framed)
+}
+
+fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
+    let head = bytes
+        .get(..bytes.len().min(HEADER_BYTES_MAX))
+        .unwrap_or_default();
+    let Some(end) = head.iter().position(|&byte| byte == b'\n') else {
+        return Ok(None);
+    };
+    let Some((checked, digits)) = head
+        .get(..end)
+        .and_then(|line| line.split_last_chunk::<8>())
+    else {
+        return Ok(None);
+    };
+    let stamp = crc32c::crc32c(checked);
+    if hex(digits) != Some(stamp) {
+        return Ok(None);
+    }
+    // From here on the line is as it was written.
+    let Some((version, fields)) = std::str::from_utf8(checked)
+        .ok()
+        .and_then(|line| line.strip_prefix(MAGIC)?.split_once(' '))
+    else {
+        return Ok(None);
+    };
+    match version.parse() {
+        Ok(FORMAT_VERSION) => {}
+        Ok(version) => return Err(DecodeError::NewerVersion { version }),
+        Err(_) => return Ok(None),
+    }
+    let field = |name: &str| {
+        fields
+            .split(' ')
+            .find_map(|field| field.strip_prefix(name)?.strip_prefix('='))
+    };
+    let header = (|| {
+        Some(Header {
+            generation: field("generation")?.parse().ok()?,
+            seq: field("seq")?.parse().ok()?,
+            snapshot: field("snapshot")?.parse().ok()?,
+            crc: hex(field("crc32c")?.as_bytes())?,
+            stamp: Stamp(stamp),
+            length: end + 1,
+        })
+    })();
+    Ok(header)
+}
+
+/// Whether a file without a whole first line and without a whole record is a damaged one of ours
+/// and not somebody else's: empty or beginning with zeros, as a crash of the machine leaves files
+/// behind, or with most of the first line's start or of the document's frame still there.
+fn resembles(bytes: &[u8]) -> bool {
+    let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
+    let differing = bytes
+        .iter()
+        .zip(MAGIC.as_bytes())
+        .filter(|(a, b)| a != b)
+        .count();
+    differing * 4 <= bytes.len().min(MAGIC.len())
+        || bytes.iter().take(HEADER_BYTES_MAX).all(|&byte| byte == 0)
+        || contains(b"\nsession:\n") && contains(b"\njournal:\n")
+}
+
+impl<'a> Framed<'a> {
+    /// A file in which nothing is whole.
+    pub(crate) fn unreadable(bytes: &'a [u8]) -> Self {
+        let (lines, damaged) = (Vec::new(), Vec::new());
+        Self {
+            header: None,
+            bytes,
+            lines,
+            torn: None,
+            damaged,
+            end_lost: true,
+        }
+    }
+
+    /// The snapshot, read and checked.
+    pub(crate) fn checkpoint(&self) -> Result<Checkpoint, SnapshotError> {
+        let header = self.header.ok_or(SnapshotError::Header)?;
+        let behind = self.bytes.get(header.length..).unwrap_or_default();
+        let snapshot = usize::try_from(header.snapshot)
+            .ok()
+            .and_then(|length| behind.get(..length))
+            .ok_or(SnapshotError::Truncated {
+                expected: header.snapshot,
+                found: behind.len() as u64,
+            })?;
+        let found = crc32c::crc32c(snapshot);
+        if found != header.crc {
+            return Err(SnapshotError::Checksum {
+                expected: header.crc,
+                found,
+            });
+        }
+        std::str::from_utf8(snapshot)
+            .map_err(|error| error.to_string())
+            .and_then(document::read_snapshot)
+            .map_err(|why| SnapshotError::Content { why })
+    }
+
+    /// The records above number `after`. A line whose check holds and whose text does not make
+    /// sense is added to `damaged`.
+    pub(crate) fn records(&self, after: u64, damaged: &mut Vec<Damage>) -> Vec<Record> {
+        let lines = self.lines.iter().filter(|line| line.seq > after);
+        lines
+            .filter_map(|line| {
+                let entry = std::str::from_utf8(line.body)
+                    .map_err(|error| error.to_string())
+                    .and_then(document::read_record);
+                match entry {
+                    Ok(entry) => Some(Record {
+                        seq: line.seq,
+                        entry,
+                    }),
+                    Err(why) => {
+                        let why = format!("record {} does not make sense: {why}", line.seq);
+                        damaged.push(Damage {
+                            offset: line.offset,
+                            why,
+                        });
+                        None
+                    }
+                }
+            })
+            .collect()
+    }
+
+    /// Finds the whole lines of the journal and says what is wrong with the others. With the first
+    /// line gone nobody knows where the journal starts, but no line of a snapshot looks like a
+    /// record.
+    fn scan_lines(&mut self) {
+        let start = match self.header {
+            Some(header) => usize::try_from(header.snapshot)
+                .map_or(usize::MAX, |length| length.saturating_add(header.length)),
+            None => 0,
+        };
+        let mut stamp = self.header.map(|header| header.stamp);
+        let mut offset = start;
+        // Where the bytes that follow the last whole line start, and what they look like.
+        let mut tail: Option<(usize, bool)> = None;
+        let mut tail_damage: Vec<Damage> = Vec::new();
+        let mut rest = self.bytes.get(start..).unwrap_or_default();
+        while !rest.is_empty() {
+            let at = offset;
+            // Reading from memory does not fail, and this finds the line's end the fastest.
+            let line_length = (&mut &*rest).skip_until(b'\n').unwrap_or(rest.len());
+            let (line, behind) = rest.split_at(line_length);
+            (rest, offset) = (behind, offset + line_length);
+            let complete = line.last() == Some(&b'\n');
+            let text = line.strip_suffix(b"\n").unwrap_or(line);
+            let journal = self.header.is_some() || !self.lines.is_empty();
+            if !journal && !text.starts_with(RECORD_START) {
+                continue;
+            }
+            let before = self.lines.last().map(|line| line.seq);
+            let before = before.or_else(|| self.header.map(|header| header.seq));
+            let problem = match open_line(text) {
+                Some((seq, mark, body))
+                    if stamp.is_none_or(|stamp| stamp == mark)
+                        && before.is_none_or(|before| before < seq) =>
+                {
+                    stamp = Some(mark);
+                    self.lines.push(Line {
+                        seq,
+                        offset: at,
+                        body,
+                    });
+                    self.damaged.append(&mut tail_damage);
+                    tail = None;
+                    continue;
+                }
+                Some((seq, ..)) => (
+                    format!("record {seq} belongs to another life of the file"),
+                    true,
+                ),
+                None if complete && !text.contains(&0) => {
+                    ("a record's check sum does not hold".to_owned(), false)
+                }
+                None => ("a record is incomplete".to_owned(), true),
+            };
+            let (why, unwritten) = problem;
+            tail_damage.push(Damage { offset: at, why });
+            let (from, all) = tail.unwrap_or((at, true));
+            tail = Some((from, all && unwritten));
+        }
+        match tail {
+            Some((from, true)) => self.torn = Some(from..self.bytes.len()),
+            Some((_, false)) => {
+                self.damaged.append(&mut tail_damage);
+                self.end_lost = true;
+            }
+            None => {}
+        }
+    }
+}
+
+/// The number, stamp and body of a line whose check holds.
+fn open_line(line: &[u8]) -> Option<(u64, Stamp, &[u8])> {
+    let (checked, digits) = line.split_last_chunk::<8>()?;
+    let checked = checked.strip_suffix(b" ")?;
+    if hex(digits)? != crc32c::crc32c(checked) {
+        return None;
+    }
+    let body_end = line.len().checked_sub(CHECK_BYTES)?;
+    let (body, mark) = checked.split_at_checked(body_end)?;
+    let stamp = Stamp(hex(mark.strip_prefix(b" #")?)?);
+    let rest = body.strip_prefix(RECORD_START)?;
+    let digits = rest.split(|&byte| byte == b',').next()?;
+    let seq = std::str::from_utf8(digits).ok()?.parse().ok()?;
+    Some((seq, stamp, body))
+}

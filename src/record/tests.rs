@@ -1,0 +1,83 @@
+//! Damage to a file of a realistic size, looked at before its YAML is.
+
+use super::*;
+use crate::xmlrpc::Value;
+
+/// A file of at least 64 KiB with more than 500 records, and where each of its lines starts.
+fn file() -> (Vec<u8>, Vec<usize>) {
+    let encoded = encode_checkpoint(&Checkpoint::default(), 1).unwrap();
+    let mut bytes = encoded.bytes;
+    let mut starts = vec![bytes.len()];
+    for seq in 1..=600 {
+        let text = "some text of a parameter that is not too long ".repeat(1 + seq % 2);
+        let params = vec![
+            "/node".into(),
+            format!("/ns/p{seq}").into(),
+            Value::String(text),
+        ];
+        let record = Record {
+            seq: seq as u64,
+            entry: Entry::Call(Call::new("setParam", params)),
+        };
+        bytes.extend(encode_record(&record, encoded.stamp).unwrap());
+        starts.push(bytes.len());
+    }
+    assert!(bytes.len() >= 64 * 1024);
+    (bytes, starts)
+}
+
+/// Without optimization a seventh of the places is all the patience there is; seven and 61 are
+/// prime, so that every position in a line and in a byte has its turn.
+const CUT_STEP: usize = if cfg!(debug_assertions) { 7 } else { 1 };
+/// See [`CUT_STEP`].
+const FLIP_STEP: usize = if cfg!(debug_assertions) { 61 } else { 16 };
+
+#[test]
+fn a_large_file_cut_at_every_byte_has_the_records_before_the_cut() {
+    let (bytes, starts) = file();
+    for cut in (starts[0]..bytes.len()).step_by(CUT_STEP) {
+        let framed = scan(&bytes[..cut]).unwrap();
+        let whole = starts.partition_point(|end| *end <= cut + 1) - 1;
+        assert_eq!(framed.lines.len(), whole, "byte {cut}");
+        assert!(
+            framed
+                .lines
+                .iter()
+                .zip(1..)
+                .all(|(line, seq)| line.seq == seq)
+        );
+        assert!(framed.damaged.is_empty() && !framed.end_lost);
+    }
+}
+
+fn assert_flips_noticed(step: usize) {
+    let (mut bytes, starts) = file();
+    for place in (0..bytes.len() * 8).step_by(step) {
+        let (at, bit) = (place / 8, 1 << (place % 8));
+        bytes[at] ^= bit;
+        let framed = scan(&bytes).unwrap();
+        let lost = 600 - framed.lines.len();
+        if at < starts[0] {
+            assert!(framed.checkpoint().is_err() && lost == 0, "place {place}");
+        } else {
+            assert!((1..=2).contains(&lost), "place {place}");
+            assert!(
+                framed.torn.is_some() || !framed.damaged.is_empty(),
+                "place {place}"
+            );
+        }
+        bytes[at] ^= bit;
+    }
+}
+
+#[test]
+fn bits_of_a_large_file_flipped_are_noticed() {
+    assert_flips_noticed(FLIP_STEP);
+}
+
+/// All bits; for releases: `cargo test --release -- --ignored flipped`.
+#[test]
+#[ignore = "minutes without optimization"]
+fn every_bit_of_a_large_file_flipped_is_noticed() {
+    assert_flips_noticed(1);
+}

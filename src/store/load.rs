@@ -1,0 +1,207 @@
+//! What a checkpoint and its previous generation say together.
+
+use std::io;
+use std::path::Path;
+
+use super::names::Names;
+use super::{OpenError, Storage};
+use crate::record::{self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session};
+
+/// No checkpoint is larger; what is, is not read.
+const FILE_BYTES_MAX: u64 = 1 << 30;
+
+/// What was found on disk.
+#[derive(Debug, Default)]
+pub struct Loaded {
+    /// The newest whole snapshot. Without one, `records` is all that is left of the state.
+    pub checkpoint: Option<Checkpoint>,
+    /// The whole records after it, in order.
+    pub records: Vec<Record>,
+    /// Whether these make exactly the state that was recorded; if not, something is missing.
+    pub exact: bool,
+    /// An append that was cut short, as a crash leaves it: it was never acknowledged.
+    pub torn: Option<String>,
+    /// What else is wrong, a sentence each; to be said loudly.
+    pub damage: Vec<String>,
+}
+
+impl Loaded {
+    /// The newest session.
+    pub fn session(&self) -> Option<&Session> {
+        let later = self
+            .records
+            .iter()
+            .rev()
+            .find_map(|record| match &record.entry {
+                Entry::Session(session) => Some(session),
+                Entry::Call(_) => None,
+            });
+        later.or_else(|| Some(&self.checkpoint.as_ref()?.session))
+    }
+}
+
+/// [`Loaded`], and what the store needs to go on from there.
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    pub(super) loaded: Loaded,
+    /// Number of the last record known.
+    pub(super) seq: u64,
+    /// The highest generation known.
+    pub(super) generation: u64,
+    /// Whether the present file can serve as the previous generation of the next.
+    pub(super) usable: bool,
+    /// The bytes of an append that was cut short.
+    pub(super) torn: Option<Vec<u8>>,
+}
+
+/// Reads the checkpoint of `names`; `None` if there is none.
+pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
+    let Some(bytes) = read(storage, &names.path)? else {
+        return Ok(None);
+    };
+    // A fallback that cannot be read is none.
+    let previous = read(storage, &names.previous()).ok().flatten();
+    let previous = previous
+        .as_deref()
+        .and_then(|bytes| record::scan(bytes).ok());
+    match (record::scan(&bytes), previous) {
+        (Ok(present), previous) => Ok(Some(join(names, &present, previous.as_ref(), &bytes))),
+        (Err(DecodeError::NewerVersion { version }), _) => Err(OpenError::NewerVersion {
+            path: names.path.clone(),
+            version,
+        }),
+        // Beside a previous generation of ours, this was ours too.
+        (Err(DecodeError::NotACheckpoint), Some(previous)) => {
+            let nothing = Framed::unreadable(&bytes);
+            Ok(Some(join(names, &nothing, Some(&previous), &bytes)))
+        }
+        (Err(DecodeError::NotACheckpoint), None) => Err(OpenError::NotACheckpoint {
+            path: names.path.clone(),
+        }),
+    }
+}
+
+fn read(storage: &impl Storage, path: &Path) -> Result<Option<Vec<u8>>, OpenError> {
+    let failed = |source| OpenError::Io {
+        doing: "read",
+        path: path.to_owned(),
+        source,
+    };
+    match storage.read(path, FILE_BYTES_MAX) {
+        Ok(bytes) if bytes.len() as u64 > FILE_BYTES_MAX => {
+            Err(failed(io::Error::other("it is larger than any checkpoint")))
+        }
+        Ok(bytes) => Ok(Some(bytes)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(failed(error)),
+    }
+}
+
+fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, bytes: &[u8]) -> Found {
+    let path = &names.path;
+    let mut damage = Vec::new();
+    let mut damaged = present.damaged.clone();
+    let snapshot = present.checkpoint();
+    let usable = snapshot.is_ok();
+    let checkpoint = match snapshot {
+        Ok(checkpoint) => Some(checkpoint),
+        Err(why) => {
+            damage.push(format!(
+                "the snapshot of `{}` cannot be used: {why}",
+                path.display()
+            ));
+            fall_back(&names.previous(), previous, &mut damage)
+        }
+    };
+    let base = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.seq);
+
+    // The previous generation may hold records that the present one lost or, after a loss of power
+    // just behind a compaction, has not got yet.
+    let mut records = present.records(base, &mut damaged);
+    // A file that somebody put back from a copy is no successor of the previous generation.
+    let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
+    let older = previous.filter(|previous| {
+        generation(present).is_none_or(|present| generation(previous).is_some_and(|g| g < present))
+    });
+    if let Some(previous) = older {
+        let mut ignored: Vec<Damage> = Vec::new();
+        records.extend(previous.records(base, &mut ignored));
+        // Stable: of two equal numbers the present generation's stays.
+        records.sort_by_key(|record| record.seq);
+        records.dedup_by_key(|record| record.seq);
+    }
+    damage.extend(damaged.into_iter().map(|Damage { offset, why }| {
+        format!("`{}` is damaged at byte {offset}: {why}", path.display())
+    }));
+
+    // What the present file had reached when it was begun.
+    let begun = present.header.map(|header| header.seq);
+    let begun = begun.or_else(|| Some(present.lines.first()?.seq.saturating_sub(1)));
+    let mut exact = checkpoint.is_some() && !present.end_lost && begun.is_some();
+    let mut expected = base.saturating_add(1);
+    for record in &records {
+        if checkpoint.is_some() && record.seq != expected {
+            let last = record.seq.saturating_sub(1);
+            damage.push(format!("the records {expected} to {last} are lost"));
+            exact = false;
+        }
+        expected = record.seq.saturating_add(1);
+    }
+    if let Some(begun) = begun.filter(|begun| checkpoint.is_some() && *begun >= expected) {
+        damage.push(format!("the records {expected} to {begun} are lost"));
+        exact = false;
+        expected = begun.saturating_add(1);
+    }
+    let torn = present.torn.clone();
+    Found {
+        seq: expected - 1,
+        generation: previous
+            .and_then(generation)
+            .max(generation(present))
+            .unwrap_or(0),
+        usable,
+        torn: torn
+            .clone()
+            .and_then(|range| bytes.get(range).map(<[u8]>::to_vec)),
+        loaded: Loaded {
+            checkpoint,
+            records,
+            exact,
+            torn: torn.map(|range| {
+                let length = range.len();
+                format!(
+                    "`{}` ends in {length} bytes of an append that was cut short",
+                    path.display()
+                )
+            }),
+            damage,
+        },
+    }
+}
+
+fn fall_back(
+    path: &Path,
+    previous: Option<&Framed<'_>>,
+    damage: &mut Vec<String>,
+) -> Option<Checkpoint> {
+    let Some(previous) = previous else {
+        damage.push(format!(
+            "there is no previous generation `{}` to fall back on",
+            path.display()
+        ));
+        return None;
+    };
+    match previous.checkpoint() {
+        Ok(checkpoint) => {
+            damage.push(format!(
+                "its previous generation `{}` is used",
+                path.display()
+            ));
+            Some(checkpoint)
+        }
+        Err(why) => {
+            damage.push(format!("nor can that of `{}`: {why}", path.display()));
+            None
+        }
+    }
+}
