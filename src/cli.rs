@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 /// Keeps a ROS 1 robot running when its master dies.
 ///
@@ -39,6 +39,7 @@ pub struct CoreArgs {
     pub port: Option<u16>,
     /// Print more: rosrescue's own log at level debug
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
+    #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
     /// Threads with which rosmaster tells nodes of changes; more than roscore's 3, so that nodes
     /// that cannot be reached do not hold up the others
@@ -58,6 +59,7 @@ pub struct CoreArgs {
     pub rosmaster: Option<PathBuf>,
     /// Do not run rosout
     #[arg(long, env = "ROSRESCUE_NO_ROSOUT")]
+    #[arg(value_parser = FalseyValueParser::new())]
     pub no_rosout: bool,
     /// Address to serve, instead of all addresses (loopback only if ROS_IP or ROS_HOSTNAME is)
     #[arg(long, env = "ROSRESCUE_LISTEN", value_name = "ADDR")]
@@ -79,6 +81,7 @@ pub struct ProxyArgs {
     pub listen: Option<String>,
     /// Print more: rosrescue's own log at level debug
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
+    #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
     /// What both commands have.
     #[command(flatten)]

@@ -7,17 +7,32 @@
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
 //! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
-//! * [`record`]: the checkpoint's snapshot and journal records to and from bytes, with check sums.
+//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
+//! * [`session`]: whether a checkpoint's session goes on.
+//! * [`record`]: the checkpoint's snapshot and records to and from bytes.
 //!
-//! The *shell* does the work and decides nothing:
+//! The *shell* does IO and decides as little as possible.
 //!
-//! * [`store`]: the checkpoint on disk: lock, load, append, sync, compaction.
+//! * [`cli`], [`config`], [`ros_env`]: what is to be run, and what ROS's environment means.
+//! * [`store`]: the checkpoint on the disk.
+//! * [`proxy`]: listener, door, gate, lane, pool, mirror.
+//! * [`recovery`]: watching the master, examining and injecting, census and healing.
+//! * [`supervisor`]: the processes of rosmaster and rosout.
+//! * [`admin`]: the status page.
+//! * [`app`]: puts it all together.
 
+pub mod admin;
+pub mod app;
 pub mod cli;
+pub mod clock;
 pub mod config;
 pub mod lifecycle;
 pub mod master;
+pub mod proxy;
 pub mod record;
+pub mod recovery;
 pub mod ros_env;
+pub mod session;
 pub mod store;
+pub mod supervisor;
 pub mod xmlrpc;

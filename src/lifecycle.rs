@@ -203,6 +203,10 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
+            // It died while it was being examined, or it closes every connection: not in a rush.
+            Input::ConnectionLost if self.phase == Phase::Examining => {
+                self.connect_later(now, false)
+            }
             Input::ConnectionLost => self.lost(now, Cause::ConnectionLost, vec![Action::Connect]),
             Input::Examined => {
                 self.phase = Phase::Serving;
@@ -572,6 +576,19 @@ mod tests {
         script.now += START_LIMIT + Duration::from_secs(1);
         script
             .feed(Input::Refused, &[Action::Kill])
+            .feed(Input::Exited, &[Action::Spawn]);
+    }
+
+    #[test]
+    fn a_master_that_dies_while_it_is_examined_is_replaced_without_a_rush() {
+        let mut script = Script::new(Supervision::Ours);
+        script
+            .feed(Input::Start { remembered: false }, &[Action::Spawn])
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(Input::ConnectionLost, &[])
+            .wake(Duration::from_millis(1), &[Action::Connect])
+            .feed(Input::Refused, &[])
             .feed(Input::Exited, &[Action::Spawn]);
     }
 

@@ -1,3 +1,141 @@
-//! The command line of rosrescue.
+//! The command line of rosrescue: arguments, logging, signals, exit codes.
 
-fn main() {}
+use std::{
+    io::{IsTerminal, Write},
+    process::ExitCode,
+};
+
+use clap::{CommandFactory, Parser, error::ErrorKind};
+use rosrescue::{
+    app,
+    cli::{Cli, Command, CommonArgs, LogFormat},
+    config::Config,
+    proxy::listener,
+};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+use tracing_subscriber::EnvFilter;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let env = |name: &str| std::env::var(name).ok();
+    let hostname = rustix::system::uname()
+        .nodename()
+        .to_string_lossy()
+        .into_owned();
+    let local = listener::local_address();
+    let (config, common, verbose) = match &cli.command {
+        Some(Command::Proxy(args)) => (
+            Config::proxy(args, &env, &hostname, local),
+            &args.common,
+            args.verbose,
+        ),
+        Some(Command::Core(args)) => (
+            Config::core(args, &env, &hostname, local),
+            &args.common,
+            args.verbose,
+        ),
+        None => {
+            let args = &cli.core;
+            (
+                Config::core(args, &env, &hostname, local),
+                &args.common,
+                args.verbose,
+            )
+        }
+    };
+    let config = match config {
+        Ok(config) => config,
+        // Exit status 2, as all usage errors.
+        Err(error) => Cli::command()
+            .error(ErrorKind::ValueValidation, error)
+            .exit(),
+    };
+    if let Err(error) = start_log(common, verbose) {
+        Cli::command()
+            .error(ErrorKind::ValueValidation, error)
+            .exit();
+    }
+    raise_file_limit();
+    match run(config, hostname) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("rosrescue: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+#[tokio::main]
+async fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
+    let stop = CancellationToken::new();
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
+    let stopper = stop.clone();
+    tokio::spawn(async move {
+        for first in [true, false] {
+            let status = tokio::select! {
+                _ = interrupt.recv() => 130,
+                _ = terminate.recv() => 143,
+            };
+            if first {
+                stopper.cancel();
+            } else {
+                std::process::exit(status);
+            }
+        }
+    });
+    let mut names = vec![hostname, config.advertised.host.clone()];
+    names.extend(std::env::var("ROS_HOSTNAME").ok());
+    app::run(config, names, stop, say).await?;
+    Ok(())
+}
+
+/// Prints a line; a reader that has gone away is no reason to stop.
+fn say(line: &str) {
+    let mut stdout = std::io::stdout();
+    let colour = stdout.is_terminal() && colour_is_welcome();
+    let (on, off) = if colour {
+        ("\x1b[1m", "\x1b[0m")
+    } else {
+        ("", "")
+    };
+    let _ = writeln!(stdout, "{on}{line}{off}").and_then(|()| stdout.flush());
+}
+
+fn colour_is_welcome() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+}
+
+fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
+    let default = if verbose {
+        "warn,rosrescue=debug"
+    } else {
+        "warn,rosrescue=info"
+    };
+    let filter = args.log.as_deref().unwrap_or(default);
+    let filter =
+        EnvFilter::try_new(filter).map_err(|error| format!("--log: `{filter}`: {error}"))?;
+    let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .with_ansi(ansi);
+    match args.log_format {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().init(),
+    }
+    Ok(())
+}
+
+/// As many connections as the system lets us have; the usual limit of 1024 is soon reached.
+fn raise_file_limit() {
+    use rustix::process::{Resource, getrlimit, setrlimit};
+    let mut limit = getrlimit(Resource::Nofile);
+    limit.current = limit.maximum;
+    // Without it there is room for fewer connections.
+    let _ = setrlimit(Resource::Nofile, limit);
+}

@@ -1,0 +1,184 @@
+//! The status: what is known at one moment, and how it is written for people.
+
+use std::{
+    fmt,
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use serde::Serialize;
+use tokio::sync::watch;
+
+use crate::{
+    proxy::Proxy,
+    recovery::{
+        census::Census,
+        report::{Counts, Report},
+    },
+};
+
+/// Where those who recover the master say how it goes.
+#[derive(Debug, Default)]
+pub struct Board {
+    inner: Mutex<Inner>,
+    opened: watch::Sender<bool>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    open: bool,
+    crash_loop: bool,
+    recoveries: u64,
+    report: Option<Report>,
+}
+
+impl Board {
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The gate has been opened or shut.
+    pub fn set_open(&self, open: bool) {
+        self.lock().open = open;
+        if open {
+            self.opened.send_replace(true);
+        }
+    }
+
+    /// Returns when the gate has been open for the first time.
+    pub async fn first_opening(&self) {
+        // The sender is ours and stays.
+        let _ = self.opened.subscribe().wait_for(|opened| *opened).await;
+    }
+
+    /// The master dies again and again, or no longer.
+    pub fn set_crash_loop(&self, crash_loop: bool) {
+        self.lock().crash_loop = crash_loop;
+    }
+
+    /// A master has been examined.
+    pub fn set_report(&self, report: Report) {
+        let mut inner = self.lock();
+        inner.recoveries += 1;
+        inner.report = Some(report);
+    }
+
+    /// What census and healing found after the last recovery.
+    pub fn add_to_report(&self, census: Census, healed: Vec<String>) {
+        if let Some(report) = &mut self.lock().report {
+            report.removed = census.removed;
+            report.suspects = census.suspects;
+            report.healed = healed;
+        }
+    }
+
+    /// The process id of the last master that was examined.
+    pub fn master_pid(&self) -> Option<i32> {
+        self.lock().report.as_ref().map(|report| report.master_pid)
+    }
+
+    /// The report of the last recovery.
+    pub fn report(&self) -> Option<Report> {
+        self.lock().report.clone()
+    }
+}
+
+/// The status at one moment.
+#[derive(Clone, Debug, Serialize)]
+pub struct Status {
+    /// Version of rosrescue.
+    pub version: &'static str,
+    /// What nodes use as `ROS_MASTER_URI`.
+    pub uri: String,
+    /// The real master.
+    pub master: String,
+    /// Whether calls pass to it.
+    pub open: bool,
+    /// Whether it dies again and again.
+    pub crash_loop: bool,
+    /// The checkpoint file.
+    pub checkpoint: String,
+    /// Why the state is not recorded; none if all is well.
+    pub unprotected: Option<String>,
+    /// What the mirror holds.
+    pub state: Counts,
+    /// Masters examined since the start.
+    pub recoveries: u64,
+    /// The last one.
+    pub last_recovery: Option<Report>,
+    /// What was counted since the start.
+    pub counters: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Status {
+    /// The status now.
+    pub fn of(proxy: &Proxy) -> Self {
+        let counters = proxy.stats.list();
+        let counters = counters
+            .into_iter()
+            .map(|(name, _, value)| (name.to_owned(), value.into()));
+        let unprotected = proxy.shadow.unprotected();
+        let state = proxy.shadow.with_mirror(Counts::of);
+        let inner = proxy.board.lock();
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            uri: proxy.uri.clone(),
+            master: proxy.upstream.address().to_string(),
+            open: inner.open,
+            crash_loop: inner.crash_loop,
+            checkpoint: proxy.config.checkpoint.display().to_string(),
+            unprotected,
+            state,
+            recoveries: inner.recoveries,
+            last_recovery: inner.report.clone(),
+            counters: counters.collect(),
+        }
+    }
+}
+
+impl fmt::Display for Status {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "rosrescue {}", self.version)?;
+        writeln!(f, "ROS_MASTER_URI  {}", self.uri)?;
+        let gate = if self.open {
+            "open"
+        } else {
+            "shut: the master is away"
+        };
+        writeln!(f, "master          {} (gate {gate})", self.master)?;
+        if self.crash_loop {
+            writeln!(
+                f,
+                "                crash loop: the master dies again and again"
+            )?;
+        }
+        let protection = self.unprotected.as_deref().map_or_else(
+            || "protected".to_owned(),
+            |reason| format!("UNPROTECTED: {reason}"),
+        );
+        writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
+        writeln!(f, "state           {}", self.state)?;
+        if let Some(report) = &self.last_recovery {
+            writeln!(
+                f,
+                "last recovery   {} ms after {}",
+                report.phases.total_ms.round(),
+                report.cause
+            )?;
+            for (what, names) in [
+                ("not injected", &report.skipped),
+                ("differs", &report.mismatches),
+                ("removed", &report.removed),
+                ("suspect", &report.suspects),
+                ("healed", &report.healed),
+            ] {
+                if !names.is_empty() {
+                    writeln!(f, "  {what:<14}{}", names.join(", "))?;
+                }
+            }
+        }
+        for (name, value) in &self.counters {
+            writeln!(f, "{name:<16}{value}")?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,379 @@
+//! Puts the parts together, from the first look at the checkpoint to the orderly stop.
+
+use std::{
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU32},
+    },
+    time::Duration,
+};
+
+use hyper::header::{HeaderValue, InvalidHeaderValue};
+use thiserror::Error;
+use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
+
+use crate::{
+    admin::Board,
+    cli::Restore,
+    clock,
+    config::{Config, MasterConfig},
+    master::{Mark, Master},
+    proxy::{
+        Proxy, gate, keeper,
+        lane::{self, LaneRunner},
+        listener::{self, ListenError},
+        pool::Pool,
+        shadow::Shadow,
+        stats::Stats,
+        upstream::Upstream,
+    },
+    record::Session,
+    recovery::{
+        Guard,
+        census::{self, Sign},
+        core_duties,
+        master_process::MasterProcess,
+        report::Counts,
+    },
+    ros_env::MasterUri,
+    session::{self, Decision, Evidence},
+    store::{self, OpenError, Store},
+    supervisor::{Rosmaster, SupervisorError},
+    xmlrpc::Call,
+};
+
+/// How long nodes have to show that a session goes on.
+const LIFE_SIGN: Duration = Duration::from_secs(1);
+/// How long connections have to end at the stop.
+const DRAIN: Duration = Duration::from_millis(500);
+
+/// What prevents the work. Exit status 1.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The port cannot be served.
+    #[error(transparent)]
+    Listen(#[from] ListenError),
+    /// The checkpoint belongs to somebody else.
+    #[error(transparent)]
+    Checkpoint(OpenError),
+    /// No master can be run.
+    #[error(transparent)]
+    Supervisor(#[from] SupervisorError),
+    /// The master's address is our own.
+    #[error(
+        "--master {master} is this rosrescue itself: give the address of the real rosmaster, and \
+         serve another one with --listen"
+    )]
+    Loop {
+        /// The address.
+        master: MasterUri,
+    },
+    /// Cannot happen with what the kernel gives as an id.
+    #[error("the kernel's random id is not usable: {0}")]
+    Instance(#[from] InvalidHeaderValue),
+}
+
+/// What was found at the start.
+struct Beginning {
+    mirror: Master,
+    session: Session,
+    store: Option<Store>,
+    restored: bool,
+    /// In words, for the person who started us.
+    story: String,
+}
+
+/// Runs until `stop`. `say` prints a line for the person who started us.
+pub async fn run(
+    mut config: Config,
+    names: Vec<String>,
+    stop: CancellationToken,
+    say: impl Fn(&str),
+) -> Result<(), RunError> {
+    let option = match &config.master {
+        MasterConfig::Supervised(_) => "-p",
+        MasterConfig::External(_) => "--listen",
+    };
+    let listeners = listener::bind(&config.listen, option)?;
+    if let Some(bound) = listeners
+        .first()
+        .and_then(|listener| listener.local_addr().ok())
+    {
+        config.advertised.port = bound.port();
+    }
+    let beginning = begin(&config).await?;
+    let uri = config.advertised.to_string();
+    say(&format!("ROS_MASTER_URI={uri}"));
+    say(&format!("checkpoint: {}", config.checkpoint.display()));
+
+    let remembered = beginning
+        .session
+        .master_uri
+        .as_deref()
+        .and_then(|uri| MasterUri::parse(uri).ok());
+    let (process, address) = match &config.master {
+        MasterConfig::External(address) => (None, address.clone()),
+        MasterConfig::Supervised(supervised) => {
+            let rosmaster = Rosmaster::find(supervised, &config.checkpoint)?;
+            let address = remembered
+                .clone()
+                .unwrap_or_else(|| uri_of(supervised.port.unwrap_or(0)));
+            let port = remembered.map(|uri| uri.port);
+            (Some(MasterProcess::new(rosmaster, port)), address)
+        }
+    };
+    let supervised = match &config.master {
+        MasterConfig::Supervised(supervised) => Some(supervised.clone()),
+        MasterConfig::External(_) => None,
+    };
+    let (gate_keeper, gate) = gate::gate();
+    let (lane, lane_runner) = lane::lane(config.max_parked);
+    let instance = kernel_id("/proc/sys/kernel/random/uuid");
+    // Counted for as long as the process lives.
+    let stats: &'static Stats = Box::leak(Box::default());
+    let Beginning {
+        mirror,
+        session,
+        store,
+        restored,
+        story,
+    } = beginning;
+    let proxy = Arc::new(Proxy {
+        uri,
+        names,
+        looped: AtomicBool::new(false),
+        mark: Mark::new(&session.mark),
+        gate,
+        lane,
+        pool: Pool::new(config.master_connections),
+        upstream: Upstream::new(address, HeaderValue::from_str(&instance)?),
+        instance,
+        shadow: Shadow::new(mirror, session, store, stats),
+        stats,
+        rosout: AtomicU32::new(0),
+        board: Board::default(),
+        config,
+    });
+    let pid = i32::try_from(std::process::id()).unwrap_or(-1);
+    proxy.shadow.set_identity(pid, proxy.uri.clone());
+    if let Some(supervised) = &supervised {
+        core_duties::set_run_id(&proxy);
+        tokio::spawn(core_duties::run(
+            proxy.clone(),
+            supervised.rosout,
+            stop.clone(),
+        ));
+    }
+    let halt = CancellationToken::new();
+    tokio::spawn({
+        let (proxy, halt) = (proxy.clone(), halt.clone());
+        async move {
+            stop.cancelled().await;
+            // It still takes itself out of the master.
+            core_duties::stop(&proxy).await;
+            halt.cancel();
+        }
+    });
+    let guard = Guard::new(proxy.clone(), gate_keeper, process, restored);
+    let process = serve(&proxy, listeners, lane_runner, guard, &halt, || {
+        let counts = proxy.shadow.with_mirror(Counts::of);
+        say(&format!("{story}: {counts}"));
+        say("ROS Rescue enabled. Master is now fault tolerant!!");
+    })
+    .await?;
+    close(&proxy).await;
+    if let Some(process) = process {
+        process.stop(proxy.board.master_pid()).await;
+    }
+    Ok(())
+}
+
+fn uri_of(port: u16) -> MasterUri {
+    MasterUri {
+        host: "127.0.0.1".to_owned(),
+        port,
+    }
+}
+
+/// Runs all tasks until the stop or an error.
+async fn serve(
+    proxy: &Arc<Proxy>,
+    listeners: Vec<TcpListener>,
+    lane_runner: LaneRunner,
+    guard: Guard,
+    stop: &CancellationToken,
+    announce: impl Fn(),
+) -> Result<Option<MasterProcess>, RunError> {
+    let permits = Arc::new(Semaphore::new(proxy.config.max_connections));
+    let connections = TaskTracker::new();
+    let mut tasks = JoinSet::new();
+    for listener in listeners {
+        let (proxy, permits) = (proxy.clone(), permits.clone());
+        tasks.spawn(listener::run(
+            listener,
+            proxy,
+            permits,
+            connections.clone(),
+            stop.clone(),
+        ));
+    }
+    tasks.spawn(lane_runner.run(proxy.clone()));
+    tasks.spawn(keeper::keep(proxy.clone(), stop.clone()));
+    let mut guard = tokio::spawn(guard.run(stop.clone()));
+    let opening = async {
+        proxy.board.first_opening().await;
+        announce();
+        std::future::pending().await
+    };
+    let looped = async {
+        loop {
+            if proxy.looped.load(std::sync::atomic::Ordering::Relaxed) {
+                return RunError::Loop {
+                    master: proxy.upstream.address(),
+                };
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    let process = tokio::select! {
+        process = &mut guard => match process {
+            Ok(process) => process?,
+            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+        },
+        () = opening => None,
+        error = looped => return Err(error),
+    };
+    connections.close();
+    // Calls that are parked have nobody to answer them any more: their connections are closed.
+    let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
+    tasks.shutdown().await;
+    Ok(process)
+}
+
+/// Writes the closing checkpoint.
+async fn close(proxy: &Arc<Proxy>) {
+    let proxy = proxy.clone();
+    let closed = tokio::task::spawn_blocking(move || {
+        proxy.shadow.update_session(|session| session.closed = true);
+        proxy
+            .shadow
+            .with_store(|store, checkpoint| store.close(&checkpoint()))
+    });
+    match closed.await {
+        Ok(Some(Err(error))) => tracing::error!(%error, "no closing checkpoint"),
+        Ok(_) => tracing::info!("closed in order"),
+        Err(error) => tracing::error!(%error, "no closing checkpoint"),
+    }
+}
+
+/// Reads the checkpoint and decides whether its session goes on.
+async fn begin(config: &Config) -> Result<Beginning, RunError> {
+    let (mut store, loaded) = match Store::open(&config.checkpoint) {
+        Ok((store, loaded)) => (Some(store), loaded),
+        Err(error @ OpenError::Io { .. }) => {
+            // A robot without a disk still needs its master.
+            tracing::error!(
+                %error,
+                "unprotected: the checkpoint cannot be used; calls are forwarded, but a crash of \
+                 rosrescue itself would lose the state. Choose a place with --checkpoint"
+            );
+            (None, store::read(&config.checkpoint).ok().flatten())
+        }
+        Err(error) => return Err(RunError::Checkpoint(error)),
+    };
+    let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
+    let mut story = "a new session begins".to_owned();
+    let mut beginning = None;
+    if let Some(loaded) = loaded {
+        for sentence in loaded.torn.iter() {
+            tracing::info!("checkpoint: {sentence}");
+        }
+        for sentence in &loaded.damage {
+            tracing::error!("checkpoint: {sentence}");
+        }
+        let (mirror, session, trouble) = session::rebuild(loaded.checkpoint, loaded.records);
+        if let Some(trouble) = trouble {
+            tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
+        }
+        let session = session.unwrap_or_default();
+        let evidence = Evidence {
+            same_boot: session.boot_id == boot_id,
+            closed: session.closed,
+            node_alive: config.restore == Restore::Auto && any_alive(&mirror).await,
+        };
+        match session::decide(config.restore, evidence) {
+            Decision::Restore(why) => {
+                story = format!("restored ({why})");
+                beginning = Some((mirror, session));
+            }
+            Decision::Fresh(why) => {
+                let kept = store.as_mut().map(|store| store.set_aside("session"));
+                let kept = match kept {
+                    Some(Ok(Some(path))) => {
+                        format!("; the old checkpoint is kept as {}", path.display())
+                    }
+                    Some(Err(error)) => {
+                        tracing::error!(%error, "the old checkpoint is not kept");
+                        String::new()
+                    }
+                    _ => String::new(),
+                };
+                story = format!("a new session begins ({why}{kept})");
+            }
+        }
+    }
+    let restored = beginning.is_some();
+    let (mirror, mut session) = beginning.unwrap_or_default();
+    if !restored || session.mark.is_empty() {
+        session.id = kernel_id("/proc/sys/kernel/random/uuid");
+        session.mark = session.id.clone();
+        session.started = clock::wall_text(clock::wall_time());
+    }
+    session.boot_id = boot_id;
+    session.closed = false;
+    if let Some(open) = &mut store {
+        let checkpoint = crate::record::Checkpoint {
+            seq: open.seq(),
+            session: session.clone(),
+            snapshot: mirror.snapshot(),
+        };
+        if let Err(error) = open.begin(&checkpoint) {
+            tracing::error!(
+                %error,
+                "unprotected: the checkpoint cannot be written; calls are forwarded, and it is \
+                 tried again every second"
+            );
+        }
+    }
+    Ok(Beginning {
+        mirror,
+        session,
+        store,
+        restored,
+        story,
+    })
+}
+
+/// Whether any node of `state` answers.
+async fn any_alive(state: &Master) -> bool {
+    let call = Call::new("getPid", vec!["/rosrescue".into()]);
+    let mut questions = JoinSet::new();
+    for (_, api) in state.nodes() {
+        let (api, call) = (api.to_owned(), call.clone());
+        questions.spawn(async move { census::ask(&api, &call, LIFE_SIGN).await == Sign::Alive });
+    }
+    while let Some(alive) = questions.join_next().await {
+        if alive.unwrap_or(false) {
+            return true;
+        }
+    }
+    false
+}
+
+/// An id from the kernel, or a constant where there is none: it is compared, not trusted.
+fn kernel_id(path: impl AsRef<Path>) -> String {
+    std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
+}

@@ -1,0 +1,55 @@
+//! The wall clock, for people's eyes only: no decision may hang on it, because robots start without
+//! a battery-backed clock and jump by years when the network comes.
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Seconds since 1970, with microseconds; 0 before that.
+#[allow(
+    clippy::disallowed_methods,
+    reason = "the one place that reads the wall clock"
+)]
+pub fn wall_time() -> f64 {
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0.0, |since| since.as_secs_f64())
+}
+
+/// A wall time as text in UTC, such as `2026-11-21T09:26:53Z`.
+pub fn wall_text(seconds: f64) -> String {
+    let seconds = seconds.max(0.0) as i64;
+    let (days, time) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
+    // Days to a date of the Gregorian calendar, counting years from March (Howard Hinnant's
+    // "chrono-Compatible Low-Level Date Algorithms").
+    let z = days + 719_468;
+    let era = z.div_euclid(146_097);
+    let of_era = z.rem_euclid(146_097);
+    let year_of_era = (of_era - of_era / 1_460 + of_era / 36_524 - of_era / 146_096) / 365;
+    let of_year = of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted = (5 * of_year + 2) / 153;
+    let day = of_year - (153 * shifted + 2) / 5 + 1;
+    let month = if shifted < 10 {
+        shifted + 3
+    } else {
+        shifted - 9
+    };
+    let year = year_of_era + era * 400 + i64::from(month <= 2);
+    let (hour, minute, second) = (time / 3_600, time / 60 % 60, time % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dates() {
+        for (seconds, text) in [
+            (0.0, "1970-01-01T00:00:00Z"),
+            (951_782_400.0, "2000-02-29T00:00:00Z"),
+            (1_795_253_213.9, "2026-11-21T09:26:53Z"),
+            (4_102_444_799.0, "2099-12-31T23:59:59Z"),
+        ] {
+            assert_eq!(wall_text(seconds), text);
+        }
+    }
+}

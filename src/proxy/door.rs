@@ -1,0 +1,148 @@
+//! Who may come in: checks on a request's head, without IO.
+//!
+//! ROS 1 has no authentication. What can be kept out without any ROS client noticing is a web page
+//! that makes a person's browser call the master, and a `shutdown` from another computer.
+
+use std::net::IpAddr;
+
+use hyper::{
+    HeaderMap, StatusCode,
+    header::{CONTENT_TYPE, HOST, ORIGIN},
+};
+
+/// A request that is turned away.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refusal {
+    /// The HTTP status to answer.
+    pub status: StatusCode,
+    /// Why, for the person who reads it.
+    pub reason: String,
+}
+
+/// Content types that a browser sends to any site without asking it first.
+const BROWSER_TYPES: [&str; 3] = [
+    "application/x-www-form-urlencoded",
+    "multipart/form-data",
+    "text/plain",
+];
+
+/// Whether a POST with these headers may call the master. `names` are those of this computer.
+pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+    if headers.contains_key(ORIGIN) {
+        check_host(headers, names)?;
+    }
+    let Some(content_type) = headers.get(CONTENT_TYPE) else {
+        return Ok(());
+    };
+    let content_type = String::from_utf8_lossy(content_type.as_bytes());
+    let essence = content_type
+        .split(';')
+        .next()
+        .unwrap_or_default()
+        .trim()
+        .to_ascii_lowercase();
+    if BROWSER_TYPES.contains(&essence.as_str()) {
+        return Err(Refusal {
+            status: StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            reason: format!("content type `{essence}` is not taken; XML-RPC is text/xml"),
+        });
+    }
+    Ok(())
+}
+
+/// Whether `Host` is an address or a name of this computer: a page whose own name was pointed at
+/// us (DNS rebinding) names itself there.
+pub fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+    let Some(host) = headers.get(HOST) else {
+        return Ok(());
+    };
+    let host = String::from_utf8_lossy(host.as_bytes());
+    let name = match host.strip_prefix('[') {
+        Some(rest) => rest.split(']').next().unwrap_or_default(),
+        None => host.split(':').next().unwrap_or_default(),
+    };
+    let known = name.parse::<IpAddr>().is_ok()
+        || name.eq_ignore_ascii_case("localhost")
+        || names.iter().any(|own| own.eq_ignore_ascii_case(name));
+    if known {
+        return Ok(());
+    }
+    Err(Refusal {
+        status: StatusCode::FORBIDDEN,
+        reason: format!("`{name}` is not a name of this computer; use its address"),
+    })
+}
+
+/// Whether a call from `peer` may shut the master down.
+pub fn may_shut_down(peer: IpAddr) -> bool {
+    peer.to_canonical().is_loopback()
+}
+
+#[cfg(test)]
+mod tests {
+    use hyper::header::HeaderValue;
+
+    use super::*;
+
+    fn headers(pairs: &[(&'static str, &'static str)]) -> HeaderMap {
+        pairs
+            .iter()
+            .map(|(k, v)| (k.parse().unwrap(), HeaderValue::from_static(v)))
+            .collect()
+    }
+
+    #[test]
+    fn ros_clients_pass() {
+        for pairs in [
+            &[
+                ("host", "robot:11311"),
+                ("content-type", "text/xml"),
+                ("user-agent", "XMLRPC++ 0.7"),
+            ][..],
+            &[
+                ("host", "any.name.at.all"),
+                ("content-type", "text/xml; charset=utf-8"),
+            ],
+            &[],
+        ] {
+            assert_eq!(check_post(&headers(pairs), &[]), Ok(()));
+        }
+    }
+
+    #[test]
+    fn web_pages_do_not() {
+        let own = ["robot".to_owned()];
+        for (pairs, status) in [
+            (&[("content-type", "text/plain;charset=UTF-8")][..], 415),
+            (
+                &[("content-type", "application/x-www-form-urlencoded")],
+                415,
+            ),
+            (
+                &[
+                    ("origin", "http://evil.example"),
+                    ("host", "evil.example:11311"),
+                ],
+                403,
+            ),
+        ] {
+            let refusal = check_post(&headers(pairs), &own).unwrap_err();
+            assert_eq!(refusal.status.as_u16(), status);
+        }
+        let same_site = headers(&[("origin", "http://robot:8000"), ("host", "Robot:11311")]);
+        assert_eq!(check_post(&same_site, &own), Ok(()));
+        assert!(check_host(&headers(&[("host", "[::1]:11311")]), &own).is_ok());
+    }
+
+    #[test]
+    fn only_this_computer_shuts_the_master_down() {
+        for (peer, may) in [
+            ("127.0.0.1", true),
+            ("::1", true),
+            ("::ffff:127.0.0.1", true),
+            ("10.0.0.7", false),
+        ] {
+            assert_eq!(may_shut_down(peer.parse().unwrap()), may, "{peer}");
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! Keeps the checkpoint: forces the journal to the disk, writes new generations, and re-arms after
+//! the disk has failed. Beside traffic; no call waits for it but with `--sync always`.
+
+use std::{
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use tokio_util::sync::CancellationToken;
+
+use super::Proxy;
+use crate::{
+    cli::Sync,
+    store::{Compacted, Disk, Store, StoreError, SyncJob},
+};
+
+/// The keeper looks after things at least so often; an unprotected store is re-armed in that time.
+const ROUND: Duration = Duration::from_secs(1);
+/// The journal is compacted when nothing was recorded for this time,
+const QUIET: Duration = Duration::from_secs(2);
+/// but not more often than this: a memory card wears out.
+const BETWEEN: Duration = Duration::from_secs(10);
+
+/// Keeps the checkpoint until `stop`.
+pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
+    let mut keeper = Keeping {
+        proxy,
+        seq: 0,
+        recorded_at: Instant::now(),
+        compacted_at: None,
+        said: None,
+    };
+    loop {
+        let proxy = &keeper.proxy;
+        tokio::select! {
+            () = stop.cancelled() => return,
+            () = proxy.shadow.work.notified() => {}
+            () = tokio::time::sleep(ROUND) => {}
+        }
+        keeper.round().await;
+        if keeper.proxy.config.sync != Sync::Always {
+            tokio::select! {
+                () = stop.cancelled() => return,
+                () = tokio::time::sleep(keeper.proxy.config.sync_interval) => {}
+            }
+        }
+    }
+}
+
+struct Keeping {
+    proxy: Arc<Proxy>,
+    /// The journal's last record at the last round.
+    seq: u64,
+    recorded_at: Instant,
+    compacted_at: Option<Instant>,
+    /// The failure that was said last.
+    said: Option<String>,
+}
+
+impl Keeping {
+    async fn round(&mut self) {
+        if self.proxy.shadow.with_store(|_, _| ()).is_none() {
+            self.open_again().await;
+        }
+        if self.proxy.config.sync != Sync::Never {
+            self.sync().await;
+        }
+        if self.compaction_is_due() {
+            self.compact().await;
+        }
+        self.say_protection();
+    }
+
+    async fn sync(&self) {
+        let shadow = &self.proxy.shadow;
+        let job = shadow.with_store(|store, _| store.sync_job()).flatten();
+        if let Some(job) = job
+            && let Ok(done) = tokio::task::spawn_blocking(move || SyncJob::run(job)).await
+        {
+            // Its failure is the store's to remember and `say_protection`'s to tell.
+            let _ = shadow.with_store(|store, _| store.synced(done));
+        }
+        let durable = shadow.with_store(|store, _| match store.unprotected() {
+            None => store.synced_seq(),
+            Some(_) => store.seq(),
+        });
+        shadow.set_durable(durable.unwrap_or(u64::MAX));
+    }
+
+    fn compaction_is_due(&mut self) -> bool {
+        let now = Instant::now();
+        let due = self.proxy.shadow.checkpoint_due();
+        let state = self.proxy.shadow.with_store(|store, _| {
+            (
+                store.unprotected().is_some(),
+                store.wants_compaction(),
+                store.seq(),
+                store.journal_bytes(),
+            )
+        });
+        let Some((unprotected, outgrown, seq, journal_bytes)) = state else {
+            return false;
+        };
+        if seq != self.seq {
+            self.seq = seq;
+            self.recorded_at = now;
+        }
+        let rested = self
+            .compacted_at
+            .is_none_or(|at| now.duration_since(at) >= BETWEEN);
+        let quiet = now.duration_since(self.recorded_at) >= QUIET;
+        due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested)
+    }
+
+    async fn compact(&mut self) {
+        let shadow = &self.proxy.shadow;
+        let begun = shadow.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
+        let Some(Ok(job)) = begun else { return };
+        let finished = match tokio::task::spawn_blocking(move || job.run()).await {
+            Ok(done) => shadow.with_store(|store, _| finish(store, done)),
+            Err(_) => return,
+        };
+        match finished {
+            Some(Err(error)) => {
+                shadow.set_checkpoint_due();
+                tracing::debug!(%error, "compaction");
+            }
+            _ => self.compacted_at = Some(Instant::now()),
+        }
+    }
+
+    /// The checkpoint could not be opened at the start: perhaps now.
+    async fn open_again(&self) {
+        let path = self.proxy.config.checkpoint.clone();
+        let opened = tokio::task::spawn_blocking(move || open_fresh(&path)).await;
+        if let Ok(Ok(store)) = opened {
+            self.proxy.shadow.set_store(store);
+        }
+    }
+
+    /// Says, once, that the state is no longer recorded, and that it is again.
+    fn say_protection(&mut self) {
+        let unprotected = self.proxy.shadow.unprotected();
+        if unprotected == self.said {
+            return;
+        }
+        let path = self.proxy.config.checkpoint.display();
+        match (&unprotected, &self.said) {
+            (Some(reason), None) => tracing::error!(
+                checkpoint = %path, reason,
+                "unprotected: calls are forwarded, but a crash of rosrescue itself would lose the \
+                 state; free or repair the disk, and rosrescue re-arms by itself"
+            ),
+            (None, Some(_)) => tracing::info!(checkpoint = %path, "protected again"),
+            _ => {}
+        }
+        self.said = unprotected;
+    }
+}
+
+fn finish(store: &mut Store, done: Compacted<Disk>) -> Result<(), StoreError> {
+    store.finish_compaction(done)
+}
+
+/// Opens a store of which nothing is read: what the memory holds is newer.
+fn open_fresh(path: &Path) -> Result<Store, crate::store::OpenError> {
+    Store::open(path).map(|(store, _)| store)
+}

@@ -1,0 +1,388 @@
+//! The lane: mutating calls travel to the master one journey at a time, so that the journal's order
+//! is the order in which the master ran them. Calls that queue up travel together.
+
+use std::{
+    collections::VecDeque,
+    pin::Pin,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use tokio::sync::{mpsc, oneshot};
+
+use super::{
+    Proxy,
+    gate::{Gate, StandIn, State},
+    journey::{self, Answer, LaneItem, TravelError},
+    look::{self, LookError},
+    pool::connect_verified,
+    upstream::{CallError, Connection, RawReply},
+};
+use crate::{
+    cli::Sync,
+    master::{Kind, Master},
+    xmlrpc::{self, Call, Reply},
+};
+
+/// Pause before a failed journey is tried again while the gate stays open: whoever watches the
+/// master needs a moment to see why it failed.
+const RETRY_PAUSE: Duration = Duration::from_millis(20);
+/// A call that gets no reply so often is given up and its connection closed: a master that breaks
+/// off each reply must not hold up the lane for ever.
+const ATTEMPTS: u32 = 3;
+/// Calls that wait between the clients and the queue.
+const CHANNEL: usize = 64;
+
+/// The way into the lane.
+#[derive(Clone, Debug)]
+pub struct Lane {
+    items: mpsc::Sender<LaneItem>,
+}
+
+impl Lane {
+    /// Puts a call in the queue. None: the gate is shut and there is no room.
+    pub(super) async fn submit(&self, gate: &Gate, item: LaneItem) -> Option<()> {
+        match self.items.try_send(item) {
+            Ok(()) => Some(()),
+            Err(mpsc::error::TrySendError::Full(item))
+                if matches!(gate.state(), State::Open { .. }) =>
+            {
+                self.items.send(item).await.ok()
+            }
+            Err(_) => None,
+        }
+    }
+
+    /// Makes a call of rosrescue's own, recorded as any other. None if the master never answers.
+    pub async fn call(&self, call: Call, kind: Kind) -> Option<Reply> {
+        let (answer, answered) = oneshot::channel();
+        let item = LaneItem {
+            raw: None,
+            call: Some(call),
+            kind,
+            answer,
+            attempts: 0,
+        };
+        self.items.send(item).await.ok()?;
+        match answered.await.ok()? {
+            Answer::Made(reply) => Some(reply),
+            Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
+            Answer::Close => None,
+        }
+    }
+}
+
+/// Makes a lane; the second part is to be run.
+pub fn lane(max_parked: usize) -> (Lane, LaneRunner) {
+    let (tx, rx) = mpsc::channel(CHANNEL);
+    let runner = LaneRunner {
+        items: rx,
+        max_parked,
+        queue: VecDeque::new(),
+        connection: None,
+        flight: None,
+        resync_due: false,
+        retry_at: None,
+    };
+    (Lane { items: tx }, runner)
+}
+
+/// What a flight brings back.
+struct Landed {
+    connection: Option<(u64, Connection)>,
+    result: Result<Cargo, TravelError>,
+}
+
+enum Cargo {
+    Reply(RawReply),
+    Resynced(Box<Master>),
+}
+
+/// Calls on their way to the master, or a resync if there are none.
+struct Flight {
+    incarnation: u64,
+    items: Vec<LaneItem>,
+    landing: Pin<Box<dyn Future<Output = Landed> + Send>>,
+}
+
+/// The single traveller.
+pub struct LaneRunner {
+    items: mpsc::Receiver<LaneItem>,
+    max_parked: usize,
+    queue: VecDeque<LaneItem>,
+    connection: Option<(u64, Connection)>,
+    flight: Option<Flight>,
+    resync_due: bool,
+    retry_at: Option<tokio::time::Instant>,
+}
+
+impl LaneRunner {
+    /// Runs until every [`Lane`] is gone.
+    pub async fn run(mut self, proxy: Arc<Proxy>) {
+        let mut gate = proxy.gate.clone();
+        loop {
+            let room = self.queue.len() < self.max_parked;
+            tokio::select! {
+                item = self.items.recv(), if room => match item {
+                    Some(item) => self.queue.push_back(item),
+                    None => return,
+                },
+                () = gate.changed() => self.retry_at = None,
+                landed = landing(&mut self.flight) => self.landed(&proxy, landed),
+                () = sleep_until(self.retry_at) => self.retry_at = None,
+            }
+            while self.queue.len() < self.max_parked {
+                let Ok(item) = self.items.try_recv() else {
+                    break;
+                };
+                self.queue.push_back(item);
+            }
+            // A client that has gone away, or was sent away, will ask again.
+            self.queue.retain(|item| !item.answer.is_closed());
+            match gate.look() {
+                State::Open { incarnation } => self.depart(&proxy, incarnation),
+                State::Shut(StandIn::Unregistrations) => self.unregister(&proxy),
+                State::Shut(_) => {}
+            }
+        }
+    }
+
+    /// Starts the next flight, if there is none and something to carry.
+    fn depart(&mut self, proxy: &Arc<Proxy>, incarnation: u64) {
+        if let Some(flight) = self
+            .flight
+            .take_if(|flight| flight.incarnation != incarnation)
+        {
+            // Its master has been succeeded, and the new one never saw these calls.
+            self.take_back(flight.items);
+        }
+        if self.flight.is_some() || self.retry_at.is_some() {
+            return;
+        }
+        let items = if self.resync_due {
+            Vec::new()
+        } else {
+            journey::pack(&mut self.queue)
+        };
+        if items.is_empty() && !self.resync_due {
+            return;
+        }
+        self.resync_due = false;
+        let connection = self
+            .connection
+            .take()
+            .filter(|(of, connection)| *of == incarnation && !connection.is_closed());
+        proxy.stats.journeys.count();
+        let landing = Box::pin(travel(proxy.clone(), incarnation, connection, &items));
+        self.flight = Some(Flight {
+            incarnation,
+            items,
+            landing,
+        });
+    }
+
+    fn landed(&mut self, proxy: &Arc<Proxy>, landed: Landed) {
+        let Some(Flight {
+            incarnation, items, ..
+        }) = self.flight.take()
+        else {
+            return;
+        };
+        self.connection = landed.connection;
+        match landed.result {
+            Ok(Cargo::Resynced(state)) => {
+                if proxy.shadow.incarnation() == incarnation && proxy.shadow.adopt(*state) {
+                    tracing::info!("the mirror was made anew from the master");
+                }
+            }
+            Ok(Cargo::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
+            Err(error) => {
+                tracing::debug!(%error, calls = items.len(), "journey");
+                let sent = matches!(&error, TravelError::Call(error) if !matches!(error, CallError::NotSent(_)));
+                // A master that cannot be looked at will be looked at after the next doubt.
+                self.resync_due |= items.is_empty() && matches!(error, TravelError::Connect(_));
+                self.retry_at = Some(tokio::time::Instant::now() + RETRY_PAUSE);
+                let mut again = Vec::with_capacity(items.len());
+                for mut item in items {
+                    item.attempts += u32::from(sent);
+                    if item.attempts < ATTEMPTS {
+                        again.push(item);
+                    } else {
+                        tracing::warn!(%error, caller_id = item.caller(), "gave up a call");
+                        let _ = item.answer.send(Answer::Close);
+                    }
+                }
+                self.take_back(again);
+            }
+        }
+    }
+
+    fn take_back(&mut self, items: Vec<LaneItem>) {
+        for item in items.into_iter().rev() {
+            self.queue.push_front(item);
+        }
+    }
+
+    /// Records what the master answered, and only then answers the clients.
+    fn deliver(
+        &mut self,
+        proxy: &Arc<Proxy>,
+        incarnation: u64,
+        items: Vec<LaneItem>,
+        raw: RawReply,
+    ) {
+        let reply = xmlrpc::decode_reply(&raw.body)
+            .ok()
+            .filter(|_| raw.status.is_success());
+        let replies = match (items.as_slice(), reply) {
+            ([_], Some(reply)) => vec![reply],
+            ([_], None) => Vec::new(),
+            (_, Some(reply)) => match journey::unpack(&reply, items.len()) {
+                Some(replies) => replies,
+                None => return self.undeliverable(items),
+            },
+            (_, None) => return self.undeliverable(items),
+        };
+        let travelled: Vec<_> = items
+            .iter()
+            .zip(&replies)
+            .filter_map(|(item, reply)| Some((item.call.as_ref()?, reply)))
+            .collect();
+        let Ok(recorded) = proxy.shadow.record(Instant::now(), incarnation, &travelled) else {
+            return self.take_back(items);
+        };
+        // What we did not understand, call or reply, may have changed anything.
+        let opaque = match (items.as_slice(), replies.as_slice()) {
+            ([LaneItem { call: None, .. }], [Reply::Value(_)]) => true,
+            ([LaneItem { call: Some(_), .. }], []) => raw.status.is_success(),
+            _ => false,
+        };
+        self.resync_due |= recorded.doubtful || opaque;
+        let answers: Vec<_> = match items.len() {
+            1 => items
+                .into_iter()
+                .map(|item| (item, Answer::Raw(raw.clone())))
+                .collect(),
+            _ => items
+                .into_iter()
+                .zip(replies.into_iter().map(Answer::Made))
+                .collect(),
+        };
+        let send = move || {
+            for (item, answer) in answers {
+                let _ = item.answer.send(answer);
+            }
+        };
+        match recorded.seq {
+            Some(seq) if proxy.config.sync == Sync::Always => {
+                let proxy = proxy.clone();
+                tokio::spawn(async move {
+                    proxy.shadow.durable(seq).await;
+                    send();
+                });
+            }
+            _ => send(),
+        }
+    }
+
+    /// A multicall of ours was answered as a whole by something else than its results. The calls
+    /// can be told apart only if they travel alone.
+    fn undeliverable(&mut self, items: Vec<LaneItem>) {
+        tracing::warn!(
+            calls = items.len(),
+            "the master did not answer each call of a multicall"
+        );
+        self.resync_due = true;
+        for item in items {
+            let _ = item.answer.send(Answer::Close);
+        }
+    }
+
+    /// Answers unregistrations from the mirror, unless their caller has an earlier call under way.
+    fn unregister(&mut self, proxy: &Arc<Proxy>) {
+        let flying = self.flight.as_ref().map_or(&[][..], |flight| &flight.items);
+        let mut busy: Vec<String> = flying
+            .iter()
+            .filter_map(LaneItem::caller)
+            .map(str::to_owned)
+            .collect();
+        let mut waiting = VecDeque::with_capacity(self.queue.len());
+        for item in self.queue.drain(..) {
+            let caller = item.caller().unwrap_or_default();
+            match &item.call {
+                Some(call)
+                    if item.kind == Kind::Unregister && !busy.iter().any(|b| b == caller) =>
+                {
+                    let reply = proxy.shadow.unregister(Instant::now(), call);
+                    proxy.stats.stood_in.count();
+                    let _ = item.answer.send(Answer::Made(reply));
+                }
+                _ => {
+                    busy.push(caller.to_owned());
+                    waiting.push_back(item);
+                }
+            }
+        }
+        self.queue = waiting;
+    }
+}
+
+async fn landing(flight: &mut Option<Flight>) -> Landed {
+    match flight {
+        Some(flight) => flight.landing.as_mut().await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn sleep_until(deadline: Option<tokio::time::Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// One journey. The future owns what it needs, so that dropping it ends it.
+fn travel(
+    proxy: Arc<Proxy>,
+    incarnation: u64,
+    connection: Option<(u64, Connection)>,
+    items: &[LaneItem],
+) -> impl Future<Output = Landed> + Send + 'static {
+    let outbound = (!items.is_empty()).then(|| journey::outbound(items));
+    async move {
+        let connected = match connection {
+            Some((_, connection)) => Ok(connection),
+            None => connect_verified(&proxy.upstream, &proxy.mark).await,
+        };
+        let mut connection = match connected {
+            Ok(connection) => connection,
+            Err(error) => {
+                return Landed {
+                    connection: None,
+                    result: Err(error.into()),
+                };
+            }
+        };
+        let result = match outbound {
+            Some((head, body)) => connection
+                .forward(&head, body)
+                .await
+                .map(Cargo::Reply)
+                .map_err(Into::into),
+            None => {
+                let held = hold_of(&proxy, &mut connection).await;
+                held.map(|held| Cargo::Resynced(held.into()))
+                    .map_err(Into::into)
+            }
+        };
+        let connection = result.is_ok().then_some((incarnation, connection));
+        Landed { connection, result }
+    }
+}
+
+/// What the master behind `connection` holds.
+async fn hold_of(proxy: &Proxy, connection: &mut Connection) -> Result<Master, LookError> {
+    let previous = proxy.shadow.with_mirror(Clone::clone);
+    let first = look::first(connection, &proxy.mark).await?;
+    look::second(first, connection, &previous).await
+}

@@ -1,0 +1,332 @@
+//! One request from its head to its answer.
+
+use std::{io::Read, net::SocketAddr, sync::Arc, time::Duration};
+
+use bytes::Bytes;
+use flate2::read::GzDecoder;
+use http_body_util::{BodyExt, Full, Limited};
+use hyper::{
+    Method, Request, Response, StatusCode,
+    body::{Body, Incoming},
+    header::{CONTENT_ENCODING, CONTENT_TYPE, SERVER},
+};
+use thiserror::Error;
+use tokio::sync::oneshot;
+
+use super::{
+    Proxy,
+    door::{self, Refusal},
+    gate::{StandIn, State},
+    journey::{self, Answer, LaneItem},
+    pace::Pace,
+    upstream::{Head, INSTANCE_HEADER, RawReply},
+};
+use crate::{
+    admin,
+    master::{self, Kind},
+    xmlrpc::{self, Call, Reply, Value},
+};
+
+/// What hyper sends.
+pub type HttpReply = Response<Full<Bytes>>;
+
+/// The connection is closed without an answer. A node asks again after that, whereas an error that
+/// we make up would cost it its registration, or its life.
+#[derive(Debug, Error)]
+#[error("closed without an answer: {0}")]
+pub struct Closed(&'static str);
+
+/// Bodies beyond this are decoded outside the runtime's threads: 64 KiB take some 0.5 ms.
+const DECODE_INLINE: usize = 64 << 10;
+/// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
+const BODY_TIME: Duration = Duration::from_secs(10);
+/// The slowest link that a body is taken from, in bytes a second.
+const BODY_RATE: u64 = 64 << 10;
+
+/// Answers one request.
+pub async fn serve(
+    proxy: Arc<Proxy>,
+    peer: SocketAddr,
+    pace: Pace,
+    request: Request<Incoming>,
+) -> Result<HttpReply, Closed> {
+    pace.serving();
+    let reply = route(proxy, peer, request).await;
+    pace.idle();
+    reply
+}
+
+async fn route(
+    proxy: Arc<Proxy>,
+    peer: SocketAddr,
+    request: Request<Incoming>,
+) -> Result<HttpReply, Closed> {
+    match *request.method() {
+        Method::GET | Method::HEAD => Ok(match door::check_host(request.headers(), &proxy.names) {
+            Ok(()) => admin::page(&proxy, request.uri().path()),
+            Err(refusal) => refuse(&proxy, peer, &refusal),
+        }),
+        Method::POST => post(proxy, peer, request).await,
+        ref method => Ok(text(
+            StatusCode::NOT_IMPLEMENTED,
+            format!("method {method} is not supported; XML-RPC is POST, the status page GET\n"),
+        )),
+    }
+}
+
+async fn post(
+    proxy: Arc<Proxy>,
+    peer: SocketAddr,
+    request: Request<Incoming>,
+) -> Result<HttpReply, Closed> {
+    if request
+        .headers()
+        .get(INSTANCE_HEADER)
+        .is_some_and(|of| of == proxy.instance.as_str())
+    {
+        proxy
+            .looped
+            .store(true, std::sync::atomic::Ordering::Relaxed);
+        return Ok(text(
+            StatusCode::LOOP_DETECTED,
+            "this is rosrescue itself\n".to_owned(),
+        ));
+    }
+    if let Err(refusal) = door::check_post(request.headers(), &proxy.names) {
+        return Ok(refuse(&proxy, peer, &refusal));
+    }
+    let head = Head {
+        path: request.uri().to_string(),
+        encoding: request.headers().get(CONTENT_ENCODING).cloned(),
+    };
+    let body = match read_body(request.into_body(), proxy.config.max_body).await {
+        Ok(body) => body,
+        Err(BodyError::TooLarge { limit }) => {
+            proxy.stats.refused.count();
+            tracing::warn!(%peer, limit, "refused a request body beyond the limit (--max-body)");
+            let reason = format!("the body is larger than {limit} bytes, see --max-body\n");
+            return Ok(text(StatusCode::PAYLOAD_TOO_LARGE, reason));
+        }
+        Err(BodyError::Broken) => return Err(Closed("the request broke off")),
+        Err(BodyError::TooSlow) => return Err(Closed("the request came too slowly")),
+    };
+    proxy.stats.calls.count();
+    let call = decode(&head, body.clone(), proxy.config.max_body).await;
+    if let Some(call) = &call {
+        let caller_id = call
+            .params
+            .first()
+            .and_then(Value::as_str)
+            .unwrap_or_default();
+        tracing::debug!(%peer, method = call.method, caller_id, "call");
+    } else {
+        proxy.stats.undecoded.count();
+        tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
+    }
+    answer(&proxy, peer, head, body, call).await
+}
+
+async fn answer(
+    proxy: &Arc<Proxy>,
+    peer: SocketAddr,
+    head: Head,
+    body: Bytes,
+    call: Option<Call>,
+) -> Result<HttpReply, Closed> {
+    let kind = call.as_ref().map_or(Kind::Mutate, master::kind);
+    match (&call, kind) {
+        (Some(call), Kind::Identity)
+            if call.method == "getUri" || !matches!(proxy.gate.state(), State::Open { .. }) =>
+        {
+            Ok(xml(&proxy.shadow.answer(call)))
+        }
+        (_, Kind::Shutdown) if !door::may_shut_down(peer.ip()) => {
+            tracing::warn!(%peer, "refused to shut the master down for another computer");
+            let refusal = "shutdown is taken from the master's own computer only";
+            let reply: [Value; 3] = [(-1).into(), refusal.into(), 0.into()];
+            Ok(xml(&Reply::Value(reply.to_vec().into())))
+        }
+        (_, Kind::Read | Kind::Identity | Kind::Unknown) => {
+            read(proxy, head, body, call.as_ref(), kind).await
+        }
+        (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
+            let (tx, rx) = oneshot::channel();
+            let item = LaneItem {
+                raw: Some((head, body)),
+                call,
+                kind,
+                answer: tx,
+                attempts: 0,
+            };
+            if proxy.lane.submit(&proxy.gate, item).await.is_none() {
+                proxy.stats.hold_expired.count();
+                return Err(Closed(
+                    "too many calls wait for the master, see --max-parked",
+                ));
+            }
+            await_lane(proxy, rx).await
+        }
+    }
+}
+
+/// Forwards a read; while the gate is shut, or when the master fails, the mirror answers.
+async fn read(
+    proxy: &Arc<Proxy>,
+    head: Head,
+    body: Bytes,
+    call: Option<&Call>,
+    kind: Kind,
+) -> Result<HttpReply, Closed> {
+    let mut gate = proxy.gate.clone();
+    let mut parked = false;
+    let mut hold = std::pin::pin!(tokio::time::sleep(proxy.config.hold));
+    loop {
+        let mut known = true;
+        match gate.look() {
+            State::Open { incarnation } => {
+                let Proxy {
+                    pool,
+                    upstream,
+                    mark,
+                    ..
+                } = &**proxy;
+                match pool
+                    .forward(upstream, mark, &mut gate, incarnation, &head, &body)
+                    .await
+                {
+                    Ok(raw) => return Ok(forwarded(proxy, call, raw)),
+                    Err(error) => tracing::debug!(%error, "read"),
+                }
+            }
+            State::Shut(stand_in) => known = stand_in != StandIn::Nobody,
+        }
+        if let Some(call) = call.filter(|_| known && kind != Kind::Unknown) {
+            proxy.stats.stood_in.count();
+            return Ok(xml(&proxy.shadow.answer(call)));
+        }
+        if !std::mem::replace(&mut parked, true) {
+            proxy.stats.parked.count();
+        }
+        tokio::select! {
+            () = gate.changed() => {}
+            () = &mut hold => {
+                proxy.stats.hold_expired.count();
+                return Err(Closed("the master did not come back in time, see --hold"));
+            }
+        }
+    }
+}
+
+async fn await_lane(
+    proxy: &Arc<Proxy>,
+    mut answered: oneshot::Receiver<Answer>,
+) -> Result<HttpReply, Closed> {
+    let mut gate = proxy.gate.clone();
+    if matches!(gate.state(), State::Shut(_)) {
+        proxy.stats.parked.count();
+    }
+    tokio::select! {
+        answer = &mut answered => match answer {
+            Ok(Answer::Raw(raw)) => Ok(plain(raw)),
+            Ok(Answer::Made(reply)) => Ok(xml(&reply)),
+            Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
+        },
+        () = gate.shut_for(proxy.config.hold) => {
+            proxy.stats.hold_expired.count();
+            Err(Closed("the master did not come back in time, see --hold"))
+        }
+    }
+}
+
+/// A master's reply to a read, with our address for its own.
+fn forwarded(proxy: &Proxy, call: Option<&Call>, raw: RawReply) -> HttpReply {
+    let names_uri = call.is_some_and(|call| call.method == "system.multicall");
+    if names_uri
+        && let (Some(call), Ok(reply)) = (call, xmlrpc::decode_reply(&raw.body))
+        && let Some(rewritten) = journey::rewrite_uri(call, &reply, &proxy.uri)
+    {
+        return xml(&rewritten);
+    }
+    plain(raw)
+}
+
+fn plain(raw: RawReply) -> HttpReply {
+    let mut reply = Response::new(Full::new(raw.body));
+    *reply.status_mut() = raw.status;
+    for name in [CONTENT_TYPE, CONTENT_ENCODING, SERVER] {
+        if let Some(value) = raw.headers.get(&name) {
+            reply.headers_mut().insert(name, value.clone());
+        }
+    }
+    reply
+}
+
+fn xml(reply: &Reply) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(xmlrpc::encode_reply(reply))));
+    http.headers_mut().insert(
+        CONTENT_TYPE,
+        hyper::header::HeaderValue::from_static("text/xml"),
+    );
+    http
+}
+
+fn text(status: StatusCode, text: String) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(text)));
+    *http.status_mut() = status;
+    let plain = hyper::header::HeaderValue::from_static("text/plain; charset=utf-8");
+    http.headers_mut().insert(CONTENT_TYPE, plain);
+    http
+}
+
+fn refuse(proxy: &Proxy, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
+    proxy.stats.refused.count();
+    tracing::warn!(%peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
+    text(refusal.status, format!("{}\n", refusal.reason))
+}
+
+enum BodyError {
+    TooLarge { limit: usize },
+    Broken,
+    TooSlow,
+}
+
+async fn read_body(body: Incoming, limit: usize) -> Result<Bytes, BodyError> {
+    let declared = body.size_hint().lower();
+    if declared > limit as u64 {
+        return Err(BodyError::TooLarge { limit });
+    }
+    let time = BODY_TIME + Duration::from_secs(declared.max(1 << 20) / BODY_RATE);
+    match tokio::time::timeout(time, Limited::new(body, limit).collect()).await {
+        Err(_) => Err(BodyError::TooSlow),
+        Ok(Ok(body)) => Ok(body.to_bytes()),
+        Ok(Err(error)) if error.is::<http_body_util::LengthLimitError>() => {
+            Err(BodyError::TooLarge { limit })
+        }
+        Ok(Err(_)) => Err(BodyError::Broken),
+    }
+}
+
+async fn decode(head: &Head, body: Bytes, limit: usize) -> Option<Call> {
+    let gzip = head.encoding.as_ref().is_some_and(|of| of == "gzip");
+    if head.encoding.is_some() && !gzip {
+        return None;
+    }
+    let long = body.len() > DECODE_INLINE;
+    let work = move || {
+        if !gzip {
+            return xmlrpc::decode_call(&body).ok();
+        }
+        let mut unpacked = Vec::new();
+        // What unpacks to more than the limit is not looked into; rosmaster will do as it likes.
+        let most = u64::try_from(limit).unwrap_or(u64::MAX);
+        GzDecoder::new(&*body)
+            .take(most)
+            .read_to_end(&mut unpacked)
+            .ok()?;
+        xmlrpc::decode_call(&unpacked).ok()
+    };
+    if gzip || long {
+        return tokio::task::spawn_blocking(work).await.ok()?;
+    }
+    work()
+}

@@ -1,0 +1,377 @@
+//! The mirror and its checkpoint under one lock: what the master knows, kept twice.
+//!
+//! The lock makes "recorded" and "applied" one step, and orders both against the moment at which a
+//! new incarnation takes over: a reply of the old master that arrives after its state was taken for
+//! the injection is not acknowledged, and the call travels again.
+
+use std::{
+    collections::HashSet,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use indexmap::IndexMap;
+use tokio::sync::{Notify, watch};
+
+use super::stats::Stats;
+use crate::{
+    master::{self, Master, Notice},
+    record::{Checkpoint, Entry, Session},
+    store::Store,
+    xmlrpc::{Call, Reply},
+};
+
+/// How long before an outage a change may lie whose notices the dead master still owed. Its three
+/// notifier threads can be held up by nodes that cannot be reached.
+const NOTICE_MEMORY: Duration = Duration::from_secs(30);
+/// Topics remembered for that.
+const NOTICE_TOPICS: usize = 4096;
+/// Replies in a log line are cut to so many bytes.
+const LOGGED_REPLY: usize = 300;
+
+/// The call's incarnation has been succeeded by another one: the call must travel again.
+#[derive(Debug)]
+pub struct Superseded;
+
+/// What became of calls that the master answered.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Recorded {
+    /// The journal's last record of them; none if nothing had to be recorded.
+    pub seq: Option<u64>,
+    /// Whether the mirror is no longer known to equal the master.
+    pub doubtful: bool,
+}
+
+/// The mirror, the journal and what belongs to them.
+pub struct Shadow {
+    inner: Mutex<Inner>,
+    stats: &'static Stats,
+    durable: watch::Sender<u64>,
+    /// Wakes the keeper of the checkpoint.
+    pub work: Notify,
+}
+
+struct Inner {
+    mirror: Master,
+    session: Session,
+    /// None if no checkpoint could be opened: unprotected.
+    store: Option<Store>,
+    incarnation: u64,
+    /// Changes with every change of the mirror.
+    version: u64,
+    /// The mirror changed otherwise than by journaled calls: a whole checkpoint is due.
+    checkpoint_due: bool,
+    /// Unregistrations taken while the gate was shut: the same incarnation, should it come back,
+    /// has not heard of them.
+    owed: Vec<Call>,
+    /// Topics whose publishers changed, and when last.
+    noticed: IndexMap<String, Instant>,
+    diverged: HashSet<String>,
+}
+
+impl Shadow {
+    /// A shadow of `mirror`, recorded in `store`.
+    pub fn new(
+        mirror: Master,
+        session: Session,
+        store: Option<Store>,
+        stats: &'static Stats,
+    ) -> Self {
+        let inner = Inner {
+            mirror,
+            session,
+            store,
+            incarnation: 0,
+            version: 0,
+            checkpoint_due: false,
+            owed: Vec::new(),
+            noticed: IndexMap::new(),
+            diverged: HashSet::new(),
+        };
+        Self {
+            inner: Mutex::new(inner),
+            stats,
+            durable: watch::channel(0).0,
+            work: Notify::new(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // No code under the lock can panic half-way through a change that matters.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Looks at the mirror.
+    pub fn with_mirror<T>(&self, look: impl FnOnce(&Master) -> T) -> T {
+        look(&self.lock().mirror)
+    }
+
+    /// What the master would answer to a read.
+    pub fn answer(&self, read: &Call) -> Reply {
+        self.lock().mirror.apply(read).reply
+    }
+
+    /// Tells the mirror what getPid and getUri answer.
+    pub fn set_identity(&self, pid: i32, uri: String) {
+        self.lock().mirror.set_identity(pid, uri);
+    }
+
+    /// The session as it is recorded.
+    pub fn session(&self) -> Session {
+        self.lock().session.clone()
+    }
+
+    /// Changes the session and records it.
+    pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
+        let mut inner = self.lock();
+        change(&mut inner.session);
+        let entry = Entry::Session(inner.session.clone());
+        inner.append(&[entry]);
+        drop(inner);
+        self.work.notify_one();
+    }
+
+    /// Records and applies calls that the master of `incarnation` has answered, in its order.
+    pub fn record(
+        &self,
+        now: Instant,
+        incarnation: u64,
+        travelled: &[(&Call, &Reply)],
+    ) -> Result<Recorded, Superseded> {
+        let mut inner = self.lock();
+        if inner.incarnation != incarnation {
+            return Err(Superseded);
+        }
+        let mut entries = Vec::with_capacity(travelled.len());
+        let mut recorded = Recorded::default();
+        for (call, reply) in travelled {
+            let accepted = master::accepted(&inner.mirror, call, reply);
+            recorded.doubtful |= !accepted.certain;
+            for (call, reply) in accepted.calls {
+                let outcome = inner.apply(now, &call);
+                if outcome != reply {
+                    recorded.doubtful = true;
+                    self.stats.divergences.count();
+                    inner.report_divergence(&call.method, &outcome, &reply);
+                }
+                entries.push(Entry::Call(call));
+            }
+        }
+        if !entries.is_empty() {
+            self.stats.recorded.add(entries.len() as u64);
+            recorded.seq = inner.append(&entries);
+            drop(inner);
+            self.work.notify_one();
+        }
+        Ok(recorded)
+    }
+
+    /// Records and applies a call of our own before there is any master.
+    pub fn seed(&self, call: &Call) {
+        let mut inner = self.lock();
+        inner.apply(Instant::now(), call);
+        inner.append(&[Entry::Call(call.clone())]);
+    }
+
+    /// Takes an unregistration while the gate is shut: records it, applies it, and answers as the
+    /// master would.
+    pub fn unregister(&self, now: Instant, call: &Call) -> Reply {
+        let mut inner = self.lock();
+        let reply = inner.apply(now, call);
+        let accepted = master::accepted(&inner.mirror, call, &reply).calls;
+        let entries: Vec<_> = accepted
+            .iter()
+            .map(|(call, _)| Entry::Call(call.clone()))
+            .collect();
+        inner
+            .owed
+            .extend(accepted.into_iter().map(|(call, _)| call));
+        inner.append(&entries);
+        drop(inner);
+        self.work.notify_one();
+        reply
+    }
+
+    /// A new incarnation takes over: replies of the old one no longer count. Answers the state that
+    /// it is to be brought to.
+    pub fn succeed(&self) -> Master {
+        let mut inner = self.lock();
+        inner.incarnation += 1;
+        inner.owed.clear();
+        inner.mirror.clone()
+    }
+
+    /// The incarnation that replies must come from.
+    pub fn incarnation(&self) -> u64 {
+        self.lock().incarnation
+    }
+
+    /// Unregistrations that the present incarnation has not heard of.
+    pub fn owed(&self) -> Vec<Call> {
+        self.lock().owed.clone()
+    }
+
+    /// The first `count` of [`Self::owed`] have been sent.
+    pub fn paid(&self, count: usize) {
+        let mut inner = self.lock();
+        let count = count.min(inner.owed.len());
+        inner.owed.drain(..count);
+    }
+
+    /// The mirror's version: equal versions mean equal states.
+    pub fn version(&self) -> u64 {
+        self.lock().version
+    }
+
+    /// The master holds `state`: so does the mirror from now on. Answers whether that changed it.
+    pub fn adopt(&self, state: Master) -> bool {
+        let mut inner = self.lock();
+        if inner.mirror == state {
+            return false;
+        }
+        inner.mirror = state;
+        inner.version += 1;
+        inner.checkpoint_due = true;
+        drop(inner);
+        self.work.notify_one();
+        true
+    }
+
+    /// Topics whose publishers changed so shortly before now that a master which died since may
+    /// have owed its subscribers the news.
+    pub fn topics_noticed(&self, now: Instant) -> Vec<String> {
+        let inner = self.lock();
+        let recent = inner
+            .noticed
+            .iter()
+            .filter(|(_, at)| now.duration_since(**at) < NOTICE_MEMORY);
+        recent.map(|(topic, _)| topic.clone()).collect()
+    }
+
+    /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
+    pub async fn durable(&self, seq: u64) {
+        let mut durable = self.durable.subscribe();
+        // The sender lives as long as we do.
+        let _ = durable.wait_for(|reached| *reached >= seq).await;
+    }
+
+    /// The journal up to `seq` is as safe as it will get.
+    pub fn set_durable(&self, seq: u64) {
+        self.durable.send_if_modified(|reached| {
+            let more = seq > *reached;
+            *reached = seq.max(*reached);
+            more
+        });
+    }
+
+    /// What a checkpoint written now holds.
+    pub fn checkpoint(&self) -> Checkpoint {
+        self.lock().checkpoint()
+    }
+
+    /// Works on the store, if there is one, with the means to take the checkpoint that belongs to
+    /// this very moment.
+    pub fn with_store<T>(
+        &self,
+        work: impl FnOnce(&mut Store, &mut dyn FnMut() -> Checkpoint) -> T,
+    ) -> Option<T> {
+        let mut inner = self.lock();
+        let mut store = inner.store.take()?;
+        let seq = store.seq();
+        let result = work(&mut store, &mut || {
+            inner.checkpoint_due = false;
+            Checkpoint {
+                seq,
+                ..inner.checkpoint()
+            }
+        });
+        inner.store = Some(store);
+        Some(result)
+    }
+
+    /// There is a store now, which holds nothing yet.
+    pub fn set_store(&self, store: Store) {
+        let mut inner = self.lock();
+        inner.store = Some(store);
+        inner.checkpoint_due = true;
+    }
+
+    /// Whether the mirror changed otherwise than by journaled calls since the last checkpoint.
+    pub fn checkpoint_due(&self) -> bool {
+        self.lock().checkpoint_due
+    }
+
+    /// The last attempt at a checkpoint failed.
+    pub fn set_checkpoint_due(&self) {
+        self.lock().checkpoint_due = true;
+    }
+
+    /// Why the state is not recorded; none if all is well.
+    pub fn unprotected(&self) -> Option<String> {
+        match &self.lock().store {
+            Some(store) => store.unprotected().map(str::to_owned),
+            None => Some("the checkpoint could not be opened".to_owned()),
+        }
+    }
+}
+
+impl Inner {
+    fn apply(&mut self, now: Instant, call: &Call) -> Reply {
+        let outcome = self.mirror.apply(call);
+        self.version += 1;
+        for notice in outcome.notices {
+            if let Notice::PublisherUpdate { topic, .. } = notice {
+                self.noticed.insert(topic, now);
+            }
+        }
+        if self.noticed.len() > NOTICE_TOPICS {
+            self.noticed
+                .retain(|_, at| now.duration_since(*at) < NOTICE_MEMORY);
+            self.noticed.truncate(NOTICE_TOPICS);
+        }
+        outcome.reply
+    }
+
+    /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.
+    fn append(&mut self, entries: &[Entry]) -> Option<u64> {
+        let store = self.store.as_mut()?;
+        if entries.is_empty() {
+            return None;
+        }
+        match store.append(entries) {
+            Ok(seq) => Some(seq),
+            Err(error) => {
+                tracing::debug!(%error, "append");
+                None
+            }
+        }
+    }
+
+    fn checkpoint(&self) -> Checkpoint {
+        Checkpoint {
+            seq: self.store.as_ref().map_or(0, Store::seq),
+            session: self.session.clone(),
+            snapshot: self.mirror.snapshot(),
+        }
+    }
+
+    fn report_divergence(&mut self, method: &str, mirror: &Reply, master: &Reply) {
+        if self.diverged.insert(method.to_owned()) {
+            tracing::warn!(
+                method,
+                mirror = cut(&format!("{mirror:?}")),
+                master = cut(&format!("{master:?}")),
+                "the mirror's reply differs from the master's; the mirror will be made anew from \
+                 the master (said once for each method)"
+            );
+        }
+    }
+}
+
+fn cut(text: &str) -> &str {
+    let end = (0..=LOGGED_REPLY)
+        .rev()
+        .find(|end| text.is_char_boundary(*end))
+        .unwrap_or(0);
+    text.get(..end.min(text.len())).unwrap_or(text)
+}

@@ -1,0 +1,241 @@
+//! Connections to the master.
+
+use std::{io, time::Duration};
+
+use bytes::Bytes;
+use http_body_util::{BodyExt, Full, Limited};
+use hyper::{
+    HeaderMap, Request, StatusCode,
+    client::conn::http1::SendRequest,
+    header::{CONTENT_ENCODING, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
+};
+use hyper_util::rt::TokioIo;
+use thiserror::Error;
+use tokio::{net::TcpStream, sync::watch};
+
+use crate::{
+    ros_env::MasterUri,
+    xmlrpc::{self, Call, Reply},
+};
+
+/// Largest reply that is taken from the master, in bytes. A parameter tree of 64 MiB written out
+/// again as XML stays below it.
+const MAX_REPLY: usize = 512 << 20;
+/// How long a connect may take. A host that drops packets never answers.
+const CONNECT_LIMIT: Duration = Duration::from_secs(3);
+
+/// Each request to the master bears it, so that a proxy that is pointed at itself notices.
+pub const INSTANCE_HEADER: &str = "x-rosrescue-instance";
+
+/// A connection that could not be made.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConnectError {
+    /// Nothing listens there.
+    #[error("nothing listens at {master}")]
+    Refused {
+        /// Where.
+        master: String,
+    },
+    /// There is no way there, or no answer.
+    #[error("cannot reach {master}: {source}")]
+    Unreachable {
+        /// Where.
+        master: String,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// A call that got no reply. Whether the master may have run it decides what may be done next.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CallError {
+    /// No byte has left: it may be sent again.
+    #[error("the call was not sent: {0}")]
+    NotSent(hyper::Error),
+    /// The master may have run it.
+    #[error("the master gave no reply: {0}")]
+    MaybeSent(hyper::Error),
+    /// The reply's body broke off, or was beyond all limits.
+    #[error("the master's reply is not whole: {0}")]
+    BrokenReply(Box<dyn std::error::Error + Send + Sync>),
+    /// The reply is whole, but no XML-RPC; only for calls of our own.
+    #[error("the master's reply is no XML-RPC (HTTP status {status}): {reason}")]
+    NotXmlRpc {
+        /// The HTTP status.
+        status: StatusCode,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// The parts of a client's request that matter to the master, besides the body.
+#[derive(Clone, Debug)]
+pub struct Head {
+    /// The request's target, such as `/RPC2`.
+    pub path: String,
+    /// How the body is packed, if it is.
+    pub encoding: Option<HeaderValue>,
+}
+
+impl Default for Head {
+    fn default() -> Self {
+        Self {
+            path: "/".to_owned(),
+            encoding: None,
+        }
+    }
+}
+
+/// A whole reply of the master.
+#[derive(Clone, Debug)]
+pub struct RawReply {
+    /// The HTTP status.
+    pub status: StatusCode,
+    /// The master's headers.
+    pub headers: HeaderMap,
+    /// The body, unchanged.
+    pub body: Bytes,
+}
+
+/// Knows where the master is and how requests to it look.
+#[derive(Debug)]
+pub struct Upstream {
+    address: watch::Sender<MasterUri>,
+    instance: HeaderValue,
+}
+
+impl Upstream {
+    /// Connections to `address`; `instance` tells this process from every other.
+    pub fn new(address: MasterUri, instance: HeaderValue) -> Self {
+        Self {
+            address: watch::Sender::new(address),
+            instance,
+        }
+    }
+
+    /// Where the master is.
+    pub fn address(&self) -> MasterUri {
+        self.address.borrow().clone()
+    }
+
+    /// The master is elsewhere from now on; open connections stay as they are.
+    pub fn relocate(&self, address: MasterUri) {
+        self.address.send_replace(address);
+    }
+
+    /// A new connection to the master.
+    pub async fn connect(&self) -> Result<Connection, ConnectError> {
+        let address = self.address();
+        let unreachable = |source| ConnectError::Unreachable {
+            master: address.to_string(),
+            source,
+        };
+        let target = (address.host.as_str(), address.port);
+        let stream = match tokio::time::timeout(CONNECT_LIMIT, TcpStream::connect(target)).await {
+            Err(_) => return Err(unreachable(io::ErrorKind::TimedOut.into())),
+            Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
+                return Err(ConnectError::Refused {
+                    master: address.to_string(),
+                });
+            }
+            Ok(Err(error)) => return Err(unreachable(error)),
+            Ok(Ok(stream)) => stream,
+        };
+        stream.set_nodelay(true).map_err(unreachable)?;
+        let (sender, driver) = hyper::client::conn::http1::Builder::new()
+            .title_case_headers(true)
+            .handshake(TokioIo::new(stream))
+            .await
+            .map_err(|error| unreachable(io::Error::other(error)))?;
+        let (end, ended) = watch::channel(());
+        tokio::spawn(async move {
+            // Its error, if any, is also that of the call under way.
+            let _ = driver.await;
+            drop(end);
+        });
+        let host = HeaderValue::from_str(&address.authority())
+            .map_err(|error| unreachable(io::Error::other(error)))?;
+        Ok(Connection {
+            sender,
+            ended,
+            host,
+            instance: self.instance.clone(),
+        })
+    }
+}
+
+/// One keep-alive connection to the master, for one call at a time.
+#[derive(Debug)]
+pub struct Connection {
+    sender: SendRequest<Full<Bytes>>,
+    ended: watch::Receiver<()>,
+    host: HeaderValue,
+    instance: HeaderValue,
+}
+
+impl Connection {
+    /// Whether the connection is known to have ended.
+    pub fn is_closed(&self) -> bool {
+        self.sender.is_closed()
+    }
+
+    /// Returns when the connection has ended.
+    pub fn ended(&self) -> impl Future<Output = ()> + Send + 'static {
+        let mut ended = self.ended.clone();
+        async move {
+            // Nothing is ever sent: it ends in the error that the sender is gone.
+            while ended.changed().await.is_ok() {}
+        }
+    }
+
+    /// Sends `body` as it is; the reply comes back as it is.
+    pub async fn forward(&mut self, head: &Head, body: Bytes) -> Result<RawReply, CallError> {
+        // rosmaster gzips replies when it may, in Python: it may not.
+        let mut request = Request::post(head.path.as_str())
+            .header(HOST, &self.host)
+            .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
+            .header(CONTENT_TYPE, "text/xml")
+            .header(INSTANCE_HEADER, &self.instance);
+        if let Some(encoding) = &head.encoding {
+            request = request.header(CONTENT_ENCODING, encoding);
+        }
+        let request = request
+            .body(Full::new(body))
+            .map_err(|error| CallError::BrokenReply(error.into()))?;
+        if let Err(error) = self.sender.ready().await {
+            return Err(CallError::NotSent(error));
+        }
+        let reply = match self.sender.send_request(request).await {
+            Ok(reply) => reply,
+            Err(error) if error.is_canceled() => return Err(CallError::NotSent(error)),
+            Err(error) => return Err(CallError::MaybeSent(error)),
+        };
+        let (parts, body) = reply.into_parts();
+        let body = Limited::new(body, MAX_REPLY)
+            .collect()
+            .await
+            .map_err(CallError::BrokenReply)?;
+        Ok(RawReply {
+            status: parts.status,
+            headers: parts.headers,
+            body: body.to_bytes(),
+        })
+    }
+
+    /// Makes a call of our own.
+    pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
+        self.call_encoded(Bytes::from(xmlrpc::encode_call(call)))
+            .await
+    }
+
+    /// Makes a call of our own that is XML already.
+    pub async fn call_encoded(&mut self, body: Bytes) -> Result<Reply, CallError> {
+        let raw = self.forward(&Head::default(), body).await?;
+        xmlrpc::decode_reply(&raw.body).map_err(|error| CallError::NotXmlRpc {
+            status: raw.status,
+            reason: error.to_string(),
+        })
+    }
+}

@@ -1,0 +1,133 @@
+//! What roscore does besides running a master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
+
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
+
+use tokio_util::sync::CancellationToken;
+
+use super::census::{self, Sign};
+use crate::{
+    master::Kind,
+    proxy::Proxy,
+    supervisor,
+    xmlrpc::{Call, Reply, Value},
+};
+
+/// The caller id under which roscore's parameters are set; it leaves no trace in the master.
+const CALLER_ID: &str = "/rosrescue";
+/// How long `rosversion` may take: it is a Python program.
+const VERSION_TIME: Duration = Duration::from_secs(20);
+/// Pause before a rosout that has ended is started again, as roslaunch's respawn has it.
+const RESPAWN: Duration = Duration::from_secs(1);
+/// The node that rosout is.
+const ROSOUT: &str = "/rosout";
+
+fn set(key: &str, value: &str) -> Call {
+    Call::new("setParam", vec![CALLER_ID.into(), key.into(), value.into()])
+}
+
+fn has(proxy: &Proxy, key: &str) -> bool {
+    let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
+    let yes = Value::Bool(true);
+    matches!(proxy.shadow.answer(&call), Reply::Value(Value::Array(answer)) if answer.get(2) == Some(&yes))
+}
+
+/// Gives a new session its run id before there is a master: it is injected with the rest, so that
+/// no roslaunch ever sees a master without one.
+pub fn set_run_id(proxy: &Proxy) {
+    if !has(proxy, "/run_id") {
+        let id = proxy.shadow.session().id;
+        proxy.shadow.seed(&set("/run_id", &id));
+    }
+}
+
+/// Does the rest once the master is there, until `stop`.
+pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
+    tokio::select! {
+        () = proxy.board.first_opening() => {}
+        () = stop.cancelled() => return,
+    }
+    let work = async {
+        if rosout {
+            tokio::join!(set_versions(&proxy), keep_rosout(&proxy));
+        } else {
+            set_versions(&proxy).await;
+        }
+    };
+    tokio::select! {
+        () = work => {}
+        () = stop.cancelled() => {}
+    }
+}
+
+/// As `roscore.xml` does: the output of `rosversion`, line feed included.
+async fn set_versions(proxy: &Proxy) {
+    let versions = [("/rosversion", "roslaunch"), ("/rosdistro", "-d")];
+    for (key, argument) in versions {
+        if has(proxy, key) {
+            continue;
+        }
+        match supervisor::output_of("rosversion", &[argument], VERSION_TIME).await {
+            Some(version) => {
+                proxy.lane.call(set(key, &version), Kind::Mutate).await;
+            }
+            None => tracing::warn!(key, "not set: `rosversion {argument}` gave no answer"),
+        }
+    }
+}
+
+/// Keeps a rosout running: ours, or one that is there already.
+async fn keep_rosout(proxy: &Proxy) {
+    loop {
+        match living_rosout(proxy).await {
+            Some(pid) => {
+                proxy.rosout.store(pid, Ordering::Relaxed);
+                while supervisor::is_alive(pid) {
+                    tokio::time::sleep(RESPAWN).await;
+                }
+            }
+            None => {
+                let Some(mut command) = supervisor::rosout(&proxy.uri) else {
+                    tracing::warn!(
+                        "no rosout is installed (apt-get install rosout): /rosout is not collected"
+                    );
+                    return;
+                };
+                match command.spawn() {
+                    Ok(mut child) => {
+                        let pid = child.id().unwrap_or_default();
+                        proxy.rosout.store(pid, Ordering::Relaxed);
+                        tracing::info!(pid, "started rosout");
+                        let ended = child.wait().await.map(supervisor::describe);
+                        tracing::warn!(pid, how = ended.unwrap_or_default(), "rosout has ended");
+                    }
+                    Err(error) => tracing::warn!(%error, "cannot start rosout"),
+                }
+            }
+        }
+        proxy.rosout.store(0, Ordering::Relaxed);
+        tokio::time::sleep(RESPAWN).await;
+    }
+}
+
+/// The process id of the registered rosout, if it answers.
+async fn living_rosout(proxy: &Proxy) -> Option<u32> {
+    let api = proxy
+        .shadow
+        .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
+    let call = Call::new("getPid", vec![CALLER_ID.into()]);
+    match census::ask_for(&api, &call, proxy.config.census_timeout).await {
+        (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
+        _ => None,
+    }
+}
+
+/// Ends rosout in order.
+pub async fn stop(proxy: &Proxy) {
+    let pid = proxy.rosout.load(Ordering::Relaxed);
+    if pid != 0 && supervisor::runs(pid, "rosout") {
+        supervisor::stop(pid, || !supervisor::runs(pid, "rosout")).await;
+    }
+}

@@ -1,0 +1,253 @@
+//! Brings a connected master to the mirror's state, or the mirror to the master's.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use thiserror::Error;
+use tokio::task::JoinHandle;
+
+use super::report::{Counts, Outcome};
+use crate::{
+    lifecycle::Input,
+    master::{FirstLook, Master, Plan},
+    proxy::{
+        Proxy,
+        gate::{Keeper, StandIn, State},
+        look::{self, LookError},
+        upstream::{CallError, Connection},
+    },
+    xmlrpc::{self, Call},
+};
+
+/// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
+const INJECTION_LIMIT: Duration = Duration::from_secs(60);
+/// A master that differs from what was injected is looked at and mended so often.
+const ROUNDS: u32 = 3;
+
+/// A master that could not be examined.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ExamineError {
+    /// It does not answer.
+    #[error("no answer within {limit:?}")]
+    Silent {
+        /// The deadline.
+        limit: Duration,
+    },
+    /// A call of ours failed, or what answers is no master.
+    #[error(transparent)]
+    Look(#[from] LookError),
+}
+
+impl From<CallError> for ExamineError {
+    fn from(error: CallError) -> Self {
+        Self::Look(error.into())
+    }
+}
+
+impl ExamineError {
+    /// What it means for the lifecycle.
+    pub fn as_input(&self) -> Input {
+        match self {
+            Self::Silent { .. } => Input::Unreachable,
+            Self::Look(LookError::Call(
+                CallError::NotSent(error) | CallError::MaybeSent(error),
+            )) if !error.is_parse() => Input::ConnectionLost,
+            Self::Look(_) => Input::NotAMaster,
+        }
+    }
+}
+
+/// What an examination came to.
+#[derive(Debug)]
+pub struct Examination {
+    /// How the master came to hold the state.
+    pub outcome: Outcome,
+    /// The master's process id.
+    pub pid: i32,
+    /// What it holds.
+    pub counts: Counts,
+    /// What was not injected, and why.
+    pub skipped: Vec<String>,
+    /// Where it differs nevertheless.
+    pub mismatches: Vec<String>,
+    /// How long the look took.
+    pub look: Duration,
+    /// How long the injection took.
+    pub injection: Duration,
+}
+
+/// An injection into an empty master, made ready while the new master starts.
+#[derive(Debug)]
+pub struct Prepared {
+    version: u64,
+    plan: Plan,
+    body: Bytes,
+}
+
+impl Prepared {
+    fn new(proxy: &Proxy, version: u64, target: &Master, found: &Master) -> Self {
+        let plan = Plan::new(target, found, &proxy.mark);
+        let body = Bytes::from(xmlrpc::encode_call(plan.call()));
+        Self {
+            version,
+            plan,
+            body,
+        }
+    }
+}
+
+/// Makes an injection ready beside everything else.
+pub fn prepare(proxy: &Arc<Proxy>) -> JoinHandle<Prepared> {
+    let proxy = proxy.clone();
+    tokio::task::spawn_blocking(move || {
+        let version = proxy.shadow.version();
+        let target = proxy.shadow.with_mirror(Clone::clone);
+        Prepared::new(&proxy, version, &target, &Master::default())
+    })
+}
+
+/// Examines the master behind `connection`. `resumable`: this process has served it before, if it
+/// bears the mark.
+pub async fn examine(
+    proxy: &Arc<Proxy>,
+    keeper: &Keeper,
+    connection: &mut Connection,
+    resumable: bool,
+    prepared: Option<JoinHandle<Prepared>>,
+) -> Result<Examination, ExamineError> {
+    let start = Instant::now();
+    let first = first_look(proxy, connection).await?;
+    let mut examination = Examination {
+        outcome: Outcome::Resumed,
+        pid: first.pid(),
+        counts: Counts::default(),
+        skipped: Vec::new(),
+        mismatches: Vec::new(),
+        look: start.elapsed(),
+        injection: Duration::ZERO,
+    };
+    if first.marked() && resumable {
+        pay_owed(proxy, connection).await?;
+    } else if first.marked() {
+        let previous = proxy.shadow.with_mirror(Clone::clone);
+        let held = second_look(first, connection, &previous).await?;
+        proxy.shadow.succeed();
+        proxy.shadow.adopt(held);
+        examination.outcome = Outcome::Adopted;
+        examination.look = start.elapsed();
+    } else {
+        inject(
+            proxy,
+            keeper,
+            connection,
+            first,
+            prepared,
+            start,
+            &mut examination,
+        )
+        .await?;
+    }
+    examination.injection = start.elapsed().saturating_sub(examination.look);
+    examination.counts = proxy.shadow.with_mirror(Counts::of);
+    Ok(examination)
+}
+
+/// Tells the same incarnation of the unregistrations that were taken while it did not answer.
+async fn pay_owed(proxy: &Proxy, connection: &mut Connection) -> Result<(), ExamineError> {
+    let owed = proxy.shadow.owed();
+    if !owed.is_empty() {
+        let count = owed.len();
+        within(INJECTION_LIMIT, connection.call(&Call::multicall(owed))).await?;
+        proxy.shadow.paid(count);
+    }
+    Ok(())
+}
+
+async fn inject(
+    proxy: &Arc<Proxy>,
+    keeper: &Keeper,
+    connection: &mut Connection,
+    first: FirstLook,
+    prepared: Option<JoinHandle<Prepared>>,
+    start: Instant,
+    examination: &mut Examination,
+) -> Result<(), ExamineError> {
+    // From here to the open gate the mirror must not change: it is what is being injected.
+    if keeper.state() == State::Shut(StandIn::Unregistrations) {
+        keeper.set(State::Shut(StandIn::Reads));
+    }
+    let target = proxy.shadow.succeed();
+    let empty = first.is_empty();
+    let ready = match prepared {
+        Some(prepared) if empty => prepared.await.ok(),
+        _ => None,
+    };
+    let found = match empty {
+        true => Master::default(),
+        false => second_look(first, connection, &Master::default()).await?,
+    };
+    examination.look = start.elapsed();
+    // Nothing of ours to bring: a running system is taken over.
+    let takes_over = target.is_empty() && !found.is_empty();
+    examination.outcome = if takes_over {
+        Outcome::Adopted
+    } else {
+        Outcome::Injected
+    };
+    let version = proxy.shadow.version();
+    let mut next = ready
+        .filter(|ready| ready.version == version)
+        .unwrap_or_else(|| Prepared::new(proxy, version, &target, &found));
+    for round in 1..=ROUNDS {
+        let Prepared { plan, body, .. } = next;
+        let reply = within(INJECTION_LIMIT, connection.call_encoded(body)).await?;
+        examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
+        let Err(mismatches) = plan.verify(&reply) else {
+            examination.mismatches.clear();
+            proxy.shadow.adopt(plan.expected().clone());
+            proxy.stats.injections.count();
+            return Ok(());
+        };
+        examination.mismatches = mismatches.iter().map(ToString::to_string).collect();
+        tracing::error!(
+            round,
+            mismatches = ?examination.mismatches,
+            "the master differs from what was injected"
+        );
+        // The truth of the master wins over what we expected of it; the rest is tried again.
+        let first = first_look(proxy, connection).await?;
+        let found = second_look(first, connection, plan.expected()).await?;
+        next = Prepared::new(proxy, version, &target, &found);
+        if round == ROUNDS {
+            proxy.shadow.adopt(found);
+        }
+    }
+    Ok(())
+}
+
+async fn first_look(proxy: &Proxy, connection: &mut Connection) -> Result<FirstLook, ExamineError> {
+    let limit = proxy.config.probe_timeout * proxy.config.probing.count;
+    within(limit, look::first(connection, &proxy.mark)).await
+}
+
+async fn second_look(
+    first: FirstLook,
+    connection: &mut Connection,
+    previous: &Master,
+) -> Result<Master, ExamineError> {
+    within(INJECTION_LIMIT, look::second(first, connection, previous)).await
+}
+
+async fn within<T, E: Into<ExamineError>>(
+    limit: Duration,
+    work: impl Future<Output = Result<T, E>>,
+) -> Result<T, ExamineError> {
+    match tokio::time::timeout(limit, work).await {
+        Ok(result) => result.map_err(Into::into),
+        Err(_) => Err(ExamineError::Silent { limit }),
+    }
+}

@@ -1,0 +1,466 @@
+//! Watches the master and brings it back: the shell around [`crate::lifecycle`].
+
+pub mod census;
+pub mod core_duties;
+pub mod examine;
+pub mod master_process;
+pub mod report;
+
+use std::{
+    pin::Pin,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use self::{
+    examine::{Examination, ExamineError, Prepared},
+    master_process::MasterProcess,
+    report::{Outcome, Phases, Report},
+};
+use crate::{
+    clock,
+    lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    proxy::{
+        Proxy,
+        gate::{Keeper, StandIn, State},
+        upstream::{ConnectError, Connection},
+    },
+    supervisor::SupervisorError,
+    xmlrpc::Call,
+};
+
+/// A message about a state that lasts is repeated after this time.
+const REPEAT: Duration = Duration::from_secs(10);
+
+/// What a step under way ends in. Steps exclude one another.
+enum Done {
+    Connected(Connection),
+    NotConnected(ConnectError),
+    Examined(Connection, Result<Examination, ExamineError>),
+    Probed(Connection, bool),
+}
+
+type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
+type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// The time since which calls have not passed.
+#[derive(Clone, Copy)]
+struct Outage {
+    cause: &'static str,
+    since: Instant,
+    wall: f64,
+    /// When the master's port was open again.
+    port_open: Option<Instant>,
+}
+
+impl Outage {
+    fn begin(cause: &'static str) -> Self {
+        Self {
+            cause,
+            since: Instant::now(),
+            wall: clock::wall_time(),
+            port_open: None,
+        }
+    }
+}
+
+/// Carries out what the lifecycle decides.
+pub struct Guard {
+    proxy: Arc<Proxy>,
+    keeper: Keeper,
+    lifecycle: Lifecycle,
+    process: Option<MasterProcess>,
+    connection: Option<Connection>,
+    /// Resolves when the connection to the master ends.
+    ended: Option<Ended>,
+    step: Option<Step>,
+    probe_deadline: Option<tokio::time::Instant>,
+    prepared: Option<JoinHandle<Prepared>>,
+    outage: Outage,
+    /// This process has served a master.
+    served: bool,
+    /// The mirror is known to be a master's state, so that it may stand in.
+    known: bool,
+    said: Option<(String, Instant)>,
+}
+
+impl Guard {
+    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
+    /// mirror comes from a checkpoint whose session goes on.
+    pub fn new(
+        proxy: Arc<Proxy>,
+        keeper: Keeper,
+        process: Option<MasterProcess>,
+        restored: bool,
+    ) -> Self {
+        let supervision = match process {
+            Some(_) => Supervision::Ours,
+            None => Supervision::Theirs,
+        };
+        Self {
+            lifecycle: Lifecycle::new(supervision, proxy.config.probing),
+            proxy,
+            keeper,
+            process,
+            connection: None,
+            ended: None,
+            step: None,
+            probe_deadline: None,
+            prepared: None,
+            outage: Outage::begin("start"),
+            served: false,
+            known: restored,
+            said: None,
+        }
+    }
+
+    /// Watches the master until `stop`. An error: no master can be started at all.
+    pub async fn run(
+        mut self,
+        stop: CancellationToken,
+    ) -> Result<Option<MasterProcess>, SupervisorError> {
+        if self.known {
+            self.keeper.set(State::Shut(StandIn::Unregistrations));
+        }
+        self.prepared = Some(examine::prepare(&self.proxy));
+        let remembered = self
+            .process
+            .as_ref()
+            .is_some_and(MasterProcess::is_remembered);
+        let mut input = Input::Start { remembered };
+        loop {
+            for action in self.lifecycle.on(Instant::now(), input) {
+                tracing::debug!(?input, ?action, "lifecycle");
+                self.carry_out(action)?;
+            }
+            if input == Input::Stop {
+                return Ok(self.process);
+            }
+            input = match self.process.as_mut().and_then(MasterProcess::take_news) {
+                Some(news) => news,
+                None => self.next_input(&stop).await,
+            };
+        }
+    }
+
+    async fn next_input(&mut self, stop: &CancellationToken) -> Input {
+        loop {
+            let wake = self
+                .lifecycle
+                .deadline()
+                .map(tokio::time::Instant::from_std);
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return Input::Stop,
+                () = pending(&mut self.ended) => {
+                    self.disconnect();
+                    return Input::ConnectionLost;
+                }
+                () = exited(&mut self.process) => {
+                    self.disconnect();
+                    return Input::Exited;
+                }
+                done = pending(&mut self.step) => {
+                    self.step = None;
+                    if let Some(input) = self.done(done) {
+                        return input;
+                    }
+                }
+                () = sleep_until(self.probe_deadline) => {
+                    self.probe_deadline = None;
+                    return Input::ProbeMissed;
+                }
+                () = sleep_until(wake) => return Input::Wake,
+            }
+        }
+    }
+
+    fn carry_out(&mut self, action: Action) -> Result<(), SupervisorError> {
+        match action {
+            Action::Connect => {
+                self.disconnect();
+                let proxy = self.proxy.clone();
+                self.step = Some(Box::pin(async move {
+                    match proxy.upstream.connect().await {
+                        Ok(connection) => Done::Connected(connection),
+                        Err(error) => Done::NotConnected(error),
+                    }
+                }));
+            }
+            Action::Examine => {
+                let Some(mut connection) = self.connection.take() else {
+                    return Ok(());
+                };
+                let (proxy, keeper) = (self.proxy.clone(), self.keeper.clone());
+                let (resumable, prepared) = (self.served, self.prepared.take());
+                self.step = Some(Box::pin(async move {
+                    let examined =
+                        examine::examine(&proxy, &keeper, &mut connection, resumable, prepared);
+                    let examined = examined.await;
+                    Done::Examined(connection, examined)
+                }));
+            }
+            Action::Probe => {
+                // A probe that was missed goes on: its answer counts whenever it comes.
+                self.probe_deadline =
+                    Some(tokio::time::Instant::now() + self.proxy.config.probe_timeout);
+                if let Some(mut connection) = self.connection.take() {
+                    self.step = Some(Box::pin(async move {
+                        let call = Call::new("getPid", vec!["/rosrescue".into()]);
+                        let answered = connection.call(&call).await.is_ok();
+                        Done::Probed(connection, answered)
+                    }));
+                }
+            }
+            Action::ShutGate(cause) => self.shut_gate(cause),
+            Action::OpenGate => self.open_gate(),
+            Action::Spawn => self.spawn()?,
+            Action::Kill => {
+                self.disconnect();
+                let pid = self.proxy.board.master_pid();
+                if let Some(process) = &mut self.process {
+                    process.kill(pid);
+                }
+            }
+            Action::ReportCrashLoop(deaths) => {
+                self.proxy.board.set_crash_loop(true);
+                let words = self.process.as_ref().map(MasterProcess::last_words);
+                tracing::error!(
+                    deaths,
+                    last_words = words.unwrap_or_default(),
+                    "crash loop: the master has died {deaths} times within a minute; it is \
+                     restarted with growing pauses"
+                );
+            }
+        }
+        Ok(())
+    }
+
+    fn done(&mut self, done: Done) -> Option<Input> {
+        match done {
+            Done::Connected(connection) => {
+                self.outage.port_open = Some(Instant::now());
+                self.ended = Some(Box::pin(connection.ended()));
+                self.connection = Some(connection);
+                Some(Input::Connected)
+            }
+            Done::NotConnected(error) => {
+                self.say_waiting(&error.to_string());
+                Some(match error {
+                    ConnectError::Refused { .. } => Input::Refused,
+                    ConnectError::Unreachable { .. } => Input::Unreachable,
+                })
+            }
+            Done::Examined(connection, Ok(examination)) => {
+                self.connection = Some(connection);
+                self.report(examination);
+                Some(Input::Examined)
+            }
+            Done::Examined(_, Err(error)) => {
+                self.disconnect();
+                let master = self.proxy.upstream.address();
+                let input = error.as_input();
+                if input == Input::NotAMaster {
+                    self.say(format!(
+                        "what answers at {master} is not a ROS master: {error}"
+                    ));
+                } else {
+                    self.say(format!(
+                        "the master at {master} could not be examined: {error}"
+                    ));
+                }
+                Some(input)
+            }
+            Done::Probed(connection, answered) => {
+                self.connection = Some(connection);
+                // Without an answer the connection has ended, which is told apart.
+                answered.then(|| {
+                    self.probe_deadline = None;
+                    Input::ProbeAnswered
+                })
+            }
+        }
+    }
+
+    fn disconnect(&mut self) {
+        // An injection that was under way froze the mirror.
+        if matches!(self.keeper.state(), State::Shut(_)) {
+            self.keeper.set(State::Shut(self.stand_in()));
+        }
+        self.connection = None;
+        self.ended = None;
+        self.step = None;
+        self.probe_deadline = None;
+    }
+
+    fn stand_in(&self) -> StandIn {
+        if self.known {
+            StandIn::Unregistrations
+        } else {
+            StandIn::Nobody
+        }
+    }
+
+    fn shut_gate(&mut self, cause: Cause) {
+        self.keeper.set(State::Shut(self.stand_in()));
+        self.outage = Outage::begin(cause.as_str());
+        if cause == Cause::Stopping {
+            return;
+        }
+        if cause == Cause::Hung {
+            self.disconnect();
+        }
+        tracing::warn!(cause = cause.as_str(), "the gate is shut");
+        self.proxy.board.set_open(false);
+        self.prepared = Some(examine::prepare(&self.proxy));
+    }
+
+    fn open_gate(&mut self) {
+        self.known = true;
+        self.served = true;
+        self.said = None;
+        let incarnation = self.proxy.shadow.incarnation();
+        self.keeper.set(State::Open { incarnation });
+        self.proxy.board.set_open(true);
+        self.proxy.board.set_crash_loop(false);
+    }
+
+    fn spawn(&mut self) -> Result<(), SupervisorError> {
+        let Some(process) = &mut self.process else {
+            return Ok(());
+        };
+        match process.spawn(&self.proxy) {
+            Ok(()) => Ok(()),
+            // At the start there is nothing to protect yet: better to say so than to try for ever.
+            Err(error) if !self.served && !self.known => Err(error),
+            Err(error) => {
+                tracing::error!(%error, "cannot start a master");
+                process.report_failure();
+                Ok(())
+            }
+        }
+    }
+
+    /// Reports what an examination came to; census and healing add to the report when they end.
+    fn report(&mut self, examination: Examination) {
+        let now = Instant::now();
+        let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
+        let Outage {
+            cause,
+            since,
+            wall,
+            port_open,
+        } = self.outage;
+        let total = now.duration_since(since);
+        let absence = port_open.map_or(total, |open| open.duration_since(since));
+        let report = Report {
+            cause,
+            detected_at: wall,
+            outcome: examination.outcome,
+            master_pid: examination.pid,
+            phases: Phases {
+                absence_ms: ms(absence),
+                look_ms: ms(examination.look),
+                injection_ms: ms(examination.injection),
+                total_ms: ms(total),
+            },
+            restored: examination.counts,
+            skipped: examination.skipped,
+            mismatches: examination.mismatches,
+            removed: Vec::new(),
+            suspects: Vec::new(),
+            healed: Vec::new(),
+        };
+        self.proxy
+            .shadow
+            .set_identity(examination.pid, self.proxy.uri.clone());
+        let Phases {
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+        } = report.phases;
+        tracing::info!(
+            cause, absence_ms, look_ms, injection_ms, total_ms,
+            master_pid = report.master_pid,
+            skipped = ?report.skipped,
+            "{}: {}",
+            describe(report.outcome),
+            report.restored
+        );
+        let resumed = report.outcome == Outcome::Resumed;
+        self.proxy.board.set_report(report);
+        if !resumed {
+            tokio::spawn(after_recovery(self.proxy.clone(), since));
+        }
+    }
+
+    fn say_waiting(&mut self, what: &str) {
+        // A child that is about to listen needs no message.
+        if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
+            || self.outage.since.elapsed() > REPEAT
+        {
+            self.say(format!("waiting for the master: {what}"));
+        }
+    }
+
+    /// Warns, at most once in [`REPEAT`] for the same text.
+    fn say(&mut self, text: String) {
+        let now = Instant::now();
+        let again = self
+            .said
+            .as_ref()
+            .is_none_or(|(said, at)| *said != text || now.duration_since(*at) >= REPEAT);
+        if again {
+            tracing::warn!("{text}");
+            self.said = Some((text, now));
+        }
+    }
+}
+
+fn describe(outcome: Outcome) -> &'static str {
+    match outcome {
+        Outcome::Injected => "the master has been restored",
+        Outcome::Adopted => "a running master has been taken over",
+        Outcome::Resumed => "the same master goes on",
+    }
+}
+
+/// Census and healing, beside traffic.
+async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
+    let mut gate = proxy.gate.clone();
+    while !matches!(gate.look(), State::Open { .. }) {
+        gate.changed().await;
+    }
+    let noticed = proxy.shadow.topics_noticed(outage);
+    let census = census::census(&proxy).await;
+    let healed = census::heal(&proxy, noticed).await;
+    if !census.removed.is_empty() || !census.suspects.is_empty() || !healed.is_empty() {
+        tracing::info!(removed = ?census.removed, suspects = ?census.suspects, ?healed, "census");
+    }
+    proxy.board.add_to_report(census, healed);
+}
+
+async fn pending<T>(future: &mut Option<Pin<Box<dyn Future<Output = T> + Send>>>) -> T {
+    match future {
+        Some(future) => future.as_mut().await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn exited(process: &mut Option<MasterProcess>) {
+    match process {
+        Some(process) => process.exited().await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn sleep_until(deadline: Option<tokio::time::Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}

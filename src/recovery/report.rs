@@ -1,0 +1,109 @@
+//! What a recovery did, and how long each part of it took.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use crate::master::Master;
+
+/// How the present master came to hold the state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// A new incarnation was brought to the mirror's state.
+    Injected,
+    /// The mirror took over what a running master holds.
+    Adopted,
+    /// It is the same incarnation as before.
+    Resumed,
+}
+
+/// Sizes of a state.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Counts {
+    /// Nodes.
+    pub nodes: usize,
+    /// Registrations as publisher.
+    pub publishers: usize,
+    /// Registrations as subscriber.
+    pub subscribers: usize,
+    /// Services.
+    pub services: usize,
+    /// Parameters, counted as leaves of the tree.
+    pub params: usize,
+    /// Subscriptions to parameters.
+    pub param_subscribers: usize,
+}
+
+impl Counts {
+    /// The sizes of `state`.
+    pub fn of(state: &Master) -> Self {
+        let counts = state.counts();
+        Self {
+            nodes: counts.nodes,
+            publishers: counts.publishers,
+            subscribers: counts.subscribers,
+            services: counts.services,
+            params: counts.params,
+            param_subscribers: counts.param_subscribers,
+        }
+    }
+}
+
+impl fmt::Display for Counts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            nodes,
+            publishers,
+            subscribers,
+            services,
+            params,
+            param_subscribers,
+        } = self;
+        write!(
+            f,
+            "{nodes} nodes, {publishers} publishers, {subscribers} subscribers, {services} \
+             services, {params} parameters, {param_subscribers} parameter subscriptions"
+        )
+    }
+}
+
+/// Durations in milliseconds.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Phases {
+    /// From the shut gate to the master's open port.
+    pub absence_ms: f64,
+    /// The look at what the master holds.
+    pub look_ms: f64,
+    /// Injection and reading back.
+    pub injection_ms: f64,
+    /// From the shut gate to the open gate.
+    pub total_ms: f64,
+}
+
+/// One recovery.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Why the gate was shut.
+    pub cause: &'static str,
+    /// When the gate was shut: seconds since 1970 by the wall clock, for comparison with logs.
+    pub detected_at: f64,
+    /// How the master came to hold the state.
+    pub outcome: Outcome,
+    /// The master's process id, as it says.
+    pub master_pid: i32,
+    /// How long it took.
+    pub phases: Phases,
+    /// What the master holds now.
+    pub restored: Counts,
+    /// What was not injected, and why.
+    pub skipped: Vec<String>,
+    /// Where the master, read back, differs from what was injected. Should be empty.
+    pub mismatches: Vec<String>,
+    /// Nodes that were found dead and taken out.
+    pub removed: Vec<String>,
+    /// Nodes that did not answer and were kept.
+    pub suspects: Vec<String>,
+    /// Topics whose subscribers were sent the full list of publishers.
+    pub healed: Vec<String>,
+}

@@ -1,0 +1,342 @@
+//! Child processes: finds, starts and ends rosmaster and rosout. It reports, and never decides.
+
+use std::{
+    fs::{File, OpenOptions},
+    io,
+    net::{Ipv4Addr, SocketAddrV4},
+    os::unix::fs::OpenOptionsExt,
+    path::{Path, PathBuf},
+    process::{ExitStatus, Stdio},
+    time::Duration,
+};
+
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use socket2::{Domain, Socket, Type};
+use thiserror::Error;
+use tokio::process::{Child, Command};
+
+use crate::config::SupervisedConfig;
+
+/// How long a process may take to end after SIGINT, and again after SIGTERM.
+const STOP_TIME: Duration = Duration::from_secs(2);
+/// Where ROS installs programs that are not on the PATH.
+const ROS_PREFIXES: &str = "/opt/ros";
+/// rosmaster's default logging also has a handler for the screen, which imports half of rospy: a
+/// file-only configuration halves its start (132 against 72 ms) and leaves master.log as it is.
+const LOG_CONFIG: &str = "\
+# Written by rosrescue for the rosmaster that it supervises: as ROS's own, without the screen.
+[loggers]
+keys=root
+[handlers]
+keys=file
+[formatters]
+keys=default
+[logger_root]
+level=INFO
+handlers=file
+[handler_file]
+class=handlers.RotatingFileHandler
+level=DEBUG
+formatter=default
+args=(os.environ['ROS_LOG_FILENAME'],'a', 50000000, 4)
+[formatter_default]
+format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
+";
+
+/// A child process that cannot be had.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum SupervisorError {
+    /// No rosmaster anywhere.
+    #[error(
+        "no rosmaster is on the PATH or in /opt/ros/*/bin: install it (apt-get install \
+         python3-rosmaster, or ros-noetic-rosmaster), source ROS's setup.bash, or name it with \
+         --rosmaster"
+    )]
+    NoRosmaster,
+    /// `--rosmaster` names no program.
+    #[error("--rosmaster: `{}` is not a program that can be run", path.display())]
+    NotAProgram {
+        /// What was named.
+        path: PathBuf,
+    },
+    /// The port of the master is taken.
+    #[error("--master-port: port {port} on loopback is in use; choose another one")]
+    PortInUse {
+        /// The port.
+        port: u16,
+    },
+    /// The system would not start it.
+    #[error("cannot start `{}`: {source}", program.display())]
+    Spawn {
+        /// The program.
+        program: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// Starts rosmasters.
+#[derive(Debug)]
+pub struct Rosmaster {
+    program: PathBuf,
+    config: SupervisedConfig,
+    /// What the last one wrote to stdout and stderr.
+    output: PathBuf,
+    log_config: Option<PathBuf>,
+}
+
+impl Rosmaster {
+    /// Finds the program. Files of its own go beside `checkpoint`.
+    pub fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, SupervisorError> {
+        let program = match &config.rosmaster {
+            Some(path) if is_program(path) => path.clone(),
+            Some(path) => return Err(SupervisorError::NotAProgram { path: path.clone() }),
+            None => find_program("rosmaster", &["bin"]).ok_or(SupervisorError::NoRosmaster)?,
+        };
+        let beside = |suffix: &str| {
+            let mut name = checkpoint.as_os_str().to_owned();
+            name.push(suffix);
+            PathBuf::from(name)
+        };
+        let log_config = beside(".rosmaster-logging.conf");
+        // Unless the person has a configuration of his own; and without one it is only slower.
+        let own = std::env::var_os("ROS_PYTHON_LOG_CONFIG_FILE").is_some();
+        let log_config =
+            (!own && std::fs::write(&log_config, LOG_CONFIG).is_ok()).then_some(log_config);
+        let output = beside(".rosmaster-output.log");
+        Ok(Self {
+            program,
+            config: config.clone(),
+            output,
+            log_config,
+        })
+    }
+
+    /// Where its port should be: the given one, else `remembered` if that is free, else a free one.
+    pub fn choose_port(&self, remembered: Option<u16>) -> Result<u16, SupervisorError> {
+        if let Some(port) = self.config.port {
+            return if is_free(port) {
+                Ok(port)
+            } else {
+                Err(SupervisorError::PortInUse { port })
+            };
+        }
+        if let Some(port) = remembered.filter(|port| is_free(*port)) {
+            return Ok(port);
+        }
+        let spawn_error = |source| SupervisorError::Spawn {
+            program: self.program.clone(),
+            source,
+        };
+        free_port().map_err(spawn_error)
+    }
+
+    /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
+    pub fn spawn(&self, port: u16) -> Result<Child, SupervisorError> {
+        let mut command = Command::new(&self.program);
+        command.arg("--core").arg("-p").arg(port.to_string());
+        command.arg("-w").arg(self.config.numworkers.to_string());
+        if self.config.timeout > 0.0 {
+            command.arg("-t").arg(self.config.timeout.to_string());
+        }
+        // Loopback only: nodes come through us.
+        command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
+        command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
+        if let Some(config) = &self.log_config {
+            command.env("ROS_PYTHON_LOG_CONFIG_FILE", config);
+        }
+        let (stdout, stderr) = match create(&self.output) {
+            Ok(file) => (
+                file.try_clone().map_or_else(|_| Stdio::null(), Stdio::from),
+                file.into(),
+            ),
+            Err(_) => (Stdio::null(), Stdio::null()),
+        };
+        // A group of its own: Ctrl-C in our terminal is for us to handle.
+        command
+            .stdin(Stdio::null())
+            .stdout(stdout)
+            .stderr(stderr)
+            .process_group(0);
+        command.spawn().map_err(|source| SupervisorError::Spawn {
+            program: self.program.clone(),
+            source,
+        })
+    }
+
+    /// The end of what the last rosmaster wrote, for the message that it died early.
+    pub fn last_words(&self) -> String {
+        let text = std::fs::read(&self.output).unwrap_or_default();
+        let tail = text
+            .get(text.len().saturating_sub(400)..)
+            .unwrap_or_default();
+        String::from_utf8_lossy(tail).trim().to_owned()
+    }
+}
+
+fn create(path: &Path) -> io::Result<File> {
+    OpenOptions::new()
+        .write(true)
+        .create(true)
+        .truncate(true)
+        .mode(0o600)
+        .open(path)
+}
+
+/// The command that runs rosout as a node of the master at `uri`.
+pub fn rosout(uri: &str) -> Option<Command> {
+    let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
+        Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
+    })?;
+    let mut command = Command::new(program);
+    command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
+    command
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .process_group(0);
+    Some(command)
+}
+
+/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `gone` says whether
+/// it has ended.
+pub async fn stop(pid: u32, mut gone: impl FnMut() -> bool) {
+    for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
+        signal_process(pid, signal);
+        let patience = tokio::time::Instant::now() + STOP_TIME;
+        while tokio::time::Instant::now() < patience {
+            if gone() {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        tracing::warn!(pid, ?signal, "a process did not end in time");
+    }
+}
+
+/// Sends a signal; a process that is not there needs none.
+pub fn signal_process(pid: u32, signal: Signal) {
+    if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
+        let _ = kill_process(pid, signal);
+    }
+}
+
+/// Whether a process with this pid exists.
+pub fn is_alive(pid: u32) -> bool {
+    i32::try_from(pid)
+        .ok()
+        .and_then(Pid::from_raw)
+        .is_some_and(|pid| test_kill_process(pid).is_ok())
+}
+
+/// Whether the process `pid` runs a program of this name, judged by its command line: a pid that we
+/// remember may be somebody else's by now.
+pub fn runs(pid: u32, name: &str) -> bool {
+    let command_line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    command_line.split(|byte| *byte == 0).any(|argument| {
+        let argument = String::from_utf8_lossy(argument);
+        Path::new(&*argument)
+            .file_name()
+            .is_some_and(|file| file == name)
+    })
+}
+
+/// How a process ended, in words.
+pub fn describe(status: ExitStatus) -> String {
+    use std::os::unix::process::ExitStatusExt;
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("exit status {code}"),
+        (None, Some(signal)) => format!("signal {signal}"),
+        (None, None) => "an unknown end".to_owned(),
+    }
+}
+
+/// The first line that `program` prints within `limit`, as roslaunch's `command=` would take it.
+pub async fn output_of(program: &str, arguments: &[&str], limit: Duration) -> Option<String> {
+    let mut command = Command::new(find_program(program, &["bin"])?);
+    command
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .kill_on_drop(true);
+    let output = tokio::time::timeout(limit, command.output())
+        .await
+        .ok()?
+        .ok()?;
+    output
+        .status
+        .success()
+        .then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// A program on the PATH, else in one of `folders` of an installed ROS.
+fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let on_path = std::env::split_paths(&path)
+        .map(|folder| folder.join(name))
+        .find(|p| is_program(p));
+    on_path.or_else(|| {
+        let mut distributions: Vec<_> = std::fs::read_dir(ROS_PREFIXES)
+            .ok()?
+            .flatten()
+            .map(|entry| entry.path())
+            .collect();
+        // The latest by name, as in kinetic, melodic, noetic.
+        distributions.sort();
+        let candidates = distributions.iter().rev();
+        let mut programs =
+            candidates.flat_map(|prefix| folders.iter().map(|f| prefix.join(f).join(name)));
+        programs.find(|path| is_program(path))
+    })
+}
+
+fn is_program(path: &Path) -> bool {
+    use std::os::unix::fs::PermissionsExt;
+    path.metadata()
+        .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
+}
+
+/// Whether rosmaster, which sets SO_REUSEADDR, could listen there.
+fn is_free(port: u16) -> bool {
+    bind_loopback(port).is_ok()
+}
+
+fn free_port() -> io::Result<u16> {
+    let address = bind_loopback(0)?.local_addr()?;
+    address
+        .as_socket()
+        .map(|address| address.port())
+        .ok_or_else(|| io::ErrorKind::AddrNotAvailable.into())
+}
+
+fn bind_loopback(port: u16) -> io::Result<Socket> {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, None)?;
+    socket.set_reuse_address(true)?;
+    socket.bind(&SocketAddrV4::new(Ipv4Addr::LOCALHOST, port).into())?;
+    socket.listen(1)?;
+    Ok(socket)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_in_use_is_not_free() {
+        let socket = bind_loopback(0).unwrap();
+        let port = socket.local_addr().unwrap().as_socket().unwrap().port();
+        assert!(!is_free(port));
+        drop(socket);
+        assert!(is_free(port));
+    }
+
+    #[test]
+    fn a_process_is_known_by_its_program() {
+        let own = std::env::current_exe().unwrap();
+        let name = own.file_name().unwrap().to_str().unwrap();
+        assert!(runs(std::process::id(), name));
+        assert!(!runs(std::process::id(), "rosmaster"));
+        assert!(is_alive(std::process::id()));
+    }
+}
