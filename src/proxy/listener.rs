@@ -157,7 +157,9 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
         service_fn(move |request| service::serve(proxy.clone(), peer, pace.clone(), request));
     let connection = hyper::server::conn::http1::Builder::new()
         .title_case_headers(true)
-        .half_close(true)
+        // A client that has gone away does not get its call run after an outage: it would register
+        // a node that is dead. No ROS client shuts down its side and still waits for an answer.
+        .half_close(false)
         .pipeline_flush(true)
         .serve_connection(io, service);
     let mut connection = std::pin::pin!(connection);

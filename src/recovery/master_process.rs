@@ -9,6 +9,9 @@ use crate::{
     supervisor::{self, Rosmaster, SupervisorError},
 };
 
+/// A child's process id, and how it ended.
+type End = (u32, String);
+
 /// The master that we start, and end.
 #[derive(Debug)]
 pub struct MasterProcess {
@@ -18,7 +21,7 @@ pub struct MasterProcess {
     /// Our child, while it has not been reported gone.
     child: Option<u32>,
     /// Ends of children.
-    ends: (mpsc::Sender<u32>, mpsc::Receiver<u32>),
+    ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     /// What a command to spawn came to; to be fed to the lifecycle next.
     news: Option<Input>,
 }
@@ -60,18 +63,12 @@ impl MasterProcess {
         tracing::info!(pid, port, "started rosmaster");
         let ends = self.ends.0.clone();
         tokio::spawn(async move {
-            match child.wait().await {
-                Ok(status) => {
-                    tracing::warn!(
-                        pid,
-                        "rosmaster has ended with {}",
-                        supervisor::describe(status)
-                    );
-                }
-                Err(error) => tracing::error!(pid, %error, "cannot wait for rosmaster"),
-            }
+            let how = match child.wait().await {
+                Ok(status) => supervisor::describe(status),
+                Err(error) => error.to_string(),
+            };
             // The receiver is gone only when nobody cares any more.
-            let _ = ends.send(pid).await;
+            let _ = ends.send((pid, how)).await;
         });
         self.port = Some(port);
         self.child = Some(pid);
@@ -93,7 +90,8 @@ impl MasterProcess {
     pub async fn exited(&mut self) {
         loop {
             match self.ends.1.recv().await {
-                Some(pid) if Some(pid) == self.child => {
+                Some((pid, how)) if Some(pid) == self.child => {
+                    tracing::warn!(pid, how, "rosmaster has ended");
                     self.child = None;
                     return;
                 }
@@ -118,7 +116,7 @@ impl MasterProcess {
         let child = self.child == Some(pid);
         supervisor::stop(pid, || match child {
             // It is reaped by the task that waits for it.
-            true => self.ends.1.try_recv().is_ok_and(|ended| ended == pid),
+            true => self.ends.1.try_recv().is_ok_and(|(ended, _)| ended == pid),
             false => !supervisor::is_alive(pid),
         })
         .await;

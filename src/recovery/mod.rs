@@ -347,7 +347,7 @@ impl Guard {
     /// Reports what an examination came to; census and healing add to the report when they end.
     fn report(&mut self, examination: Examination) {
         let now = Instant::now();
-        let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
+        let ms = |duration: Duration| (duration.as_secs_f64() * 1e5).round() / 1e2;
         let Outage {
             cause,
             since,
