@@ -21,10 +21,12 @@ use crate::{
     config::{Config, MasterConfig},
     master::{Mark, Master},
     proxy::{
-        Proxy, gate, keeper,
+        Proxy,
+        clients::Clients,
+        gate, keeper,
         lane::{self, LaneRunner},
         listener::{self, ListenError},
-        pool::Pool,
+        pool::{self, Pool},
         shadow::Shadow,
         stats::Stats,
         upstream::Upstream,
@@ -40,12 +42,14 @@ use crate::{
     ros_env::MasterUri,
     session::{self, Decision, Evidence},
     store::{self, OpenError, Store},
-    supervisor::{Rosmaster, SupervisorError},
-    xmlrpc::Call,
+    supervisor::{self, Rosmaster, SupervisorError},
+    xmlrpc::{Call, Reply, Value},
 };
 
 /// How long nodes have to show that a session goes on.
 const LIFE_SIGN: Duration = Duration::from_secs(1);
+/// So many bodies of the largest size may be in memory at the same time.
+const LARGE_BODIES: usize = 4;
 /// How long connections have to end at the stop.
 const DRAIN: Duration = Duration::from_millis(500);
 
@@ -152,6 +156,8 @@ pub async fn run(
         upstream: Upstream::new(address, HeaderValue::from_str(&instance)?),
         instance,
         shadow: Shadow::new(mirror, session, store, stats),
+        clients: Clients::default(),
+        bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
         stats,
         rosout: AtomicU32::new(0),
         board: Board::default(),
@@ -310,6 +316,9 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 beginning = Some((mirror, session));
             }
             Decision::Fresh(why) => {
+                if let MasterConfig::Supervised(_) = config.master {
+                    end_orphan(&session).await;
+                }
                 let kept = store.as_mut().map(|store| store.set_aside("session"));
                 let kept = match kept {
                     Some(Ok(Some(path))) => {
@@ -355,6 +364,31 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         restored,
         story,
     })
+}
+
+/// Ends the rosmaster that a rosrescue which crashed has left behind: the new session does not go
+/// on with it.
+async fn end_orphan(session: &Session) {
+    let Some(Ok(address)) = session.master_uri.as_deref().map(MasterUri::parse) else {
+        return;
+    };
+    let upstream = Upstream::new(address, HeaderValue::from_static("adoption"));
+    let mark = Mark::new(&session.mark);
+    let pid = tokio::time::timeout(LIFE_SIGN, async {
+        let mut connection = pool::connect_verified(&upstream, &mark).await.ok()?;
+        let call = Call::new("getPid", vec!["/rosrescue".into()]);
+        match connection.call(&call).await.ok()? {
+            Reply::Value(Value::Array(answer)) => answer.get(2)?.as_int(),
+            _ => None,
+        }
+    });
+    if let Ok(Some(pid)) = pid.await
+        && let Ok(pid) = u32::try_from(pid)
+        && supervisor::runs(pid, "rosmaster")
+    {
+        tracing::info!(pid, "ending the rosmaster of the session before");
+        supervisor::stop(pid, || !supervisor::runs(pid, "rosmaster")).await;
+    }
 }
 
 /// Whether any node of `state` answers.

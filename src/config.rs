@@ -17,6 +17,9 @@ use crate::{
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
+/// File descriptors that clients do not get: the census opens 128 at a time.
+const RESERVED_FILES: u64 = 192;
+
 /// A command line that is well formed and still cannot be meant. Exit status 2.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
@@ -172,6 +175,15 @@ impl Config {
             advertised,
             MasterConfig::External(master),
         )
+    }
+
+    /// Leaves file descriptors for the master, the nodes and the checkpoint, out of `files` that the
+    /// process may have.
+    pub fn fit_into(&mut self, files: u64) {
+        let most = files.saturating_sub(RESERVED_FILES).max(1);
+        self.max_connections = self
+            .max_connections
+            .min(usize::try_from(most).unwrap_or(usize::MAX));
     }
 
     fn common(

@@ -44,7 +44,7 @@ fn main() -> ExitCode {
             )
         }
     };
-    let config = match config {
+    let mut config = match config {
         Ok(config) => config,
         // Exit status 2, as all usage errors.
         Err(error) => Cli::command()
@@ -56,7 +56,7 @@ fn main() -> ExitCode {
             .error(ErrorKind::ValueValidation, error)
             .exit();
     }
-    raise_file_limit();
+    config.fit_into(raise_file_limit());
     match run(config, hostname) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -131,11 +131,17 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
     Ok(())
 }
 
-/// As many connections as the system lets us have; the usual limit of 1024 is soon reached.
-fn raise_file_limit() {
+/// As many files as the system lets us have; the usual limit of 1024 is soon reached. Answers how
+/// many that is.
+fn raise_file_limit() -> u64 {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);
+    let before = limit.current;
     limit.current = limit.maximum;
-    // Without it there is room for fewer connections.
-    let _ = setrlimit(Resource::Nofile, limit);
+    let now = if setrlimit(Resource::Nofile, limit).is_ok() {
+        limit.maximum
+    } else {
+        before
+    };
+    now.unwrap_or(u64::MAX)
 }

@@ -9,7 +9,7 @@ use serde::Serialize;
 use tokio::sync::watch;
 
 use crate::{
-    proxy::Proxy,
+    proxy::{Proxy, clients::Client},
     recovery::{
         census::Census,
         report::{Counts, Report},
@@ -105,6 +105,8 @@ pub struct Status {
     pub recoveries: u64,
     /// The last one.
     pub last_recovery: Option<Report>,
+    /// Connections of clients, at most a thousand of them.
+    pub clients: Vec<Client>,
     /// What was counted since the start.
     pub counters: serde_json::Map<String, serde_json::Value>,
 }
@@ -130,6 +132,7 @@ impl Status {
             state,
             recoveries: inner.recoveries,
             last_recovery: inner.report.clone(),
+            clients: proxy.clients.list(),
             counters: counters.collect(),
         }
     }

@@ -151,6 +151,8 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
     let _ = SockRef::from(&stream).set_tcp_keepalive(&keepalive);
     let _ = stream.set_nodelay(true);
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
+    let clients = proxy.clone();
+    let _present = clients.clients.enter(peer);
     let pace = Pace::default();
     let io = TokioIo::new(Paced::new(stream, pace.clone(), HEAD_TIME));
     let service =

@@ -1,5 +1,6 @@
 //! Between the nodes and the master: listener, door, gate, lane, pool, mirror.
 
+pub mod clients;
 pub mod door;
 pub mod gate;
 pub mod journey;
@@ -15,6 +16,8 @@ pub mod stats;
 pub mod upstream;
 
 use std::sync::atomic::{AtomicBool, AtomicU32};
+
+use tokio::sync::Semaphore;
 
 use crate::{admin::Board, config::Config, master::Mark};
 
@@ -42,6 +45,10 @@ pub struct Proxy {
     pub upstream: upstream::Upstream,
     /// The mirror and its checkpoint.
     pub shadow: shadow::Shadow,
+    /// Who is connected.
+    pub clients: clients::Clients,
+    /// Memory for large bodies, in KiB.
+    pub bodies: Semaphore,
     /// What was counted.
     pub stats: &'static stats::Stats,
     /// Process id of rosout, if we run it; else 0.

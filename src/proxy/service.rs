@@ -11,7 +11,7 @@ use hyper::{
     header::{CONTENT_ENCODING, CONTENT_TYPE, SERVER},
 };
 use thiserror::Error;
-use tokio::sync::oneshot;
+use tokio::sync::{SemaphorePermit, oneshot};
 
 use super::{
     Proxy,
@@ -36,8 +36,9 @@ pub type HttpReply = Response<Full<Bytes>>;
 #[error("closed without an answer: {0}")]
 pub struct Closed(&'static str);
 
-/// Bodies beyond this are decoded outside the runtime's threads: 64 KiB take some 0.5 ms.
-const DECODE_INLINE: usize = 64 << 10;
+/// Larger bodies, in bytes, wait for room in memory and are decoded outside the runtime's threads:
+/// so much takes some 0.3 ms.
+const SMALL_BODY: usize = 64 << 10;
 /// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
 const BODY_TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
@@ -99,7 +100,9 @@ async fn post(
         path: request.uri().to_string(),
         encoding: request.headers().get(CONTENT_ENCODING).cloned(),
     };
-    let body = match read_body(request.into_body(), proxy.config.max_body).await {
+    // Held until the call is answered.
+    let mut room = None;
+    let body = match read_body(&proxy, request.into_body(), &mut room).await {
         Ok(body) => body,
         Err(BodyError::TooLarge { limit }) => {
             proxy.stats.refused.count();
@@ -118,6 +121,7 @@ async fn post(
             .first()
             .and_then(Value::as_str)
             .unwrap_or_default();
+        proxy.clients.called(peer, caller_id);
         tracing::debug!(%peer, method = call.method, caller_id, "call");
     } else {
         proxy.stats.undecoded.count();
@@ -290,13 +294,30 @@ enum BodyError {
     TooSlow,
 }
 
-async fn read_body(body: Incoming, limit: usize) -> Result<Bytes, BodyError> {
-    let declared = body.size_hint().lower();
-    if declared > limit as u64 {
+/// Reads a body. A large one first waits for room, so that many at once do not fill the memory.
+async fn read_body<'a>(
+    proxy: &'a Proxy,
+    body: Incoming,
+    room: &mut Option<SemaphorePermit<'a>>,
+) -> Result<Bytes, BodyError> {
+    let limit = proxy.config.max_body;
+    let hint = body.size_hint();
+    if hint.lower() > limit as u64 {
         return Err(BodyError::TooLarge { limit });
     }
-    let time = BODY_TIME + Duration::from_secs(declared.max(1 << 20) / BODY_RATE);
-    match tokio::time::timeout(time, Limited::new(body, limit).collect()).await {
+    let most = hint
+        .upper()
+        .map_or(limit, |upper| usize::try_from(upper).unwrap_or(limit));
+    let time = BODY_TIME + Duration::from_secs(most as u64 / BODY_RATE);
+    let read = async {
+        if most > SMALL_BODY {
+            let kib = u32::try_from(most.min(limit) >> 10).unwrap_or(u32::MAX);
+            // Never closed.
+            *room = proxy.bodies.acquire_many(kib).await.ok();
+        }
+        Limited::new(body, limit).collect().await
+    };
+    match tokio::time::timeout(time, read).await {
         Err(_) => Err(BodyError::TooSlow),
         Ok(Ok(body)) => Ok(body.to_bytes()),
         Ok(Err(error)) if error.is::<http_body_util::LengthLimitError>() => {
@@ -311,7 +332,7 @@ async fn decode(head: &Head, body: Bytes, limit: usize) -> Option<Call> {
     if head.encoding.is_some() && !gzip {
         return None;
     }
-    let long = body.len() > DECODE_INLINE;
+    let long = body.len() > SMALL_BODY;
     let work = move || {
         if !gzip {
             return xmlrpc::decode_call(&body).ok();

@@ -1,0 +1,103 @@
+//! Who is connected: a table for the status page.
+
+use std::net::SocketAddr;
+
+use dashmap::DashMap;
+use serde::Serialize;
+
+/// Clients listed on the status page; there may be thousands.
+const LISTED: usize = 1000;
+
+/// The connections of clients.
+#[derive(Debug, Default)]
+pub struct Clients(DashMap<SocketAddr, Seen>);
+
+#[derive(Debug, Default)]
+struct Seen {
+    caller_id: String,
+    calls: u64,
+}
+
+/// One connection.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Client {
+    /// Where it comes from.
+    pub peer: String,
+    /// The caller id of its last call.
+    pub caller_id: String,
+    /// Calls made on it.
+    pub calls: u64,
+}
+
+impl Clients {
+    /// A connection from `peer`; it is listed until the result is dropped.
+    pub fn enter(&self, peer: SocketAddr) -> Present<'_> {
+        self.0.insert(peer, Seen::default());
+        Present {
+            clients: self,
+            peer,
+        }
+    }
+
+    /// A call came from `peer`.
+    pub fn called(&self, peer: SocketAddr, caller_id: &str) {
+        if let Some(mut seen) = self.0.get_mut(&peer) {
+            seen.calls += 1;
+            if seen.caller_id != caller_id {
+                caller_id.clone_into(&mut seen.caller_id);
+            }
+        }
+    }
+
+    /// Number of connections.
+    pub fn count(&self) -> usize {
+        self.0.len()
+    }
+
+    /// The connections, by caller id, at most a thousand.
+    pub fn list(&self) -> Vec<Client> {
+        let clients = self.0.iter().take(LISTED).map(|entry| Client {
+            peer: entry.key().to_string(),
+            caller_id: entry.caller_id.clone(),
+            calls: entry.calls,
+        });
+        let mut clients: Vec<_> = clients.collect();
+        clients.sort_by(|a, b| (&a.caller_id, &a.peer).cmp(&(&b.caller_id, &b.peer)));
+        clients
+    }
+}
+
+/// Takes a connection off the list when it ends.
+#[derive(Debug)]
+pub struct Present<'a> {
+    clients: &'a Clients,
+    peer: SocketAddr,
+}
+
+impl Drop for Present<'_> {
+    fn drop(&mut self) {
+        self.clients.0.remove(&self.peer);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_client_is_listed_while_it_is_present() {
+        let clients = Clients::default();
+        let peer = "127.0.0.1:4000".parse().unwrap();
+        let present = clients.enter(peer);
+        clients.called(peer, "/talker");
+        clients.called(peer, "/talker");
+        let expected = Client {
+            peer: peer.to_string(),
+            caller_id: "/talker".to_owned(),
+            calls: 2,
+        };
+        assert_eq!(clients.list(), [expected]);
+        drop(present);
+        assert_eq!(clients.count(), 0);
+    }
+}
