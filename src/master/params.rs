@@ -8,6 +8,11 @@ use super::api::Failure;
 use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
+/// Levels of the tree that are kept. rosmaster takes any depth, by a long key as well as by a deep
+/// value, and cannot return more than 491 levels. What lies deeper is kept as a nil, which can be
+/// returned as little: it bounds recursion over the tree, its drop included.
+const DEEPEST_TREE: usize = 512;
+
 /// The parameter tree.
 #[derive(Clone, Default)]
 pub(super) struct Params {
@@ -100,7 +105,13 @@ impl Params {
             };
         }
         let updates = updates(subscribers, key, &value, Some(caller_id));
-        let path: Vec<&str> = names::parts(key).collect();
+        let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE).collect();
+        let levels = DEEPEST_TREE - path.len();
+        let value = match value {
+            _ if levels == 0 => Value::Nil,
+            value if is_deeper(&value, levels) => cut(value, levels),
+            value => value,
+        };
         self.detach(&path);
         match (path.split_last(), value) {
             (None, Value::Struct(tree)) => self.tree = tree,
@@ -256,6 +267,38 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
     match value {
         Value::Struct(inner) => Some(inner),
         _ => None,
+    }
+}
+
+/// Whether arrays and structs lie in each other more than so many levels.
+fn is_deeper(value: &Value, levels: usize) -> bool {
+    match value {
+        Value::Array(_) | Value::Struct(_) if levels == 0 => true,
+        Value::Array(elements) => elements.iter().any(|value| is_deeper(value, levels - 1)),
+        Value::Struct(members) => members.values().any(|value| is_deeper(value, levels - 1)),
+        _ => false,
+    }
+}
+
+/// The value with nil for the arrays and structs below so many levels of them.
+fn cut(value: Value, levels: usize) -> Value {
+    match value {
+        Value::Array(_) | Value::Struct(_) if levels == 0 => Value::Nil,
+        Value::Array(elements) => Value::Array(
+            elements
+                .into_iter()
+                .map(|value| cut(value, levels - 1))
+                .collect(),
+        ),
+        Value::Struct(members) => {
+            let members = members.into_iter();
+            Value::Struct(
+                members
+                    .map(|(key, value)| (key, cut(value, levels - 1)))
+                    .collect(),
+            )
+        }
+        value => value,
     }
 }
 

@@ -428,3 +428,28 @@ fn unregistering_everything_a_node_has_makes_the_master_forget_it() {
     assert_eq!(master.counts().nodes, 0);
     assert_eq!(master.unregister_calls("/nobody"), []);
 }
+
+#[test]
+fn no_key_and_no_value_makes_the_tree_deeper_than_the_stack() {
+    let deep = (0..511).fold(Value::Int(1), |value, _| Value::Array(vec![value]));
+    let long = "/a".repeat(100_000);
+    let mut master = after([
+        set(&long, 1),
+        set(&"/b".repeat(300), deep.clone()),
+        set("/c", deep),
+    ]);
+    for (key, there) in [(&long[..1000], true), (&long[..2000], false)] {
+        let has = answer(&mut master, &call("hasParam", &["/n", key])).2;
+        assert_eq!(has, Value::Bool(there), "{}", key.len());
+    }
+    let copy = master.clone();
+    assert_eq!(copy, master);
+    assert!(matches!(
+        master.apply(&call("getParam", &["/n", "/"])).reply,
+        Reply::Fault { .. }
+    ));
+    assert_eq!(
+        message(&mut master, &call("deleteParam", &["/n", "/a"])).0,
+        1
+    );
+}
