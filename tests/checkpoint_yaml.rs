@@ -362,7 +362,7 @@ fn values() -> impl Strategy<Value = Value> {
         // NaN has one spelling on the wire and here.
         any::<f64>().prop_map(|n| Value::Double(if n.is_nan() { f64::NAN } else { n })),
         any::<u64>()
-            .prop_map(|bits| f64::from_bits(bits))
+            .prop_map(f64::from_bits)
             .prop_map(|n| { Value::Double(if n.is_nan() { f64::NAN } else { n }) }),
         text().prop_map(Value::String),
         text().prop_map(Value::DateTime),

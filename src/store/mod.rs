@@ -15,11 +15,7 @@ mod error;
 mod generation;
 mod load;
 mod names;
-#[cfg(test)]
-mod sim;
 mod storage;
-#[cfg(test)]
-mod tests;
 
 use std::io;
 use std::path::Path;
