@@ -15,7 +15,11 @@ mod error;
 mod generation;
 mod load;
 mod names;
+#[cfg(test)]
+mod sim;
 mod storage;
+#[cfg(test)]
+mod tests;
 
 use std::io;
 use std::path::Path;

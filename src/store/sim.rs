@@ -1,0 +1,345 @@
+//! A disk in memory that can die, lose what was not synced, and fail.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use super::Storage;
+
+/// How an operation fails.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Fault {
+    /// The process dies before the operation; of a write this share of the bytes, in eighths, is
+    /// taken.
+    Kill(usize),
+    /// The operation and all later ones return this error number; a write takes half of its bytes
+    /// first and says so.
+    Short(i32),
+    /// The operation and all later ones return this error number.
+    Errno(i32),
+    /// This operation alone returns this error number.
+    Once(i32),
+}
+
+/// A file: what is on the medium, and the writes since.
+#[derive(Clone, Default)]
+struct Inode {
+    durable: Vec<u8>,
+    writes: Vec<Vec<u8>>,
+    /// A sync failed: whoever touches the file again has not understood what that means.
+    poisoned: bool,
+}
+
+impl Inode {
+    fn content(&self) -> Vec<u8> {
+        [self.durable.clone(), self.writes.concat()].concat()
+    }
+}
+
+/// A change of names since the folder was synced.
+#[derive(Clone)]
+enum NameOp {
+    Set(PathBuf, usize),
+    Move(PathBuf, PathBuf, usize),
+    Remove(PathBuf),
+}
+
+impl NameOp {
+    fn apply(&self, names: &mut BTreeMap<PathBuf, usize>) {
+        match self {
+            Self::Set(path, inode) => {
+                names.insert(path.clone(), *inode);
+            }
+            Self::Move(from, to, inode) => {
+                if names.get(from) == Some(inode) {
+                    names.remove(from);
+                }
+                names.insert(to.clone(), *inode);
+            }
+            Self::Remove(path) => {
+                names.remove(path);
+            }
+        }
+    }
+}
+
+#[derive(Clone, Default)]
+struct World {
+    inodes: Vec<Inode>,
+    names: BTreeMap<PathBuf, usize>,
+    durable_names: BTreeMap<PathBuf, usize>,
+    pending: Vec<NameOp>,
+    /// Operations so far that change something.
+    ops: usize,
+    fault: Option<(usize, Fault)>,
+    hit: bool,
+    dead: bool,
+}
+
+/// The disk; clones are the same disk.
+#[derive(Clone, Default)]
+pub(super) struct SimFs(Arc<Mutex<World>>);
+
+/// An open file.
+pub(super) struct SimFile(usize);
+
+/// What is to be done, and the error to return if it is not.
+enum Step {
+    Go,
+    Partly(usize),
+    Fail(io::Error),
+}
+
+impl World {
+    /// Counts an operation and says whether it happens.
+    fn step(&mut self) -> Step {
+        let op = self.ops;
+        self.ops += 1;
+        let gone = || Step::Fail(io::Error::other("the process is dead"));
+        if self.dead {
+            return gone();
+        }
+        match self.fault {
+            Some((at, Fault::Kill(eighths))) if op == at => {
+                (self.dead, self.hit) = (true, true);
+                Step::Partly(eighths)
+            }
+            Some((at, Fault::Errno(errno))) if op >= at => {
+                self.hit = true;
+                Step::Fail(io::Error::from_raw_os_error(errno))
+            }
+            Some((at, Fault::Once(errno))) if op == at => {
+                self.hit = true;
+                Step::Fail(io::Error::from_raw_os_error(errno))
+            }
+            Some((at, Fault::Short(errno))) if op >= at => {
+                self.hit = true;
+                if op == at {
+                    Step::Partly(4)
+                } else {
+                    Step::Fail(io::Error::from_raw_os_error(errno))
+                }
+            }
+            _ => Step::Go,
+        }
+    }
+
+    /// [`step`](Self::step) of an operation that is never done in part.
+    fn whole_step(&mut self) -> io::Result<()> {
+        match self.step() {
+            Step::Go => Ok(()),
+            Step::Partly(_) => Err(io::Error::from_raw_os_error(5)),
+            Step::Fail(error) => Err(error),
+        }
+    }
+
+    fn find(&self, path: &Path) -> io::Result<usize> {
+        self.names
+            .get(path)
+            .copied()
+            .ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+
+    fn record(&mut self, op: NameOp) {
+        op.apply(&mut self.names);
+        self.pending.push(op);
+    }
+}
+
+impl SimFs {
+    /// Lets operation number `at`, counted from now, fail.
+    pub(super) fn arm(&self, at: usize, fault: Fault) {
+        let mut world = self.0.lock().unwrap();
+        world.fault = Some((world.ops + at, fault));
+        world.hit = false;
+    }
+
+    /// Ends all faults; says whether there was one.
+    pub(super) fn disarm(&self) -> bool {
+        let mut world = self.0.lock().unwrap();
+        world.fault = None;
+        world.hit
+    }
+
+    /// Operations so far.
+    pub(super) fn ops(&self) -> usize {
+        self.0.lock().unwrap().ops
+    }
+
+    fn booted(mut world: World) -> Self {
+        world.pending.clear();
+        world.durable_names = world.names.clone();
+        for inode in &mut world.inodes {
+            *inode = Inode {
+                durable: inode.content(),
+                ..Inode::default()
+            };
+        }
+        (world.fault, world.dead, world.ops) = (None, false, 0);
+        Self(Arc::new(Mutex::new(world)))
+    }
+
+    /// The disk as the next process finds it: all that was written is there, and nothing of it is
+    /// any safer than before.
+    pub(super) fn after_kill(&self) -> Self {
+        let mut world = self.0.lock().unwrap().clone();
+        (world.fault, world.dead, world.ops) = (None, false, 0);
+        world
+            .inodes
+            .iter_mut()
+            .for_each(|inode| inode.poisoned = false);
+        Self(Arc::new(Mutex::new(world)))
+    }
+
+    /// What may be on the medium after a loss of power: any subset of the changes of names, and of
+    /// every file what was synced and then nothing, or every later write as it was or as zeros, the
+    /// last one whole or half. All combinations, or about `limit` of them if there are more.
+    pub(super) fn after_power_loss(&self, limit: usize) -> Vec<Self> {
+        let world = self.0.lock().unwrap().clone();
+        let unsynced: Vec<usize> = (0..world.inodes.len())
+            .filter(|nth| !world.inodes[*nth].writes.is_empty())
+            .collect();
+        let ways = |nth: &usize| (2_usize << world.inodes[*nth].writes.len()) + 1;
+        let combinations = unsynced.iter().map(ways).product::<usize>() << world.pending.len();
+        // Odd, so that the choices of names have their turn with every other choice.
+        let stride = (combinations / limit) | 1;
+        let mut seen = BTreeSet::new();
+        let mut images = Vec::new();
+        for choice in (0..combinations).step_by(stride) {
+            let mut image = world.clone();
+            image.names = world.durable_names.clone();
+            let mut rest = choice;
+            for op in &world.pending {
+                if rest & 1 == 1 {
+                    op.apply(&mut image.names);
+                }
+                rest >>= 1;
+            }
+            for nth in &unsynced {
+                let way = rest % ways(nth);
+                rest /= ways(nth);
+                let writes = &mut image.inodes[*nth].writes;
+                if way == 0 {
+                    writes.clear();
+                    continue;
+                }
+                for (bit, write) in writes.iter_mut().enumerate() {
+                    if (way - 1) >> bit & 1 == 1 {
+                        write.fill(0);
+                    }
+                }
+                if (way - 1) >> writes.len() & 1 == 1 {
+                    let last = writes.last_mut().unwrap();
+                    last.truncate(last.len() / 2);
+                }
+            }
+            let files: Vec<_> = image
+                .names
+                .iter()
+                .map(|(path, inode)| (path.clone(), image.inodes[*inode].content()))
+                .collect();
+            if seen.insert(files) {
+                images.push(Self::booted(image));
+            }
+        }
+        images
+    }
+}
+
+impl Storage for SimFs {
+    type File = SimFile;
+    type Lock = ();
+
+    fn locate(&self, path: &Path) -> io::Result<PathBuf> {
+        Ok(path.to_owned())
+    }
+
+    fn lock(&self, _path: &Path) -> io::Result<Result<(), Option<u32>>> {
+        Ok(Ok(()))
+    }
+
+    fn read(&self, path: &Path, _limit: u64) -> io::Result<Vec<u8>> {
+        let world = self.0.lock().unwrap();
+        if world.dead {
+            return Err(io::Error::other("the process is dead"));
+        }
+        Ok(world.inodes[world.find(path)?].content())
+    }
+
+    fn create(&self, path: &Path) -> io::Result<SimFile> {
+        let mut world = self.0.lock().unwrap();
+        world.whole_step()?;
+        let inode = world.inodes.len();
+        world.inodes.push(Inode::default());
+        world.record(NameOp::Set(path.to_owned(), inode));
+        Ok(SimFile(inode))
+    }
+
+    fn append(&self, file: &SimFile, bytes: &[u8]) -> io::Result<usize> {
+        let mut world = self.0.lock().unwrap();
+        let taken = match world.step() {
+            Step::Go => bytes.len(),
+            Step::Partly(eighths) => bytes.len() * eighths / 8,
+            Step::Fail(error) => return Err(error),
+        };
+        let inode = &mut world.inodes[file.0];
+        assert!(!inode.poisoned, "a file whose sync failed was written");
+        inode.writes.push(bytes[..taken].to_vec());
+        Ok(taken)
+    }
+
+    fn sync(&self, file: &SimFile) -> io::Result<()> {
+        let mut world = self.0.lock().unwrap();
+        assert!(
+            !world.inodes[file.0].poisoned,
+            "a failed sync was tried again"
+        );
+        if let Err(error) = world.whole_step() {
+            world.inodes[file.0].poisoned = true;
+            return Err(error);
+        }
+        let inode = &mut world.inodes[file.0];
+        inode.durable = inode.content();
+        inode.writes.clear();
+        Ok(())
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let mut world = self.0.lock().unwrap();
+        let inode = world.find(from)?;
+        world.whole_step()?;
+        world.record(NameOp::Move(from.to_owned(), to.to_owned(), inode));
+        Ok(())
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<bool> {
+        let mut world = self.0.lock().unwrap();
+        let inode = world.find(from)?;
+        world.whole_step()?;
+        world.record(NameOp::Set(to.to_owned(), inode));
+        Ok(true)
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        let mut world = self.0.lock().unwrap();
+        world.find(path)?;
+        world.whole_step()?;
+        world.record(NameOp::Remove(path.to_owned()));
+        Ok(())
+    }
+
+    fn sync_dir(&self, _folder: &Path) -> io::Result<()> {
+        let mut world = self.0.lock().unwrap();
+        world.whole_step()?;
+        world.durable_names = world.names.clone();
+        world.pending.clear();
+        Ok(())
+    }
+
+    fn list(&self, _folder: &Path) -> io::Result<Vec<String>> {
+        let world = self.0.lock().unwrap();
+        let name = |path: &PathBuf| path.file_name()?.to_str().map(str::to_owned);
+        Ok(world.names.keys().filter_map(name).collect())
+    }
+}
