@@ -108,31 +108,31 @@ pub async fn run(
     {
         config.advertised.port = bound.port();
     }
+    let supervised = match &config.master {
+        MasterConfig::Supervised(supervised) => Some((
+            supervised.clone(),
+            Rosmaster::find(supervised, &config.checkpoint)?,
+        )),
+        MasterConfig::External(_) => None,
+    };
     let beginning = begin(&config).await?;
     let uri = config.advertised.to_string();
     say(&format!("ROS_MASTER_URI={uri}"));
     say(&format!("checkpoint: {}", config.checkpoint.display()));
-
-    let remembered = beginning
-        .session
-        .master_uri
-        .as_deref()
-        .and_then(|uri| MasterUri::parse(uri).ok());
-    let (process, address) = match &config.master {
-        MasterConfig::External(address) => (None, address.clone()),
-        MasterConfig::Supervised(supervised) => {
-            let rosmaster = Rosmaster::find(supervised, &config.checkpoint)?;
-            let address = remembered
-                .clone()
-                .unwrap_or_else(|| uri_of(supervised.port.unwrap_or(0)));
-            let port = remembered.map(|uri| uri.port);
-            (Some(MasterProcess::new(rosmaster, port)), address)
-        }
+    let remembered = beginning.session.master_uri.as_deref();
+    let remembered = remembered.and_then(|uri| MasterUri::parse(uri).ok());
+    let address = match (&config.master, &remembered) {
+        (MasterConfig::External(address), _) => address.clone(),
+        (_, Some(remembered)) => remembered.clone(),
+        // Until there is one.
+        (_, None) => MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port: 0,
+        },
     };
-    let supervised = match &config.master {
-        MasterConfig::Supervised(supervised) => Some(supervised.clone()),
-        MasterConfig::External(_) => None,
-    };
+    let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
+    let port = remembered.map(|uri| uri.port);
+    let process = supervised.map(|(_, rosmaster)| MasterProcess::new(rosmaster, port));
     let (gate_keeper, gate) = gate::gate();
     let (lane, lane_runner) = lane::lane(config.max_parked);
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
@@ -165,13 +165,9 @@ pub async fn run(
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     proxy.shadow.set_identity(pid, proxy.uri.clone());
-    if let Some(supervised) = &supervised {
+    if let Some(rosout) = rosout {
         core_duties::set_run_id(&proxy);
-        tokio::spawn(core_duties::run(
-            proxy.clone(),
-            supervised.rosout,
-            stop.clone(),
-        ));
+        tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()));
     }
     let halt = CancellationToken::new();
     tokio::spawn({
@@ -195,13 +191,6 @@ pub async fn run(
         process.stop(proxy.board.master_pid()).await;
     }
     Ok(())
-}
-
-fn uri_of(port: u16) -> MasterUri {
-    MasterUri {
-        host: "127.0.0.1".to_owned(),
-        port,
-    }
 }
 
 /// Runs all tasks until the stop or an error.

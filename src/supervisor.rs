@@ -83,11 +83,12 @@ pub struct Rosmaster {
     config: SupervisedConfig,
     /// What the last one wrote to stdout and stderr.
     output: PathBuf,
-    log_config: Option<PathBuf>,
+    /// The logging configuration that it is given.
+    log_config: PathBuf,
 }
 
 impl Rosmaster {
-    /// Finds the program. Files of its own go beside `checkpoint`.
+    /// Finds the program. Files for it will lie beside `checkpoint`.
     pub fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, SupervisorError> {
         let program = match &config.rosmaster {
             Some(path) if is_program(path) => path.clone(),
@@ -99,17 +100,11 @@ impl Rosmaster {
             name.push(suffix);
             PathBuf::from(name)
         };
-        let log_config = beside(".rosmaster-logging.conf");
-        // Unless the person has a configuration of his own; and without one it is only slower.
-        let own = std::env::var_os("ROS_PYTHON_LOG_CONFIG_FILE").is_some();
-        let log_config =
-            (!own && std::fs::write(&log_config, LOG_CONFIG).is_ok()).then_some(log_config);
-        let output = beside(".rosmaster-output.log");
         Ok(Self {
             program,
             config: config.clone(),
-            output,
-            log_config,
+            output: beside(".rosmaster-output.log"),
+            log_config: beside(".rosmaster-logging.conf"),
         })
     }
 
@@ -143,8 +138,10 @@ impl Rosmaster {
         // Loopback only: nodes come through us.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
-        if let Some(config) = &self.log_config {
-            command.env("ROS_PYTHON_LOG_CONFIG_FILE", config);
+        // Unless the person has a configuration of his own; and without ours it is only slower.
+        let own = std::env::var_os("ROS_PYTHON_LOG_CONFIG_FILE").is_some_and(|own| !own.is_empty());
+        if !own && self.write_log_config().is_ok() {
+            command.env("ROS_PYTHON_LOG_CONFIG_FILE", &self.log_config);
         }
         let (stdout, stderr) = match create(&self.output) {
             Ok(file) => (
@@ -163,6 +160,13 @@ impl Rosmaster {
             program: self.program.clone(),
             source,
         })
+    }
+
+    fn write_log_config(&self) -> io::Result<()> {
+        match std::fs::read(&self.log_config) {
+            Ok(present) if present == LOG_CONFIG.as_bytes() => Ok(()),
+            _ => std::fs::write(&self.log_config, LOG_CONFIG),
+        }
     }
 
     /// The end of what the last rosmaster wrote, for the message that it died early.

@@ -40,12 +40,16 @@ pub struct Keeper {
 }
 
 impl Keeper {
-    /// Changes the state; waiters see it at once.
+    /// Changes the state; waiters see it at once. The same state again wakes nobody.
     pub fn set(&self, state: State) {
-        let before = self.state.send_replace(state);
-        if before != state {
-            tracing::debug!(?before, ?state, "gate");
-        }
+        self.state.send_if_modified(|now| {
+            if *now == state {
+                return false;
+            }
+            tracing::debug!(before = ?now, ?state, "gate");
+            *now = state;
+            true
+        });
     }
 
     /// The state now.

@@ -18,10 +18,9 @@ use tokio_util::sync::CancellationToken;
 use self::{
     examine::{Examination, ExamineError, Prepared},
     master_process::MasterProcess,
-    report::{Outcome, Phases, Report},
+    report::{Outage, Outcome, Phases},
 };
 use crate::{
-    clock,
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
     proxy::{
         Proxy,
@@ -45,27 +44,6 @@ enum Done {
 
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
-
-/// The time since which calls have not passed.
-#[derive(Clone, Copy)]
-struct Outage {
-    cause: &'static str,
-    since: Instant,
-    wall: f64,
-    /// When the master's port was open again.
-    port_open: Option<Instant>,
-}
-
-impl Outage {
-    fn begin(cause: &'static str) -> Self {
-        Self {
-            cause,
-            since: Instant::now(),
-            wall: clock::wall_time(),
-            port_open: None,
-        }
-    }
-}
 
 /// Carries out what the lifecycle decides.
 pub struct Guard {
@@ -110,7 +88,7 @@ impl Guard {
             step: None,
             probe_deadline: None,
             prepared: None,
-            outage: Outage::begin("start"),
+            outage: Outage::begin(Instant::now(), "start"),
             served: false,
             known: restored,
             said: None,
@@ -242,7 +220,7 @@ impl Guard {
     fn done(&mut self, done: Done) -> Option<Input> {
         match done {
             Done::Connected(connection) => {
-                self.outage.port_open = Some(Instant::now());
+                self.outage.port_open(Instant::now());
                 self.ended = Some(Box::pin(connection.ended()));
                 self.connection = Some(connection);
                 Some(Input::Connected)
@@ -306,7 +284,7 @@ impl Guard {
 
     fn shut_gate(&mut self, cause: Cause) {
         self.keeper.set(State::Shut(self.stand_in()));
-        self.outage = Outage::begin(cause.as_str());
+        self.outage = Outage::begin(Instant::now(), cause.as_str());
         if cause == Cause::Stopping {
             return;
         }
@@ -346,37 +324,15 @@ impl Guard {
 
     /// Reports what an examination came to; census and healing add to the report when they end.
     fn report(&mut self, examination: Examination) {
-        let now = Instant::now();
-        let ms = |duration: Duration| (duration.as_secs_f64() * 1e5).round() / 1e2;
-        let Outage {
-            cause,
-            since,
-            wall,
-            port_open,
-        } = self.outage;
-        let total = now.duration_since(since);
-        let absence = port_open.map_or(total, |open| open.duration_since(since));
-        let report = Report {
-            cause,
-            detected_at: wall,
-            outcome: examination.outcome,
-            master_pid: examination.pid,
-            phases: Phases {
-                absence_ms: ms(absence),
-                look_ms: ms(examination.look),
-                injection_ms: ms(examination.injection),
-                total_ms: ms(total),
-            },
-            restored: examination.counts,
-            skipped: examination.skipped,
-            mismatches: examination.mismatches,
-            removed: Vec::new(),
-            suspects: Vec::new(),
-            healed: Vec::new(),
-        };
-        self.proxy
-            .shadow
-            .set_identity(examination.pid, self.proxy.uri.clone());
+        let Outage { cause, since, .. } = self.outage;
+        let report = self.outage.report(Instant::now(), examination);
+        let uri = self.proxy.uri.clone();
+        self.proxy.shadow.set_identity(report.master_pid, uri);
+        if report.outcome == Outcome::Resumed && cause == Cause::ConnectionLost.as_str() {
+            // Such as after each idle connection that a master with `-t` closes.
+            tracing::debug!("the same master goes on");
+            return;
+        }
         let Phases {
             absence_ms,
             look_ms,
@@ -384,11 +340,15 @@ impl Guard {
             total_ms,
         } = report.phases;
         tracing::info!(
-            cause, absence_ms, look_ms, injection_ms, total_ms,
+            cause,
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
             master_pid = report.master_pid,
             skipped = ?report.skipped,
             "{}: {}",
-            describe(report.outcome),
+            report.outcome,
             report.restored
         );
         let resumed = report.outcome == Outcome::Resumed;
@@ -418,14 +378,6 @@ impl Guard {
             tracing::warn!("{text}");
             self.said = Some((text, now));
         }
-    }
-}
-
-fn describe(outcome: Outcome) -> &'static str {
-    match outcome {
-        Outcome::Injected => "the master has been restored",
-        Outcome::Adopted => "a running master has been taken over",
-        Outcome::Resumed => "the same master goes on",
     }
 }
 

@@ -1,10 +1,14 @@
 //! What a recovery did, and how long each part of it took.
 
-use std::fmt;
+use std::{
+    fmt,
+    time::{Duration, Instant},
+};
 
 use serde::Serialize;
 
-use crate::master::Master;
+use super::examine::Examination;
+use crate::{clock, master::Master};
 
 /// How the present master came to hold the state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -16,6 +20,16 @@ pub enum Outcome {
     Adopted,
     /// It is the same incarnation as before.
     Resumed,
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Injected => "the master has been restored",
+            Self::Adopted => "a running master has been taken over",
+            Self::Resumed => "the same master goes on",
+        })
+    }
 }
 
 /// Sizes of a state.
@@ -106,4 +120,59 @@ pub struct Report {
     pub suspects: Vec<String>,
     /// Topics whose subscribers were sent the full list of publishers.
     pub healed: Vec<String>,
+}
+
+/// The time since which calls have not passed.
+#[derive(Clone, Copy, Debug)]
+pub struct Outage {
+    /// Why.
+    pub cause: &'static str,
+    /// Since when.
+    pub since: Instant,
+    wall: f64,
+    port_open: Option<Instant>,
+}
+
+impl Outage {
+    /// An outage that begins now.
+    pub fn begin(now: Instant, cause: &'static str) -> Self {
+        Self {
+            cause,
+            since: now,
+            wall: clock::wall_time(),
+            port_open: None,
+        }
+    }
+
+    /// The master's port is open again.
+    pub fn port_open(&mut self, now: Instant) {
+        self.port_open = Some(now);
+    }
+
+    /// The report of an outage that ends now with `examination`.
+    pub fn report(&self, now: Instant, examination: Examination) -> Report {
+        let ms = |duration: Duration| (duration.as_secs_f64() * 1e5).round() / 1e2;
+        let total = now.duration_since(self.since);
+        let absence = self
+            .port_open
+            .map_or(total, |open| open.duration_since(self.since));
+        Report {
+            cause: self.cause,
+            detected_at: self.wall,
+            outcome: examination.outcome,
+            master_pid: examination.pid,
+            phases: Phases {
+                absence_ms: ms(absence),
+                look_ms: ms(examination.look),
+                injection_ms: ms(examination.injection),
+                total_ms: ms(total),
+            },
+            restored: examination.counts,
+            skipped: examination.skipped,
+            mismatches: examination.mismatches,
+            removed: Vec::new(),
+            suspects: Vec::new(),
+            healed: Vec::new(),
+        }
+    }
 }
