@@ -85,6 +85,8 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the census.
     pub census_timeout: Duration,
+    /// Pause between two comparisons of the mirror with the master, if there are to be any.
+    pub resync_interval: Option<Duration>,
     /// Connections to the master for reads.
     pub master_connections: usize,
     /// Connections of clients.
@@ -210,6 +212,8 @@ impl Config {
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
             census_timeout: Duration::from_millis(args.census_timeout),
+            resync_interval: Some(seconds("--resync-interval", args.resync_interval, 86_400.0)?)
+                .filter(|interval| !interval.is_zero()),
             master_connections: usize_of(args.master_connections),
             max_connections: usize_of(args.max_connections),
             max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),

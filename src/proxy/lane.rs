@@ -120,6 +120,7 @@ impl LaneRunner {
     /// Runs until every [`Lane`] is gone.
     pub async fn run(mut self, proxy: Arc<Proxy>) {
         let mut gate = proxy.gate.clone();
+        let mut resync = proxy.config.resync_interval.map(tokio::time::interval);
         loop {
             let room = self.queue.len() < self.max_parked;
             tokio::select! {
@@ -130,6 +131,7 @@ impl LaneRunner {
                 () = gate.changed() => self.retry_at = None,
                 landed = landing(&mut self.flight) => self.landed(&proxy, landed),
                 () = sleep_until(self.retry_at) => self.retry_at = None,
+                () = tick(&mut resync) => self.resync_due = true,
             }
             while self.queue.len() < self.max_parked {
                 let Ok(item) = self.items.try_recv() else {
@@ -191,8 +193,14 @@ impl LaneRunner {
         self.connection = landed.connection;
         match landed.result {
             Ok(Cargo::Resynced(state)) => {
-                if proxy.shadow.incarnation() == incarnation && proxy.shadow.adopt(*state) {
-                    tracing::info!("the mirror was made anew from the master");
+                if proxy.shadow.incarnation() == incarnation {
+                    let difference = proxy.shadow.adopt(*state);
+                    if !difference.is_empty() {
+                        tracing::warn!(
+                            ?difference,
+                            "the master differed from the mirror, which was made anew from it"
+                        );
+                    }
                 }
             }
             Ok(Cargo::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
@@ -330,6 +338,15 @@ impl LaneRunner {
 async fn landing(flight: &mut Option<Flight>) -> Landed {
     match flight {
         Some(flight) => flight.landing.as_mut().await,
+        None => std::future::pending().await,
+    }
+}
+
+async fn tick(interval: &mut Option<tokio::time::Interval>) {
+    match interval {
+        Some(interval) => {
+            interval.tick().await;
+        }
         None => std::future::pending().await,
     }
 }

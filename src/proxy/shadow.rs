@@ -53,6 +53,8 @@ pub struct Shadow {
 
 struct Inner {
     mirror: Master,
+    /// What getPid and getUri answer; no part of the state.
+    identity: (i32, String),
     session: Session,
     /// None if no checkpoint could be opened: unprotected.
     store: Option<Store>,
@@ -79,6 +81,7 @@ impl Shadow {
     ) -> Self {
         let inner = Inner {
             mirror,
+            identity: (-1, String::new()),
             session,
             store,
             incarnation: 0,
@@ -113,7 +116,9 @@ impl Shadow {
 
     /// Tells the mirror what getPid and getUri answer.
     pub fn set_identity(&self, pid: i32, uri: String) {
-        self.lock().mirror.set_identity(pid, uri);
+        let mut inner = self.lock();
+        inner.mirror.set_identity(pid, uri.clone());
+        inner.identity = (pid, uri);
     }
 
     /// The session as it is recorded.
@@ -223,18 +228,22 @@ impl Shadow {
         self.lock().version
     }
 
-    /// The master holds `state`: so does the mirror from now on. Answers whether that changed it.
-    pub fn adopt(&self, state: Master) -> bool {
+    /// The master holds `state`: so does the mirror from now on. Answers in what it differed before,
+    /// in a few sentences without values.
+    pub fn adopt(&self, state: Master) -> Vec<String> {
         let mut inner = self.lock();
         if inner.mirror == state {
-            return false;
+            return Vec::new();
         }
+        let difference = master::difference(&inner.mirror, &state);
+        let (pid, uri) = inner.identity.clone();
         inner.mirror = state;
+        inner.mirror.set_identity(pid, uri);
         inner.version += 1;
         inner.checkpoint_due = true;
         drop(inner);
         self.work.notify_one();
-        true
+        difference
     }
 
     /// Topics whose publishers changed so shortly before now that a master which died since may
@@ -464,6 +473,18 @@ mod tests {
         assert_eq!(shadow.owed(), [bye("/b")]);
         assert_eq!(shadow.succeed().counts().publishers, 0);
         assert_eq!(shadow.owed(), []);
+    }
+
+    #[test]
+    fn who_the_master_is_outlasts_a_resync() {
+        let shadow = shadow();
+        shadow.set_identity(42, "http://us:1/".to_owned());
+        let get_pid = call("getPid", &["/n"]);
+        let before = shadow.answer(&get_pid);
+        let mut other = Master::default();
+        other.apply(&publish("/t"));
+        assert_ne!(shadow.adopt(other), Vec::<String>::new());
+        assert_eq!(shadow.answer(&get_pid), before);
     }
 
     #[test]

@@ -136,7 +136,10 @@ pub async fn examine(
         let previous = proxy.shadow.with_mirror(Clone::clone);
         let held = second_look(first, connection, &previous).await?;
         proxy.shadow.succeed();
-        proxy.shadow.adopt(held);
+        let difference = proxy.shadow.adopt(held);
+        if !difference.is_empty() {
+            tracing::info!(?difference, "the master went on without us; the mirror follows it");
+        }
         examination.outcome = Outcome::Adopted;
         examination.look = start.elapsed();
     } else {
