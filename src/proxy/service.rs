@@ -39,6 +39,9 @@ pub struct Closed(&'static str);
 /// Larger bodies, in bytes, wait for room in memory and are decoded outside the runtime's threads:
 /// so much takes some 0.3 ms.
 const SMALL_BODY: usize = 64 << 10;
+/// A master that takes longer to say its process id is answered for: roslaunch waits 5 s for that,
+/// and then starts a master of its own on our port.
+const IDENTITY_TIME: Duration = Duration::from_secs(1);
 /// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
 const BODY_TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
@@ -194,12 +197,17 @@ async fn read(
                     mark,
                     ..
                 } = &**proxy;
-                match pool
-                    .forward(upstream, mark, &mut gate, incarnation, &head, &body)
-                    .await
-                {
-                    Ok(raw) => return Ok(forwarded(proxy, call, raw)),
-                    Err(error) => tracing::debug!(%error, "read"),
+                let limit = match kind {
+                    Kind::Identity => IDENTITY_TIME,
+                    _ => Duration::MAX,
+                };
+                let mut watch = gate.clone();
+                let reply =
+                    pool.forward(upstream, mark, &mut watch, incarnation, &head, &body);
+                match tokio::time::timeout(limit, reply).await {
+                    Ok(Ok(raw)) => return Ok(forwarded(proxy, call, raw)),
+                    Ok(Err(error)) => tracing::debug!(%error, "read"),
+                    Err(_) => tracing::debug!("the master is slow to say who it is"),
                 }
             }
             State::Shut(stand_in) => known = stand_in != StandIn::Nobody,
