@@ -141,7 +141,7 @@ pub struct CommonArgs {
         long,
         env = "ROSRESCUE_PROBE_TIMEOUT",
         value_name = "MS",
-        default_value_t = 3000
+        default_value_t = 2000
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub probe_timeout: u64,
