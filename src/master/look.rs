@@ -191,7 +191,7 @@ impl FirstLook {
         }
         .iter();
         let mut address = |method, name: &str, fallback: Option<&str>| {
-            if names::reach(name, CALLER_ID).is_none() {
+            if lookup(method, name).is_none() {
                 return Ok(fallback.map(str::to_owned));
             }
             match results.next().and_then(answer) {
@@ -299,7 +299,7 @@ fn only(
 
 /// A lookup of `name`, if any call can name it.
 pub(super) fn lookup(method: &'static str, name: &str) -> Option<Call> {
-    let (caller_id, name) = names::reach(name, CALLER_ID)?;
+    let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
     Some(Call::new(method, vec![caller_id.into(), name.into()]))
 }
 

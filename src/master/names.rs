@@ -118,14 +118,19 @@ fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<Str
         .find(|name| !name.is_empty() && names(name))
 }
 
-/// A caller id and a name that the master resolves to `key`, where the caller id may be chosen:
-/// `preferred` wherever that can be. None for what no call can name, such as a node that calls
-/// itself `/a/`.
-pub(super) fn reach(key: &str, preferred: &str) -> Option<(String, String)> {
+/// A caller id and a name that the master resolves to `key`, where the caller id may be any that is
+/// `usable`, and is `preferred` wherever that can be. None for what no such call can name, such as a
+/// node that calls itself `/a/`.
+pub(super) fn reach(
+    key: &str,
+    preferred: &str,
+    usable: impl Fn(&str) -> bool,
+) -> Option<(String, String)> {
     let base = key.rfind('/').map_or(0, |slash| slash + 1);
     let neighbour = format!("{}rosrescue", key.get(..base).unwrap_or_default());
     [preferred, &neighbour, key]
         .into_iter()
+        .filter(|caller_id| usable(caller_id))
         .find_map(|caller_id| Some((caller_id.to_owned(), name_for(key, caller_id)?)))
 }
 
@@ -187,9 +192,9 @@ mod tests {
     #[test]
     fn a_node_with_a_strange_name_can_be_looked_up() {
         for node in ["/x", "x", "a/b", "/a//b", "/a b", "/a:b/c"] {
-            let (caller, name) = reach(node, CALLER_ID).expect(node);
+            let (caller, name) = reach(node, CALLER_ID, |_| true).expect(node);
             assert_eq!(resolve(&name, &caller), node);
         }
-        assert_eq!(reach("/a/", CALLER_ID), None);
+        assert_eq!(reach("/a/", CALLER_ID, |_| true), None);
     }
 }

@@ -272,7 +272,10 @@ impl<'a> Restore<'a> {
     /// The same where nobody provides the service any more: a helper takes it and gives it up.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.calls.len();
-        let Some((helper, name)) = names::reach(service, HELPER) else {
+        let Some((helper, name)) = self.helper(service) else {
+            for caller_id in losers {
+                self.skip_unnameable(service, caller_id);
+            }
             return;
         };
         self.lose(service, losers);
@@ -348,11 +351,20 @@ impl<'a> Restore<'a> {
         self.types_in = self.types_in.max(end);
     }
 
+    /// A caller id that is no node's, and the name by which it says `key`.
+    fn helper(&self, key: &str) -> Option<(String, String)> {
+        let is_node = |caller_id: &str| {
+            let nodes = [self.target, self.found].map(|master| &master.registry.nodes);
+            nodes.iter().any(|nodes| nodes.contains_key(caller_id))
+        };
+        names::reach(key, HELPER, |caller_id| !is_node(caller_id))
+    }
+
     fn bring_type(&mut self, topic: &str, topic_type: &str) {
         if self.model.topic_types.contains_key(topic) {
             return;
         }
-        let Some((helper, name)) = names::reach(topic, HELPER) else {
+        let Some((helper, name)) = self.helper(topic) else {
             return self.skip_unnameable(topic, HELPER);
         };
         let (register, unregister) = if topic_type != "*" {

@@ -1,0 +1,107 @@
+//! Nodes that only listen: they note every callback that a master sends them.
+
+use std::io::{BufReader, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use rosrescue::master::Notice;
+use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call, encode_reply};
+
+use crate::real::read_message;
+
+/// Longest wait for callbacks. rosmaster's three notifiers look for work ten times a second.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A listening node.
+pub(crate) struct Node {
+    pub(crate) api: String,
+    heard: Arc<Mutex<Vec<Call>>>,
+}
+
+impl Node {
+    pub(crate) fn start() -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let api = format!("http://{}/", listener.local_addr().unwrap());
+        let heard = Arc::new(Mutex::new(Vec::new()));
+        let notes = Arc::clone(&heard);
+        std::thread::spawn(move || {
+            for connection in listener.incoming().flatten() {
+                let notes = Arc::clone(&notes);
+                std::thread::spawn(move || serve(connection, &notes));
+            }
+        });
+        Self { api, heard }
+    }
+
+    /// Waits until `last` says that it is there, and takes all that was heard.
+    pub(crate) fn take(&self, last: impl Fn(&Call) -> bool) -> Vec<Call> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let mut heard = self.heard.lock().unwrap();
+            if heard.last().is_some_and(&last) {
+                return std::mem::take(&mut *heard);
+            }
+            assert!(
+                Instant::now() < deadline,
+                "the last callback did not come: {heard:?}"
+            );
+            drop(heard);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+fn serve(connection: TcpStream, notes: &Mutex<Vec<Call>>) {
+    connection.set_nodelay(true).unwrap();
+    let mut connection = BufReader::new(connection);
+    while let Some(body) = read_message(&mut connection) {
+        notes.lock().unwrap().push(decode_call(&body).unwrap());
+        let answer = vec![Value::Int(1), "".into(), 0.into()];
+        let body = encode_reply(&Reply::Value(Value::Array(answer)));
+        let head = format!(
+            "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
+            body.len()
+        );
+        if connection
+            .get_mut()
+            .write_all(&[head.as_bytes(), &body].concat())
+            .is_err()
+        {
+            return;
+        }
+    }
+}
+
+/// Who is called, and with what. Structs are blanked: rosmaster writes a callback when it sends it,
+/// and a dict of the parameter tree may have changed by then.
+pub(crate) fn as_call(notice: &Notice) -> (&str, Call) {
+    let master = || Value::from("/master");
+    match notice {
+        Notice::PublisherUpdate {
+            to,
+            topic,
+            publishers,
+        } => {
+            let params = vec![master(), topic.as_str().into(), publishers.clone().into()];
+            (to, Call::new("publisherUpdate", params))
+        }
+        Notice::ParamUpdate { to, key, value } => {
+            let params = vec![master(), key.as_str().into(), value.clone()];
+            (to, blank(Call::new("paramUpdate", params)))
+        }
+        Notice::Shutdown { to, reason } => (
+            to,
+            Call::new("shutdown", vec![master(), reason.as_str().into()]),
+        ),
+    }
+}
+
+pub(crate) fn blank(mut call: Call) -> Call {
+    for param in &mut call.params {
+        if let Value::Struct(members) = param {
+            *members = Struct::new();
+        }
+    }
+    call
+}
