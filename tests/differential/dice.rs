@@ -34,7 +34,7 @@ const ODD_KEYS: &[&str] = &[
 const MEMBERS: &[&str] = &[
     "a", "b", "c", "d", "x", "b/c", "/a", "", "~p", "é", "it's/c", "c/",
 ];
-const TYPES: &[&str] = &["a/B", "a/C", "d/E", "*", "a/B"];
+const TYPES: &[&str] = &["a/B", "a/C", "*"];
 const ODD_TYPES: &[&str] = &["", "a", "a/b/C", "/", " / "];
 const READS: &[&str] = &[
     "getSystemState",
@@ -242,11 +242,37 @@ impl Dice {
         }
     }
 
+    /// Reads and writes of few namespaces, which within one multicall see each other.
+    fn churn(&mut self, cast: &Cast) -> Call {
+        let key = self.pick(&["/a", "/a/b", "/a/b/c", "/"]).into();
+        let mut params = vec!["/n0".into(), key];
+        let method = match self.below(6) {
+            0 | 1 => "getParam",
+            2 => "deleteParam",
+            3 => {
+                params.insert(1, self.api(cast, "/n0"));
+                "subscribeParam"
+            }
+            _ => {
+                params.push(self.value(cast, 3));
+                "setParam"
+            }
+        };
+        Call::new(method, params)
+    }
+
     fn multicall(&mut self, cast: &Cast, levels: usize) -> Call {
         let len = self.below(7);
-        let calls = (0..len)
-            .map(|_| self.call(cast, levels))
-            .collect::<Vec<_>>();
+        let churns = self.once_in(3);
+        let calls: Vec<_> = (0..len)
+            .map(|_| {
+                if churns {
+                    self.churn(cast)
+                } else {
+                    self.call(cast, levels)
+                }
+            })
+            .collect();
         let mut call = Call::multicall(calls);
         if cast.errors
             && self.once_in(4)
