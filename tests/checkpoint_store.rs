@@ -231,6 +231,46 @@ fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
 }
 
 #[test]
+fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 3);
+    store.begin(&checkpoint(3)).unwrap();
+    drop(store);
+    for _ in 0..2 {
+        let mut bytes = fs::read(&path).unwrap();
+        bytes[200] ^= 4;
+        fs::write(&path, &bytes).unwrap();
+        let (mut store, loaded) = Store::open(&path).unwrap();
+        let loaded = loaded.unwrap();
+        assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+        assert_eq!(loaded.records.len(), 3);
+        store.begin(&checkpoint(3)).unwrap();
+    }
+}
+
+#[test]
+fn a_file_put_back_from_a_copy_is_what_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    let copy = fs::read(&path).unwrap();
+    store.begin(&checkpoint(2)).unwrap();
+    store.append(&[entry(3)]).unwrap();
+    store.begin(&checkpoint(3)).unwrap();
+    drop(store);
+    fs::write(&path, copy).unwrap();
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+    assert_eq!(loaded.records.len(), 2);
+    assert!(
+        loaded.exact && loaded.damage.is_empty(),
+        "{:?}",
+        loaded.damage
+    );
+}
+
+#[test]
 fn a_lost_record_is_said_and_the_others_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("c.yaml");
@@ -355,6 +395,22 @@ fn a_session_set_aside_has_no_part_in_the_next() {
     assert_eq!(store.set_aside("session").unwrap(), None);
     drop(store);
     assert!(Store::open(&path).unwrap().1.is_none());
+}
+
+#[test]
+fn a_session_set_aside_is_no_fallback_of_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    store.begin(&checkpoint(2)).unwrap();
+    store.set_aside("session").unwrap();
+    store.begin(&checkpoint(2)).unwrap();
+    drop(store);
+    let mut broken = fs::read(&path).unwrap();
+    broken[200] ^= 4;
+    fs::write(&path, broken).unwrap();
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert!(loaded.checkpoint.is_none() && loaded.records.is_empty() && !loaded.exact);
 }
 
 #[test]
