@@ -453,6 +453,35 @@ fn a_file_removed_under_a_running_store_is_noticed_by_the_next_sync() {
 }
 
 #[test]
+fn what_a_crash_left_unfinished_is_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    drop(started(&path, 1));
+    for name in [
+        "c.yaml.new-7",
+        "c.yaml.previous.new",
+        "c.yaml.new-x",
+        "d.yaml.new-1",
+    ] {
+        fs::write(folder.path().join(name), "# rosrescue").unwrap();
+    }
+    let (store, _) = Store::open(&path).unwrap();
+    drop(store);
+    let left = ["c.yaml", "c.yaml.lock", "c.yaml.new-x", "d.yaml.new-1"];
+    assert_eq!(names(folder.path()), left);
+}
+
+#[test]
+fn jobs_can_run_on_another_thread() {
+    fn sendable<T: Send + 'static>() {}
+    sendable::<Store>();
+    sendable::<rosrescue::store::SyncJob<rosrescue::store::Disk>>();
+    sendable::<rosrescue::store::Synced>();
+    sendable::<rosrescue::store::CompactionJob<rosrescue::store::Disk>>();
+    sendable::<rosrescue::store::Compacted<rosrescue::store::Disk>>();
+}
+
+#[test]
 fn an_orderly_stop_is_in_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("c.yaml");

@@ -40,6 +40,8 @@ const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
 /// What is recorded while a new generation is written is kept in memory too, up to this size;
 /// beyond it that generation is given up and the present file goes on.
 const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
+/// Room for encoding that is kept between appends.
+const BUFFER_BYTES_MAX: usize = 1024 * 1024;
 
 /// A checkpoint, locked and open.
 pub struct Store<S: Storage = Disk> {
@@ -210,6 +212,7 @@ impl<S: Storage> Store<S> {
         self.seq = self.seq.saturating_add(entries.len() as u64);
         let mut encoded = Ok(());
         self.buffer.clear();
+        self.buffer.shrink_to(BUFFER_BYTES_MAX);
         for (seq, entry) in (first..).zip(entries) {
             let start = self.buffer.len();
             if let Err(error) = record::push_body(&mut self.buffer, seq, entry) {
@@ -314,7 +317,7 @@ impl<S: Storage> Store<S> {
     /// Begins a new generation with `checkpoint`, taken as of now: its [`Checkpoint::seq`] is
     /// [`seq`](Self::seq). Run the job anywhere, go on appending, then give its result to
     /// [`finish_compaction`](Self::finish_compaction). Also the way to re-arm an unprotected store
-    /// beside traffic.
+    /// beside traffic. A job that is dropped instead is ended by [`begin`](Self::begin).
     ///
     /// # Errors
     ///

@@ -31,52 +31,63 @@ impl Names {
     }
 
     pub(super) fn fresh(&self, generation: u64) -> PathBuf {
-        self.with(&format!(".new-{generation}"))
+        self.numbered("new", generation)
     }
 
     pub(super) fn folder(&self) -> &Path {
         self.path.parent().unwrap_or_else(|| Path::new("/"))
     }
 
-    /// The numbers and names of the files called `PATH.KIND-NUMBER`, lowest first.
-    fn numbered(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<(u64, PathBuf)>> {
-        let stem = self
-            .path
-            .file_name()
-            .and_then(|name| name.to_str())
-            .unwrap_or_default();
-        let start = format!("{stem}.{kind}-");
-        let mut found: Vec<_> = storage
-            .list(self.folder())?
-            .into_iter()
-            .filter_map(|name| {
-                let number = name.strip_prefix(&start)?.parse().ok()?;
-                Some((number, self.folder().join(name)))
-            })
-            .collect();
-        found.sort_unstable();
-        Ok(found)
+    /// The endings of the names in the folder that start with the checkpoint's and a dot.
+    fn endings(&self, storage: &impl Storage) -> io::Result<Vec<String>> {
+        let stem = self.path.file_name().unwrap_or_default().to_string_lossy() + ".";
+        let names = storage.list(self.folder())?.into_iter();
+        Ok(names
+            .filter_map(|name| name.strip_prefix(&*stem).map(str::to_owned))
+            .collect())
+    }
+
+    /// The numbers of the files called `PATH.KIND-NUMBER`, lowest first.
+    fn numbers(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<u64>> {
+        let number = |ending: &String| {
+            ending
+                .strip_prefix(kind)?
+                .strip_prefix('-')?
+                .parse::<u64>()
+                .ok()
+        };
+        let mut numbers: Vec<u64> = self.endings(storage)?.iter().filter_map(number).collect();
+        numbers.sort_unstable();
+        Ok(numbers)
+    }
+
+    fn numbered(&self, kind: &str, number: u64) -> PathBuf {
+        self.with(&format!(".{kind}-{number}"))
     }
 
     /// A name for a file of this kind that none has yet. Numbered: the clock may be anywhere.
     /// Makes room for it.
     pub(super) fn aside(&self, storage: &impl Storage, kind: &str) -> io::Result<PathBuf> {
-        let found = self.numbered(storage, kind)?;
-        let number = found
-            .last()
-            .map_or(0, |(number, _)| *number)
-            .saturating_add(1);
+        let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
-        for (_, old) in found.iter().take(surplus) {
-            storage.remove(old)?;
+        for number in found.iter().take(surplus) {
+            storage.remove(&self.numbered(kind, *number))?;
         }
-        Ok(self.with(&format!(".{kind}-{number}")))
+        let number = found.last().copied().unwrap_or(0).saturating_add(1);
+        Ok(self.numbered(kind, number))
     }
 
-    /// Removes new generations that a crash left unfinished.
+    /// Removes what a crash left unfinished: new generations, and names on their way to another.
     pub(super) fn remove_unfinished(&self, storage: &impl Storage) -> io::Result<()> {
-        for (_, path) in self.numbered(storage, "new")? {
-            storage.remove(&path)?;
+        for generation in self.numbers(storage, "new")? {
+            storage.remove(&self.fresh(generation))?;
+        }
+        for ending in self
+            .endings(storage)?
+            .iter()
+            .filter(|ending| ending.ends_with(".new"))
+        {
+            storage.remove(&self.with(&format!(".{ending}")))?;
         }
         Ok(())
     }

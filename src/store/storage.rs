@@ -38,7 +38,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Returns when the names in `folder` are on the medium.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;
-    /// The names in `folder`.
+    /// The names in `folder`, as far as they are text.
     fn list(&self, folder: &Path) -> io::Result<Vec<String>>;
 }
 
@@ -186,11 +186,7 @@ impl Storage for Disk {
 
     fn list(&self, folder: &Path) -> io::Result<Vec<String>> {
         fs::read_dir(folder)?
-            .filter_map(|entry| {
-                entry
-                    .map(|entry| entry.file_name().into_string().ok())
-                    .transpose()
-            })
+            .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
             .collect()
     }
 }
