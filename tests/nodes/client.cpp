@@ -1,0 +1,25 @@
+// Calls the service `who` again and again, each time looking it up anew. Usage: client [HZ]
+#include <cstdlib>
+#include <ros/ros.h>
+#include <roscpp/GetLoggers.h>
+
+#include "lines.h"
+
+int main(int argc, char** argv)
+{
+  ros::init(argc, argv, "client");
+  const double hz = argc > 1 ? std::atof(argv[1]) : 5.0;
+  ros::NodeHandle node;
+  ros::service::waitForService("who");
+  say("ready " + ros::this_node::getName());
+  ros::Rate rate(hz);
+  while (ros::ok())
+  {
+    roscpp::GetLoggers call;
+    if (ros::service::call("who", call) && !call.response.loggers.empty())
+      say("reply " + call.response.loggers[0].name);
+    else if (ros::ok())
+      say("failed the call of the service");
+    rate.sleep();
+  }
+}

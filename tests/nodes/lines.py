@@ -1,0 +1,27 @@
+"""What every test node says, and how: one line per event on standard output, flushed at once.
+
+    ready NAME              the node is registered and at work
+    sent N                  talker: message N has been published
+    got PUBLISHER N         listener: message N of PUBLISHER has arrived
+    links N                 talker, listener: the number of live TCPROS links is now N
+    update TOPIC URI...     listener: a publisherUpdate with these publishers came
+    called N                service server: the Nth call was answered
+    reply NAME              service client: the server that calls itself NAME answered
+    value JSON              parameter user: what the cached parameter is now (null if unset)
+    failed TEXT             something that should have worked did not
+
+The roscpp nodes say the same (lines.h). `tests/support/node.rs` reads it.
+"""
+
+import sys
+import threading
+
+_lock = threading.Lock()
+
+
+def say(*words):
+    """Prints one line, whole, whatever the other threads print."""
+    line = " ".join(str(word) for word in words) + "\n"
+    with _lock:
+        sys.stdout.write(line)
+        sys.stdout.flush()

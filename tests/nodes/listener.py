@@ -1,0 +1,66 @@
+#!/usr/bin/python3
+"""Subscribes to `chatter` and says each message, each change of its links and each publisherUpdate.
+
+rospy has no call-back for links of a subscriber, so this wraps the places where it makes and ends them.
+"""
+
+import rospy
+import rospy.impl.masterslave
+import rospy.impl.tcpros_base
+from std_msgs.msg import String
+
+from lines import say
+
+
+def watch_updates():
+    """Says every publisherUpdate. To be called before the node's server starts."""
+    original = rospy.impl.masterslave.ROSHandler.publisherUpdate
+
+    def publisher_update(self, caller_id, topic, publishers):
+        say("update", topic, *publishers)
+        return original(self, caller_id, topic, publishers)
+
+    rospy.impl.masterslave.ROSHandler.publisherUpdate = publisher_update
+
+
+def watch_reconnects():
+    """rospy mends a broken link under the same connection object: that is a lost link all the same."""
+    original = rospy.impl.tcpros_base.TCPROSTransport._reconnect
+
+    def reconnect(self):
+        say("links", 0)
+        original(self)
+
+    rospy.impl.tcpros_base.TCPROSTransport._reconnect = reconnect
+
+
+def watch_links(subscriber):
+    """Says how many publishers are connected whenever that changes."""
+    impl = subscriber.impl
+
+    def watched(original):
+        def method(connection):
+            answer = original(connection)
+            say("links", impl.get_num_connections())
+            return answer
+
+        return method
+
+    impl.add_connection = watched(impl.add_connection)
+    impl.remove_connection = watched(impl.remove_connection)
+
+
+def main():
+    watch_updates()
+    watch_reconnects()
+    rospy.init_node("listener")
+    subscriber = rospy.Subscriber(
+        "chatter", String, lambda message: say("got", message.data), queue_size=None
+    )
+    watch_links(subscriber)
+    say("ready", rospy.get_name())
+    rospy.spin()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+#!/usr/bin/python3
+"""Says what `get_param_cached` holds for a parameter, whenever it changes. Usage: param_user.py KEY
+
+After the first look only a paramUpdate of the master changes the cache.
+"""
+
+import json
+
+import rospy
+
+from lines import say
+
+
+def main():
+    key = rospy.myargv()[1]
+    rospy.init_node("param_user")
+    rospy.get_param_cached(key, None)
+    say("ready", rospy.get_name())
+    seen = object()
+    rate = rospy.Rate(50)
+    while not rospy.is_shutdown():
+        try:
+            value = rospy.get_param_cached(key, None)
+            if value != seen:
+                say("value", json.dumps(value))
+                seen = value
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            break
+        except Exception as error:  # a failed look must be seen by the test, not end the node
+            say("failed", type(error).__name__, error)
+            rospy.sleep(0.1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+#!/usr/bin/python3
+"""Offers the service `who`, which answers with the name of this node.
+
+The type is roscpp/GetLoggers, which every ROS installation has for rospy and for roscpp.
+"""
+
+import rospy
+from roscpp.msg import Logger
+from roscpp.srv import GetLoggers, GetLoggersResponse
+
+from lines import say
+
+calls = 0
+
+
+def answer(_request):
+    """Names this node and counts the call."""
+    global calls
+    calls += 1
+    say("called", calls)
+    return GetLoggersResponse([Logger(rospy.get_name(), "INFO")])
+
+
+def main():
+    rospy.init_node("server")
+    rospy.Service("who", GetLoggers, answer)
+    say("ready", rospy.get_name())
+    rospy.spin()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+// Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ]
+#include <cstdlib>
+#include <ros/ros.h>
+#include <std_msgs/String.h>
+
+#include "lines.h"
+
+static ros::Publisher publisher;
+
+static void on_link(const ros::SingleSubscriberPublisher&)
+{
+  say("links " + std::to_string(publisher.getNumSubscribers()));
+}
+
+int main(int argc, char** argv)
+{
+  ros::init(argc, argv, "talker");
+  const double hz = argc > 1 ? std::atof(argv[1]) : 50.0;
+  ros::NodeHandle node;
+  publisher = node.advertise<std_msgs::String>("chatter", 1000, on_link, on_link);
+  say("ready " + ros::this_node::getName());
+  ros::Rate rate(hz);
+  for (unsigned long number = 1; ros::ok(); ++number)
+  {
+    std_msgs::String message;
+    message.data = ros::this_node::getName() + " " + std::to_string(number);
+    publisher.publish(message);
+    say("sent " + std::to_string(number));
+    ros::spinOnce();
+    rate.sleep();
+  }
+}

@@ -1,0 +1,45 @@
+#!/usr/bin/python3
+"""Publishes `std_msgs/String` "NAME N" on `chatter`, numbered from 1. Usage: talker.py [HZ]"""
+
+import rospy
+from std_msgs.msg import String
+
+from lines import say
+
+
+class Links(rospy.SubscribeListener):
+    """Says how many subscribers are connected whenever that changes."""
+
+    def __init__(self):
+        super().__init__()
+        self.publisher = None
+
+    def peer_subscribe(self, _topic, _publish, _peer_publish):
+        say("links", self.publisher.get_num_connections() if self.publisher else 0)
+
+    def peer_unsubscribe(self, _topic, peers):
+        say("links", peers)
+
+
+def main():
+    arguments = rospy.myargv()
+    hz = float(arguments[1]) if len(arguments) > 1 else 50.0
+    rospy.init_node("talker")
+    links = Links()
+    publisher = rospy.Publisher("chatter", String, subscriber_listener=links, queue_size=1000)
+    links.publisher = publisher
+    say("ready", rospy.get_name())
+    number = 0
+    rate = rospy.Rate(hz)
+    while not rospy.is_shutdown():
+        number += 1
+        publisher.publish("%s %d" % (rospy.get_name(), number))
+        say("sent", number)
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            break
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,326 @@
+//! Fakes of both ends: a node that records what the master tells it, and a master that says anything.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread;
+
+use rosrescue::xmlrpc::{self, Reply, Value};
+
+use super::params;
+use super::rpc::Client;
+
+/// A call that a fake node was sent.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Heard {
+    pub(crate) method: String,
+    pub(crate) params: Vec<Value>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    heard: Mutex<Vec<Heard>>,
+    holding: Mutex<bool>,
+    released: Condvar,
+    publications: Mutex<BTreeMap<String, String>>,
+    subscriptions: Mutex<BTreeMap<String, String>>,
+}
+
+/// A node without TCPROS: an XML-RPC server that answers what a node must answer, truthfully, and
+/// remembers what it was sent.
+#[derive(Debug)]
+pub(crate) struct FakeNode {
+    pub(crate) name: String,
+    pub(crate) api: String,
+    inner: Arc<Inner>,
+    server: Server,
+}
+
+impl FakeNode {
+    pub(crate) fn start(name: &str) -> Self {
+        let inner = Arc::new(Inner::default());
+        let state = Arc::clone(&inner);
+        let server = Server::start(move |stream| serve_node(&state, stream));
+        Self {
+            name: name.to_owned(),
+            api: format!("http://127.0.0.1:{}/", server.port),
+            inner,
+            server,
+        }
+    }
+
+    /// What the master (or rosrescue) sent, without the questions that everybody asks.
+    pub(crate) fn heard(&self, method: &str) -> Vec<Vec<Value>> {
+        let heard = lock(&self.inner.heard);
+        heard
+            .iter()
+            .filter(|call| call.method == method)
+            .map(|call| call.params.clone())
+            .collect()
+    }
+
+    /// The publishers of every publisherUpdate for `topic`, as they came.
+    pub(crate) fn updates(&self, topic: &str) -> Vec<Vec<String>> {
+        self.heard("publisherUpdate")
+            .into_iter()
+            .filter(|params| params[1] == Value::from(topic))
+            .map(|params| {
+                let uris = params[2].as_array().expect("a list of addresses");
+                uris.iter()
+                    .map(|uri| uri.as_str().expect("an address").to_owned())
+                    .collect()
+            })
+            .collect()
+    }
+
+    /// From now on calls are taken and not answered.
+    pub(crate) fn hold(&self) {
+        *lock(&self.inner.holding) = true;
+    }
+
+    /// Answers again.
+    pub(crate) fn release(&self) {
+        *lock(&self.inner.holding) = false;
+        self.inner.released.notify_all();
+    }
+
+    #[track_caller]
+    pub(crate) fn publish(&self, master: &Client, topic: &str, topic_type: &str) {
+        lock(&self.inner.publications).insert(topic.to_owned(), topic_type.to_owned());
+        let params = params![self.name.as_str(), topic, topic_type, self.api.as_str()];
+        master.ok("registerPublisher", params);
+    }
+
+    #[track_caller]
+    pub(crate) fn unpublish(&self, master: &Client, topic: &str) {
+        lock(&self.inner.publications).remove(topic);
+        let params = params![self.name.as_str(), topic, self.api.as_str()];
+        assert_eq!(master.ok("unregisterPublisher", params), Value::Int(1));
+    }
+
+    #[track_caller]
+    pub(crate) fn subscribe(&self, master: &Client, topic: &str, topic_type: &str) {
+        lock(&self.inner.subscriptions).insert(topic.to_owned(), topic_type.to_owned());
+        let params = params![self.name.as_str(), topic, topic_type, self.api.as_str()];
+        master.ok("registerSubscriber", params);
+    }
+
+    #[track_caller]
+    pub(crate) fn unsubscribe(&self, master: &Client, topic: &str) {
+        lock(&self.inner.subscriptions).remove(topic);
+        let params = params![self.name.as_str(), topic, self.api.as_str()];
+        assert_eq!(master.ok("unregisterSubscriber", params), Value::Int(1));
+    }
+
+    /// What the node says when it is asked, without a call to the master.
+    pub(crate) fn claim_publication(&self, topic: &str, topic_type: Option<&str>) {
+        let mut publications = lock(&self.inner.publications);
+        match topic_type {
+            Some(topic_type) => publications.insert(topic.to_owned(), topic_type.to_owned()),
+            None => publications.remove(topic),
+        };
+    }
+
+    /// Its address for services. Nobody answers there in TCPROS.
+    pub(crate) fn service_api(&self) -> String {
+        format!("rosrpc://127.0.0.1:{}", self.server.port)
+    }
+
+    #[track_caller]
+    pub(crate) fn offer(&self, master: &Client, service: &str) {
+        let params = params![
+            self.name.as_str(),
+            service,
+            self.service_api(),
+            self.api.as_str()
+        ];
+        master.ok("registerService", params);
+    }
+
+    #[track_caller]
+    pub(crate) fn watch_param(&self, master: &Client, key: &str) -> Value {
+        master.ok(
+            "subscribeParam",
+            params![self.name.as_str(), self.api.as_str(), key],
+        )
+    }
+}
+
+impl Drop for FakeNode {
+    fn drop(&mut self) {
+        self.release();
+    }
+}
+
+fn serve_node(inner: &Inner, stream: TcpStream) {
+    let mut stream = BufReader::new(stream);
+    while let Some((_, body)) = read_request(&mut stream) {
+        let Ok(call) = xmlrpc::decode_call(&body) else {
+            break;
+        };
+        lock(&inner.heard).push(Heard {
+            method: call.method.clone(),
+            params: call.params,
+        });
+        let mut holding = lock(&inner.holding);
+        while *holding {
+            holding = inner
+                .released
+                .wait(holding)
+                .unwrap_or_else(PoisonError::into_inner);
+        }
+        drop(holding);
+        let pairs = |table: &Mutex<BTreeMap<String, String>>| {
+            let table = lock(table);
+            Value::from(
+                table
+                    .iter()
+                    .map(|(a, b)| params![a.as_str(), b.as_str()])
+                    .collect::<Vec<_>>(),
+            )
+        };
+        let value = match call.method.as_str() {
+            "getPid" => Value::Int(i32::try_from(std::process::id()).unwrap()),
+            "getPublications" => pairs(&inner.publications),
+            "getSubscriptions" => pairs(&inner.subscriptions),
+            "requestTopic" => Value::Array(Vec::new()),
+            _ => Value::Int(0),
+        };
+        let code = i32::from(call.method != "requestTopic");
+        let reply = Reply::Value(Value::Array(vec![code.into(), "".into(), value]));
+        if stream
+            .get_mut()
+            .write_all(&http_reply(&xmlrpc::encode_reply(&reply)))
+            .is_err()
+        {
+            break;
+        }
+    }
+}
+
+/// A server that answers a request with whatever bytes the test says, then closes.
+#[derive(Debug)]
+pub(crate) struct FakeMaster {
+    server: Server,
+}
+
+impl FakeMaster {
+    /// `answer` gets the body of a request and gives all the bytes that go back.
+    pub(crate) fn start(answer: impl Fn(&[u8]) -> Vec<u8> + Send + Sync + 'static) -> Self {
+        let server = Server::start(move |stream| {
+            let mut stream = BufReader::new(stream);
+            while let Some((_, body)) = read_request(&mut stream) {
+                let bytes = answer(&body);
+                let whole = bytes.starts_with(b"HTTP/1.1 200 OK\r\nServer: fake-keep-alive");
+                if stream.get_mut().write_all(&bytes).is_err() || !whole {
+                    break;
+                }
+            }
+            let _ = stream.get_mut().shutdown(Shutdown::Both);
+        });
+        Self { server }
+    }
+
+    pub(crate) fn port(&self) -> u16 {
+        self.server.port
+    }
+
+    /// The bytes of a proper answer with `value`; the connection stays open.
+    pub(crate) fn proper(reply: &Reply) -> Vec<u8> {
+        let body = xmlrpc::encode_reply(reply);
+        let head = format!(
+            "HTTP/1.1 200 OK\r\nServer: fake-keep-alive\r\nContent-Type: text/xml\r\n\
+             Content-Length: {}\r\n\r\n",
+            body.len()
+        );
+        [head.as_bytes(), &body].concat()
+    }
+}
+
+fn http_reply(body: &[u8]) -> Vec<u8> {
+    let length = body.len();
+    let head =
+        format!("HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n");
+    [head.as_bytes(), body].concat()
+}
+
+/// Head and body of the next request; nothing at the end of the connection.
+fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String, Vec<u8>)> {
+    let mut head = String::new();
+    loop {
+        let mut line = String::new();
+        if stream.read_line(&mut line).ok()? == 0 {
+            return None;
+        }
+        if line.trim().is_empty() {
+            break;
+        }
+        head += &line;
+    }
+    let length = head.lines().find_map(|line| {
+        let (name, value) = line.split_once(':')?;
+        name.eq_ignore_ascii_case("content-length")
+            .then(|| value.trim().parse().ok())?
+    });
+    let mut body = vec![0; length.unwrap_or(0)];
+    stream.read_exact(&mut body).ok()?;
+    Some((head, body))
+}
+
+/// A listener with a thread a connection; all connections end on drop.
+#[derive(Debug)]
+struct Server {
+    port: u16,
+    done: Arc<AtomicBool>,
+    open: Arc<Mutex<Vec<TcpStream>>>,
+}
+
+impl Server {
+    fn start(serve: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let done = Arc::new(AtomicBool::new(false));
+        let open = Arc::new(Mutex::new(Vec::new()));
+        let serve = Arc::new(serve);
+        let (stop, connections) = (Arc::clone(&done), Arc::clone(&open));
+        thread::spawn(move || {
+            for stream in listener.incoming().flatten() {
+                if stop.load(Ordering::SeqCst) {
+                    break;
+                }
+                let Ok(other) = stream.try_clone() else {
+                    continue;
+                };
+                let _ = stream.set_nodelay(true);
+                lock(&connections).push(other);
+                let serve = Arc::clone(&serve);
+                thread::spawn(move || {
+                    let closing = stream.try_clone();
+                    serve(stream);
+                    // The list above holds a second handle: say explicitly that it is over.
+                    if let Ok(stream) = closing {
+                        let _ = stream.shutdown(Shutdown::Both);
+                    }
+                });
+            }
+        });
+        Self { port, done, open }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.done.store(true, Ordering::SeqCst);
+        let _ = TcpStream::connect((Ipv4Addr::LOCALHOST, self.port));
+        for stream in lock(&self.open).drain(..) {
+            let _ = stream.shutdown(Shutdown::Both);
+        }
+    }
+}
+
+/// The lock, also after the panic of another thread: the panic is reported where it was.
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

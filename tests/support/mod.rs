@@ -1,0 +1,59 @@
+//! What every integration test stands on: real rosmasters and nodes, rosrescue itself, fakes of both
+//! ends, the state of a master, and patience.
+//!
+//! Whatever a test starts carries the token of its [`Scratch`] in its environment and is ended, by its
+//! own process id, when the scratch folder is dropped, after a panic too.
+
+#![allow(
+    dead_code,
+    unused_imports,
+    reason = "every test file takes its own part"
+)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod fake;
+mod node;
+mod patience;
+mod process;
+mod rescue;
+mod robot;
+mod ros;
+mod rpc;
+mod scratch;
+mod state;
+
+pub(crate) use fake::{FakeMaster, FakeNode, Heard};
+pub(crate) use node::{Library, Node};
+pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
+pub(crate) use process::{Process, alive, signal};
+pub(crate) use rescue::{Rescue, Setup};
+pub(crate) use robot::{Mode, Robot};
+pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, ros_command};
+pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request};
+pub(crate) use scratch::{Scratch, free_port};
+pub(crate) use state::State;
+
+/// The parameters of a call: everything that [`rosrescue::xmlrpc::Value`] can be made from.
+#[allow(unused_macros)]
+macro_rules! params {
+    ($($param:expr),* $(,)?) => {
+        vec![$(rosrescue::xmlrpc::Value::from($param)),*]
+    };
+}
+pub(crate) use params;
+
+/// A struct value.
+#[allow(unused_macros)]
+macro_rules! tree {
+    ($($key:literal => $value:expr),* $(,)?) => {
+        rosrescue::xmlrpc::Value::Struct(rosrescue::xmlrpc::Struct::from_iter([
+            $(($key.to_owned(), rosrescue::xmlrpc::Value::from($value))),*
+        ]))
+    };
+}
+pub(crate) use tree;

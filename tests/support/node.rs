@@ -1,0 +1,163 @@
+//! Real nodes of both client libraries, and what they say (`tests/nodes/lines.py`).
+
+use std::ops::{Deref, DerefMut};
+use std::path::Path;
+use std::process::Command;
+
+use super::patience::eventually;
+use super::process::Process;
+use super::ros::{NODES, cpp_nodes, ros_command};
+use super::scratch::Scratch;
+
+/// A client library of ROS.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Library {
+    Rospy,
+    Roscpp,
+}
+
+impl Library {
+    /// A command that runs `node` of this library at the master at `port`. Debian's rospy belongs to
+    /// the system's Python, whatever the PATH says.
+    pub(crate) fn command(self, scratch: &Scratch, port: u16, node: &str) -> Command {
+        match self {
+            Self::Rospy => {
+                let mut command = ros_command(scratch, "/usr/bin/python3", port);
+                command.arg(Path::new(NODES).join(format!("{node}.py")));
+                command
+            }
+            Self::Roscpp => ros_command(scratch, cpp_nodes().join(node), port),
+        }
+    }
+}
+
+/// A running node.
+#[derive(Debug)]
+pub(crate) struct Node {
+    process: Process,
+}
+
+impl Node {
+    /// Starts `node` with `arguments` (remappings too) and does not wait for it.
+    #[track_caller]
+    pub(crate) fn spawn(
+        scratch: &Scratch,
+        library: Library,
+        port: u16,
+        node: &str,
+        arguments: &[&str],
+    ) -> Self {
+        let mut command = library.command(scratch, port, node);
+        command.args(arguments);
+        let name = format!("{library:?} {node} {arguments:?}");
+        Self {
+            process: Process::start(name, &mut command),
+        }
+    }
+
+    /// Starts `node` and waits until it is at work.
+    #[track_caller]
+    pub(crate) fn start(
+        scratch: &Scratch,
+        library: Library,
+        port: u16,
+        node: &str,
+        arguments: &[&str],
+    ) -> Self {
+        let mut node = Self::spawn(scratch, library, port, node, arguments);
+        node.wait_line("`ready`", |line| line.starts_with("ready "));
+        node
+    }
+
+    /// The rest of every line that begins with `word`.
+    pub(crate) fn said(&self, word: &str) -> Vec<String> {
+        let start = format!("{word} ");
+        let lines = self.process.stdout();
+        lines
+            .iter()
+            .filter_map(|line| line.strip_prefix(&start))
+            .map(str::to_owned)
+            .collect()
+    }
+
+    /// The numbers of the messages of `publisher` that a listener got, as they came.
+    pub(crate) fn messages(&self, publisher: &str) -> Vec<u64> {
+        let start = format!("{publisher} ");
+        let got = self.said("got");
+        got.iter()
+            .filter_map(|line| line.strip_prefix(&start)?.parse().ok())
+            .collect()
+    }
+
+    /// The numbers of live links, as they changed.
+    pub(crate) fn links(&self) -> Vec<usize> {
+        self.said("links")
+            .iter()
+            .filter_map(|count| count.parse().ok())
+            .collect()
+    }
+
+    /// The publishers of every publisherUpdate for `topic`, as they came.
+    pub(crate) fn updates(&self, topic: &str) -> Vec<Vec<String>> {
+        let updates = self.said("update");
+        updates
+            .iter()
+            .map(|line| line.split(' ').map(str::to_owned).collect::<Vec<_>>())
+            .filter(|words| words[0] == topic)
+            .map(|words| words[1..].to_vec())
+            .collect()
+    }
+
+    /// Waits until `more` further messages of `publisher` have come.
+    #[track_caller]
+    pub(crate) fn wait_messages(&self, publisher: &str, more: usize) {
+        let before = self.messages(publisher).len();
+        eventually(
+            &format!("{more} more messages of {publisher} (after {before})"),
+            || self.messages(publisher).len() >= before + more,
+        );
+    }
+
+    /// Panics unless the messages of `publisher` came without a gap, a repetition or a disorder.
+    #[track_caller]
+    pub(crate) fn assert_no_message_lost(&self, publisher: &str) {
+        let messages = self.messages(publisher);
+        assert!(
+            !messages.is_empty(),
+            "no message of {publisher} came at all"
+        );
+        for pair in messages.windows(2) {
+            assert!(
+                pair[1] == pair[0] + 1,
+                "after message {} of {publisher} came {}",
+                pair[0],
+                pair[1]
+            );
+        }
+    }
+
+    /// Panics if the number of links ever went down.
+    #[track_caller]
+    pub(crate) fn assert_no_link_lost(&self) {
+        let links = self.links();
+        assert!(
+            links.is_sorted(),
+            "a link was lost: {links:?}\n{}",
+            self.process.log()
+        );
+    }
+}
+
+impl Deref for Node {
+    type Target = Process;
+
+    fn deref(&self) -> &Process {
+        &self.process
+    }
+}
+
+impl DerefMut for Node {
+    fn deref_mut(&mut self) -> &mut Process {
+        &mut self.process
+    }
+}

@@ -1,0 +1,43 @@
+//! Waiting: for a condition, with a bound, never for a time.
+
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+/// How long anything may take on two busy cores before a test gives up.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+const STEP: Duration = Duration::from_millis(10);
+
+/// Waits until `condition` holds. Panics with `what` after [`PATIENCE`].
+#[track_caller]
+pub(crate) fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
+    eventually_some(what, || condition().then_some(()));
+}
+
+/// Waits until `look` finds something, and returns it. Panics with `what` after [`PATIENCE`].
+#[track_caller]
+pub(crate) fn eventually_some<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let start = Instant::now();
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(
+            start.elapsed() < PATIENCE,
+            "never happened in {PATIENCE:?}: {what}"
+        );
+        sleep(STEP);
+    }
+}
+
+/// Whether `condition` holds all through `span`: for what must *not* happen.
+pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool {
+    let start = Instant::now();
+    while start.elapsed() < span {
+        if !condition() {
+            return false;
+        }
+        sleep(STEP);
+    }
+    true
+}

@@ -1,0 +1,218 @@
+//! A child process whose output is watched.
+
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal};
+
+use super::patience::{PATIENCE, eventually_some};
+
+/// Sends `signal` to one process. A process that is gone is no error.
+pub(crate) fn signal(pid: u32, signal: Signal) {
+    let pid = i32::try_from(pid)
+        .ok()
+        .and_then(Pid::from_raw)
+        .expect("a process id");
+    let _ = rustix::process::kill_process(pid, signal);
+}
+
+/// Whether a process with this id is there and is no zombie.
+pub(crate) fn alive(pid: u32) -> bool {
+    std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| {
+        !stat
+            .rsplit(')')
+            .next()
+            .unwrap_or("")
+            .trim_start()
+            .starts_with('Z')
+    })
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stream {
+    Out,
+    Err,
+}
+
+#[derive(Debug)]
+struct Line {
+    at: Duration,
+    stream: Stream,
+    text: String,
+}
+
+/// A running (or ended) child. It is killed on drop; after a panic its output is shown.
+#[derive(Debug)]
+pub(crate) struct Process {
+    name: String,
+    child: Child,
+    ended: Option<ExitStatus>,
+    lines: Arc<Mutex<Vec<Line>>>,
+}
+
+impl Process {
+    #[track_caller]
+    pub(crate) fn start(name: impl Into<String>, command: &mut Command) -> Self {
+        let name = name.into();
+        let mut child = command
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("cannot start {name} ({command:?}): {error}"));
+        let lines = Arc::new(Mutex::new(Vec::new()));
+        let start = Instant::now();
+        collect(child.stdout.take().unwrap(), Stream::Out, start, &lines);
+        collect(child.stderr.take().unwrap(), Stream::Err, start, &lines);
+        Self {
+            name,
+            child,
+            ended: None,
+            lines,
+        }
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub(crate) fn signal(&self, which: Signal) {
+        if self.ended.is_none() {
+            signal(self.pid(), which);
+        }
+    }
+
+    /// SIGKILL, and the end of the process.
+    pub(crate) fn kill(&mut self) {
+        self.signal(Signal::KILL);
+        self.wait();
+    }
+
+    /// SIGTERM, and the end of the process within [`PATIENCE`].
+    #[track_caller]
+    pub(crate) fn terminate(&mut self) -> ExitStatus {
+        self.signal(Signal::TERM);
+        self.wait()
+    }
+
+    /// The exit status, if the process has ended.
+    pub(crate) fn exited(&mut self) -> Option<ExitStatus> {
+        if self.ended.is_none() {
+            self.ended = self.child.try_wait().expect("cannot wait for a child");
+        }
+        self.ended
+    }
+
+    /// The exit status once the process has ended by itself.
+    #[track_caller]
+    pub(crate) fn wait(&mut self) -> ExitStatus {
+        let what = format!("{} ends", self.name);
+        eventually_some(&what, || self.exited())
+    }
+
+    /// What it wrote to standard output so far, line by line.
+    pub(crate) fn stdout(&self) -> Vec<String> {
+        self.text(Some(Stream::Out))
+    }
+
+    /// What it wrote to standard error so far, line by line.
+    pub(crate) fn stderr(&self) -> Vec<String> {
+        self.text(Some(Stream::Err))
+    }
+
+    /// Everything it wrote so far, line by line.
+    pub(crate) fn output(&self) -> Vec<String> {
+        self.text(None)
+    }
+
+    fn text(&self, stream: Option<Stream>) -> Vec<String> {
+        let lines = self.lines.lock().unwrap();
+        lines
+            .iter()
+            .filter(|line| stream.is_none_or(|stream| line.stream == stream))
+            .map(|line| line.text.clone())
+            .collect()
+    }
+
+    /// Waits for a line, on either stream, that `wanted` accepts. Panics if the process ends first.
+    #[track_caller]
+    pub(crate) fn wait_line(&mut self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
+        let what = format!("{} says {what}", self.name);
+        eventually_some(&what, || {
+            let ended = self.exited();
+            let found = self.output().into_iter().find(|line| wanted(line));
+            if let (None, Some(status)) = (&found, ended) {
+                // What it wrote last may still be on its way through the pipe.
+                thread::sleep(Duration::from_millis(200));
+                let found = self.output().into_iter().find(|line| wanted(line));
+                assert!(
+                    found.is_some(),
+                    "never happened: {what}; it ended with {status}"
+                );
+                return found;
+            }
+            found
+        })
+    }
+
+    /// The output for a person.
+    pub(crate) fn log(&self) -> String {
+        let lines = self.lines.lock().unwrap();
+        let mut log = format!("---- {} (process {})\n", self.name, self.pid());
+        // A talker says thousands of lines; the first and the last tell the story.
+        let (head, tail) = (100, 100);
+        for (number, line) in lines.iter().enumerate() {
+            if number >= head && number + tail < lines.len() {
+                if number == head {
+                    log += &format!("     ... {} lines ...\n", lines.len() - head - tail);
+                }
+                continue;
+            }
+            let sign = if line.stream == Stream::Out { ' ' } else { '!' };
+            log += &format!("{:9.3} {sign} {}\n", line.at.as_secs_f64(), line.text);
+        }
+        log
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let ended = self.exited();
+        if ended.is_none() {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+        if thread::panicking() {
+            eprintln!("{}     (ended before the test: {ended:?})", self.log());
+        }
+    }
+}
+
+fn collect(
+    from: impl Read + Send + 'static,
+    stream: Stream,
+    start: Instant,
+    lines: &Arc<Mutex<Vec<Line>>>,
+) {
+    let lines = Arc::clone(lines);
+    thread::spawn(move || {
+        let mut from = BufReader::new(from);
+        let mut bytes = Vec::new();
+        // The end of the pipe, or an error, is the end of what there is to read.
+        while from
+            .read_until(b'\n', &mut bytes)
+            .is_ok_and(|count| count > 0)
+        {
+            let text = String::from_utf8_lossy(&bytes).trim_end().to_owned();
+            lines.lock().unwrap().push(Line {
+                at: start.elapsed(),
+                stream,
+                text,
+            });
+            bytes.clear();
+        }
+    });
+}

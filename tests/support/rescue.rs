@@ -1,0 +1,173 @@
+//! rosrescue itself, as a person starts it.
+
+use std::ffi::OsStr;
+use std::ops::{Deref, DerefMut};
+use std::path::PathBuf;
+use std::process::Command;
+
+use super::patience::eventually;
+use super::process::Process;
+use super::rpc::Client;
+use super::scratch::{Scratch, free_port};
+
+/// How to start rosrescue; the same again after a crash.
+#[derive(Debug)]
+pub(crate) struct Setup {
+    command: Command,
+    pub(crate) port: u16,
+    pub(crate) checkpoint: PathBuf,
+}
+
+impl Setup {
+    /// `rosrescue` with `arguments` and nothing else but the environment of the scratch folder.
+    pub(crate) fn bare<I: AsRef<OsStr>>(
+        scratch: &Scratch,
+        arguments: impl IntoIterator<Item = I>,
+    ) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+        scratch.prepare(&mut command);
+        command.args(arguments).current_dir(scratch.path(""));
+        Self {
+            command,
+            port: 0,
+            checkpoint: scratch.log_dir().join("latest-chkpt.yaml"),
+        }
+    }
+
+    /// `rosrescue core` on a free port, its rosmaster on `master_port`.
+    pub(crate) fn core(scratch: &Scratch, master_port: u16) -> Self {
+        let port = free_port();
+        let mut setup = Self::bare(scratch, ["core", "-p", &port.to_string()]);
+        setup.port = port;
+        setup.arg("--master-port").arg(master_port.to_string())
+    }
+
+    /// `rosrescue proxy` on a free port before the master at `master_port`.
+    pub(crate) fn proxy(scratch: &Scratch, master_port: u16) -> Self {
+        let port = free_port();
+        let master = format!("http://127.0.0.1:{master_port}");
+        let listen = format!("127.0.0.1:{port}");
+        let mut setup = Self::bare(scratch, ["proxy", "--master", &master, "--listen", &listen]);
+        setup.port = port;
+        setup
+    }
+
+    pub(crate) fn arg(mut self, argument: impl AsRef<OsStr>) -> Self {
+        self.command.arg(argument);
+        self
+    }
+
+    pub(crate) fn args<I: AsRef<OsStr>>(mut self, arguments: impl IntoIterator<Item = I>) -> Self {
+        self.command.args(arguments);
+        self
+    }
+
+    pub(crate) fn env(mut self, key: &str, value: impl AsRef<OsStr>) -> Self {
+        self.command.env(key, value);
+        self
+    }
+
+    pub(crate) fn at_port(mut self, port: u16) -> Self {
+        self.port = port;
+        self
+    }
+
+    pub(crate) fn at_checkpoint(mut self, checkpoint: PathBuf) -> Self {
+        self.command.arg("--checkpoint").arg(&checkpoint);
+        self.checkpoint = checkpoint;
+        self
+    }
+
+    /// Starts it and waits until it serves a living master.
+    #[track_caller]
+    pub(crate) fn start(self) -> Rescue {
+        let mut rescue = self.spawn();
+        rescue.wait_serving();
+        rescue
+    }
+
+    /// Starts it and waits for nothing.
+    #[track_caller]
+    pub(crate) fn spawn(mut self) -> Rescue {
+        let process = Process::start("rosrescue", &mut self.command);
+        Rescue {
+            process,
+            setup: self,
+        }
+    }
+}
+
+/// A running rosrescue. On drop it is killed; what it started ends with the scratch folder.
+#[derive(Debug)]
+pub(crate) struct Rescue {
+    process: Process,
+    setup: Setup,
+}
+
+impl Rescue {
+    pub(crate) fn port(&self) -> u16 {
+        self.setup.port
+    }
+
+    pub(crate) fn checkpoint(&self) -> PathBuf {
+        self.setup.checkpoint.clone()
+    }
+
+    pub(crate) fn client(&self) -> Client {
+        Client::new(self.setup.port)
+    }
+
+    /// Waits until it has said its address and the master answers through it.
+    #[track_caller]
+    pub(crate) fn wait_serving(&mut self) {
+        self.wait_line("its address", |line| {
+            line.contains("ROS_MASTER_URI=http://")
+        });
+        let client = self.client();
+        eventually("a master answers through rosrescue", || {
+            let ended = self.process.exited();
+            assert!(ended.is_none(), "rosrescue ended: {ended:?}");
+            client.master_pid().is_some_and(super::process::alive)
+        });
+    }
+
+    /// Starts it again, with the same arguments, after it has ended; waits for nothing.
+    #[track_caller]
+    pub(crate) fn start_again(&mut self) {
+        assert!(self.process.exited().is_some(), "rosrescue still runs");
+        self.assert_no_panic();
+        self.process = Process::start("rosrescue, again", &mut self.setup.command);
+    }
+
+    #[track_caller]
+    pub(crate) fn assert_no_panic(&self) {
+        let panic = self
+            .process
+            .output()
+            .into_iter()
+            .find(|line| line.contains("panicked at"));
+        assert!(panic.is_none(), "rosrescue panicked: {panic:?}");
+    }
+}
+
+impl Drop for Rescue {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            self.assert_no_panic();
+        }
+    }
+}
+
+impl Deref for Rescue {
+    type Target = Process;
+
+    fn deref(&self) -> &Process {
+        &self.process
+    }
+}
+
+impl DerefMut for Rescue {
+    fn deref_mut(&mut self) -> &mut Process {
+        &mut self.process
+    }
+}

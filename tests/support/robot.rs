@@ -1,0 +1,207 @@
+//! A robot's ROS with rosrescue in it, in either mode: what a test kills and brings back.
+
+use std::collections::BTreeSet;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+
+use super::node::{Library, Node};
+use super::patience::{PATIENCE, eventually, eventually_some};
+use super::process::{alive, signal};
+use super::rescue::{Rescue, Setup};
+use super::ros::Rosmaster;
+use super::rpc::Client;
+use super::scratch::{Scratch, free_port};
+use super::state::State;
+
+/// How rosrescue is run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mode {
+    /// rosrescue starts and restarts the master.
+    Core,
+    /// The test starts and restarts it.
+    Proxy,
+}
+
+/// rosrescue and its master.
+#[derive(Debug)]
+pub(crate) struct Robot {
+    mode: Mode,
+    // The order is that of the drops: who restarts others goes first, the scratch folder last.
+    pub(crate) rescue: Rescue,
+    master: Option<Rosmaster>,
+    master_port: u16,
+    pub(crate) scratch: Scratch,
+}
+
+impl Robot {
+    #[track_caller]
+    pub(crate) fn start(mode: Mode) -> Self {
+        Self::start_with(mode, &[])
+    }
+
+    /// Starts one with more options for rosrescue.
+    #[track_caller]
+    pub(crate) fn start_with(mode: Mode, options: &[&str]) -> Self {
+        let scratch = Scratch::new();
+        let master_port = free_port();
+        let (master, setup) = match mode {
+            Mode::Core => (None, Setup::core(&scratch, master_port)),
+            Mode::Proxy => (
+                Some(Rosmaster::start_at(&scratch, master_port)),
+                Setup::proxy(&scratch, master_port),
+            ),
+        };
+        let rescue = setup.args(options).start();
+        let robot = Self {
+            mode,
+            rescue,
+            master,
+            master_port,
+            scratch,
+        };
+        if mode == Mode::Core {
+            eventually("rosout is at work", || robot.state().knows("/rosout"));
+        }
+        robot
+    }
+
+    /// The port that nodes use.
+    pub(crate) fn port(&self) -> u16 {
+        self.rescue.port()
+    }
+
+    /// A client through rosrescue.
+    pub(crate) fn client(&self) -> Client {
+        self.rescue.client()
+    }
+
+    /// A client of the real master: what it says is not what rosrescue says.
+    pub(crate) fn bare(&self) -> Client {
+        Client::new(self.master_port)
+    }
+
+    /// The state of the real master.
+    #[track_caller]
+    pub(crate) fn state(&self) -> State {
+        State::read(&self.bare())
+    }
+
+    /// The state of the real master once nobody changes it any more.
+    #[track_caller]
+    pub(crate) fn settled_state(&self) -> State {
+        let mut last = None;
+        eventually_some("the master's state is at rest", || {
+            let now = State::try_read(&self.bare()).ok()?;
+            if last.as_ref() == Some(&now) {
+                return last.take();
+            }
+            last = Some(now);
+            sleep(Duration::from_millis(300));
+            None
+        })
+    }
+
+    /// Waits until the real master's state is `wanted`; panics with the difference.
+    #[track_caller]
+    pub(crate) fn await_state(&self, wanted: &State, when: &str) {
+        let start = Instant::now();
+        loop {
+            let now = State::try_read(&self.bare());
+            if now.as_ref().is_ok_and(|now| now == wanted) {
+                return;
+            }
+            if start.elapsed() > PATIENCE {
+                wanted.assert_same(&now.expect("the state of the master"), when);
+            }
+            sleep(Duration::from_millis(50));
+        }
+    }
+
+    #[track_caller]
+    pub(crate) fn node(&self, library: Library, node: &str, arguments: &[&str]) -> Node {
+        Node::start(&self.scratch, library, self.port(), node, arguments)
+    }
+
+    #[track_caller]
+    pub(crate) fn spawn_node(&self, library: Library, node: &str, arguments: &[&str]) -> Node {
+        Node::spawn(&self.scratch, library, self.port(), node, arguments)
+    }
+
+    /// The process id of the real master.
+    #[track_caller]
+    pub(crate) fn master_pid(&self) -> u32 {
+        eventually_some("the master says its process id", || {
+            self.bare().master_pid()
+        })
+    }
+
+    /// SIGKILL to the real master.
+    #[track_caller]
+    pub(crate) fn kill_master(&mut self) {
+        match &mut self.master {
+            Some(master) => master.kill(),
+            None => signal(self.master_pid(), Signal::KILL),
+        }
+    }
+
+    /// SIGKILL to a core's master of which the process id is known: it may be a zombie by now.
+    pub(crate) fn kill_master_at_once(&mut self, pid: u32) {
+        signal(pid, Signal::KILL);
+        if let Some(master) = &mut self.master {
+            master.kill();
+        }
+    }
+
+    /// A new master where the dead one was: by the test for a proxy, by rosrescue for a core.
+    #[track_caller]
+    pub(crate) fn revive_master(&mut self) {
+        if self.mode == Mode::Proxy {
+            self.master = Some(Rosmaster::start_at(&self.scratch, self.master_port));
+        }
+    }
+
+    /// Waits until a master other than `dead` serves through rosrescue and calls that change its
+    /// state pass again.
+    #[track_caller]
+    pub(crate) fn await_recovery(&self, dead: u32) {
+        let client = self.client();
+        eventually("rosrescue names a new master", || {
+            client
+                .master_pid()
+                .is_some_and(|pid| pid != dead && alive(pid))
+        });
+        self.await_gate();
+    }
+
+    /// Waits until calls that change the master's state pass; it leaves no trace.
+    #[track_caller]
+    pub(crate) fn await_gate(&self) {
+        let client = self.client();
+        eventually("rosrescue lets calls pass", || {
+            client
+                .ask("setParam", super::params!["/test", "/barrier", 1])
+                .is_some()
+        });
+        client.ok("deleteParam", super::params!["/test", "/barrier"]);
+    }
+
+    /// The whole fault: SIGKILL to the master, a new one, and its state back.
+    #[track_caller]
+    pub(crate) fn crash_master(&mut self) {
+        let dead = self.master_pid();
+        self.kill_master_at_once(dead);
+        self.revive_master();
+        self.await_recovery(dead);
+    }
+
+    /// Ids of all processes of this robot.
+    pub(crate) fn processes(&self) -> BTreeSet<u32> {
+        self.scratch
+            .survivors()
+            .into_iter()
+            .map(|(pid, _)| pid)
+            .collect()
+    }
+}

@@ -1,0 +1,229 @@
+//! The real things of ROS: rosmaster, the command line tools, and the place of the test nodes.
+
+use std::ffi::OsStr;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+use super::patience::eventually;
+use super::process::Process;
+use super::rpc::Client;
+use super::scratch::{Scratch, free_port};
+
+/// The folder of the rospy nodes and of the sources of the roscpp ones.
+pub(crate) const NODES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/nodes");
+
+const MISSING: &str = "this test needs ROS 1: `tests/run.sh` installs what is missing";
+
+/// A program of ROS, from the PATH or from where ROS installs itself.
+pub(crate) fn find_program(name: &str) -> PathBuf {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let on_path = std::env::split_paths(&path).map(|folder| folder.join(name));
+    let installed = fs::read_dir("/opt/ros")
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|distro| distro.path().join("bin").join(name));
+    on_path
+        .chain(installed)
+        .find(|program| program.is_file())
+        .unwrap_or_else(|| panic!("there is no `{name}`; {MISSING}"))
+}
+
+/// A command with the environment of a node that belongs to the master at `port`.
+pub(crate) fn ros_command(scratch: &Scratch, program: impl AsRef<OsStr>, port: u16) -> Command {
+    let mut command = Command::new(program);
+    scratch.prepare(&mut command);
+    let packages = [NODES, cpp_nodes().to_str().unwrap()].join(":");
+    let packages = match std::env::var("ROS_PACKAGE_PATH") {
+        Ok(others) => format!("{packages}:{others}"),
+        Err(_) => packages,
+    };
+    command
+        .env("ROS_MASTER_URI", format!("http://127.0.0.1:{port}"))
+        .env("ROS_PACKAGE_PATH", packages)
+        .current_dir(scratch.path(""));
+    command
+}
+
+/// A real rosmaster, nothing else.
+#[derive(Debug)]
+pub(crate) struct Rosmaster {
+    process: Process,
+    pub(crate) port: u16,
+}
+
+impl Rosmaster {
+    /// Starts one on a free port and waits until it answers.
+    #[track_caller]
+    pub(crate) fn start(scratch: &Scratch) -> Self {
+        Self::start_at(scratch, free_port())
+    }
+
+    /// Starts one on `port` and waits until it answers.
+    #[track_caller]
+    pub(crate) fn start_at(scratch: &Scratch, port: u16) -> Self {
+        Self::start_with(scratch, port, |_| {})
+    }
+
+    /// As [`Self::start_at`], with more arguments or another environment.
+    #[track_caller]
+    pub(crate) fn start_with(
+        scratch: &Scratch,
+        port: u16,
+        change: impl FnOnce(&mut Command),
+    ) -> Self {
+        let mut command = Command::new(find_program("rosmaster"));
+        scratch.prepare(&mut command);
+        command.args(["--core", "-p"]).arg(port.to_string());
+        change(&mut command);
+        let ipv6 = command
+            .get_envs()
+            .any(|(key, value)| key == "ROS_IPV6" && value.is_some());
+        let host = if ipv6 { "[::1]" } else { "127.0.0.1" };
+        let client = Client::at(host, port);
+        let mut process = Process::start(format!("rosmaster at {port}"), &mut command);
+        let pid = i32::try_from(process.pid()).unwrap();
+        eventually(&format!("rosmaster answers at {port}"), || {
+            let ended = process.exited();
+            assert!(
+                ended.is_none(),
+                "rosmaster ended ({ended:?}):\n{}",
+                process.log()
+            );
+            client
+                .ask("getPid", vec!["/test".into()])
+                .is_some_and(|value| value == Value::Int(pid))
+        });
+        Self { process, port }
+    }
+
+    pub(crate) fn client(&self) -> Client {
+        Client::new(self.port)
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.process.pid()
+    }
+
+    /// SIGKILL, and the end of the process.
+    pub(crate) fn kill(&mut self) {
+        self.process.kill();
+    }
+
+    /// SIGSTOP: it hangs.
+    pub(crate) fn stop(&self) {
+        self.process.signal(Signal::STOP);
+    }
+
+    /// SIGCONT: it goes on.
+    pub(crate) fn cont(&self) {
+        self.process.signal(Signal::CONT);
+    }
+}
+
+/// One run of a command line tool of ROS.
+#[derive(Debug)]
+pub(crate) struct Tool {
+    pub(crate) status: ExitStatus,
+    pub(crate) stdout: String,
+    pub(crate) stderr: String,
+}
+
+impl Tool {
+    /// Runs `name` against the master at `port` until it ends by itself.
+    #[track_caller]
+    pub(crate) fn run(scratch: &Scratch, port: u16, name: &str, arguments: &[&str]) -> Self {
+        let mut command = ros_command(scratch, find_program(name), port);
+        let mut process = Process::start(format!("{name} {arguments:?}"), command.args(arguments));
+        let status = process.wait();
+        // The readers of the pipes may be a moment behind the end of the process.
+        std::thread::sleep(Duration::from_millis(50));
+        Self {
+            status,
+            stdout: process.stdout().join("\n"),
+            stderr: process.stderr().join("\n"),
+        }
+    }
+}
+
+/// The folder of the compiled roscpp nodes. They are compiled here, and nowhere else, when a source
+/// is newer; a lock keeps test processes that run at the same time from doing it twice.
+pub(crate) fn cpp_nodes() -> &'static Path {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    FOLDER.get_or_init(|| {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("ros-nodes");
+        fs::create_dir_all(&folder).unwrap();
+        let lock = File::create(folder.join("lock")).unwrap();
+        lock.lock()
+            .expect("cannot lock the folder of the roscpp nodes");
+        compile(&folder);
+        folder
+    })
+}
+
+fn compile(folder: &Path) {
+    let sources: Vec<_> = fs::read_dir(NODES)
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path())
+        .collect();
+    let is =
+        |path: &Path, extension: &str| path.extension().is_some_and(|found| found == extension);
+    let changed = |path: &Path| {
+        fs::metadata(path)
+            .and_then(|metadata| metadata.modified())
+            .ok()
+    };
+    let headers = sources
+        .iter()
+        .filter(|path| is(path, "h"))
+        .filter_map(|path| changed(path))
+        .max();
+    let mut flags = None;
+    for source in sources.iter().filter(|path| is(path, "cpp")) {
+        let node = folder.join(source.file_stem().unwrap());
+        if changed(&node) > changed(source).max(headers) {
+            continue;
+        }
+        // Debian has no catkin; these lines are all that a plain node needs. `listener.cpp` says why
+        // access is not checked. A node that is half written has another name.
+        let half = node.with_extension("half");
+        let output = Command::new("g++")
+            .args(["-O1", "-Wall", "-fno-access-control", "-o"])
+            .args([&half, source])
+            .args(flags.get_or_insert_with(roscpp_flags))
+            .output()
+            .unwrap_or_else(|error| panic!("cannot run g++: {error}; {MISSING}"));
+        assert!(
+            output.status.success(),
+            "cannot compile {}; {MISSING}\n{}",
+            source.display(),
+            String::from_utf8_lossy(&output.stderr)
+        );
+        fs::rename(half, node).unwrap();
+    }
+    // roslaunch finds a node by the package that its folder is.
+    let package = fs::read_to_string(Path::new(NODES).join("package.xml")).unwrap();
+    let package = package.replace("rosrescue_nodes", "rosrescue_cpp_nodes");
+    fs::write(folder.join("package.xml"), package).unwrap();
+}
+
+fn roscpp_flags() -> Vec<String> {
+    let output = Command::new("pkg-config")
+        .args(["--cflags", "--libs", "roscpp", "std_msgs"])
+        .output()
+        .unwrap_or_else(|error| panic!("cannot run pkg-config: {error}; {MISSING}"));
+    assert!(
+        output.status.success(),
+        "{}\n{MISSING}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let flags = String::from_utf8(output.stdout).unwrap();
+    flags.split_whitespace().map(str::to_owned).collect()
+}

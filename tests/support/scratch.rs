@@ -1,0 +1,158 @@
+//! A folder, a token and ports for one test.
+
+use std::ffi::OsString;
+use std::fs;
+use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use tempfile::TempDir;
+
+use super::process::signal;
+
+/// The variable that marks every process of a test.
+const TOKEN: &str = "ROSRESCUE_SCRATCH_TOKEN";
+
+/// A folder for one test. On drop everything that was started in it is killed; the folder is removed
+/// unless the test failed.
+#[derive(Debug)]
+pub(crate) struct Scratch {
+    folder: TempDir,
+    token: String,
+}
+
+impl Scratch {
+    pub(crate) fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let token = format!(
+            "{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        );
+        let folder = tempfile::Builder::new()
+            .prefix(&format!("scratch-{token}-"))
+            .tempdir_in(env!("CARGO_TARGET_TMPDIR"))
+            .expect("cannot make a scratch folder");
+        fs::create_dir_all(folder.path().join("log")).unwrap();
+        Self { folder, token }
+    }
+
+    pub(crate) fn path(&self, name: impl AsRef<Path>) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// `$ROS_LOG_DIR` of everything in this test.
+    pub(crate) fn log_dir(&self) -> PathBuf {
+        self.path("log")
+    }
+
+    /// Gives `command` this folder for everything that ROS writes, the token, and an address that
+    /// needs no name service. Nothing of the caller's own ROS set-up is left but where it is installed.
+    pub(crate) fn prepare(&self, command: &mut Command) {
+        for (key, _) in std::env::vars_os() {
+            let name = key.to_string_lossy();
+            if name.starts_with("ROSRESCUE_") || (name.starts_with("ROS_") && !is_install(&name)) {
+                command.env_remove(&key);
+            }
+        }
+        command
+            .env(TOKEN, &self.token)
+            .env("ROS_HOME", self.folder.path())
+            .env("ROS_LOG_DIR", self.log_dir())
+            .env("ROS_IP", "127.0.0.1")
+            .env("PYTHONUNBUFFERED", "1")
+            .env("PYTHONDONTWRITEBYTECODE", "1");
+    }
+
+    /// Processes that this test started, directly or not, and that are still there: id and command.
+    pub(crate) fn survivors(&self) -> Vec<(u32, String)> {
+        let mark = format!("{TOKEN}={}", self.token);
+        let mut found = Vec::new();
+        for entry in fs::read_dir("/proc").unwrap().flatten() {
+            let Some(pid) = entry
+                .file_name()
+                .to_str()
+                .and_then(|name| name.parse().ok())
+            else {
+                continue;
+            };
+            let environment = fs::read(entry.path().join("environ")).unwrap_or_default();
+            if environment
+                .split(|&byte| byte == 0)
+                .any(|pair| pair == mark.as_bytes())
+            {
+                let command = fs::read(entry.path().join("cmdline")).unwrap_or_default();
+                found.push((pid, String::from_utf8_lossy(&command).replace('\0', " ")));
+            }
+        }
+        found
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let start = Instant::now();
+        // Again and again: a supervisor may have started another child meanwhile.
+        while start.elapsed() < Duration::from_secs(10) {
+            let survivors = self.survivors();
+            if survivors.is_empty() {
+                break;
+            }
+            for (pid, _) in survivors {
+                signal(pid, Signal::KILL);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        if std::thread::panicking() {
+            eprintln!(
+                "the scratch folder is kept: {}",
+                self.folder.path().display()
+            );
+            self.folder.disable_cleanup(true);
+        }
+    }
+}
+
+fn is_install(variable: &str) -> bool {
+    [
+        "ROS_ROOT",
+        "ROS_ETC_DIR",
+        "ROS_DISTRO",
+        "ROS_VERSION",
+        "ROS_PYTHON_VERSION",
+        "ROS_PACKAGE_PATH",
+    ]
+    .contains(&variable)
+}
+
+/// A port that nobody listens at, on IPv4 and IPv6, and below those that the kernel gives to
+/// outgoing connections: nobody gets it by chance before the test binds it.
+pub(crate) fn free_port() -> u16 {
+    const FIRST: u32 = 12_000;
+    const COUNT: u32 = 20_000;
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    // Test processes that run at the same time begin far from each other.
+    let start = std::process::id().wrapping_mul(7919);
+    for _ in 0..COUNT {
+        let offset = start.wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed)) % COUNT;
+        let port = u16::try_from(FIRST + offset).unwrap();
+        let v4 = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port));
+        drop(
+            v4.as_ref()
+                .ok()
+                .map(|_| TcpListener::bind((Ipv6Addr::LOCALHOST, port))),
+        );
+        if v4.is_ok() {
+            return port;
+        }
+    }
+    panic!("no free port between {FIRST} and {}", FIRST + COUNT);
+}
+
+/// The text of an environment value for a message.
+pub(crate) fn shown(text: &OsString) -> String {
+    text.to_string_lossy().into_owned()
+}

@@ -1,0 +1,230 @@
+//! All that can be read of a master's state, and the difference of two states in words.
+
+use std::fmt::{self, Display, Formatter};
+use std::io;
+
+use rosrescue::xmlrpc::Value;
+
+use super::rpc::Client;
+
+/// The state of a master as its clients see it. Every list keeps the master's order.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct State {
+    /// Publishers, subscribers and service providers: name and node names.
+    pub(crate) publishers: Vec<(String, Vec<String>)>,
+    pub(crate) subscribers: Vec<(String, Vec<String>)>,
+    pub(crate) services: Vec<(String, Vec<String>)>,
+    pub(crate) topic_types: Vec<(String, String)>,
+    /// The address of every node that appears above.
+    pub(crate) nodes: Vec<(String, String)>,
+    /// The address of every service.
+    pub(crate) service_apis: Vec<(String, String)>,
+    pub(crate) params: Value,
+    pub(crate) param_names: Vec<String>,
+}
+
+impl State {
+    /// Reads it with one call after the other: the master should be at rest.
+    #[track_caller]
+    pub(crate) fn read(client: &Client) -> Self {
+        Self::try_read(client).unwrap_or_else(|error| panic!("{}: {error}", client.uri()))
+    }
+
+    pub(crate) fn try_read(client: &Client) -> io::Result<Self> {
+        let ask = |method: &str, argument: Option<&str>| {
+            let params = std::iter::once("/test")
+                .chain(argument)
+                .map(Value::from)
+                .collect();
+            let (code, text, value) = client.status(method, params)?;
+            match code {
+                1 => Ok(value),
+                _ => Err(io::Error::other(format!(
+                    "{method} {argument:?}: {code} {text}"
+                ))),
+            }
+        };
+        let system = ask("getSystemState", None)?;
+        let [publishers, subscribers, services] = list(&system) else {
+            return Err(io::Error::other(format!("getSystemState: {system:?}")));
+        };
+        let (publishers, subscribers, services) = (
+            registrations(publishers),
+            registrations(subscribers),
+            registrations(services),
+        );
+        let mut names: Vec<&String> = Vec::new();
+        for (_, nodes) in publishers.iter().chain(&subscribers).chain(&services) {
+            names.extend(nodes);
+        }
+        names.sort();
+        names.dedup();
+        let mut nodes = Vec::new();
+        for name in names {
+            nodes.push((name.clone(), text(&ask("lookupNode", Some(name))?)));
+        }
+        let mut service_apis = Vec::new();
+        for (service, _) in &services {
+            service_apis.push((service.clone(), text(&ask("lookupService", Some(service))?)));
+        }
+        let types = ask("getTopicTypes", None)?;
+        Ok(Self {
+            topic_types: list(&types)
+                .iter()
+                .map(|pair| (text(&list(pair)[0]), text(&list(pair)[1])))
+                .collect(),
+            params: ask("getParam", Some("/"))?,
+            param_names: list(&ask("getParamNames", None)?)
+                .iter()
+                .map(text)
+                .collect(),
+            publishers,
+            subscribers,
+            services,
+            nodes,
+            service_apis,
+        })
+    }
+
+    /// This state without one node: what is left when it has gone. Topic types stay.
+    pub(crate) fn without_node(&self, node: &str) -> Self {
+        let mut rest = self.clone();
+        for table in [
+            &mut rest.publishers,
+            &mut rest.subscribers,
+            &mut rest.services,
+        ] {
+            for (_, nodes) in table.iter_mut() {
+                nodes.retain(|name| name != node);
+            }
+            table.retain(|(_, nodes)| !nodes.is_empty());
+        }
+        rest.nodes.retain(|(name, _)| name != node);
+        let services = &rest.services;
+        rest.service_apis
+            .retain(|(name, _)| services.iter().any(|(kept, _)| kept == name));
+        rest
+    }
+
+    /// This state without one topic type.
+    pub(crate) fn without_type(&self, topic: &str) -> Self {
+        let mut rest = self.clone();
+        rest.topic_types.retain(|(name, _)| name != topic);
+        rest
+    }
+
+    /// Whether `node` has any registration.
+    pub(crate) fn knows(&self, node: &str) -> bool {
+        self.nodes.iter().any(|(name, _)| name == node)
+    }
+
+    pub(crate) fn publishers_of(&self, topic: &str) -> Vec<String> {
+        let found = self.publishers.iter().find(|(name, _)| name == topic);
+        found.map(|(_, nodes)| nodes.clone()).unwrap_or_default()
+    }
+
+    pub(crate) fn subscribers_of(&self, topic: &str) -> Vec<String> {
+        let found = self.subscribers.iter().find(|(name, _)| name == topic);
+        found.map(|(_, nodes)| nodes.clone()).unwrap_or_default()
+    }
+
+    /// What differs from `other`, a line a fact; empty if nothing does.
+    pub(crate) fn difference(&self, other: &Self) -> String {
+        let (mine, theirs) = (self.to_string(), other.to_string());
+        let (mine, theirs): (Vec<_>, Vec<_>) = (mine.lines().collect(), theirs.lines().collect());
+        let mut lines = Vec::new();
+        lines.extend(
+            mine.iter()
+                .filter(|line| !theirs.contains(line))
+                .map(|line| format!("- {line}")),
+        );
+        lines.extend(
+            theirs
+                .iter()
+                .filter(|line| !mine.contains(line))
+                .map(|line| format!("+ {line}")),
+        );
+        if lines.is_empty() && mine != theirs {
+            lines.push("the same facts in another order; was:".to_owned());
+            lines.extend(mine.iter().map(|line| format!("- {line}")));
+            lines.push("is:".to_owned());
+            lines.extend(theirs.iter().map(|line| format!("+ {line}")));
+        }
+        lines.join("\n")
+    }
+
+    /// Panics with the difference unless `now` is the same.
+    #[track_caller]
+    pub(crate) fn assert_same(&self, now: &Self, when: &str) {
+        assert!(
+            self == now,
+            "the state differs {when}:\n{}",
+            self.difference(now)
+        );
+    }
+}
+
+/// One fact a line.
+impl Display for State {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let tables = [
+            ("publishers of", &self.publishers),
+            ("subscribers of", &self.subscribers),
+            ("provider of", &self.services),
+        ];
+        for (what, table) in tables {
+            for (name, nodes) in table {
+                writeln!(f, "{what} {name}: {}", nodes.join(", "))?;
+            }
+        }
+        let pairs = [
+            ("type of", &self.topic_types),
+            ("address of node", &self.nodes),
+            ("address of service", &self.service_apis),
+        ];
+        for (what, table) in pairs {
+            for (name, value) in table {
+                writeln!(f, "{what} {name}: {value}")?;
+            }
+        }
+        parameters(f, "", &self.params)?;
+        writeln!(f, "parameter names: {}", self.param_names.join(", "))
+    }
+}
+
+fn parameters(f: &mut Formatter<'_>, key: &str, value: &Value) -> fmt::Result {
+    match value {
+        Value::Struct(members) if !members.is_empty() => {
+            for (name, member) in members {
+                parameters(f, &format!("{key}/{name}"), member)?;
+            }
+            Ok(())
+        }
+        other => writeln!(f, "parameter {key}: {other:.300?}"),
+    }
+}
+
+fn list(value: &Value) -> &[Value] {
+    value
+        .as_array()
+        .unwrap_or_else(|| panic!("not an array: {value:?}"))
+}
+
+fn text(value: &Value) -> String {
+    value
+        .as_str()
+        .unwrap_or_else(|| panic!("not a string: {value:?}"))
+        .to_owned()
+}
+
+fn registrations(table: &Value) -> Vec<(String, Vec<String>)> {
+    list(table)
+        .iter()
+        .map(|entry| {
+            (
+                text(&list(entry)[0]),
+                list(&list(entry)[1]).iter().map(text).collect(),
+            )
+        })
+        .collect()
+}
