@@ -18,7 +18,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Struct, Value};
-use support::{Client, FakeNode, Library, Mode, PATIENCE, Robot, State, eventually, params};
+use support::{Client, FakeNode, Library, Mode, PATIENCE, Robot, State, eventually, params, short};
 
 #[test]
 fn rospy_core() {
@@ -128,7 +128,9 @@ fn assert_ledger(ledger: &Ledger, state: &State, when: &str) {
         let found = params.get(key);
         assert!(
             found == Some(value),
-            "lost {when}: /ledger/{key} is {found:.60?}, not {value:.60?}"
+            "lost {when}: /ledger/{key} is {}, not {}",
+            short(found),
+            short(value)
         );
     }
     for key in params.keys() {
@@ -352,11 +354,12 @@ fn insist(client: &Client, shared: &(Mutex<Shared>, Condvar), method: &str, para
                 assert!(text.ends_with("is not set"), "{text}");
                 return;
             }
-            Ok(other) => panic!("{method}{params:.100?}: {other:?}"),
+            Ok(other) => panic!("{method}{}: {other:?}", short(&params)),
             Err(error) => {
                 assert!(
                     start.elapsed() < PATIENCE,
-                    "{method}{params:.100?}: {error}"
+                    "{method}{}: {error}",
+                    short(&params)
                 );
                 if shared.0.lock().unwrap().order == Order::End {
                     return;

@@ -17,6 +17,7 @@
 )]
 
 mod fake;
+mod kinds;
 mod node;
 mod patience;
 mod process;
@@ -26,8 +27,10 @@ mod ros;
 mod rpc;
 mod scratch;
 mod state;
+mod twins;
 
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
+pub(crate) use kinds::kinds;
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
 pub(crate) use process::{Process, alive, signal};
@@ -37,6 +40,12 @@ pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, ros_command};
 pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request};
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use state::State;
+pub(crate) use twins::{Twins, assert_form};
+
+/// `value` for a message, cut where it becomes long.
+pub(crate) fn short(value: impl std::fmt::Debug) -> String {
+    format!("{value:?}").chars().take(200).collect()
+}
 
 /// The parameters of a call: everything that [`rosrescue::xmlrpc::Value`] can be made from.
 #[allow(unused_macros)]

@@ -162,13 +162,19 @@ impl Process {
     pub(crate) fn log(&self) -> String {
         let lines = self.lines.lock().unwrap();
         let mut log = format!("---- {} (process {})\n", self.name, self.pid());
-        // A talker says thousands of lines; the first and the last tell the story.
-        let (head, tail) = (100, 100);
+        // A talker says thousands of lines; of a run of them the first and the last tell the story.
+        let run = |line: &Line| {
+            line.text
+                .split(' ')
+                .next()
+                .map(|word| ["got", "sent"].contains(&word))
+        };
         for (number, line) in lines.iter().enumerate() {
-            if number >= head && number + tail < lines.len() {
-                if number == head {
-                    log += &format!("     ... {} lines ...\n", lines.len() - head - tail);
-                }
+            let around = [number.wrapping_sub(1), number, number + 1];
+            if around
+                .iter()
+                .all(|&near| lines.get(near).and_then(run) == Some(true))
+            {
                 continue;
             }
             let sign = if line.stream == Stream::Out { ' ' } else { '!' };

@@ -96,7 +96,7 @@ impl Client {
     /// The value of a call that succeeds.
     #[track_caller]
     pub(crate) fn ok(&self, method: &str, params: Vec<Value>) -> Value {
-        let shown = format!("{method}{params:.200?}");
+        let shown = format!("{method}{}", super::short(&params));
         match self.status(method, params) {
             Ok((1, _, value)) => value,
             other => panic!("{shown} at {}: {other:?}", self.uri()),

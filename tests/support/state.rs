@@ -200,7 +200,10 @@ fn parameters(f: &mut Formatter<'_>, key: &str, value: &Value) -> fmt::Result {
             }
             Ok(())
         }
-        other => writeln!(f, "parameter {key}: {other:.300?}"),
+        other => {
+            let text: String = format!("{other:?}").chars().take(300).collect();
+            writeln!(f, "parameter {key}: {text}")
+        }
     }
 }
 

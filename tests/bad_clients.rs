@@ -1,0 +1,164 @@
+//! What clients should not send: bytes that are no HTTP, XML made to hurt, requests that stop half-way,
+//! web pages. Each gets a refusal or the master's own answer; the others are served all the while.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use support::{Mode, PATIENCE, Robot, encode_call, http_request, params, request};
+
+#[test]
+fn garbage_from_clients() {
+    let robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    client.set_param("/kept", 1);
+    let body = encode_call("setParam", params!["/c", "/garbage", 1]);
+    let text = String::from_utf8(body.clone()).unwrap();
+    let length = body.len();
+    let mut cases: Vec<Vec<u8>> = vec![
+        b"\n\n\n\n".to_vec(),
+        b"garbage\r\n\r\n".to_vec(),
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03TLS client hello".to_vec(),
+        b"SSH-2.0-OpenSSH\r\n".to_vec(),
+        b"POST\r\n\r\n".to_vec(),
+        b"POST / HTTP/9.9\r\n\r\n".to_vec(),
+        b"POST / HTTP/1.1\r\nno colon\r\n\r\n".to_vec(),
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec(),
+        (0..=255).collect(),
+        vec![0; 100_000],
+        format!("POST / HTTP/1.1\r\nContent-Length: -1\r\n\r\n{text}").into(),
+        format!("POST / HTTP/1.1\r\nContent-Length: many\r\n\r\n{text}").into(),
+        format!("POST / HTTP/1.1\r\nContent-Length: 99999999999999999999\r\n\r\n{text}").into(),
+        format!("POST / HTTP/1.1\r\nContent-Length: 10000000000\r\n\r\n{text}").into(),
+        format!("POST / HTTP/1.1\r\nContent-Length: {length}\r\nContent-Length: 3\r\n\r\n{text}")
+            .into(),
+        format!("POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n{text}\r\n0\r\n\r\n")
+            .into(),
+        format!("POST /{} HTTP/1.1\r\n\r\n", "a".repeat(1_000_000)).into(),
+        format!("POST / HTTP/1.1\r\nX: {}\r\n\r\n", "a".repeat(1_000_000)).into(),
+        format!("POST / HTTP/1.1\r\n{}\r\n", "X: y\r\n".repeat(100_000)).into(),
+    ];
+    // A whole request that is cut short anywhere.
+    let whole = http_request(&body);
+    for end in (1..whole.len()).step_by(17) {
+        cases.push(whole[..end].to_vec());
+    }
+    for bytes in &cases {
+        let mut wire = client.connect().unwrap();
+        wire.set_patience(PATIENCE);
+        // It may be refused before it is read to the end.
+        let _ = wire.send(bytes);
+        let _ = wire.finish();
+        if let Ok(response) = wire.response() {
+            let shown = String::from_utf8_lossy(&bytes[..bytes.len().min(80)]).into_owned();
+            assert!(response.code >= 400, "{}: {shown}", response.status);
+        }
+    }
+    assert_eq!(client.param("/kept"), Some(1.into()));
+    assert_eq!(robot.bare().param("/garbage"), None);
+    robot.rescue.assert_no_panic();
+}
+
+/// Deep or endless XML costs neither the stack nor the memory.
+#[test]
+fn hostile_xml_from_clients() {
+    let robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    client.set_param("/kept", 1);
+    let wrap = |value: &str| {
+        format!(
+            "<methodCall><methodName>setParam</methodName><params><param><value>/c</value></param>\
+             <param><value>/hostile</value></param><param><value>{value}</value></param></params></methodCall>"
+        )
+    };
+    let deep = |depth: usize| {
+        wrap(&format!(
+            "{}{}",
+            "<array><data><value>".repeat(depth),
+            "</value></data></array>".repeat(depth)
+        ))
+    };
+    let many: String = "<value><i4>1</i4></value>".repeat(200_000);
+    let bodies = [
+        deep(10_000),
+        deep(200_000),
+        "<a>".repeat(500_000),
+        wrap(&format!("<array><data>{many}</data></array>")),
+        wrap(&format!("<int>{}</int>", "9".repeat(1_000_000))),
+        wrap(&format!("<double>{}</double>", "9".repeat(1_000_000))),
+        wrap(&format!("<base64>{}</base64>", "=".repeat(1_000_000))),
+        format!(
+            "<methodCall><methodName>{}</methodName></methodCall>",
+            "m".repeat(5_000_000)
+        ),
+        format!(
+            "<?xml version='1.0' encoding='{}'?><methodCall/>",
+            "x".repeat(1_000_000)
+        ),
+    ];
+    for body in bodies {
+        let mut wire = client.connect().unwrap();
+        let _ = wire.send(&http_request(body.as_bytes()));
+        // The master's own verdict, whatever it is, or the end of the connection.
+        let _ = wire.response();
+        assert_eq!(client.param("/kept"), Some(1.into()), "{:.60}", body);
+    }
+    robot.rescue.assert_no_panic();
+}
+
+#[test]
+fn a_request_that_stops_half_way_is_ended() {
+    let robot = Robot::start(Mode::Proxy);
+    let whole = http_request(&encode_call("setParam", params!["/c", "/half", 1]));
+    let head = whole
+        .windows(4)
+        .position(|window| window == b"\r\n\r\n")
+        .unwrap();
+    for end in [10, head, whole.len() - 1] {
+        let mut wire = robot.client().connect().unwrap();
+        wire.send(&whole[..end]).unwrap();
+        wire.set_patience(PATIENCE);
+        match wire.response() {
+            Ok(response) => assert_eq!(response.code, 408, "{}", response.status),
+            Err(error) => assert_ne!(
+                error.kind(),
+                std::io::ErrorKind::WouldBlock,
+                "a request of {end} bytes is waited for longer than {PATIENCE:?}"
+            ),
+        }
+    }
+    assert_eq!(robot.bare().param("/half"), None);
+}
+
+/// A page in a browser that somebody on the robot's network opens must not set parameters.
+#[test]
+fn a_web_page_cannot_change_anything() {
+    let robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let body = encode_call("setParam", params!["/c", "/evil", 1]);
+    let length = body.len();
+    let text = String::from_utf8(body.clone()).unwrap();
+    let request_of = |kind: &str, more: &str| {
+        format!(
+            "POST / HTTP/1.1\r\nHost: evil.example\r\nContent-Type: {kind}\r\n{more}Content-Length: {length}\r\n\r\n{text}"
+        )
+    };
+    for bytes in [
+        request_of("text/plain", "Origin: http://evil.example\r\n"),
+        request_of("text/plain;charset=UTF-8", ""),
+        request_of("application/x-www-form-urlencoded", ""),
+        request_of("multipart/form-data; boundary=x", ""),
+        request_of("text/xml", "Origin: http://evil.example\r\n"),
+    ] {
+        let response = client.exchange(bytes.as_bytes()).unwrap();
+        assert!(response.code >= 400, "{}: {bytes}", response.status);
+    }
+    assert_eq!(robot.bare().param("/evil"), None);
+    let fine = request("POST / HTTP/1.1", &[], &body);
+    assert_eq!(client.exchange(&fine).unwrap().code, 200);
+}

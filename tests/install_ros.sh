@@ -1,0 +1,60 @@
+# Installs what is missing of ROS 1 for the tests and the examples, and makes it known to this shell:
+#
+#     . tests/install_ros.sh
+#
+# Debian and Ubuntu carry ROS 1 themselves. A ROS in /opt/ros is used as it is.
+
+for ros_setup in /opt/ros/*/setup.sh; do
+    if [ -r "$ros_setup" ] && [ -z "${ROS_DISTRO:-}" ]; then
+        set +u # not written for it
+        . "$ros_setup"
+        set -u
+    fi
+done
+
+# The packages of what does not work here. `python3` may be another one than ROS was made for.
+ros_missing() {
+    need() { # PACKAGES CHECK...
+        packages=$1
+        shift
+        "$@" >/dev/null 2>&1 || echo "$packages"
+    }
+    for tool in rosmaster roslaunch rosnode rostopic rosservice rosparam; do
+        need "python3-$tool" command -v "$tool"
+    done
+    need python3-rospy /usr/bin/python3 -c 'import rospy, roscpp.srv'
+    need python3-std-msgs /usr/bin/python3 -c 'import std_msgs.msg'
+    need python3-std-srvs /usr/bin/python3 -c 'import std_srvs.srv'
+    need python3-yaml /usr/bin/python3 -c 'import yaml'
+    need rosout find /usr/lib/rosout/rosout /opt/ros/*/lib/rosout/rosout -prune -quit
+    need g++ command -v g++
+    need pkg-config command -v pkg-config
+    need libroscpp-dev pkg-config --exists roscpp
+    need libstd-msgs-dev pkg-config --exists std_msgs
+}
+
+ros_packages=$(ros_missing | tr '\n' ' ')
+if [ -n "$ros_packages" ]; then
+    if ! command -v apt-get >/dev/null; then
+        echo "ROS 1 is not complete here and there is no apt-get to install: $ros_packages" >&2
+        exit 1
+    fi
+    if [ "$(id -u)" = 0 ]; then
+        as_root=
+    elif command -v sudo >/dev/null; then
+        as_root=sudo
+    else
+        echo "neither root nor sudo; let somebody run: apt-get install $ros_packages" >&2
+        exit 1
+    fi
+    echo "installing: $ros_packages"
+    $as_root apt-get update -qq
+    # shellcheck disable=SC2086 # words are what is wanted
+    if ! $as_root env DEBIAN_FRONTEND=noninteractive \
+        apt-get install -y -qq --no-install-recommends $ros_packages; then
+        echo "apt-get cannot install all of: $ros_packages" >&2
+        echo "This needs a Debian or Ubuntu that carries ROS 1 (Debian 11 or 12, Ubuntu 22.04 or 24.04)," >&2
+        echo "or a ROS Noetic in /opt/ros." >&2
+        exit 1
+    fi
+fi

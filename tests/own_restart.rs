@@ -1,0 +1,202 @@
+//! rosrescue's own restarts: it adopts a living master, fills an empty one, restores from the file what
+//! is worth restoring, and takes over a system that ran without it.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::fs;
+use std::thread;
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+use support::{
+    FakeNode, Library, Mode, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
+    free_port,
+};
+
+#[test]
+fn rosrescue_that_was_killed_adopts_the_living_master() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        let client = robot.client();
+        let talker = robot.node(Library::Roscpp, "talker", &[]);
+        let listener = robot.node(Library::Rospy, "listener", &[]);
+        let node = FakeNode::start("/fake");
+        client.set_param("/watched", 1);
+        node.watch_param(&client, "/watched");
+        node.subscribe(&client, "/chatter", "std_msgs/String");
+        listener.wait_messages("/talker", 5);
+        let before = robot.settled_state();
+        let master = robot.master_pid();
+        let updates = node.heard("publisherUpdate").len();
+
+        robot.rescue.kill();
+        robot.rescue.start_again();
+        robot.rescue.wait_serving();
+        robot.await_gate();
+        assert_eq!(
+            robot.master_pid(),
+            master,
+            "the living master is adopted, not replaced"
+        );
+        before.assert_same(&robot.state(), "after rosrescue's own restart");
+        assert_eq!(
+            node.heard("publisherUpdate").len(),
+            updates,
+            "nothing is injected"
+        );
+
+        // What it adopted it can restore; parameter subscriptions it knows from the checkpoint.
+        robot.crash_master();
+        before.assert_same(&robot.state(), "after the master's crash that followed");
+        client.set_param("/watched", 2);
+        eventually("the parameter's subscriber is told", || {
+            node.heard("paramUpdate")
+                .last()
+                .is_some_and(|call| call[2] == Value::Int(2))
+        });
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+        listener.wait_messages("/talker", 5);
+        listener.assert_no_message_lost("/talker");
+        talker.assert_no_link_lost();
+    }
+}
+
+#[test]
+fn rosrescue_that_was_killed_fills_an_empty_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.client().set_param("/kept", "yes");
+    let listener = robot.node(Library::Rospy, "listener", &[]);
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    robot.rescue.kill();
+    robot.kill_master();
+    robot.revive_master();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    before.assert_same(&robot.state(), "after the restart of both");
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}
+
+#[test]
+fn a_core_of_which_everything_was_killed_restores_from_the_file() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.client().set_param("/kept", "yes");
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    robot.kill_master_at_once(master);
+    eventually("the master is dead", || !alive(master));
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    // rosout may have been started anew; its address is its own affair.
+    let (before, now) = (before.without_node("/rosout"), robot.settled_state());
+    before.assert_same(&now.without_node("/rosout"), "after both were killed");
+    let late = robot.node(Library::Roscpp, "listener", &["__name:=late"]);
+    late.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}
+
+#[test]
+fn yesterdays_parameters_do_not_wake_up_tomorrow() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.client().set_param("/use_sim_time", true);
+    let run_id = robot.client().param("/run_id").expect("a run id");
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    let yesterday = fs::read_to_string(robot.rescue.checkpoint()).expect("a closing snapshot");
+    assert!(yesterday.contains("use_sim_time"), "{yesterday}");
+
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(robot.client().param("/use_sim_time"), None);
+    assert_ne!(robot.client().param("/run_id"), Some(run_id));
+    let kept = fs::read_dir(robot.rescue.checkpoint().parent().unwrap())
+        .unwrap()
+        .flatten()
+        .filter(|entry| entry.path() != robot.rescue.checkpoint() && entry.path().is_file())
+        .filter_map(|entry| fs::read_to_string(entry.path()).ok())
+        .any(|text| text.contains("use_sim_time"));
+    assert!(kept, "the old checkpoint is kept under another name");
+}
+
+#[test]
+fn a_stopped_session_is_restored_when_told_so() {
+    let scratch = Scratch::new();
+    let (port, master_port) = (free_port(), free_port());
+    let start = |restore: &str| {
+        let master_port = master_port.to_string();
+        let port_text = port.to_string();
+        let arguments = [
+            "core",
+            "-p",
+            &port_text,
+            "--master-port",
+            &master_port,
+            "--restore",
+            restore,
+        ];
+        Setup::bare(&scratch, arguments).at_port(port).start()
+    };
+    let mut rescue = start("auto");
+    rescue.client().set_param("/kept", "yes");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let mut rescue = start("always");
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
+    rescue.kill();
+    let mut rescue = start("never");
+    // With --restore never even the living master of the killed rosrescue is no reason to inject,
+    // but what that master holds is the truth.
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let rescue = start("never");
+    assert_eq!(rescue.client().param("/kept"), None);
+}
+
+#[test]
+fn a_running_system_is_taken_over() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let bare = master.client();
+    bare.set_param("/gain", 3);
+    let talker = Node::start(&scratch, Library::Rospy, master.port, "talker", &[]);
+    let listener = Node::start(&scratch, Library::Roscpp, master.port, "listener", &[]);
+    let _server = Node::start(&scratch, Library::Roscpp, master.port, "server", &[]);
+    listener.wait_messages("/talker", 5);
+    let mut before = State::read(&bare);
+    eventually("the state is at rest", || {
+        thread::sleep(Duration::from_millis(300));
+        let last = std::mem::replace(&mut before, State::read(&bare));
+        last == before
+    });
+
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    before.assert_same(&State::read(&rescue.client()), "when it was taken over");
+    let dead = master.pid();
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let client = rescue.client();
+    eventually("rosrescue names the new master", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    eventually("the state is back", || {
+        State::try_read(&master.client()).is_ok_and(|now| now == before)
+    });
+    listener.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}

@@ -1,0 +1,19 @@
+#!/bin/sh
+# Runs every check of rosrescue on a bare Debian or Ubuntu: installs what is missing of ROS 1, then
+# formatting, clippy, and unit, integration and documentation tests. Needs a Rust toolchain.
+set -eu
+cd "$(dirname "$0")/.."
+
+if ! command -v cargo >/dev/null; then
+    PATH="$PATH:$HOME/.cargo/bin"
+fi
+if ! command -v cargo >/dev/null; then
+    echo "tests/run.sh: there is no cargo; install a Rust toolchain first: https://rustup.rs" >&2
+    exit 1
+fi
+
+. tests/install_ros.sh
+
+cargo fmt --all --check
+cargo clippy --locked --all-targets -- -D warnings
+cargo test --locked

@@ -1,0 +1,482 @@
+//! How rosrescue starts, refuses to start, and stops: its arguments, files, ports and signals. Each
+//! mistake gets one clear sentence; nothing is left behind and nothing of a person's is lost.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use support::{
+    Mode, Rescue, Robot, Rosmaster, Scratch, Setup, alive, eventually, free_port, holds, params,
+};
+
+/// Runs rosrescue to its end, which must come by itself, with `code`, one clear sentence on standard
+/// error, and nothing left behind. Gives the sentence.
+#[track_caller]
+fn refused(scratch: &Scratch, setup: Setup, code: i32) -> String {
+    let before = scratch.survivors();
+    let mut rescue = setup.spawn();
+    let status = rescue.wait();
+    eventually("the output is whole", || !rescue.stderr().is_empty());
+    thread::sleep(Duration::from_millis(50));
+    let said = rescue.stderr().join("\n");
+    assert_eq!(status.code(), Some(code), "{said}");
+    rescue.assert_no_panic();
+    // A usage error comes with a hint how to get help; anything else is one sentence, perhaps
+    // after lines of the log.
+    let sentence = said.lines().last().unwrap().to_owned();
+    for noise in ["Os {", "Err(", "Some(", "stack backtrace", "kind:"] {
+        assert!(!said.contains(noise), "`{noise}` is not for people: {said}");
+    }
+    assert_eq!(scratch.survivors(), before, "processes are left behind");
+    if code == 2 { said } else { sentence }
+}
+
+#[test]
+fn usage_errors_end_with_2_and_say_which() {
+    let scratch = Scratch::new();
+    let cases: &[(&[&str], &str)] = &[
+        (&["--no-such-option"], "--no-such-option"),
+        (&["no-such-command"], "no-such-command"),
+        (&["core", "-p", "0"], "-p"),
+        (&["core", "-p", "70000"], "70000"),
+        (&["core", "-p", "eleven"], "eleven"),
+        (&["core", "--master-port", "-1"], "-1"),
+        (&["core", "--hold", "long"], "long"),
+        (&["core", "--hold", "-1"], "hold"),
+        (&["core", "--probe-interval", "0"], "--probe-interval"),
+        (&["core", "--restore", "sometimes"], "sometimes"),
+        (&["proxy"], "--master"),
+        (&["proxy", "--master", ""], "master"),
+        (&["proxy", "--master", "ftp://localhost:1"], "ftp"),
+        (&["proxy", "--master", "http://"], "http://"),
+        (&["proxy", "--master", "http://localhost:99999"], "99999"),
+        (
+            &[
+                "proxy",
+                "--master",
+                "http://localhost:1",
+                "--listen",
+                "nowhere:at:all",
+            ],
+            "nowhere",
+        ),
+        (
+            &["proxy", "--master", "http://localhost:1", "-w", "3"],
+            "-w",
+        ),
+    ];
+    for (arguments, named) in cases {
+        let said = refused(&scratch, Setup::bare(&scratch, *arguments), 2);
+        assert!(said.contains(named), "{arguments:?}: {said}");
+    }
+    let said = refused(
+        &scratch,
+        Setup::bare(&scratch, ["core"]).env("ROSRESCUE_PORT", "x"),
+        2,
+    );
+    assert!(said.contains('x'), "{said}");
+}
+
+#[test]
+fn help_and_version_need_nothing_and_end_with_0() {
+    let scratch = Scratch::new();
+    for arguments in [
+        &["--help"][..],
+        &["--version"],
+        &["core", "--help"],
+        &["proxy", "--help"],
+    ] {
+        let mut rescue = Setup::bare(&scratch, arguments)
+            .env("PATH", "/nonexistent")
+            .spawn();
+        assert_eq!(rescue.wait().code(), Some(0), "{arguments:?}");
+        eventually("it said something", || !rescue.stdout().is_empty());
+        assert_eq!(rescue.stderr(), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn a_ros_master_uri_that_is_none() {
+    let scratch = Scratch::new();
+    for uri in ["rosmaster", "http://", "http://host:port/", "://"] {
+        let setup = Setup::bare(&scratch, ["core"]).env("ROS_MASTER_URI", uri);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(code == Some(1) || code == Some(2), "{uri}: {code:?}");
+        eventually("it names the variable", || {
+            rescue.stderr().join("\n").contains("ROS_MASTER_URI")
+        });
+        rescue.assert_no_panic();
+    }
+}
+
+#[test]
+fn ports_in_use() {
+    let scratch = Scratch::new();
+    let taken = TcpListener::bind("0.0.0.0:0").unwrap();
+    let port = taken.local_addr().unwrap().port();
+    let text = port.to_string();
+    let master = free_port();
+    let core = Setup::bare(
+        &scratch,
+        ["core", "-p", &text, "--master-port", &master.to_string()],
+    );
+    let said = refused(&scratch, core, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+
+    let core = Setup::bare(
+        &scratch,
+        ["core", "-p", &master.to_string(), "--master-port", &text],
+    );
+    let said = refused(&scratch, core, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+
+    let listen = format!("127.0.0.1:{port}");
+    let uri = format!("http://127.0.0.1:{master}");
+    let proxy = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &listen]);
+    let said = refused(&scratch, proxy, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+}
+
+/// Tests may run as root, who may write everywhere: what no one can write is a file where a folder
+/// should be, and a folder where the file should be.
+#[test]
+fn a_checkpoint_that_cannot_be_written() {
+    let scratch = Scratch::new();
+    let file = scratch.path("file");
+    fs::write(&file, "a file").unwrap();
+    let folder = scratch.path("folder");
+    fs::create_dir(&folder).unwrap();
+    for checkpoint in [
+        file.join("chkpt.yaml"),
+        folder.clone(),
+        "/proc/chkpt.yaml".into(),
+    ] {
+        let setup = Setup::core(&scratch, free_port()).at_checkpoint(checkpoint.clone());
+        let said = refused(&scratch, setup, 1);
+        assert!(said.contains(checkpoint.to_str().unwrap()), "{said}");
+    }
+    assert_eq!(fs::read_to_string(&file).unwrap(), "a file");
+}
+
+/// What somebody else wrote is never lost: it stays where it is, or is kept under another name.
+#[test]
+fn a_checkpoint_that_is_not_ours() {
+    let scratch = Scratch::new();
+    let contents: &[&[u8]] = &[
+        b"my: precious\nnotes: [1, 2]\n",
+        b"\x7fELF\x00\x01\xff\xfe garbage",
+        b"# rosrescue checkpoint v999 generation=1\n",
+        b"{{{{",
+        "- registerPublisher\n"
+            .repeat(10_000)
+            .as_bytes()
+            .to_owned()
+            .leak(),
+    ];
+    for (number, content) in contents.iter().enumerate() {
+        let folder = scratch.path(format!("case{number}"));
+        fs::create_dir(&folder).unwrap();
+        let checkpoint = folder.join("chkpt.yaml");
+        fs::write(&checkpoint, content).unwrap();
+        let mut rescue = Setup::core(&scratch, free_port())
+            .at_checkpoint(checkpoint.clone())
+            .spawn();
+        let client = rescue.client();
+        eventually("it serves or refuses", || {
+            rescue.exited().is_some() || client.ask("setParam", params!["/c", "/x", 1]).is_some()
+        });
+        eventually("it names the file", || {
+            rescue
+                .output()
+                .iter()
+                .any(|line| line.contains("chkpt.yaml"))
+        });
+        match rescue.exited() {
+            Some(status) => assert_eq!(status.code(), Some(1)),
+            None => assert_eq!(rescue.terminate().code(), Some(0)),
+        }
+        rescue.assert_no_panic();
+        let kept = fs::read_dir(&folder)
+            .unwrap()
+            .flatten()
+            .any(|entry| fs::read(entry.path()).is_ok_and(|kept| kept == *content));
+        assert!(kept, "case {number}: the content is lost");
+    }
+}
+
+#[test]
+fn an_empty_checkpoint_is_a_fresh_start() {
+    let scratch = Scratch::new();
+    let checkpoint = scratch.path("empty.yaml");
+    fs::write(&checkpoint, "").unwrap();
+    let rescue = Setup::core(&scratch, free_port())
+        .at_checkpoint(checkpoint)
+        .start();
+    rescue.client().set_param("/x", 1);
+}
+
+#[test]
+fn a_damaged_checkpoint_gives_what_is_whole_and_says_so() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    for i in 0..20 {
+        rescue.client().set_param(&format!("/p{i}"), i);
+    }
+    rescue.kill();
+    let checkpoint = rescue.checkpoint();
+    let mut bytes = fs::read(&checkpoint).unwrap();
+    // The last record is torn: it was never acknowledged for all that the file can tell.
+    let end = bytes
+        .iter()
+        .rposition(|&byte| byte == b'{')
+        .expect("a record");
+    bytes.truncate(end + 5);
+    fs::write(&checkpoint, &bytes).unwrap();
+    master.kill();
+    let _master = Rosmaster::start_at(&scratch, master.port);
+    rescue.start_again();
+    rescue.wait_serving();
+    for i in 0..19 {
+        assert_eq!(
+            rescue.client().param(&format!("/p{i}")),
+            Some(i.into()),
+            "/p{i}"
+        );
+    }
+}
+
+#[test]
+fn no_rosmaster_installed() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(
+        &scratch,
+        ["core", "-p", &port, "--rosmaster", "/nonexistent/rosmaster"],
+    );
+    let said = refused(&scratch, setup, 1);
+    assert!(said.contains("/nonexistent/rosmaster"), "{said}");
+
+    // Where there is no /opt/ros an empty PATH is enough.
+    let empty = scratch.path("empty");
+    fs::create_dir(&empty).unwrap();
+    if !Path::new("/opt/ros").exists() {
+        let setup = Setup::bare(&scratch, ["core", "-p", &port]).env("PATH", &empty);
+        let said = refused(&scratch, setup, 1);
+        assert!(
+            said.contains("python3-rosmaster"),
+            "it says which package to install: {said}"
+        );
+    }
+
+    // One that ends at once is no master either, and is reported as such.
+    let mut setup = Setup::bare(&scratch, ["core", "-p", &port, "--rosmaster", "/bin/false"]);
+    setup.port = port.parse().unwrap();
+    let mut rescue = setup.spawn();
+    let said = |rescue: &Rescue| rescue.stderr().join("\n");
+    eventually("it says that its rosmaster ends", || {
+        rescue.exited().is_some() || said(&rescue).contains("rosmaster")
+    });
+    assert!(said(&rescue).contains("rosmaster"), "{}", said(&rescue));
+    if rescue.exited().is_none() {
+        assert_eq!(rescue.terminate().code(), Some(0));
+    }
+}
+
+#[test]
+fn a_master_that_is_not_there_is_waited_for() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let mut rescue = Setup::proxy(&scratch, port).spawn();
+    rescue.wait_line("that it waits", |line| line.to_lowercase().contains("wait"));
+    assert!(holds(Duration::from_secs(1), || rescue.exited().is_none()));
+    let client = rescue.client();
+    let parked = thread::spawn({
+        let client = client.clone();
+        move || client.status("setParam", params!["/c", "/early", 1])
+    });
+    thread::sleep(Duration::from_millis(300));
+    let master = Rosmaster::start_at(&scratch, port);
+    rescue.wait_serving();
+    assert_eq!(
+        parked
+            .join()
+            .unwrap()
+            .expect("the parked call is answered")
+            .0,
+        1
+    );
+    assert_eq!(master.client().param("/early"), Some(1.into()));
+}
+
+#[test]
+fn master_pointing_at_ourselves() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    for (host, listen) in [
+        ("127.0.0.1", "127.0.0.1"),
+        ("localhost", "127.0.0.1"),
+        ("127.0.0.1", "0.0.0.0"),
+        ("[::1]", "[::]"),
+        ("localhost", "0.0.0.0"),
+    ] {
+        let uri = format!("http://{host}:{port}");
+        let address = format!("{listen}:{port}");
+        let setup = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &address]);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(
+            code == Some(1) || code == Some(2),
+            "{uri} at {address}: {code:?}"
+        );
+        eventually("it says why", || {
+            rescue.stderr().join("\n").contains(&port.to_string())
+        });
+    }
+    // As roscore's own port it may come from the environment.
+    let text = port.to_string();
+    let said = {
+        let setup = Setup::bare(&scratch, ["core", "-p", &text, "--master-port", &text]);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(code == Some(1) || code == Some(2), "{code:?}");
+        eventually("it says why", || !rescue.stderr().is_empty());
+        rescue.stderr().join("\n")
+    };
+    assert!(said.contains(&text), "{said}");
+}
+
+#[test]
+fn a_second_rosrescue_on_the_same_checkpoint_is_refused() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let first = Setup::proxy(&scratch, master.port).start();
+    first.client().set_param("/first", 1);
+    let said = refused(&scratch, Setup::proxy(&scratch, master.port), 1);
+    assert!(said.contains("latest-chkpt.yaml"), "{said}");
+    first.client().set_param("/first", 2);
+    // Another file is no matter of the first one.
+    let other = Setup::proxy(&scratch, master.port)
+        .at_checkpoint(scratch.path("other.yaml"))
+        .start();
+    assert_eq!(other.client().param("/first"), Some(2.into()));
+}
+
+#[test]
+fn an_orderly_stop_leaves_nothing_behind() {
+    for signal in [Signal::TERM, Signal::INT] {
+        let mut robot = Robot::start(Mode::Core);
+        robot.client().set_param("/x", 1);
+        let master = robot.master_pid();
+        assert!(
+            robot.processes().len() >= 3,
+            "rosrescue, rosmaster and rosout: {:?}",
+            robot.processes()
+        );
+        robot.rescue.signal(signal);
+        assert_eq!(robot.rescue.wait().code(), Some(0));
+        assert!(!alive(master), "rosmaster is left behind");
+        assert_eq!(robot.scratch.survivors(), vec![], "{signal:?}");
+        assert!(robot.rescue.checkpoint().exists());
+    }
+    let mut robot = Robot::start(Mode::Proxy);
+    let master = robot.master_pid();
+    robot.rescue.signal(Signal::TERM);
+    assert_eq!(robot.rescue.wait().code(), Some(0));
+    assert!(alive(master), "the master of others is ended");
+}
+
+#[test]
+fn an_orderly_stop_in_an_outage_with_parked_calls() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.kill_master();
+    let client = robot.client();
+    let parked: Vec<_> = (0..5)
+        .map(|i| {
+            let client = client.clone();
+            thread::spawn(move || client.status("setParam", params!["/c", "/parked", i]))
+        })
+        .collect();
+    assert!(holds(Duration::from_millis(500), || parked
+        .iter()
+        .all(|call| !call.is_finished())));
+    let start = Instant::now();
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    assert!(
+        start.elapsed() < Duration::from_secs(15),
+        "{:?}",
+        start.elapsed()
+    );
+    for call in parked {
+        // Nothing did it, so nothing may say that it was done.
+        assert!(!matches!(call.join().unwrap(), Ok((1, ..))));
+    }
+    let checkpoint = fs::read_to_string(robot.rescue.checkpoint()).unwrap();
+    assert!(!checkpoint.contains("parked"), "{checkpoint}");
+}
+
+#[test]
+fn a_core_stops_even_if_its_master_hangs() {
+    let mut robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    support::signal(master, Signal::STOP);
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    eventually("the master that hangs is ended", || !alive(master));
+    assert_eq!(robot.scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_second_signal_ends_at_once() {
+    let mut robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    // An orderly stop has to wait for this one.
+    support::signal(master, Signal::STOP);
+    robot.rescue.signal(Signal::TERM);
+    thread::sleep(Duration::from_millis(50));
+    let start = Instant::now();
+    robot.rescue.signal(Signal::INT);
+    robot.rescue.wait();
+    assert!(
+        start.elapsed() < Duration::from_secs(3),
+        "{:?}",
+        start.elapsed()
+    );
+}
+
+/// rosout is kept alive; what it says for itself in the master is there again.
+#[test]
+fn a_core_keeps_rosout_alive() {
+    let robot = Robot::start(Mode::Core);
+    let before = robot.settled_state();
+    let rosout = |robot: &Robot| {
+        let processes = robot.scratch.survivors();
+        processes
+            .into_iter()
+            .find(|(_, command)| command.contains("rosout/rosout"))
+            .map(|(pid, _)| pid)
+    };
+    let old = rosout(&robot).expect("rosout runs");
+    support::signal(old, Signal::KILL);
+    eventually("another rosout runs", || {
+        rosout(&robot).is_some_and(|pid| pid != old)
+    });
+    eventually("it is registered", || {
+        let now = robot.settled_state();
+        now.publishers == before.publishers
+            && now.subscribers == before.subscribers
+            && now.nodes != before.nodes
+    });
+}

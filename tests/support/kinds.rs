@@ -1,0 +1,58 @@
+//! Parameter values of every kind.
+
+use rosrescue::xmlrpc::Value;
+
+use super::tree;
+
+/// Values that YAML, XML or Python tend to spoil, and that a master can return.
+pub(crate) fn kinds() -> Value {
+    let texts = [
+        "",
+        " ",
+        "  two  ",
+        "no",
+        "on",
+        "yes",
+        "null",
+        "~",
+        "=",
+        "<<",
+        "1:30",
+        "0x1f",
+        "0o17",
+        "1_000",
+        "1.0",
+        "1e3",
+        ".inf",
+        "2001-01-01",
+        "- a",
+        "a: b",
+        "# c",
+        "'",
+        "\"",
+        "\\n",
+        "%d",
+        "&amp;",
+        "]]>",
+        "<b>&lt;</b>",
+        "tab\there",
+        "line\nbreak\n",
+        "\n",
+        "naïve ☃ 𝄞",
+        "\u{85}\u{2028}",
+        "trailing ",
+    ];
+    tree! {
+        "texts" => texts.to_vec(),
+        "one" => 1, "one point" => 1.0, "truth" => true, "falsehood" => false,
+        "largest" => i32::MAX, "least" => i32::MIN,
+        "third" => 1.0 / 3.0, "tiny" => 5e-324, "huge" => f64::MAX, "zero" => -0.0,
+        "infinite" => f64::INFINITY, "not a number" => f64::NAN,
+        "bytes" => Value::Base64((0..=255).collect()),
+        "when" => Value::DateTime("20260101T12:00:00".to_owned()),
+        "nothing" => Value::Array(vec![]),
+        "mixed" => Value::Array(vec![1.into(), "two".into(), 3.0.into(), vec!["four"].into()]),
+        "on" => "a key that YAML 1.1 takes for a truth", "1" => "a number", "" => "no key",
+        "with/slash" => "unreachable by its path",
+    }
+}
