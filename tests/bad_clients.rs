@@ -119,9 +119,12 @@ fn a_request_that_stops_half_way_is_ended() {
         .windows(4)
         .position(|window| window == b"\r\n\r\n")
         .unwrap();
-    for end in [10, head, whole.len() - 1] {
+    let mut wires = [10, head, whole.len() - 1].map(|end| {
         let mut wire = robot.client().connect().unwrap();
         wire.send(&whole[..end]).unwrap();
+        (end, wire)
+    });
+    for (end, wire) in &mut wires {
         wire.set_patience(PATIENCE);
         match wire.response() {
             Ok(response) => assert_eq!(response.code, 408, "{}", response.status),
@@ -133,6 +136,30 @@ fn a_request_that_stops_half_way_is_ended() {
         }
     }
     assert_eq!(robot.bare().param("/half"), None);
+}
+
+/// rosmaster does not read the body behind a head that it refuses; what is left in that connection must
+/// not become somebody else's request.
+#[test]
+fn a_refused_request_spoils_no_other_call() {
+    let robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    client.set_param("/kept", 1);
+    let body = encode_call("getParam", params!["/c", "/kept"]);
+    let refused = [
+        request("POST /no/such/page HTTP/1.1", &[], &body),
+        request("POST /RPC2 HTTP/1.1", &["Content-Encoding: br"], &body),
+        request("POST /RPC2 HTTP/1.1", &["Content-Encoding: gzip"], &body),
+        request("PUT / HTTP/1.1", &[], &body),
+    ];
+    for bytes in refused.iter().cycle().take(20) {
+        let response = client.exchange(bytes).unwrap();
+        assert!(response.code >= 400, "{}", response.status);
+        for _ in 0..5 {
+            let answer = client.status("getParam", params!["/c", "/kept"]);
+            assert_eq!(answer.expect("an answer").2, 1.into());
+        }
+    }
 }
 
 /// A page in a browser that somebody on the robot's network opens must not set parameters.

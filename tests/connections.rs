@@ -270,20 +270,30 @@ fn a_slow_client_does_not_hold_up_the_others() {
 fn ipv6_on_both_sides() {
     let scratch = Scratch::new();
     let port = free_port();
-    let master = Rosmaster::start_with(&scratch, port, |command| {
+    let _master = Rosmaster::start_with(&scratch, port, |command| {
         command.env("ROS_IPV6", "on").env("ROS_IP", "::1");
     });
+    let uri = format!("http://[::1]:{port}");
+    let bare = Client::at("[::1]", port);
+
+    // All addresses, unless it is told otherwise.
     let listen = free_port();
-    let uri = format!("http://[::1]:{}", master.port);
-    let address = format!("[::]:{listen}");
-    let _rescue = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &address])
+    let mut rescue = Setup::bare(&scratch, ["proxy", "--master", &uri])
+        .env("ROS_MASTER_URI", format!("http://localhost:{listen}"))
+        .env("ROS_IP", "")
+        .env("ROS_HOSTNAME", "localhost.localdomain")
         .at_port(listen)
         .start();
-    for host in ["[::1]", "127.0.0.1", "localhost"] {
-        let client = Client::at(host, listen);
-        client.set_param("/from", host);
-        assert_eq!(Client::at("[::1]", port).param("/from"), Some(host.into()));
+    for host in ["[::1]", "127.0.0.1"] {
+        Client::at(host, listen).set_param("/from", host);
+        assert_eq!(bare.param("/from"), Some(host.into()));
     }
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    let only = format!("[::1]:{listen}");
+    let _rescue = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &only]).start();
+    Client::at("[::1]", listen).set_param("/from", "one address");
+    assert_eq!(bare.param("/from"), Some("one address".into()));
 }
 
 #[test]

@@ -271,6 +271,36 @@ fn a_proxy_waits_for_a_master_that_hangs() {
     assert_eq!(client.master_pid(), Some(pid));
 }
 
+/// What was unregistered while the master did not answer is unregistered in the master that goes on.
+#[test]
+fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
+    let robot = Robot::start_with(Mode::Proxy, &QUICK_PROBES);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+        node.subscribe(&client, "/other", "std_msgs/String");
+        node.offer(&client, &format!("{}/service", node.name));
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let pid = robot.master_pid();
+    support::signal(pid, Signal::STOP);
+    // Whether the answer comes at once or when the master goes on: it is a promise.
+    let unregistering = thread::spawn(move || {
+        leaving.unpublish(&client, "/topic");
+        leaving.unsubscribe(&client, "/other");
+        leaving.withdraw(&client, "/leaving/service");
+        leaving
+    });
+    holds(Duration::from_secs(3), || !unregistering.is_finished());
+    support::signal(pid, Signal::CONT);
+    let _leaving = unregistering.join().unwrap();
+    robot.await_gate();
+    robot.await_state(&after, "when the master went on");
+    assert_eq!(robot.client().master_pid(), Some(pid));
+    after.assert_same(&State::read(&robot.client()), "through rosrescue");
+}
+
 #[test]
 fn a_restart_that_nobody_saw_is_found() {
     let mut robot = Robot::start(Mode::Proxy);

@@ -15,9 +15,10 @@ use std::thread;
 use std::time::Duration;
 
 use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
 use support::{
     FakeNode, Library, Mode, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
-    free_port,
+    free_port, holds,
 };
 
 #[test]
@@ -66,6 +67,35 @@ fn rosrescue_that_was_killed_adopts_the_living_master() {
         listener.assert_no_message_lost("/talker");
         talker.assert_no_link_lost();
     }
+}
+
+/// Between its first open port and its first look at the living master it knows only the checkpoint.
+/// What it acknowledges then must be true in the master that it adopts.
+#[test]
+fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    support::signal(master, Signal::STOP);
+    robot.rescue.start_again();
+    eventually("rosrescue listens", || client.connect().is_ok());
+    let unregistering = thread::spawn(move || {
+        leaving.unpublish(&client, "/topic");
+        leaving
+    });
+    holds(Duration::from_secs(1), || !unregistering.is_finished());
+    support::signal(master, Signal::CONT);
+    let _leaving = unregistering.join().unwrap();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    robot.await_state(&after, "at the adopted master");
+    after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
 #[test]

@@ -150,8 +150,9 @@ fn ports_in_use() {
     assert!(said.contains(&text) && said.contains("in use"), "{said}");
 }
 
-/// Tests may run as root, who may write everywhere: what no one can write is a file where a folder
-/// should be, and a folder where the file should be.
+/// The robot runs on: rosrescue says that it is unprotected and why, and restores a dead master from
+/// what it remembers. (Tests may run as root, who may write everywhere: what nobody can write is a file
+/// where a folder should be, and a folder where the file should be.)
 #[test]
 fn a_checkpoint_that_cannot_be_written() {
     let scratch = Scratch::new();
@@ -159,14 +160,24 @@ fn a_checkpoint_that_cannot_be_written() {
     fs::write(&file, "a file").unwrap();
     let folder = scratch.path("folder");
     fs::create_dir(&folder).unwrap();
-    for checkpoint in [
-        file.join("chkpt.yaml"),
-        folder.clone(),
-        "/proc/chkpt.yaml".into(),
-    ] {
-        let setup = Setup::core(&scratch, free_port()).at_checkpoint(checkpoint.clone());
-        let said = refused(&scratch, setup, 1);
-        assert!(said.contains(checkpoint.to_str().unwrap()), "{said}");
+    for checkpoint in [file.join("chkpt.yaml"), folder, "/proc/chkpt.yaml".into()] {
+        let mut rescue = Setup::core(&scratch, free_port())
+            .at_checkpoint(checkpoint.clone())
+            .start();
+        rescue.wait_line("which file it cannot write", |line| {
+            line.contains("unprotected") && line.contains(checkpoint.to_str().unwrap())
+        });
+        let client = rescue.client();
+        client.set_param("/kept", 1);
+        let dead = client.master_pid().expect("the master's process id");
+        support::signal(dead, Signal::KILL);
+        eventually("another master is there", || {
+            client.master_pid().is_some_and(|pid| pid != dead)
+        });
+        assert_eq!(client.param("/kept"), Some(1.into()));
+        client.set_param("/kept", 2);
+        assert_eq!(rescue.terminate().code(), Some(0));
+        assert_eq!(scratch.survivors(), vec![]);
     }
     assert_eq!(fs::read_to_string(&file).unwrap(), "a file");
 }

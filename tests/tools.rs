@@ -18,7 +18,7 @@ use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 use support::{
     Library, Mode, NODES, Node, Process, Robot, Rosmaster, Scratch, Tool, eventually, holds,
-    params, ros_command, tree,
+    params, ros_command, sorted, tree,
 };
 
 /// A small robot: what the tools look at.
@@ -237,21 +237,6 @@ fn launched_params() -> Value {
         "names" => vec!["left", "right"],
         "robot_description" => description,
         "talker" => tree! { "private" => "mine" },
-    }
-}
-
-/// Keys in the order of the alphabet, at every level: roslaunch sends them in an order of its own.
-fn sorted(value: &Value) -> Value {
-    match value {
-        Value::Struct(members) => {
-            let mut members: Vec<_> = members
-                .iter()
-                .map(|(k, v)| (k.clone(), sorted(v)))
-                .collect();
-            members.sort_by(|a, b| a.0.cmp(&b.0));
-            Value::Struct(members.into_iter().collect())
-        }
-        other => other.clone(),
     }
 }
 

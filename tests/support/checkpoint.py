@@ -5,6 +5,7 @@ Usage: checkpoint.py FILE MASTER_URI. Prints `same`, or the first difference. Ty
 of the keys count. No line of rosrescue takes part in this.
 """
 
+import datetime
 import sys
 import xmlrpc.client
 
@@ -22,6 +23,8 @@ def canonical(value):
         return "array", [canonical(element) for element in value]
     if isinstance(value, xmlrpc.client.DateTime):
         return "dateTime.iso8601", value.value
+    if isinstance(value, datetime.datetime):  # a time that YAML has a type for
+        return "dateTime.iso8601", value.strftime("%Y%m%dT%H:%M:%S")
     if isinstance(value, xmlrpc.client.Binary):
         return "bytes", value.data
     return type(value).__name__, repr(value) if isinstance(value, float) else value

@@ -140,6 +140,12 @@ impl FakeNode {
     }
 
     #[track_caller]
+    pub(crate) fn withdraw(&self, master: &Client, service: &str) {
+        let params = params![self.name.as_str(), service, self.service_api()];
+        assert_eq!(master.ok("unregisterService", params), Value::Int(1));
+    }
+
+    #[track_caller]
     pub(crate) fn watch_param(&self, master: &Client, key: &str) -> Value {
         master.ok(
             "subscribeParam",

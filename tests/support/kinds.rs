@@ -49,10 +49,26 @@ pub(crate) fn kinds() -> Value {
         "third" => 1.0 / 3.0, "tiny" => 5e-324, "huge" => f64::MAX, "zero" => -0.0,
         "infinite" => f64::INFINITY, "not a number" => f64::NAN,
         "bytes" => Value::Base64((0..=255).collect()),
+        "no time" => Value::DateTime("once upon a time".to_owned()),
         "when" => Value::DateTime("20260101T12:00:00".to_owned()),
         "nothing" => Value::Array(vec![]),
         "mixed" => Value::Array(vec![1.into(), "two".into(), 3.0.into(), vec!["four"].into()]),
         "on" => "a key that YAML 1.1 takes for a truth", "1" => "a number", "" => "no key",
         "with/slash" => "unreachable by its path",
+    }
+}
+
+/// Keys in the order of the alphabet, at every level: for what was sent in an order of its own.
+pub(crate) fn sorted(value: &Value) -> Value {
+    match value {
+        Value::Struct(members) => {
+            let mut members: Vec<_> = members
+                .iter()
+                .map(|(k, v)| (k.clone(), sorted(v)))
+                .collect();
+            members.sort_by(|a, b| a.0.cmp(&b.0));
+            Value::Struct(members.into_iter().collect())
+        }
+        other => other.clone(),
     }
 }

@@ -30,7 +30,7 @@ mod state;
 mod twins;
 
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
-pub(crate) use kinds::kinds;
+pub(crate) use kinds::{kinds, sorted};
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
 pub(crate) use process::{Process, alive, signal};

@@ -62,7 +62,9 @@ impl Robot {
             scratch,
         };
         if mode == Mode::Core {
-            eventually("rosout is at work", || robot.state().knows("/rosout"));
+            eventually("rosout is at work", || {
+                State::try_read(&robot.bare()).is_ok_and(|state| state.knows("/rosout"))
+            });
         }
         robot
     }

@@ -197,6 +197,7 @@ impl Wire {
     pub(crate) fn response(&mut self) -> io::Result<Response> {
         let mut response = self.head()?;
         match response.header("content-length") {
+            _ if response.code < 200 => {}
             Some(length) => {
                 let length = length.parse().map_err(io::Error::other)?;
                 response.body = vec![0; length];
