@@ -26,7 +26,7 @@ use crate::{
         gate, keeper,
         lane::{self, LaneRunner},
         listener::{self, ListenError},
-        pool::{self, Pool},
+        pool::Pool,
         shadow::Shadow,
         stats::Stats,
         upstream::Upstream,
@@ -42,8 +42,8 @@ use crate::{
     ros_env::MasterUri,
     session::{self, Decision, Evidence},
     store::{self, OpenError, Store},
-    supervisor::{self, Rosmaster, SupervisorError},
-    xmlrpc::{Call, Reply, Value},
+    supervisor::{Rosmaster, SupervisorError},
+    xmlrpc::Call,
 };
 
 /// How long nodes have to show that a session goes on.
@@ -166,7 +166,9 @@ pub async fn run(
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     proxy.shadow.set_identity(pid, proxy.uri.clone());
     if let Some(rosout) = rosout {
-        core_duties::set_run_id(&proxy);
+        if port.is_none() {
+            core_duties::seed_run_id(&proxy);
+        }
         tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()));
     }
     let halt = CancellationToken::new();
@@ -282,6 +284,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
     let mut story = "a new session begins".to_owned();
     let mut beginning = None;
+    let mut master_uri = None;
     if let Some(loaded) = loaded {
         for sentence in loaded.torn.iter() {
             tracing::info!("checkpoint: {sentence}");
@@ -305,9 +308,8 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 beginning = Some((mirror, session));
             }
             Decision::Fresh(why) => {
-                if let MasterConfig::Supervised(_) = config.master {
-                    end_orphan(&session).await;
-                }
+                // A master that a rosrescue left behind when it crashed is taken over.
+                master_uri = session.master_uri.filter(|_| !session.closed);
                 let kept = store.as_mut().map(|store| store.set_aside("session"));
                 let kept = match kept {
                     Some(Ok(Some(path))) => {
@@ -326,6 +328,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let restored = beginning.is_some();
     let (mirror, mut session) = beginning.unwrap_or_default();
     if !restored || session.mark.is_empty() {
+        session.master_uri = master_uri;
         session.id = kernel_id("/proc/sys/kernel/random/uuid");
         session.mark = session.id.clone();
         session.started = clock::wall_text(clock::wall_time());
@@ -353,31 +356,6 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         restored,
         story,
     })
-}
-
-/// Ends the rosmaster that a rosrescue which crashed has left behind: the new session does not go
-/// on with it.
-async fn end_orphan(session: &Session) {
-    let Some(Ok(address)) = session.master_uri.as_deref().map(MasterUri::parse) else {
-        return;
-    };
-    let upstream = Upstream::new(address, HeaderValue::from_static("adoption"));
-    let mark = Mark::new(&session.mark);
-    let pid = tokio::time::timeout(LIFE_SIGN, async {
-        let mut connection = pool::connect_verified(&upstream, &mark).await.ok()?;
-        let call = Call::new("getPid", vec!["/rosrescue".into()]);
-        match connection.call(&call).await.ok()? {
-            Reply::Value(Value::Array(answer)) => answer.get(2)?.as_int(),
-            _ => None,
-        }
-    });
-    if let Ok(Some(pid)) = pid.await
-        && let Ok(pid) = u32::try_from(pid)
-        && supervisor::runs(pid, "rosmaster")
-    {
-        tracing::info!(pid, "ending the rosmaster of the session before");
-        supervisor::stop(pid, || !supervisor::runs(pid, "rosmaster")).await;
-    }
 }
 
 /// Whether any node of `state` answers.

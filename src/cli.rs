@@ -165,7 +165,12 @@ pub struct CommonArgs {
     pub census_timeout: u64,
     /// How often the mirror is compared with the master, for writes that reached it past the proxy,
     /// in seconds; 0 for never (it is compared at each connect and after each doubt anyway)
-    #[arg(long, env = "ROSRESCUE_RESYNC_INTERVAL", value_name = "SECONDS", default_value_t = 0.0)]
+    #[arg(
+        long,
+        env = "ROSRESCUE_RESYNC_INTERVAL",
+        value_name = "SECONDS",
+        default_value_t = 0.0
+    )]
     #[arg(allow_negative_numbers = true)]
     pub resync_interval: f64,
     /// Connections to the master for calls that only read

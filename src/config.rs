@@ -212,8 +212,12 @@ impl Config {
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
             census_timeout: Duration::from_millis(args.census_timeout),
-            resync_interval: Some(seconds("--resync-interval", args.resync_interval, 86_400.0)?)
-                .filter(|interval| !interval.is_zero()),
+            resync_interval: Some(seconds(
+                "--resync-interval",
+                args.resync_interval,
+                86_400.0,
+            )?)
+            .filter(|interval| !interval.is_zero()),
             master_connections: usize_of(args.master_connections),
             max_connections: usize_of(args.max_connections),
             max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),

@@ -392,7 +392,12 @@ fn travel(
                     .map_err(Into::into)
             }
         };
-        let connection = result.is_ok().then_some((incarnation, connection));
+        let usable = match &result {
+            Ok(Cargo::Reply(reply)) => reply.leaves_connection_usable(),
+            Ok(Cargo::Resynced(_)) => true,
+            Err(_) => false,
+        };
+        let connection = usable.then_some((incarnation, connection));
         Landed { connection, result }
     }
 }

@@ -10,10 +10,7 @@ use super::{
     gate::{Gate, State},
     upstream::{CallError, ConnectError, Connection, Head, RawReply, Upstream},
 };
-use crate::{
-    master::Mark,
-    xmlrpc::{Reply, Value},
-};
+use crate::master::Mark;
 
 /// A read that got no reply from the master.
 #[derive(Debug, Error)]
@@ -50,11 +47,9 @@ pub enum VerifyError {
 /// died and come back between two looks.
 pub async fn connect_verified(upstream: &Upstream, mark: &Mark) -> Result<Connection, VerifyError> {
     let mut connection = upstream.connect().await?;
-    match connection.call(&mark.lookup()).await? {
-        Reply::Value(Value::Array(reply)) if reply.first() == Some(&Value::Int(1)) => {
-            Ok(connection)
-        }
-        _ => Err(VerifyError::Unmarked),
+    match Mark::is_found(&connection.call(&mark.lookup()).await?) {
+        true => Ok(connection),
+        false => Err(VerifyError::Unmarked),
     }
 }
 
@@ -92,12 +87,12 @@ impl Pool {
             if let Some(mut connection) = self.take_idle(incarnation)
                 && let Ok(reply) = connection.forward(head, body.clone()).await
             {
-                self.put_idle(incarnation, connection);
+                self.put_idle(incarnation, connection, &reply);
                 return Ok(reply);
             }
             let mut connection = connect_verified(upstream, mark).await?;
             let reply = connection.forward(head, body.clone()).await?;
-            self.put_idle(incarnation, connection);
+            self.put_idle(incarnation, connection, &reply);
             Ok(reply)
         };
         let shut = async {
@@ -117,8 +112,10 @@ impl Pool {
         idle.pop().map(|(_, connection)| connection)
     }
 
-    fn put_idle(&self, incarnation: u64, connection: Connection) {
-        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        idle.push((incarnation, connection));
+    fn put_idle(&self, incarnation: u64, connection: Connection, reply: &RawReply) {
+        if reply.leaves_connection_usable() {
+            let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+            idle.push((incarnation, connection));
+        }
     }
 }

@@ -66,7 +66,7 @@ async fn route(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
-        Method::GET | Method::HEAD => Ok(match door::check_host(request.headers(), &proxy.names) {
+        Method::GET => Ok(match door::check_host(request.headers(), &proxy.names) {
             Ok(()) => admin::page(&proxy, request.uri().path()),
             Err(refusal) => refuse(&proxy, peer, &refusal),
         }),
@@ -202,8 +202,7 @@ async fn read(
                     _ => Duration::MAX,
                 };
                 let mut watch = gate.clone();
-                let reply =
-                    pool.forward(upstream, mark, &mut watch, incarnation, &head, &body);
+                let reply = pool.forward(upstream, mark, &mut watch, incarnation, &head, &body);
                 match tokio::time::timeout(limit, reply).await {
                     Ok(Ok(raw)) => return Ok(forwarded(proxy, call, raw)),
                     Ok(Err(error)) => tracing::debug!(%error, "read"),

@@ -7,7 +7,7 @@ use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
     HeaderMap, Request, StatusCode,
     client::conn::http1::SendRequest,
-    header::{CONTENT_ENCODING, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
+    header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
 };
 use hyper_util::rt::TokioIo;
 use thiserror::Error;
@@ -85,6 +85,14 @@ impl Default for Head {
             path: "/".to_owned(),
             encoding: None,
         }
+    }
+}
+
+impl RawReply {
+    /// Whether the connection may be used again: rosmaster does not read the body behind a head
+    /// that it refuses, and would take the rest of it for the next request.
+    pub fn leaves_connection_usable(&self) -> bool {
+        self.status.is_success()
     }
 }
 
@@ -197,6 +205,8 @@ impl Connection {
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
+            // Of an empty body too: without it rosmaster answers with a status 500 and no body.
+            .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {
             request = request.header(CONTENT_ENCODING, encoding);

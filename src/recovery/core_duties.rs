@@ -34,12 +34,15 @@ fn has(proxy: &Proxy, key: &str) -> bool {
     matches!(proxy.shadow.answer(&call), Reply::Value(Value::Array(answer)) if answer.get(2) == Some(&yes))
 }
 
+fn run_id(proxy: &Proxy) -> Call {
+    set("/run_id", &proxy.shadow.session().id)
+}
+
 /// Gives a new session its run id before there is a master: it is injected with the rest, so that
-/// no roslaunch ever sees a master without one.
-pub fn set_run_id(proxy: &Proxy) {
+/// no roslaunch ever sees a master without one. Not if there may be a master that has one.
+pub fn seed_run_id(proxy: &Proxy) {
     if !has(proxy, "/run_id") {
-        let id = proxy.shadow.session().id;
-        proxy.shadow.seed(&set("/run_id", &id));
+        proxy.shadow.seed(&run_id(proxy));
     }
 }
 
@@ -50,6 +53,9 @@ pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
         () = stop.cancelled() => return,
     }
     let work = async {
+        if !has(&proxy, "/run_id") {
+            proxy.lane.call(run_id(&proxy), Kind::Mutate).await;
+        }
         if rosout {
             tokio::join!(set_versions(&proxy), keep_rosout(&proxy));
         } else {

@@ -120,7 +120,14 @@ pub async fn examine(
     prepared: Option<JoinHandle<Prepared>>,
 ) -> Result<Examination, ExamineError> {
     let start = Instant::now();
-    let first = first_look(proxy, connection).await?;
+    let mut first = first_look(proxy, connection).await?;
+    // From here to the open gate the mirror must not change: the master is compared with it.
+    if keeper.state() == State::Shut(StandIn::Unregistrations) {
+        keeper.set(State::Shut(StandIn::Reads));
+    }
+    if !first.is_empty() && pay_owed(proxy, connection).await? {
+        first = first_look(proxy, connection).await?;
+    }
     let mut examination = Examination {
         outcome: Outcome::Resumed,
         pid: first.pid(),
@@ -130,59 +137,48 @@ pub async fn examine(
         look: start.elapsed(),
         injection: Duration::ZERO,
     };
-    if first.marked() && resumable {
-        pay_owed(proxy, connection).await?;
-    } else if first.marked() {
+    if !first.marked() {
+        inject(proxy, connection, first, prepared, start, &mut examination).await?;
+    } else if !resumable {
         let previous = proxy.shadow.with_mirror(Clone::clone);
         let held = second_look(first, connection, &previous).await?;
         proxy.shadow.succeed();
         let difference = proxy.shadow.adopt(held);
         if !difference.is_empty() {
-            tracing::info!(?difference, "the master went on without us; the mirror follows it");
+            tracing::info!(
+                ?difference,
+                "the master went on without us; the mirror follows it"
+            );
         }
         examination.outcome = Outcome::Adopted;
         examination.look = start.elapsed();
-    } else {
-        inject(
-            proxy,
-            keeper,
-            connection,
-            first,
-            prepared,
-            start,
-            &mut examination,
-        )
-        .await?;
     }
     examination.injection = start.elapsed().saturating_sub(examination.look);
     examination.counts = proxy.shadow.with_mirror(Counts::of);
     Ok(examination)
 }
 
-/// Tells the same incarnation of the unregistrations that were taken while it did not answer.
-async fn pay_owed(proxy: &Proxy, connection: &mut Connection) -> Result<(), ExamineError> {
+/// Tells the master of the unregistrations that were taken while it did not answer. Answers whether
+/// there were any.
+async fn pay_owed(proxy: &Proxy, connection: &mut Connection) -> Result<bool, ExamineError> {
     let owed = proxy.shadow.owed();
-    if !owed.is_empty() {
-        let count = owed.len();
-        within(INJECTION_LIMIT, connection.call(&Call::multicall(owed))).await?;
-        proxy.shadow.paid(count);
+    if owed.is_empty() {
+        return Ok(false);
     }
-    Ok(())
+    let count = owed.len();
+    within(INJECTION_LIMIT, connection.call(&Call::multicall(owed))).await?;
+    proxy.shadow.paid(count);
+    Ok(true)
 }
 
 async fn inject(
     proxy: &Arc<Proxy>,
-    keeper: &Keeper,
     connection: &mut Connection,
     first: FirstLook,
     prepared: Option<JoinHandle<Prepared>>,
     start: Instant,
     examination: &mut Examination,
 ) -> Result<(), ExamineError> {
-    // From here to the open gate the mirror must not change: it is what is being injected.
-    if keeper.state() == State::Shut(StandIn::Unregistrations) {
-        keeper.set(State::Shut(StandIn::Reads));
-    }
     let target = proxy.shadow.succeed();
     let empty = first.is_empty();
     let ready = match prepared {
