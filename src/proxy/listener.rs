@@ -19,7 +19,7 @@ use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use super::{
     Proxy,
-    pace::{Pace, Paced},
+    pace::{Pace, Paced, Shared},
     service,
 };
 
@@ -153,15 +153,14 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
     let clients = proxy.clone();
     let _present = clients.clients.enter(peer);
-    let pace = Pace::default();
-    let io = TokioIo::new(Paced::new(stream, pace.clone(), HEAD_TIME));
+    let stream = Arc::new(stream);
+    let pace = Pace::of(stream.clone());
+    let io = TokioIo::new(Paced::new(Shared(stream), pace.clone(), HEAD_TIME));
     let service =
         service_fn(move |request| service::serve(proxy.clone(), peer, pace.clone(), request));
     let connection = hyper::server::conn::http1::Builder::new()
         .title_case_headers(true)
-        // A client that has gone away does not get its call run after an outage: it would register
-        // a node that is dead. No ROS client shuts down its side and still waits for an answer.
-        .half_close(false)
+        .half_close(true)
         .pipeline_flush(true)
         .serve_connection(io, service);
     let mut connection = std::pin::pin!(connection);

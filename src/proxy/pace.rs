@@ -15,28 +15,52 @@ use std::{
     time::Duration,
 };
 
+use socket2::SockRef;
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
+    net::TcpStream,
     time::{Instant, Sleep},
 };
 
 /// Where a connection stands between requests.
 #[derive(Clone, Debug, Default)]
-pub struct Pace(Arc<AtomicU8>);
+pub struct Pace {
+    place: Arc<AtomicU8>,
+    stream: Option<Arc<TcpStream>>,
+}
 
 const IDLE: u8 = 0;
 const HEAD: u8 = 1;
 const SERVING: u8 = 2;
 
 impl Pace {
+    /// The pace of `stream`.
+    pub fn of(stream: Arc<TcpStream>) -> Self {
+        Self {
+            place: Arc::default(),
+            stream: Some(stream),
+        }
+    }
+
+    /// Returns when the peer has closed its side behind the request, as it does when it ends.
+    /// Never if it has sent more.
+    pub async fn hung_up(&self) {
+        if let Some(stream) = &self.stream
+            && !matches!(stream.peek(&mut [0]).await, Ok(1..))
+        {
+            return;
+        }
+        std::future::pending().await
+    }
+
     /// The head has been read; the body and the answer have limits of their own.
     pub fn serving(&self) {
-        self.0.store(SERVING, Ordering::Relaxed);
+        self.place.store(SERVING, Ordering::Relaxed);
     }
 
     /// The request has been answered: the next byte begins a head.
     pub fn idle(&self) {
-        self.0.store(IDLE, Ordering::Relaxed);
+        self.place.store(IDLE, Ordering::Relaxed);
     }
 }
 
@@ -70,12 +94,12 @@ impl<S: AsyncRead + Unpin> AsyncRead for Paced<S> {
         let this = &mut *self;
         let before = buf.filled().len();
         let polled = Pin::new(&mut this.stream).poll_read(cx, buf);
-        if buf.filled().len() > before && this.pace.0.load(Ordering::Relaxed) == IDLE {
-            this.pace.0.store(HEAD, Ordering::Relaxed);
+        if buf.filled().len() > before && this.pace.place.load(Ordering::Relaxed) == IDLE {
+            this.pace.place.store(HEAD, Ordering::Relaxed);
             this.deadline.as_mut().reset(Instant::now() + this.limit);
         }
         if polled.is_pending()
-            && this.pace.0.load(Ordering::Relaxed) == HEAD
+            && this.pace.place.load(Ordering::Relaxed) == HEAD
             && this.deadline.as_mut().poll(cx).is_ready()
         {
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
@@ -111,6 +135,74 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<S> {
 
     fn is_write_vectored(&self) -> bool {
         self.stream.is_write_vectored()
+    }
+}
+
+/// A stream that [`Pace::hung_up`] may look at beside its reader.
+#[derive(Debug)]
+pub struct Shared(pub Arc<TcpStream>);
+
+impl Shared {
+    /// Tries until it is done, fails, or has to wait for readiness.
+    fn attempt<T>(
+        ready: impl Fn() -> Poll<io::Result<()>>,
+        mut attempt: impl FnMut() -> io::Result<T>,
+    ) -> Poll<io::Result<T>> {
+        loop {
+            std::task::ready!(ready())?;
+            match attempt() {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                done => return Poll::Ready(done),
+            }
+        }
+    }
+}
+
+impl AsyncRead for Shared {
+    fn poll_read(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let cx = std::cell::RefCell::new(cx);
+        let ready = || self.0.poll_read_ready(&mut cx.borrow_mut());
+        let read = std::task::ready!(Self::attempt(ready, || {
+            self.0.try_read(buf.initialize_unfilled())
+        }))?;
+        buf.advance(read);
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl AsyncWrite for Shared {
+    fn poll_write(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        self.poll_write_vectored(cx, &[io::IoSlice::new(buf)])
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(SockRef::from(&*self.0).shutdown(std::net::Shutdown::Write))
+    }
+
+    fn poll_write_vectored(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bufs: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let cx = std::cell::RefCell::new(cx);
+        let ready = || self.0.poll_write_ready(&mut cx.borrow_mut());
+        Self::attempt(ready, || self.0.try_write_vectored(bufs))
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        true
     }
 }
 

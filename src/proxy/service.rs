@@ -55,7 +55,7 @@ pub async fn serve(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     pace.serving();
-    let reply = route(proxy, peer, request).await;
+    let reply = route(proxy, peer, &pace, request).await;
     pace.idle();
     reply
 }
@@ -63,6 +63,7 @@ pub async fn serve(
 async fn route(
     proxy: Arc<Proxy>,
     peer: SocketAddr,
+    pace: &Pace,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
@@ -70,7 +71,7 @@ async fn route(
             Ok(()) => admin::page(&proxy, request.uri().path()),
             Err(refusal) => refuse(&proxy, peer, &refusal),
         }),
-        Method::POST => post(proxy, peer, request).await,
+        Method::POST => post(proxy, peer, pace, request).await,
         ref method => Ok(text(
             StatusCode::NOT_IMPLEMENTED,
             format!("method {method} is not supported; XML-RPC is POST, the status page GET\n"),
@@ -81,6 +82,7 @@ async fn route(
 async fn post(
     proxy: Arc<Proxy>,
     peer: SocketAddr,
+    pace: &Pace,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     if request
@@ -130,12 +132,13 @@ async fn post(
         proxy.stats.undecoded.count();
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
     }
-    answer(&proxy, peer, head, body, call).await
+    answer(&proxy, peer, pace, head, body, call).await
 }
 
 async fn answer(
     proxy: &Arc<Proxy>,
     peer: SocketAddr,
+    pace: &Pace,
     head: Head,
     body: Bytes,
     call: Option<Call>,
@@ -171,7 +174,7 @@ async fn answer(
                     "too many calls wait for the master, see --max-parked",
                 ));
             }
-            await_lane(proxy, rx).await
+            await_lane(proxy, pace, rx).await
         }
     }
 }
@@ -230,12 +233,20 @@ async fn read(
 
 async fn await_lane(
     proxy: &Arc<Proxy>,
+    pace: &Pace,
     mut answered: oneshot::Receiver<Answer>,
 ) -> Result<HttpReply, Closed> {
     let mut gate = proxy.gate.clone();
     if matches!(gate.state(), State::Shut(_)) {
         proxy.stats.parked.count();
     }
+    // While the master is there, a client may close its half and wait for the answer. A call that
+    // is parked is not run for a client that has gone: it would register a node that is dead.
+    let abandoned = async {
+        let mut gate = proxy.gate.clone();
+        pace.hung_up().await;
+        gate.shut_for(Duration::ZERO).await;
+    };
     tokio::select! {
         answer = &mut answered => match answer {
             Ok(Answer::Raw(raw)) => Ok(plain(raw)),
@@ -246,6 +257,7 @@ async fn await_lane(
             proxy.stats.hold_expired.count();
             Err(Closed("the master did not come back in time, see --hold"))
         }
+        () = abandoned => Err(Closed("the client has gone")),
     }
 }
 
@@ -264,6 +276,9 @@ fn forwarded(proxy: &Proxy, call: Option<&Call>, raw: RawReply) -> HttpReply {
 fn plain(raw: RawReply) -> HttpReply {
     let mut reply = Response::new(Full::new(raw.body));
     *reply.status_mut() = raw.status;
+    if let Some(reason) = raw.reason {
+        reply.extensions_mut().insert(reason);
+    }
     for name in [CONTENT_TYPE, CONTENT_ENCODING, SERVER] {
         if let Some(value) = raw.headers.get(&name) {
             reply.headers_mut().insert(name, value.clone());

@@ -7,6 +7,7 @@ use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
     HeaderMap, Request, StatusCode,
     client::conn::http1::SendRequest,
+    ext::ReasonPhrase,
     header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
 };
 use hyper_util::rt::TokioIo;
@@ -101,6 +102,8 @@ impl RawReply {
 pub struct RawReply {
     /// The HTTP status.
     pub status: StatusCode,
+    /// The words behind the status, if they are not the usual ones.
+    pub reason: Option<ReasonPhrase>,
     /// The master's headers.
     pub headers: HeaderMap,
     /// The body, unchanged.
@@ -229,6 +232,7 @@ impl Connection {
             .map_err(CallError::BrokenReply)?;
         Ok(RawReply {
             status: parts.status,
+            reason: parts.extensions.get().cloned(),
             headers: parts.headers,
             body: body.to_bytes(),
         })

@@ -134,6 +134,10 @@ impl Guard {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
                 () = pending(&mut self.ended) => {
+                    if matches!(self.keeper.state(), State::Shut(_)) {
+                        let master = self.proxy.upstream.address();
+                        self.say_waiting(&format!("{master} closes the connection unasked"));
+                    }
                     self.disconnect();
                     return Input::ConnectionLost;
                 }
