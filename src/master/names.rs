@@ -126,9 +126,14 @@ pub(super) fn reach(
     preferred: &str,
     usable: impl Fn(&str) -> bool,
 ) -> Option<(String, String)> {
+    if usable(preferred)
+        && let Some(name) = name_for(key, preferred)
+    {
+        return Some((preferred.to_owned(), name));
+    }
     let base = key.rfind('/').map_or(0, |slash| slash + 1);
     let neighbour = format!("{}rosrescue", key.get(..base).unwrap_or_default());
-    [preferred, &neighbour, key]
+    [neighbour.as_str(), key]
         .into_iter()
         .filter(|caller_id| usable(caller_id))
         .find_map(|caller_id| Some((caller_id.to_owned(), name_for(key, caller_id)?)))

@@ -2,8 +2,9 @@
 
 use std::fmt;
 
-use super::restore::{Restore, reads};
-use super::{Mark, Master};
+use super::look::lookup;
+use super::restore::Restore;
+use super::{CALLER_ID, Mark, Master, python};
 use crate::xmlrpc::{Call, Reply, Value};
 
 /// Most mismatches that are told apart.
@@ -249,6 +250,21 @@ impl Plan {
             Err(mismatches)
         }
     }
+}
+
+/// Reads that show everything a master in the target state can show.
+fn reads(model: &Master) -> Vec<Call> {
+    let own = |method| Call::new(method, vec![CALLER_ID.into()]);
+    let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
+    // A single value that cannot be returned would fault the whole multicall.
+    if python::is_writable(model.params()) {
+        calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
+    }
+    let nodes = model.registry.nodes.keys();
+    calls.extend(nodes.filter_map(|node| lookup("lookupNode", node)));
+    let services = model.registry.services.keys();
+    calls.extend(services.filter_map(|service| lookup("lookupService", service)));
+    calls
 }
 
 fn mismatch(entry: &Value) -> Mismatch {

@@ -171,11 +171,20 @@ fn error_within(value: &Value, levels: usize) -> Option<&'static str> {
     }
 }
 
+/// Levels of a namespace within the tree that can be written in a multicall's result, where the tree
+/// lies in the result's list, the entry's, and the answer's.
+const DEEPEST_NAMESPACE: usize = DEEPEST_REPLY - 4;
+
+/// Whether a multicall can return the whole tree.
+pub(super) fn is_writable(tree: &Struct) -> bool {
+    let mut values = tree.values();
+    values.all(|value| error_within(value, DEEPEST_NAMESPACE).is_none())
+}
+
 /// The tree without what a master could take but never return, and the keys of what was left out.
-/// The verification of an injection reads the tree inside a multicall, two arrays further down.
 pub(super) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();
-    let kept = keep_writable(tree, "", DEEPEST_REPLY - 4, &mut left_out);
+    let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);
     (kept, left_out)
 }
 

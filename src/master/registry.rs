@@ -212,7 +212,9 @@ impl Registry {
 
 fn drop_caller(registrations: &mut Registrations, key: &str, caller_id: &str) {
     if let Some(callers) = registrations.get_mut(key) {
-        callers.retain(|caller| caller != caller_id);
+        if let Some(index) = callers.iter().position(|caller| caller == caller_id) {
+            callers.remove(index);
+        }
         if callers.is_empty() {
             registrations.shift_remove(key);
         }

@@ -2,7 +2,6 @@
 
 use std::collections::HashMap;
 
-use super::look::lookup;
 use super::mark::{HELPER, NO_API};
 use super::names::{self, CALLER_ID};
 use super::plan::Skipped;
@@ -116,10 +115,13 @@ impl<'a> Restore<'a> {
     }
 
     fn skip_unnameable(&mut self, key: &str, caller_id: &str) {
-        self.skipped.push(Skipped::Unnameable {
+        let skipped = Skipped::Unnameable {
             key: key.to_owned(),
             caller_id: caller_id.to_owned(),
-        });
+        };
+        if !self.skipped.contains(&skipped) {
+            self.skipped.push(skipped);
+        }
     }
 
     /// The type to register a topic with. One that the new master knows already stays.
@@ -372,29 +374,20 @@ impl<'a> Restore<'a> {
         } else if !self.model.registry.subscribers.contains_key(topic) {
             ("registerPublisher", "unregisterPublisher")
         } else {
-            let topic = topic.to_owned();
-            return self.skipped.push(Skipped::Type { topic });
+            let skipped = Skipped::Type {
+                topic: topic.to_owned(),
+            };
+            // A second attempt comes at the end.
+            if !self.skipped.contains(&skipped) {
+                self.skipped.push(skipped);
+            }
+            return;
         };
         let out = vec![helper.as_str().into(), name.as_str().into(), NO_API.into()];
         let params = vec![helper.into(), name.into(), topic_type.into(), NO_API.into()];
         self.push(register, params);
         self.push(unregister, out);
     }
-}
-
-/// Reads that show everything a master in the target state can show.
-pub(super) fn reads(model: &Master) -> Vec<Call> {
-    let own = |method| Call::new(method, vec![CALLER_ID.into()]);
-    let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
-    // A single value that cannot be returned would fault the whole multicall.
-    if python::writable(model.params()).1.is_empty() {
-        calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
-    }
-    let nodes = model.registry.nodes.keys();
-    calls.extend(nodes.filter_map(|node| lookup("lookupNode", node)));
-    let services = model.registry.services.keys();
-    calls.extend(services.filter_map(|service| lookup("lookupService", service)));
-    calls
 }
 
 /// `ours` over `theirs`, namespace by namespace.

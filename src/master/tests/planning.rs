@@ -310,3 +310,29 @@ fn a_difference_is_told_in_words_without_values() {
     let many = after((0..100).map(|i| set(&format!("/p{i}"), 1)));
     assert_eq!(difference(&many, &a).len(), 20);
 }
+
+#[test]
+fn a_star_is_left_out_where_its_subscribers_would_be_told_of_a_helper() {
+    let mut target = after([publish("/p", "/star", "*"), publish("/p", "/t", "a/B")]);
+    target.apply(&call("unregisterPublisher", &["/p", "/star", &api("/p")]));
+    let found = after([subscribe("/s", "/star", "*")]);
+    let plan = Plan::new(&target, &found, &mark());
+    let (_, notices) = run(&plan, &found);
+    assert_eq!(notices, []);
+    let topic = "/star".to_owned();
+    assert_eq!(plan.skipped(), [Skipped::Type { topic }]);
+}
+
+#[test]
+fn no_helper_takes_the_name_of_a_node() {
+    // Only `/o d` itself can say this topic, by `~`: as a helper it would bump itself.
+    let mut target = after([publish("/o d", "/t", "a/B"), subscribe("/o d", "~", "a/B")]);
+    target.apply(&call("unregisterSubscriber", &["/o d", "~", &api("/o d")]));
+    let plan = Plan::new(&target, &Master::default(), &mark());
+    let (master, notices) = run(&plan, &Master::default());
+    assert_eq!(
+        (master.publishers_of("/t"), notices),
+        (vec![api("/o d")], vec![])
+    );
+    assert!(matches!(plan.skipped(), [Skipped::Unnameable { .. }]));
+}

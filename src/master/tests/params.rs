@@ -1,0 +1,175 @@
+//! The quirks of the parameter server.
+
+use super::*;
+
+#[test]
+fn a_parameter_in_the_way_becomes_a_namespace_and_empty_ones_stay() {
+    let mut master = after([set("/a", 1), set("/a/b/c", 2)]);
+    master.apply(&call("deleteParam", &["/n", "/a/b/c"]));
+    let names = answer(&mut master, &call("getParamNames", &["/n"])).2;
+    assert_eq!(names, Value::Array(vec![]));
+    let (code, _, value) = answer(&mut master, &call("getParam", &["/n", "/a"]));
+    assert_eq!((code, value), (1, tree([("b", tree([]))])));
+}
+
+#[test]
+fn deleting_below_a_value_fails_as_python_does() {
+    let list: Value = vec!["x"].into();
+    for (value, text) in [
+        (
+            1.into(),
+            "Error: invalid arguments: argument of type 'int' is not iterable",
+        ),
+        (
+            "axb".into(),
+            "Error: invalid arguments: 'str' object does not support item deletion",
+        ),
+        ("ab".into(), "parameter [/k/x] is not set"),
+        (
+            list,
+            "Error: invalid arguments: list indices must be integers or slices, not str",
+        ),
+    ] {
+        let mut master = after([set("/k", value)]);
+        assert_eq!(
+            message(&mut master, &call("deleteParam", &["/n", "/k/x"])),
+            (-1, text.into())
+        );
+    }
+}
+
+#[test]
+fn reading_a_relative_key_forgets_its_first_part() {
+    // Only a caller without a leading slash can resolve to such a key.
+    let mut master = Master::default();
+    master.apply(&Call::new(
+        "setParam",
+        vec!["a/n".into(), "k".into(), 1.into()],
+    ));
+    assert_eq!(
+        message(&mut master, &call("getParam", &["/n", "/a/k"])).0,
+        1
+    );
+    assert_eq!(message(&mut master, &call("getParam", &["a/n", "k"])).0, -1);
+    master.apply(&set("/k", 1));
+    assert_eq!(message(&mut master, &call("getParam", &["a/n", "k"])).0, 1);
+}
+
+#[test]
+fn a_search_looks_for_the_first_part_only() {
+    let mut master = after([set("/pr2/robot/base", 1), set("/robot/arm", 1)]);
+    let mut search =
+        |caller: &str, key: &str| answer(&mut master, &call("searchParam", &[caller, key]));
+    assert_eq!(
+        search("/pr2/n", "robot/arm").2,
+        Value::from("/pr2/robot/arm")
+    );
+    assert_eq!(search("/n", "robot/arm").2, Value::from("/robot/arm"));
+    assert_eq!(search("/n", "nothing").0, -1);
+    assert_eq!(search("/n", "~robot").1, "Internal failure: invalid key");
+    assert_eq!(
+        search("n", "robot").1,
+        "Internal failure: namespace must be global"
+    );
+    assert_eq!(search("/n", "/robot//arm/").2, Value::from("/robot//arm/"));
+}
+
+#[test]
+fn param_updates_reach_those_above_below_and_at_the_key() {
+    let mut master = after([
+        watch("/root", "/"),
+        watch("/exact", "/a"),
+        watch("/set", "/a"),
+        watch("/leaf", "/a/b"),
+        watch("/gone", "/a/c"),
+        watch("/other", "/ab"),
+    ]);
+    let value = tree([("b", 2.into())]);
+    let told = notices(&mut master, &set("/a", value.clone()));
+    let update = |node: &str, key: &str, value: &Value| Notice::ParamUpdate {
+        to: api(node),
+        key: key.to_owned(),
+        value: value.clone(),
+    };
+    // The setter, `/set`, is left out; the root and exact ones come first.
+    assert_eq!(
+        told,
+        [
+            update("/root", "/a/", &value),
+            update("/exact", "/a/", &value),
+            update("/gone", "/a/c/", &tree([])),
+            update("/leaf", "/a/b/", &2.into()),
+        ]
+    );
+    // A scalar over the parent of a subscribed key tells nobody below.
+    assert_eq!(notices(&mut master, &set("/a", 1)).len(), 2);
+    let told = notices(&mut master, &call("deleteParam", &["/set", "/a"]));
+    assert_eq!(told.len(), 5);
+}
+
+#[test]
+fn what_cannot_be_returned_poisons_its_parents() {
+    let mut master = after([
+        set("/a", vec![Value::Nil]),
+        set("/b", Value::BigInt("-5000000000".into())),
+    ]);
+    let mut fault = |key: &str| match master.apply(&call("getParam", &["/n", key])).reply {
+        Reply::Fault { text, .. } => text,
+        other => panic!("{other:?}"),
+    };
+    let nil = "<class 'TypeError'>:cannot marshal None unless allow_none is enabled";
+    assert_eq!(fault("/a"), nil);
+    assert_eq!(
+        fault("/b"),
+        "<class 'OverflowError'>:int exceeds XML-RPC limits"
+    );
+    assert_eq!(fault("/"), nil);
+}
+
+#[test]
+fn a_multicall_shows_a_namespace_as_it_is_at_the_end() {
+    let mut master = after([set("/a", tree([("x", 1.into())]))]);
+    let get = call("getParam", &["/n", "/a"]);
+    let calls = [
+        get.clone(),
+        set("/a/y", 2),
+        get.clone(),
+        set("/a", tree([("z", 3.into())])),
+        get,
+    ];
+    let Reply::Value(Value::Array(results)) = master.apply(&Call::multicall(calls)).reply else {
+        panic!("no results")
+    };
+    let value = |index: usize| match results[index].as_array() {
+        Some([Value::Array(answer)]) => answer[2].clone(),
+        _ => panic!("no answer"),
+    };
+    let first = tree([("x", 1.into()), ("y", 2.into())]);
+    assert_eq!((value(0), value(2)), (first.clone(), first));
+    assert_eq!(value(4), tree([("z", 3.into())]));
+}
+
+#[test]
+fn no_key_and_no_value_makes_the_tree_deeper_than_the_stack() {
+    let deep = (0..511).fold(Value::Int(1), |value, _| Value::Array(vec![value]));
+    let long = "/a".repeat(100_000);
+    let mut master = after([
+        set(&long, 1),
+        set(&"/b".repeat(300), deep.clone()),
+        set("/c", deep),
+    ]);
+    for (key, there) in [(&long[..1000], true), (&long[..2000], false)] {
+        let has = answer(&mut master, &call("hasParam", &["/n", key])).2;
+        assert_eq!(has, Value::Bool(there), "{}", key.len());
+    }
+    let copy = master.clone();
+    assert_eq!(copy, master);
+    assert!(matches!(
+        master.apply(&call("getParam", &["/n", "/"])).reply,
+        Reply::Fault { .. }
+    ));
+    assert_eq!(
+        message(&mut master, &call("deleteParam", &["/n", "/a"])).0,
+        1
+    );
+}
