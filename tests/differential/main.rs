@@ -25,7 +25,7 @@ use rosrescue::master::{
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 /// Sequences by default: about a minute on two cores.
-const SEQUENCES: u64 = 200;
+const SEQUENCES: u64 = 120;
 
 /// Calls of a sequence.
 const CALLS: usize = 80;
