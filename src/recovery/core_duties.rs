@@ -48,40 +48,44 @@ pub fn seed_run_id(proxy: &Proxy) {
 
 /// Does the rest once the master is there, until `stop`.
 pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
-    tokio::select! {
-        () = proxy.board.first_opening() => {}
-        () = stop.cancelled() => return,
-    }
-    let work = async {
-        if !has(&proxy, "/run_id") {
-            proxy.lane.call(run_id(&proxy), Kind::Mutate).await;
+    let duties = async {
+        // They take their time: while the master starts, too.
+        let versions = tokio::join!(
+            version(&proxy, "/rosversion", "roslaunch"),
+            version(&proxy, "/rosdistro", "-d"),
+            proxy.board.first_opening(),
+        );
+        let missing = Some(run_id(&proxy)).filter(|_| !has(&proxy, "/run_id"));
+        let calls: Vec<_> = [missing, versions.0, versions.1]
+            .into_iter()
+            .flatten()
+            .collect();
+        if !calls.is_empty() {
+            proxy.lane.call(Call::multicall(calls), Kind::Mutate).await;
         }
+    };
+    let rosout = async {
+        proxy.board.first_opening().await;
         if rosout {
-            tokio::join!(set_versions(&proxy), keep_rosout(&proxy));
-        } else {
-            set_versions(&proxy).await;
+            keep_rosout(&proxy).await;
         }
     };
     tokio::select! {
-        () = work => {}
+        ((), ()) = async { tokio::join!(duties, rosout) } => {}
         () = stop.cancelled() => {}
     }
 }
 
-/// As `roscore.xml` does: the output of `rosversion`, line feed included.
-async fn set_versions(proxy: &Proxy) {
-    let versions = [("/rosversion", "roslaunch"), ("/rosdistro", "-d")];
-    for (key, argument) in versions {
-        if has(proxy, key) {
-            continue;
-        }
-        match supervisor::output_of("rosversion", &[argument], VERSION_TIME).await {
-            Some(version) => {
-                proxy.lane.call(set(key, &version), Kind::Mutate).await;
-            }
-            None => tracing::warn!(key, "not set: `rosversion {argument}` gave no answer"),
-        }
+/// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
+async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
+    if has(proxy, key) {
+        return None;
     }
+    let version = supervisor::output_of("rosversion", &[argument], VERSION_TIME).await;
+    if version.is_none() {
+        tracing::warn!(key, "not set: `rosversion {argument}` gave no answer");
+    }
+    version.map(|version| set(key, &version))
 }
 
 /// Keeps a rosout running: ours, or one that is there already.
