@@ -1,9 +1,10 @@
 //! Values to YAML.
 //!
-//! One emitter for both styles, because no writer at hand writes what PyYAML (YAML 1.1) and YAML 1.2
-//! readers understand alike: every string and key is double-quoted on one line, numbers take the
-//! form that both resolve, and what YAML has no type for goes into `!!pairs`, which no XML-RPC
-//! value can collide with.
+//! One emitter for both styles. Every string and key is double-quoted on one line, numbers take the
+//! form that YAML 1.1 and 1.2 resolve alike, and what YAML has no type for goes into `!!pairs`,
+//! which no XML-RPC value can collide with. serde-saphyr's writer is not used because it has no
+//! integers beyond 128 bits, spreads texts over several lines, and takes four times as long for a
+//! record (1.1 us against 0.25 us).
 
 use std::io::Write;
 

@@ -194,13 +194,13 @@ impl SimFs {
 
     /// What may be on the medium after a loss of power: any subset of the changes of names, and of
     /// every file what was synced and then nothing, or every later write as it was or as zeros, the
-    /// last one whole or half. All combinations, or about `limit` of them if there are more.
+    /// last one whole or cut at an eighth of it. All combinations, or about `limit` of them if there are more.
     pub(super) fn after_power_loss(&self, limit: usize) -> Vec<Self> {
         let world = self.0.lock().unwrap().clone();
         let unsynced: Vec<usize> = (0..world.inodes.len())
             .filter(|nth| !world.inodes[*nth].writes.is_empty())
             .collect();
-        let ways = |nth: &usize| (2_usize << world.inodes[*nth].writes.len()) + 1;
+        let ways = |nth: &usize| (8_usize << world.inodes[*nth].writes.len()) + 1;
         let combinations = unsynced.iter().map(ways).product::<usize>() << world.pending.len();
         // Odd, so that the choices of names have their turn with every other choice.
         let stride = (combinations / limit) | 1;
@@ -229,10 +229,9 @@ impl SimFs {
                         write.fill(0);
                     }
                 }
-                if (way - 1) >> writes.len() & 1 == 1 {
-                    let last = writes.last_mut().unwrap();
-                    last.truncate(last.len() / 2);
-                }
+                let eighths = 8 - ((way - 1) >> writes.len());
+                let last = writes.last_mut().unwrap();
+                last.truncate(last.len() * eighths / 8);
             }
             let files: Vec<_> = image
                 .names

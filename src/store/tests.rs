@@ -207,8 +207,13 @@ fn operations() -> usize {
 #[test]
 fn killed_at_every_operation_nothing_acknowledged_is_lost() {
     let mut crashes = 0;
+    let shares: &[usize] = if cfg!(debug_assertions) {
+        &[0, 4]
+    } else {
+        &[0, 1, 4, 7, 8]
+    };
     for at in 0..operations() {
-        for eighths in [0, 1, 4, 7, 8] {
+        for &eighths in shares {
             let fs = SimFs::default();
             fs.arm(at, Fault::Kill(eighths));
             let mut model = Model::default();
@@ -256,19 +261,26 @@ fn killed_at_every_operation_nothing_acknowledged_is_lost() {
 #[test]
 fn without_power_at_every_operation_nothing_synced_is_lost() {
     let mut images = 0;
-    for at in 0..=operations() {
-        let fs = SimFs::default();
-        fs.arm(at, Fault::Kill(4));
-        let mut model = Model::default();
-        life(&fs, &mut model);
-        for (nth, image) in fs.after_power_loss(400).iter().enumerate() {
-            let context = format!("no power at operation {at}, image {nth}");
-            let loaded = open(image)
-                .unwrap_or_else(|error| panic!("{context}: {error}"))
-                .1;
-            check(&model, loaded.as_ref(), model.synced, &context);
-            go_on(image, &context);
-            images += 1;
+    let limit = if cfg!(debug_assertions) { 10 } else { 4_096 };
+    // Synced always, never, and now and then.
+    for lazy in [0, u32::MAX, 0b0110_0110, 0b1110_1110] {
+        for at in 0..=operations() {
+            let fs = SimFs::default();
+            fs.arm(at, Fault::Kill(4));
+            let mut model = Model {
+                lazy,
+                ..Model::default()
+            };
+            life(&fs, &mut model);
+            for (nth, image) in fs.after_power_loss(limit).iter().enumerate() {
+                let context = format!("no power at operation {at}, syncs {lazy:b}, image {nth}");
+                let loaded = open(image)
+                    .unwrap_or_else(|error| panic!("{context}: {error}"))
+                    .1;
+                check(&model, loaded.as_ref(), model.synced, &context);
+                go_on(image, &context);
+                images += 1;
+            }
         }
     }
     println!("{images} images");
