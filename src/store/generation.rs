@@ -1,43 +1,56 @@
-//! Writing a new generation of the file, and the sync of the present one: what may run on a
-//! blocking thread while calls go on being recorded.
+//! Writing a new generation of the file while calls go on being recorded.
 
 use std::io;
 use std::sync::Arc;
 
-use super::names::Names;
-use super::{Storage, StoreError};
+use super::journal::Active;
+use super::{Names, Storage, Store, StoreError, SyncJob};
 use crate::record::{self, Checkpoint, Stamp};
+
+/// A journal that is smaller than this is not worth a new generation.
+pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
+/// What is recorded while a new generation is written is kept in memory too, up to this size;
+/// beyond it that generation is given up and the present file goes on.
+pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// A new generation that is being written.
+pub(super) struct Pending {
+    generation: u64,
+    /// Bodies of the records since, each with a line feed.
+    pub(super) meanwhile: Vec<u8>,
+    overtaken: bool,
+}
 
 /// Writes a new generation; from [`Store::begin_compaction`](super::Store::begin_compaction).
 #[must_use = "the journal goes on growing until the job has run and has been finished"]
 pub struct CompactionJob<S: Storage> {
-    pub(super) plan: Plan<S>,
-    pub(super) checkpoint: Checkpoint,
+    plan: Plan<S>,
+    checkpoint: Checkpoint,
 }
 
 /// Where a new generation goes.
-pub(super) struct Plan<S: Storage> {
-    pub(super) storage: S,
-    pub(super) names: Names,
-    pub(super) generation: u64,
+struct Plan<S: Storage> {
+    storage: S,
+    names: Names,
+    generation: u64,
     /// Whether the present file becomes the previous generation.
-    pub(super) keep_present: bool,
+    keep_present: bool,
 }
 
 /// A new generation on disk under a name of its own, or why there is none.
 #[must_use = "give it to `Store::finish_compaction`"]
 pub struct Compacted<S: Storage> {
-    pub(super) generation: u64,
-    pub(super) result: Result<Written<S>, StoreError>,
+    generation: u64,
+    result: Result<Written<S>, StoreError>,
 }
 
-pub(super) struct Written<S: Storage> {
-    pub(super) file: S::File,
-    pub(super) stamp: Stamp,
-    pub(super) snapshot_bytes: u64,
+struct Written<S: Storage> {
+    file: S::File,
+    stamp: Stamp,
+    snapshot_bytes: u64,
     /// Whether the previous generation is the present file itself, so that it has what is appended
     /// to that until the new one takes its place.
-    pub(super) linked: bool,
+    linked: bool,
 }
 
 impl<S: Storage> CompactionJob<S> {
@@ -48,7 +61,7 @@ impl<S: Storage> CompactionJob<S> {
 }
 
 impl<S: Storage> Plan<S> {
-    pub(super) fn run(self, checkpoint: &Checkpoint) -> Compacted<S> {
+    fn run(self, checkpoint: &Checkpoint) -> Compacted<S> {
         Compacted {
             generation: self.generation,
             result: self.write(checkpoint),
@@ -92,45 +105,175 @@ impl<S: Storage> Plan<S> {
     }
 }
 
-/// Brings everything that was appended so far to the medium; from
-/// [`Store::sync_job`](super::Store::sync_job).
-#[must_use = "nothing is synced until it has run"]
-pub struct SyncJob<S: Storage> {
-    pub(super) storage: S,
-    pub(super) file: Arc<S::File>,
-    /// The names, if the folder is to be synced too.
-    pub(super) names: Option<Names>,
-    pub(super) generation: u64,
-    pub(super) seq: u64,
-}
-
-/// How a sync went.
-#[must_use = "give it to `Store::synced`"]
-pub struct Synced {
-    pub(super) generation: u64,
-    pub(super) seq: u64,
-    pub(super) named: bool,
-    pub(super) result: io::Result<()>,
-}
-
-impl<S: Storage> SyncJob<S> {
-    /// Syncs; blocks as long as the disk does.
-    pub fn run(self) -> Synced {
-        let mut result = self.storage.sync(&self.file);
-        if let (Ok(()), Some(names)) = (&result, &self.names) {
-            result = self.storage.sync_dir(names.folder());
+impl<S: Storage> Store<S> {
+    /// Writes `checkpoint` as a fresh generation and returns when it is on the medium. The present
+    /// file becomes the previous generation.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be written: the store is unprotected if it was before, else it goes on with the
+    /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
+    pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        if checkpoint.seq >= self.seq {
+            self.pending = None;
         }
-        let Self {
+        let done = self.plan(checkpoint.seq)?.run(checkpoint);
+        self.finish_compaction(done)?;
+        match self.sync_job().map(SyncJob::run) {
+            Some(done) => self.synced(done),
+            None => Ok(()),
+        }
+    }
+
+    /// Whether the journal has outgrown the snapshot, so that a new generation is worth writing.
+    pub fn wants_compaction(&self) -> bool {
+        self.pending.is_none()
+            && self.active.as_ref().is_some_and(|active| {
+                active.journal_bytes > active.snapshot_bytes.max(self.compact_above)
+            })
+    }
+
+    /// Begins a new generation with `checkpoint`, taken as of now: its [`Checkpoint::seq`] is
+    /// [`seq`](Self::seq). Run the job anywhere, go on appending, then give its result to
+    /// [`finish_compaction`](Self::finish_compaction). Also the way to re-arm an unprotected store
+    /// beside traffic. A job that is dropped instead is ended by [`begin`](Self::begin).
+    ///
+    /// # Errors
+    ///
+    /// If the checkpoint is behind the journal or another generation is being written.
+    pub fn begin_compaction(
+        &mut self,
+        checkpoint: Checkpoint,
+    ) -> Result<CompactionJob<S>, StoreError> {
+        let plan = self.plan(checkpoint.seq)?;
+        Ok(CompactionJob { plan, checkpoint })
+    }
+
+    fn plan(&mut self, seq: u64) -> Result<Plan<S>, StoreError> {
+        if seq < self.seq {
+            return Err(StoreError::Stale {
+                snapshot: seq,
+                journal: self.seq,
+            });
+        }
+        if self.pending.is_some() {
+            return Err(StoreError::Busy);
+        }
+        self.seq = seq;
+        self.generation += 1;
+        let generation = self.generation;
+        self.pending = Some(Pending {
             generation,
-            seq,
-            names,
-            ..
-        } = self;
-        Synced {
+            meanwhile: Vec::new(),
+            overtaken: false,
+        });
+        Ok(Plan {
+            storage: self.storage.clone(),
+            names: self.names.clone(),
             generation,
-            seq,
-            named: names.is_some(),
-            result,
+            keep_present: self.usable,
+        })
+    }
+
+    /// Adds what was recorded meanwhile to the new generation and puts it in the present file's
+    /// place. Quick: it waits for no disk that can give a file two names.
+    ///
+    /// # Errors
+    ///
+    /// If there is no new generation. The present file goes on as it was, and the next compaction
+    /// is wanted when it has doubled.
+    pub fn finish_compaction(&mut self, done: Compacted<S>) -> Result<(), StoreError> {
+        let fresh = self.names.fresh(done.generation);
+        let pending = self
+            .pending
+            .take_if(|pending| pending.generation == done.generation);
+        let finished = self.switch(pending, done);
+        if finished.is_err() {
+            // It may not be there at all; if it stays, the next start removes it.
+            let _ = self.storage.remove(&fresh);
+            let journal = self
+                .active
+                .as_ref()
+                .map_or(0, |active| active.journal_bytes);
+            self.compact_above = journal.saturating_mul(2).max(COMPACTION_BYTES_MIN);
+        }
+        finished
+    }
+
+    fn switch(&mut self, pending: Option<Pending>, done: Compacted<S>) -> Result<(), StoreError> {
+        let fresh = self.names.fresh(done.generation);
+        let written = done.result?;
+        let Some(pending) = pending.filter(|pending| !pending.overtaken) else {
+            return Err(StoreError::Overtaken {
+                path: self.names.path.clone(),
+            });
+        };
+        let mut journal = Vec::with_capacity(pending.meanwhile.len());
+        for body in pending
+            .meanwhile
+            .split(|&byte| byte == b'\n')
+            .filter(|body| !body.is_empty())
+        {
+            let start = journal.len();
+            journal.extend_from_slice(body);
+            record::seal(&mut journal, start, written.stamp);
+        }
+        append_all(&self.storage, &written.file, &journal)
+            .and_then(|()| match written.linked {
+                true => Ok(()),
+                // The one case in which it waits: on file systems such as FAT.
+                false => self.storage.sync(&written.file),
+            })
+            .map_err(failed("write", &fresh))?;
+        if let Err(source) = self.storage.rename(&fresh, &self.names.path) {
+            // Which file the path names now, nobody knows.
+            return Err(self.latch(failed("replace", &self.names.path)(source)));
+        }
+        self.active = Some(Active {
+            file: Arc::new(written.file),
+            stamp: written.stamp,
+            generation: done.generation,
+            snapshot_bytes: written.snapshot_bytes,
+            journal_bytes: journal.len() as u64,
+            clean: journal.is_empty(),
+            named: false,
+        });
+        self.usable = true;
+        self.unprotected = None;
+        self.compact_above = COMPACTION_BYTES_MIN;
+        Ok(())
+    }
+
+    /// Ends being unprotected: [`begin`](Self::begin) under the name that says why.
+    ///
+    /// # Errors
+    ///
+    /// As `begin`; try again later.
+    pub fn rearm(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        self.begin(checkpoint)
+    }
+
+    /// Writes a last generation, which `checkpoint` says is closed, and stops recording.
+    ///
+    /// # Errors
+    ///
+    /// As [`begin`](Self::begin).
+    pub fn close(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        self.begin(checkpoint)?;
+        self.active = None;
+        self.unprotected = Some("it is closed".to_owned());
+        Ok(())
+    }
+}
+
+impl Pending {
+    pub(super) fn keep(&mut self, body: &[u8]) {
+        self.overtaken |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
+        if self.overtaken {
+            self.meanwhile = Vec::new();
+        } else if !body.is_empty() {
+            self.meanwhile.extend_from_slice(body);
+            self.meanwhile.push(b'\n');
         }
     }
 }

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
+use super::generation::MEANWHILE_BYTES_MAX;
 use super::sim::{Fault, SimFs};
 use super::*;
-use crate::record::Session;
+use crate::record::{Checkpoint, Entry, Session};
 use crate::xmlrpc::{Call, Value};
 
 const PATH: &str = "/log/latest-chkpt.yaml";

@@ -1,0 +1,83 @@
+//! Keeping files under other names: what was damaged, and sessions that have ended.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use super::generation::{append_all, failed};
+use super::{Loaded, Names, Storage, Store, StoreError};
+
+impl<S: Storage> Store<S> {
+    /// Gives the present file another name, `PATH.REASON-NUMBER`, and its previous generation too,
+    /// so that neither has a part in what comes next. Nothing can be recorded before the next
+    /// [`begin`](Self::begin). Returns the file's new path, if there was a file.
+    ///
+    /// # Errors
+    ///
+    /// If they cannot be renamed: they may still be where they were.
+    pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
+        self.active = None;
+        self.pending = None;
+        self.unprotected = Some("its file has been set aside".to_owned());
+        self.usable = false;
+        let kind: String = reason
+            .chars()
+            .map(|letter| {
+                if letter.is_ascii_alphanumeric() {
+                    letter
+                } else {
+                    '-'
+                }
+            })
+            .collect();
+        let path = &self.names.path;
+        // The previous generation first: left behind alone it could come back.
+        let moved = set_aside_previous(&self.storage, &self.names, &kind).and_then(|()| {
+            let aside = self.names.aside(&self.storage, &kind)?;
+            let moved = rename_if_there(&self.storage, path, &aside)?;
+            self.storage.sync_dir(self.names.folder())?;
+            Ok(moved.then_some(aside))
+        });
+        moved.map_err(failed("set aside", path))
+    }
+}
+
+/// Keeps what is damaged, and says under which name.
+pub(super) fn keep_aside(
+    storage: &impl Storage,
+    names: &Names,
+    loaded: &mut Loaded,
+    torn: Option<Vec<u8>>,
+) -> io::Result<()> {
+    if let (Some(bytes), Some(sentence)) = (torn, &mut loaded.torn) {
+        let aside = names.aside(storage, "torn")?;
+        let file = storage.create(&aside)?;
+        append_all(storage, &file, &bytes)?;
+        sentence.push_str(&format!("; they are kept as `{}`", aside.display()));
+    }
+    if !loaded.damage.is_empty() {
+        let aside = names.aside(storage, "broken")?;
+        storage.link(&names.path, &aside)?;
+        loaded
+            .damage
+            .push(format!("the damaged file is kept as `{}`", aside.display()));
+    }
+    Ok(())
+}
+
+pub(super) fn set_aside_previous(
+    storage: &impl Storage,
+    names: &Names,
+    kind: &str,
+) -> io::Result<()> {
+    let previous = names.previous();
+    let aside = names.aside(storage, kind)?;
+    rename_if_there(storage, &previous, &aside).map(|_| ())
+}
+
+fn rename_if_there(storage: &impl Storage, from: &Path, to: &Path) -> io::Result<bool> {
+    match storage.rename(from, to) {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+    }
+}
