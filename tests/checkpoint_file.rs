@@ -90,7 +90,7 @@ fn a_person_finds_nodes_topics_and_services_in_it() {
             "std_msgs/String",
             "/fake/service",
             "/gains",
-            "/run_id",
+            "run_id",
             &node.api,
             &node.service_api(),
         ];

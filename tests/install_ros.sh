@@ -12,6 +12,13 @@ for ros_setup in /opt/ros/*/setup.sh; do
     fi
 done
 
+ros_has_rosout() {
+    for rosout in /usr/lib/rosout/rosout /opt/ros/*/lib/rosout/rosout; do
+        [ ! -x "$rosout" ] || return 0
+    done
+    return 1
+}
+
 # The packages of what does not work here. `python3` may be another one than ROS was made for.
 ros_missing() {
     need() { # PACKAGES CHECK...
@@ -26,7 +33,7 @@ ros_missing() {
     need python3-std-msgs /usr/bin/python3 -c 'import std_msgs.msg'
     need python3-std-srvs /usr/bin/python3 -c 'import std_srvs.srv'
     need python3-yaml /usr/bin/python3 -c 'import yaml'
-    need rosout find /usr/lib/rosout/rosout /opt/ros/*/lib/rosout/rosout -prune -quit
+    need rosout ros_has_rosout
     need g++ command -v g++
     need pkg-config command -v pkg-config
     need libroscpp-dev pkg-config --exists roscpp
@@ -53,8 +60,8 @@ if [ -n "$ros_packages" ]; then
     if ! $as_root env DEBIAN_FRONTEND=noninteractive \
         apt-get install -y -qq --no-install-recommends $ros_packages; then
         echo "apt-get cannot install all of: $ros_packages" >&2
-        echo "This needs a Debian or Ubuntu that carries ROS 1 (Debian 11 or 12, Ubuntu 22.04 or 24.04)," >&2
-        echo "or a ROS Noetic in /opt/ros." >&2
+        echo "This needs a Debian or Ubuntu that carries ROS 1, as Debian 12 does, or a ROS Noetic in" >&2
+        echo "/opt/ros." >&2
         exit 1
     fi
 fi

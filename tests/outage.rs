@@ -245,7 +245,7 @@ fn a_core_replaces_a_master_that_hangs() {
     client.set_param("/kept", "yes");
     let before = robot.settled_state();
     let hung = robot.master_pid();
-    support::signal(hung, Signal::STOP);
+    support::stop(hung);
     robot.await_recovery(hung);
     eventually("the master that hangs is ended", || !alive(hung));
     before.assert_same(&robot.state(), "after the hung master was replaced");
@@ -258,12 +258,14 @@ fn a_proxy_waits_for_a_master_that_hangs() {
     client.set_param("/kept", "yes");
     let before = robot.settled_state();
     let pid = robot.master_pid();
-    support::signal(pid, Signal::STOP);
+    support::stop(pid);
     let waiting = thread::spawn({
         let client = client.clone();
         move || client.status("setParam", params!["/test", "/waits", 1])
     });
-    assert!(holds(Duration::from_secs(2), || !waiting.is_finished()));
+    if !holds(Duration::from_secs(2), || !waiting.is_finished()) {
+        panic!("the master hangs and yet: {:?}", waiting.join().unwrap());
+    }
     support::signal(pid, Signal::CONT);
     assert_eq!(waiting.join().unwrap().expect("the call is answered").0, 1);
     client.ok("deleteParam", params!["/test", "/waits"]);
@@ -284,7 +286,7 @@ fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
     }
     let after = robot.settled_state().without_node("/leaving");
     let pid = robot.master_pid();
-    support::signal(pid, Signal::STOP);
+    support::stop(pid);
     // Whether the answer comes at once or when the master goes on: it is a promise.
     let unregistering = thread::spawn(move || {
         leaving.unpublish(&client, "/topic");
@@ -310,7 +312,7 @@ fn a_restart_that_nobody_saw_is_found() {
     node.publish(&client, "/topic", "std_msgs/String");
     let before = robot.settled_state();
     let dead = robot.master_pid();
-    robot.rescue.signal(Signal::STOP);
+    support::stop(robot.rescue.pid());
     robot.kill_master();
     robot.revive_master();
     robot.rescue.signal(Signal::CONT);

@@ -82,7 +82,7 @@ fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() 
     let after = robot.settled_state().without_node("/leaving");
     let master = robot.master_pid();
     robot.rescue.kill();
-    support::signal(master, Signal::STOP);
+    support::stop(master);
     robot.rescue.start_again();
     eventually("rosrescue listens", || client.connect().is_ok());
     let unregistering = thread::spawn(move || {

@@ -205,7 +205,7 @@ fn case_2_the_master_dies_before_it_tells(library: Library, mode: Mode) {
     // A publisher leaves untold.
     let staying = FakeNode::start("/staying");
     let dead = robot.master_pid();
-    listener.signal(Signal::STOP);
+    support::stop(listener.pid());
     observer.hold();
     staying.publish(&client, "/chatter", "std_msgs/String");
     eventually(
@@ -236,7 +236,7 @@ fn case_2_the_master_dies_before_it_tells(library: Library, mode: Mode) {
     // A publisher comes untold.
     let coming = FakeNode::start("/coming");
     let dead = robot.master_pid();
-    listener.signal(Signal::STOP);
+    support::stop(listener.pid());
     observer.hold();
     leaving.publish(&client, "/chatter", "std_msgs/String");
     eventually(

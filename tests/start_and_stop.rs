@@ -443,7 +443,7 @@ fn an_orderly_stop_in_an_outage_with_parked_calls() {
 fn a_core_stops_even_if_its_master_hangs() {
     let mut robot = Robot::start(Mode::Core);
     let master = robot.master_pid();
-    support::signal(master, Signal::STOP);
+    support::stop(master);
     assert_eq!(robot.rescue.terminate().code(), Some(0));
     eventually("the master that hangs is ended", || !alive(master));
     assert_eq!(robot.scratch.survivors(), vec![]);
@@ -454,7 +454,7 @@ fn a_second_signal_ends_at_once() {
     let mut robot = Robot::start(Mode::Core);
     let master = robot.master_pid();
     // An orderly stop has to wait for this one.
-    support::signal(master, Signal::STOP);
+    support::stop(master);
     robot.rescue.signal(Signal::TERM);
     thread::sleep(Duration::from_millis(50));
     let start = Instant::now();

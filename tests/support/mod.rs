@@ -33,7 +33,7 @@ pub(crate) use fake::{FakeMaster, FakeNode, Heard};
 pub(crate) use kinds::{kinds, sorted};
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
-pub(crate) use process::{Process, alive, signal};
+pub(crate) use process::{Process, alive, signal, stop};
 pub(crate) use rescue::{Rescue, Setup};
 pub(crate) use robot::{Mode, Robot};
 pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, ros_command};

@@ -1,6 +1,7 @@
 //! A child process whose output is watched.
 
 use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -8,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
-use super::patience::{PATIENCE, eventually_some};
+use super::patience::{eventually, eventually_some};
 
 /// Sends `signal` to one process. A process that is gone is no error.
 pub(crate) fn signal(pid: u32, signal: Signal) {
@@ -19,16 +20,29 @@ pub(crate) fn signal(pid: u32, signal: Signal) {
     let _ = rustix::process::kill_process(pid, signal);
 }
 
+/// SIGSTOP, and the stop: the kernel takes its time with the threads that run on another core.
+#[track_caller]
+pub(crate) fn stop(pid: u32) {
+    signal(pid, Signal::STOP);
+    let tasks = format!("/proc/{pid}/task");
+    eventually("every thread of a process has stopped", || {
+        std::fs::read_dir(&tasks)
+            .expect("a living process")
+            .flatten()
+            .all(|task| state(&task.path()).is_none_or(|state| state == 'T'))
+    });
+}
+
 /// Whether a process with this id is there and is no zombie.
 pub(crate) fn alive(pid: u32) -> bool {
-    std::fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| {
-        !stat
-            .rsplit(')')
-            .next()
-            .unwrap_or("")
-            .trim_start()
-            .starts_with('Z')
-    })
+    state(Path::new(&format!("/proc/{pid}"))).is_some_and(|state| state != 'Z')
+}
+
+/// The state letter of a process or thread, if it is there.
+fn state(folder: &Path) -> Option<char> {
+    let stat = std::fs::read_to_string(folder.join("stat")).ok()?;
+    // The command's name comes before, in parentheses, with whatever it likes in it.
+    stat.rsplit(')').next()?.trim_start().chars().next()
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -8,7 +8,6 @@ use std::sync::OnceLock;
 use std::time::Duration;
 
 use rosrescue::xmlrpc::Value;
-use rustix::process::Signal;
 
 use super::patience::eventually;
 use super::process::Process;
@@ -114,16 +113,6 @@ impl Rosmaster {
     /// SIGKILL, and the end of the process.
     pub(crate) fn kill(&mut self) {
         self.process.kill();
-    }
-
-    /// SIGSTOP: it hangs.
-    pub(crate) fn stop(&self) {
-        self.process.signal(Signal::STOP);
-    }
-
-    /// SIGCONT: it goes on.
-    pub(crate) fn cont(&self) {
-        self.process.signal(Signal::CONT);
     }
 }
 
