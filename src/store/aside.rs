@@ -16,7 +16,7 @@ impl<S: Storage> Store<S> {
     /// If they cannot be renamed: they may still be where they were.
     pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
         self.active = None;
-        self.pending = None;
+        self.overtake();
         self.unprotected = Some("its file has been set aside".to_owned());
         self.usable = false;
         let kind: String = reason

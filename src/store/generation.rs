@@ -1,7 +1,7 @@
 //! Writing a new generation of the file while calls go on being recorded.
 
 use std::io;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use super::journal::Active;
 use super::{Names, Storage, Store, StoreError, SyncJob};
@@ -19,6 +19,20 @@ pub(super) struct Pending {
     /// Bodies of the records since, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     overtaken: bool,
+    /// Dangles when the job or its result was dropped instead of being finished.
+    ticket: Weak<Ticket>,
+}
+
+/// Whether a generation is still wanted; locked while its job changes names, so that no job that
+/// was overtaken touches the files of the one that overtook it.
+#[derive(Debug)]
+struct Ticket(Mutex<bool>);
+
+impl Ticket {
+    fn lock(&self) -> MutexGuard<'_, bool> {
+        // A truth value is whole whatever became of the thread that wrote it.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// Writes a new generation; from [`Store::begin_compaction`](super::Store::begin_compaction).
@@ -35,6 +49,7 @@ struct Plan<S: Storage> {
     generation: u64,
     /// Whether the present file becomes the previous generation.
     keep_present: bool,
+    ticket: Arc<Ticket>,
 }
 
 /// A new generation on disk under a name of its own, or why there is none.
@@ -42,6 +57,7 @@ struct Plan<S: Storage> {
 pub struct Compacted<S: Storage> {
     generation: u64,
     result: Result<Written<S>, StoreError>,
+    _ticket: Arc<Ticket>,
 }
 
 struct Written<S: Storage> {
@@ -65,24 +81,29 @@ impl<S: Storage> Plan<S> {
         Compacted {
             generation: self.generation,
             result: self.write(checkpoint),
+            _ticket: self.ticket,
         }
     }
 
-    fn write(self, checkpoint: &Checkpoint) -> Result<Written<S>, StoreError> {
+    fn write(&self, checkpoint: &Checkpoint) -> Result<Written<S>, StoreError> {
         let Self {
             storage,
             names,
             generation,
-            keep_present,
+            ..
         } = self;
+        let generation = *generation;
         let encoded = record::encode_checkpoint(checkpoint, generation)?;
         let path = names.fresh(generation);
         let file = storage.create(&path).map_err(failed("create", &path))?;
-        let written =
-            append_all(&storage, &file, &encoded.bytes).and_then(|()| storage.sync(&file));
+        let written = append_all(storage, &file, &encoded.bytes).and_then(|()| storage.sync(&file));
         written.map_err(failed("write", &path))?;
+        let wanted = self.ticket.lock();
+        if !*wanted {
+            return Err(names.overtaken());
+        }
         let mut linked = true;
-        if keep_present {
+        if self.keep_present {
             let previous = names.previous();
             linked = match storage.link(&names.path, &previous) {
                 // Somebody removed it; a new one is the best that can be done.
@@ -115,7 +136,7 @@ impl<S: Storage> Store<S> {
     /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
     pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         if checkpoint.seq >= self.seq {
-            self.pending = None;
+            self.overtake();
         }
         let done = self.plan(checkpoint.seq)?.run(checkpoint);
         self.finish_compaction(done)?;
@@ -127,7 +148,7 @@ impl<S: Storage> Store<S> {
 
     /// Whether the journal has outgrown the snapshot, so that a new generation is worth writing.
     pub fn wants_compaction(&self) -> bool {
-        self.pending.is_none()
+        !self.is_busy()
             && self.active.as_ref().is_some_and(|active| {
                 active.journal_bytes > active.snapshot_bytes.max(self.compact_above)
             })
@@ -136,7 +157,7 @@ impl<S: Storage> Store<S> {
     /// Begins a new generation with `checkpoint`, taken as of now: its [`Checkpoint::seq`] is
     /// [`seq`](Self::seq). Run the job anywhere, go on appending, then give its result to
     /// [`finish_compaction`](Self::finish_compaction). Also the way to re-arm an unprotected store
-    /// beside traffic. A job that is dropped instead is ended by [`begin`](Self::begin).
+    /// beside traffic.
     ///
     /// # Errors
     ///
@@ -156,23 +177,43 @@ impl<S: Storage> Store<S> {
                 journal: self.seq,
             });
         }
-        if self.pending.is_some() {
+        if self.is_busy() {
             return Err(StoreError::Busy);
         }
         self.seq = seq;
         self.generation += 1;
         let generation = self.generation;
+        let ticket = Arc::new(Ticket(Mutex::new(true)));
         self.pending = Some(Pending {
             generation,
             meanwhile: Vec::new(),
             overtaken: false,
+            ticket: Arc::downgrade(&ticket),
         });
         Ok(Plan {
             storage: self.storage.clone(),
             names: self.names.clone(),
             generation,
             keep_present: self.usable,
+            ticket,
         })
+    }
+
+    /// Whether a new generation is being written.
+    fn is_busy(&self) -> bool {
+        let ticket = self.pending.as_ref().map(|pending| &pending.ticket);
+        ticket.is_some_and(|ticket| ticket.strong_count() > 0)
+    }
+
+    /// Takes care that a generation that is being written touches no file but its own from now on.
+    pub(super) fn overtake(&mut self) {
+        if let Some(ticket) = self
+            .pending
+            .take()
+            .and_then(|pending| pending.ticket.upgrade())
+        {
+            *ticket.lock() = false;
+        }
     }
 
     /// Adds what was recorded meanwhile to the new generation and puts it in the present file's
@@ -204,9 +245,7 @@ impl<S: Storage> Store<S> {
         let fresh = self.names.fresh(done.generation);
         let written = done.result?;
         let Some(pending) = pending.filter(|pending| !pending.overtaken) else {
-            return Err(StoreError::Overtaken {
-                path: self.names.path.clone(),
-            });
+            return Err(self.names.overtaken());
         };
         let mut journal = Vec::with_capacity(pending.meanwhile.len());
         for body in pending

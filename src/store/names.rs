@@ -3,7 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::Storage;
+use super::{Storage, StoreError};
 
 /// Files of one kind that are kept; older ones are removed, so that a robot that is switched on
 /// every morning does not fill its disk.
@@ -32,6 +32,11 @@ impl Names {
 
     pub(super) fn fresh(&self, generation: u64) -> PathBuf {
         self.numbered("new", generation)
+    }
+
+    pub(super) fn overtaken(&self) -> StoreError {
+        let path = self.path.clone();
+        StoreError::Overtaken { path }
     }
 
     pub(super) fn folder(&self) -> &Path {

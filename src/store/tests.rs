@@ -387,6 +387,33 @@ fn a_compaction_that_cannot_keep_up_is_given_up_in_bounded_memory() {
 }
 
 #[test]
+fn a_job_that_was_overtaken_or_lost_is_in_nobodys_way() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    let lost = store.begin_compaction(model.checkpoint(0)).unwrap();
+    let busy = store.begin_compaction(model.checkpoint(0)).map(|_| ());
+    assert!(matches!(busy, Err(StoreError::Busy)));
+    drop(lost);
+    let late = store.begin_compaction(model.checkpoint(0)).unwrap();
+    model.append(&mut store, 1);
+    model.begin(&mut store);
+    let names = fs.list(Path::new("/log")).unwrap();
+    let previous = fs
+        .read(Path::new("/log/latest-chkpt.yaml.previous"), 0)
+        .unwrap();
+    let error = store.finish_compaction(late.run()).unwrap_err();
+    assert!(matches!(error, StoreError::Overtaken { .. }));
+    assert_eq!(fs.list(Path::new("/log")).unwrap(), names);
+    assert!(
+        fs.read(Path::new("/log/latest-chkpt.yaml.previous"), 0)
+            .unwrap()
+            == previous
+    );
+}
+
+#[test]
 fn a_session_is_set_aside_whole_or_not_at_all() {
     let run = |fs: &SimFs| {
         let Ok((mut store, loaded)) = open(fs) else {
