@@ -1,0 +1,247 @@
+//! Files that are damaged, foreign or gone.
+
+use std::fs;
+
+use rosrescue::store::{OpenError, Store};
+
+use super::{checkpoint, entry, names, started};
+
+#[test]
+fn a_foreign_file_is_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.yaml");
+    fs::write(&path, "use_sim_time: true\n").unwrap();
+    let error = Store::open(&path).err().unwrap();
+    assert!(matches!(error, OpenError::NotACheckpoint { .. }));
+    assert!(
+        error
+            .to_string()
+            .contains("is not a rosrescue checkpoint; move it away"),
+        "{error}"
+    );
+    assert_eq!(fs::read(&path).unwrap(), b"use_sim_time: true\n");
+    assert_eq!(names(folder.path()), ["params.yaml", "params.yaml.lock"]);
+
+    // Nor is a folder one, or a pipe, at which reading would wait for ever.
+    let error = Store::open(&folder.path().join("")).err().unwrap();
+    assert!(matches!(error, OpenError::Io { .. }), "{error}");
+}
+
+#[test]
+fn a_torn_record_is_cut_and_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    drop(started(&path, 3));
+    let bytes = fs::read(&path).unwrap();
+    fs::write(&path, &bytes[..bytes.len() - 5]).unwrap();
+    let (mut store, loaded) = Store::open(&path).unwrap();
+    let loaded = loaded.unwrap();
+    assert_eq!(loaded.records.len(), 2);
+    assert!(loaded.exact && loaded.damage.is_empty());
+    assert!(loaded.torn.unwrap().contains("c.yaml.torn-1"));
+    let torn = fs::read_to_string(folder.path().join("c.yaml.torn-1")).unwrap();
+    assert!(torn.starts_with("- {seq: 3"));
+
+    // Goes on behind the cut, and the torn record never comes back.
+    store.begin(&checkpoint(2)).unwrap();
+    store.append(&[entry(33)]).unwrap();
+    drop(store);
+    let (_, loaded) = Store::open(&path).unwrap();
+    let loaded = loaded.unwrap();
+    assert!(loaded.exact && loaded.torn.is_none() && loaded.damage.is_empty());
+    assert_eq!(
+        loaded
+            .records
+            .iter()
+            .map(|r| (r.seq, r.entry.clone()))
+            .collect::<Vec<_>>(),
+        [(3, entry(33))]
+    );
+}
+
+#[test]
+fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 3);
+    store.begin(&checkpoint(3)).unwrap();
+    store.append(&[entry(4), entry(5)]).unwrap();
+    drop(store);
+    let whole = fs::read(&path).unwrap();
+    for at in [10, 200] {
+        let mut bytes = whole.clone();
+        bytes[at] ^= 4;
+        fs::write(&path, &bytes).unwrap();
+        let (store, loaded) = Store::open(&path).unwrap();
+        let loaded = loaded.unwrap();
+        assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+        assert_eq!(
+            loaded
+                .records
+                .iter()
+                .map(|record| record.seq)
+                .collect::<Vec<_>>(),
+            [1, 2, 3, 4, 5]
+        );
+        assert!(loaded.exact, "{:?}", loaded.damage);
+        assert!(
+            loaded
+                .damage
+                .iter()
+                .any(|sentence| sentence.contains("c.yaml.broken-"))
+        );
+        assert_eq!(store.seq(), 5);
+    }
+    assert_eq!(
+        names(folder.path()),
+        [
+            "c.yaml",
+            "c.yaml.broken-1",
+            "c.yaml.broken-2",
+            "c.yaml.lock",
+            "c.yaml.previous"
+        ]
+    );
+}
+
+#[test]
+fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 3);
+    store.begin(&checkpoint(3)).unwrap();
+    drop(store);
+    for _ in 0..2 {
+        let mut bytes = fs::read(&path).unwrap();
+        bytes[200] ^= 4;
+        fs::write(&path, &bytes).unwrap();
+        let (mut store, loaded) = Store::open(&path).unwrap();
+        let loaded = loaded.unwrap();
+        assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+        assert_eq!(loaded.records.len(), 3);
+        store.begin(&checkpoint(3)).unwrap();
+    }
+}
+
+#[test]
+fn a_file_put_back_from_a_copy_is_what_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    let copy = fs::read(&path).unwrap();
+    store.begin(&checkpoint(2)).unwrap();
+    store.append(&[entry(3)]).unwrap();
+    store.begin(&checkpoint(3)).unwrap();
+    drop(store);
+    fs::write(&path, copy).unwrap();
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+    assert_eq!(loaded.records.len(), 2);
+    assert!(
+        loaded.exact && loaded.damage.is_empty(),
+        "{:?}",
+        loaded.damage
+    );
+}
+
+#[test]
+fn a_lost_record_is_said_and_the_others_are_used() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    drop(started(&path, 3));
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replacen("\"/p2\"", "\"/q2\"", 1)).unwrap();
+    let (mut store, loaded) = Store::open(&path).unwrap();
+    let loaded = loaded.unwrap();
+    assert_eq!(
+        loaded
+            .records
+            .iter()
+            .map(|record| record.seq)
+            .collect::<Vec<_>>(),
+        [1, 3]
+    );
+    assert!(!loaded.exact);
+    assert_eq!(loaded.damage.len(), 3, "{:?}", loaded.damage);
+    assert!(loaded.damage[1].contains("the records 2 to 2 are lost"));
+    store.begin(&checkpoint(3)).unwrap();
+}
+
+#[test]
+fn without_any_snapshot_the_records_are_left() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    drop(started(&path, 3));
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[200] ^= 1;
+    fs::write(&path, &bytes).unwrap();
+    let loaded = rosrescue::store::read(&path).unwrap().unwrap();
+    assert!(loaded.checkpoint.is_none() && !loaded.exact);
+    assert_eq!(loaded.records.len(), 3);
+}
+
+#[test]
+fn a_file_removed_under_a_running_store_is_noticed_by_the_next_sync() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 1);
+    fs::remove_file(&path).unwrap();
+    let done = store.sync_job().unwrap().run();
+    assert!(
+        store
+            .synced(done)
+            .unwrap_err()
+            .to_string()
+            .contains("removed")
+    );
+    assert!(store.unprotected().is_some());
+    store.rearm(&checkpoint(1)).unwrap();
+    assert!(store.unprotected().is_none() && path.is_file());
+}
+
+#[test]
+fn what_a_crash_left_unfinished_is_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    drop(started(&path, 1));
+    for name in [
+        "c.yaml.new-7",
+        "c.yaml.previous.new",
+        "c.yaml.new-x",
+        "d.yaml.new-1",
+    ] {
+        fs::write(folder.path().join(name), "# rosrescue").unwrap();
+    }
+    let (store, _) = Store::open(&path).unwrap();
+    drop(store);
+    let left = ["c.yaml", "c.yaml.lock", "c.yaml.new-x", "d.yaml.new-1"];
+    assert_eq!(names(folder.path()), left);
+}
+
+#[test]
+fn a_later_format_is_refused_and_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let line = "# rosrescue checkpoint v9 header=";
+    let text = format!("{line}{:08x}\nnew: true\n", crc32c::crc32c(line.as_bytes()));
+    fs::write(&path, &text).unwrap();
+    let error = Store::open(&path).err().unwrap();
+    assert!(
+        matches!(error, OpenError::NewerVersion { version: 9, .. }),
+        "{error}"
+    );
+    assert_eq!(fs::read_to_string(&path).unwrap(), text);
+}
+
+#[test]
+fn a_folder_that_cannot_be_made_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    let error = Store::open(&file.join("c.yaml")).err().unwrap();
+    let text = error.to_string();
+    assert!(
+        text.contains("file/c.yaml") && text.contains("--checkpoint"),
+        "{text}"
+    );
+}
