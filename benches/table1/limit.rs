@@ -1,0 +1,145 @@
+//! The best that anybody could do: the same rosmaster started by somebody who knows everything before,
+//! and brought to the state by a single call.
+
+use std::{
+    fs,
+    process::{Child, Command, Stdio},
+    thread::sleep,
+    time::{Duration, Instant},
+};
+
+use rosrescue::xmlrpc::{self, Call, Value};
+
+use crate::{
+    robot::Robot,
+    support::{State, Wire, free_port, http_request, params},
+};
+
+/// Pause between two looks at whether the port is open. A shorter one slows down what is waited for.
+const PAUSE: Duration = Duration::from_millis(1);
+/// How long a rosmaster may take to listen.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// In milliseconds.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Limit {
+    /// From the start of the process to its open port.
+    pub(crate) start: f64,
+    /// From there to the reply to one compact multicall that brings the whole state.
+    pub(crate) injection: f64,
+}
+
+impl Limit {
+    /// From nothing to the whole state.
+    pub(crate) fn total(self) -> f64 {
+        self.start + self.injection
+    }
+}
+
+/// Starts a second rosmaster just as rosrescue started the robot's and brings it to the same state.
+/// Nothing is looked at or compared. No node notices: in this order no master calls any.
+pub(crate) fn measure(robot: &Robot) -> Limit {
+    let request = http_request(&injection(&robot.state()));
+    let port = free_port();
+    let mut command = same_command(robot, port);
+
+    let begin = Instant::now();
+    let _master = Master(command.spawn().expect("a second rosmaster"));
+    let mut wire = loop {
+        match Wire::connect("127.0.0.1", port) {
+            Ok(wire) => break wire,
+            Err(error) => assert!(begin.elapsed() < PATIENCE, "no rosmaster: {error}"),
+        }
+        sleep(PAUSE);
+    };
+    let start = begin.elapsed();
+    wire.send(&request).expect("a call");
+    let reply = wire.response().expect("an answer");
+    let total = begin.elapsed();
+
+    let results = reply.reply();
+    let failed = |result: &&Value| result.as_array().is_none();
+    let xmlrpc::Reply::Value(Value::Array(results)) = &results else {
+        panic!("{results:?}");
+    };
+    assert_eq!(results.iter().find(failed), None);
+    let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
+    Limit {
+        start: ms(start),
+        injection: ms(total.saturating_sub(start)),
+    }
+}
+
+/// A process that ends with this value.
+struct Master(Child);
+
+impl Drop for Master {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The command line and environment of the master that rosrescue runs, but for the port and the folder
+/// of its log.
+fn same_command(robot: &Robot, port: u16) -> Command {
+    let pid = robot.master_pid();
+    let read = |file: &str| {
+        let text = fs::read_to_string(format!("/proc/{pid}/{file}")).expect("the master's process");
+        let words = text.split_terminator('\0').map(str::to_owned);
+        words.collect::<Vec<_>>()
+    };
+    let mut arguments = read("cmdline");
+    let place = arguments.iter().position(|word| word == "-p").expect("-p") + 1;
+    arguments[place] = port.to_string();
+    let environment = read("environ");
+    let mut command = Command::new(&arguments[0]);
+    command
+        .args(&arguments[1..])
+        .env_clear()
+        .envs(environment.iter().filter_map(|pair| pair.split_once('=')))
+        .env("ROS_LOG_DIR", robot.scratch.path("limit"))
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
+    command
+}
+
+/// One multicall that makes `state` of an empty master's, in the order that disturbs nobody.
+fn injection(state: &State) -> Vec<u8> {
+    let text = |pairs: &[(String, String)], key: &str| {
+        let found = pairs.iter().find(|(name, _)| name == key);
+        found
+            .map(|(_, value)| value.clone())
+            .expect("a name that is known")
+    };
+    let register = |method: &'static str, table: &[(String, Vec<String>)]| {
+        let mut calls = Vec::new();
+        for (topic, nodes) in table {
+            for node in nodes {
+                let topic_type = text(&state.topic_types, topic);
+                let api = text(&state.nodes, node);
+                calls.push(Call::new(
+                    method,
+                    params![node.clone(), topic.clone(), topic_type, api],
+                ));
+            }
+        }
+        calls
+    };
+    let services = state.services.iter().map(|(service, nodes)| {
+        let service_api = text(&state.service_apis, service);
+        let api = text(&state.nodes, &nodes[0]);
+        let params = params![nodes[0].clone(), service.clone(), service_api, api];
+        Call::new("registerService", params)
+    });
+    let params = Call::new("setParam", params!["/limit", "/", state.params.clone()]);
+    let publishers = register("registerPublisher", &state.publishers);
+    let subscribers = register("registerSubscriber", &state.subscribers);
+    let calls = [params]
+        .into_iter()
+        .chain(publishers)
+        .chain(services)
+        .chain(subscribers);
+    xmlrpc::encode_call(&Call::multicall(calls))
+}

@@ -1,0 +1,38 @@
+//! What the numbers were measured on.
+
+use std::{fs, process::Command, thread::available_parallelism};
+
+use rosrescue::clock;
+
+/// Processor, system, and versions, in one phrase.
+pub(crate) fn describe() -> String {
+    let cores = available_parallelism().map_or(0, usize::from);
+    let date = clock::wall_text(clock::wall_time());
+    let date = date.split('T').next().unwrap_or_default();
+    let uname = rustix::system::uname();
+    format!(
+        "{}, {cores} cores, Linux {}, {}, rosmaster {}, {date}",
+        processor(),
+        uname.release().to_string_lossy(),
+        said("/usr/bin/python3", &["--version"]),
+        said("rosversion", &["rosmaster"]),
+    )
+}
+
+fn processor() -> String {
+    let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    // ARM has no names of models there.
+    let name = text.lines().find_map(|line| {
+        let (key, value) = line.split_once(':')?;
+        (key.trim() == "model name").then(|| value.trim().to_owned())
+    });
+    name.unwrap_or_else(|| std::env::consts::ARCH.to_owned())
+}
+
+fn said(program: &str, arguments: &[&str]) -> String {
+    let output = Command::new(program).args(arguments).output();
+    output.map_or_else(
+        |_| "of unknown version".to_owned(),
+        |output| String::from_utf8_lossy(&output.stdout).trim().to_owned(),
+    )
+}

@@ -1,0 +1,89 @@
+//! The paper's Table 1: how long a recovery of the master takes, against the limit of this machine.
+//!
+//! `cargo bench --bench table1` prints it as Markdown. The real rosmaster is killed with SIGKILL under
+//! `rosrescue core`, with synthetic and with real rospy nodes: two publishers and two subscribers each,
+//! which makes seven registrations a node with those that every node has.
+//!
+//! Between any two kills the same machine shows what the best possible recovery takes at that moment
+//! ([`limit`]). What a column means is said below the tables ([`table::print`]).
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a bench ends at the first thing that goes wrong"
+)]
+
+mod limit;
+mod machine;
+mod robot;
+mod table;
+
+#[path = "../../tests/support/mod.rs"]
+mod support;
+
+use clap::Parser;
+
+use crate::{
+    robot::{Kind, Robot},
+    table::Row,
+};
+
+/// A sixth death of the master within a minute counts as a crash loop and is answered with a pause.
+const KILLS_A_LIFE: usize = 5;
+
+/// Measures the paper's Table 1 with the real rosmaster.
+#[derive(Debug, Parser)]
+struct Options {
+    /// Numbers of nodes
+    #[arg(long, value_name = "COUNT,…", value_delimiter = ',')]
+    #[arg(default_values_t = [1, 5, 10, 20, 40, 80])]
+    nodes: Vec<usize>,
+    /// Kills for each number of synthetic nodes; 0 for none
+    #[arg(long, value_name = "COUNT", default_value_t = 10)]
+    synthetic: usize,
+    /// Kills for each number of real rospy nodes; 0 for none
+    #[arg(long, value_name = "COUNT", default_value_t = 3)]
+    real: usize,
+    /// What `cargo bench` passes
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+fn main() {
+    let options = Options::parse();
+    if !options.bench {
+        println!("nothing is measured in a test; run `cargo bench --bench table1`");
+        return;
+    }
+    let kinds = [
+        (Kind::Synthetic, options.synthetic),
+        (Kind::Real, options.real),
+    ];
+    let tables: Vec<_> = kinds
+        .into_iter()
+        .filter(|(_, kills)| *kills > 0)
+        .map(|(kind, kills)| {
+            let measured = options.nodes.iter().map(|nodes| row(kind, *nodes, kills));
+            (kind, measured.collect())
+        })
+        .collect();
+    table::print(&tables);
+}
+
+/// Kills the master of a robot with so many nodes again and again.
+fn row(kind: Kind, nodes: usize, kills: usize) -> Row {
+    let mut row = Row::new(nodes);
+    while row.kills() < kills {
+        let mut robot = Robot::start(kind, nodes);
+        for _ in 0..KILLS_A_LIFE.min(kills - row.kills()) {
+            robot.settle();
+            let best = limit::measure(&robot);
+            robot.settle();
+            let ours = robot.kill_master();
+            eprintln!("{kind}, {nodes} nodes: {ours:.1?}, the limit: {best:.1?}");
+            row.push(ours, best);
+        }
+    }
+    row
+}
