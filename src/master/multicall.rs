@@ -187,6 +187,14 @@ fn fault_entry(text: String) -> Value {
     ]))
 }
 
+/// A reply as an entry of a multicall's result.
+pub(super) fn reply_entry(reply: &Reply) -> Value {
+    match reply {
+        Reply::Value(value) => Value::Array(vec![value.clone()]),
+        Reply::Fault { text, .. } => fault_entry(text.clone()),
+    }
+}
+
 /// The reply that an entry of a multicall's result stands for.
 pub(super) fn entry_reply(result: &Value) -> Option<Reply> {
     match result {

@@ -1,6 +1,6 @@
 //! Bringing a new master to a state: one call, and what it must answer.
 
-use std::fmt;
+use std::{collections::HashSet, fmt};
 
 use super::look::lookup;
 use super::restore::Restore;
@@ -21,7 +21,8 @@ const MOST_MISMATCHES: usize = 20;
 ///    are the fewest that give the order.
 /// 3. Services, each after the nodes that it was taken from.
 /// 4. Subscribers, then subscribers of parameters.
-/// 5. Reads of everything, for [`Plan::verify`].
+/// 5. Reads of everything, for [`Plan::verify`]; but not of the addresses that stand in the answers to
+///    the subscribers, as those of all who publish to `/rosout` do.
 /// 6. The mark: a master that bears it has been brought to the state as a whole.
 ///
 /// On an empty master no callback is sent at all, and every read is answered afterwards as it was
@@ -183,9 +184,10 @@ impl Plan {
             mut predicted,
             mut model,
             skipped,
+            answered,
             ..
         } = Restore::run(target, found);
-        for call in reads(&model) {
+        for call in reads(&model, &answered) {
             predicted.push(model.apply(&call).reply);
             calls.push(call);
         }
@@ -203,6 +205,12 @@ impl Plan {
     /// The multicall to send.
     pub fn call(&self) -> &Call {
         &self.call
+    }
+
+    /// What a master answers to it if it answers each entry as the model predicted.
+    pub fn predicted(&self) -> Reply {
+        let results = self.predicted.iter().map(super::multicall::reply_entry);
+        Reply::Value(Value::Array(results.collect()))
     }
 
     /// What the master holds afterwards, the mark apart.
@@ -252,8 +260,11 @@ impl Plan {
     }
 }
 
-/// Reads that show everything a master in the target state can show.
-fn reads(model: &Master) -> Vec<Call> {
+/// Reads that show everything a master in the target state can show, but for the addresses of
+/// publishers of the topics in `answered`.
+fn reads(model: &Master, answered: &[&str]) -> Vec<Call> {
+    let publishers = |topic: &&str| model.registry.publishers.get(*topic);
+    let known: HashSet<&String> = answered.iter().filter_map(publishers).flatten().collect();
     let own = |method| Call::new(method, vec![CALLER_ID.into()]);
     let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
     // A single value that cannot be returned would fault the whole multicall.
@@ -261,6 +272,7 @@ fn reads(model: &Master) -> Vec<Call> {
         calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
     }
     let nodes = model.registry.nodes.keys();
+    let nodes = nodes.filter(|node| !known.contains(node));
     calls.extend(nodes.filter_map(|node| lookup("lookupNode", node)));
     let services = model.registry.services.keys();
     calls.extend(services.filter_map(|service| lookup("lookupService", service)));

@@ -110,6 +110,16 @@ pub struct RawReply {
     pub body: Bytes,
 }
 
+impl RawReply {
+    /// The reply to a call of our own.
+    pub fn decode(&self) -> Result<Reply, CallError> {
+        xmlrpc::decode_reply(&self.body).map_err(|error| CallError::NotXmlRpc {
+            status: self.status,
+            reason: error.to_string(),
+        })
+    }
+}
+
 /// Knows where the master is and how requests to it look.
 #[derive(Debug)]
 pub struct Upstream {
@@ -240,16 +250,7 @@ impl Connection {
 
     /// Makes a call of our own.
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
-        self.call_encoded(Bytes::from(xmlrpc::encode_call(call)))
-            .await
-    }
-
-    /// Makes a call of our own that is XML already.
-    pub async fn call_encoded(&mut self, body: Bytes) -> Result<Reply, CallError> {
-        let raw = self.forward(&Head::default(), body).await?;
-        xmlrpc::decode_reply(&raw.body).map_err(|error| CallError::NotXmlRpc {
-            status: raw.status,
-            reason: error.to_string(),
-        })
+        let body = Bytes::from(xmlrpc::encode_call(call));
+        self.forward(&Head::default(), body).await?.decode()
     }
 }

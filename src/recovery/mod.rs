@@ -22,6 +22,7 @@ use self::{
 };
 use crate::{
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    master::Kind,
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
@@ -103,7 +104,6 @@ impl Guard {
         if self.known {
             self.keeper.set(State::Shut(StandIn::Unregistrations));
         }
-        self.prepared = Some(examine::prepare(&self.proxy));
         let remembered = self
             .process
             .as_ref()
@@ -164,6 +164,9 @@ impl Guard {
         match action {
             Action::Connect => {
                 self.disconnect();
+                // Whatever comes of it: the one before may have gone to a master that died then.
+                let proxy = &self.proxy;
+                self.prepared.get_or_insert_with(|| examine::prepare(proxy));
                 let proxy = self.proxy.clone();
                 self.step = Some(Box::pin(async move {
                     match proxy.upstream.connect().await {
@@ -297,7 +300,8 @@ impl Guard {
         }
         tracing::warn!(cause = cause.as_str(), "the gate is shut");
         self.proxy.board.set_open(false);
-        self.prepared = Some(examine::prepare(&self.proxy));
+        // What was prepared before is of another time.
+        self.prepared = None;
     }
 
     fn open_gate(&mut self) {
@@ -391,6 +395,9 @@ async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     while !matches!(gate.look(), State::Open { .. }) {
         gate.changed().await;
     }
+    // Parked calls first. This one waits behind them; its answer does not matter.
+    let last = Call::new("getPid", vec!["/rosrescue".into()]);
+    proxy.lane.call(last, Kind::Mutate).await;
     let noticed = proxy.shadow.topics_noticed(outage);
     let census = census::census(&proxy).await;
     let healed = census::heal(&proxy, noticed).await;

@@ -1,3 +1,5 @@
+use std::collections::HashSet;
+
 use super::*;
 use crate::master::{Kind, Mark, Mismatch, Plan, Skipped, difference, kind};
 
@@ -10,6 +12,7 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     let mut master = found.clone();
     let outcome = master.apply(plan.call());
     assert_eq!(plan.verify(&outcome.reply), Ok(()));
+    assert_eq!(plan.predicted(), outcome.reply);
     assert!(Mark::is_found(&master.apply(&mark().lookup()).reply));
     let gone = call(
         "unsubscribeParam",
@@ -76,6 +79,26 @@ fn a_whole_state_comes_back_to_the_last_order() {
         set("/q", Value::DateTime("20200101T00:00:00".into())),
     ]);
     restores(&master);
+}
+
+#[test]
+fn addresses_that_the_answer_to_a_subscriber_holds_are_not_asked_for() {
+    let plan = restores(&after([
+        publish("/one", "/t", "a/B"),
+        publish("/two", "/t", "a/B"),
+        publish("/three", "/unheard", "a/B"),
+        subscribe("/ear", "/t", "a/B"),
+    ]));
+    let entries = plan.call().params[0].as_array().unwrap();
+    let asked = entries.iter().filter_map(|entry| {
+        let entry = entry.as_struct().unwrap();
+        let params = entry["params"].as_array().unwrap();
+        (entry["methodName"].as_str() == Some("lookupNode")).then(|| params[1].as_str().unwrap())
+    });
+    assert_eq!(
+        asked.collect::<HashSet<_>>(),
+        HashSet::from(["/three", "/ear"])
+    );
 }
 
 #[test]
