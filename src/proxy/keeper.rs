@@ -29,6 +29,7 @@ pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
         seq: 0,
         recorded_at: Instant::now(),
         compacted_at: None,
+        failed_at: None,
         said: None,
     };
     loop {
@@ -54,6 +55,7 @@ struct Keeping {
     seq: u64,
     recorded_at: Instant,
     compacted_at: Option<Instant>,
+    failed_at: Option<Instant>,
     /// The failure that was said last.
     said: Option<String>,
 }
@@ -110,7 +112,9 @@ impl Keeping {
             .compacted_at
             .is_none_or(|at| now.duration_since(at) >= BETWEEN);
         let quiet = now.duration_since(self.recorded_at) >= QUIET;
-        due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested)
+        // A whole snapshot on a disk that is full is not to be written at every turn.
+        let failed = self.failed_at.is_some_and(|at| now.duration_since(at) < ROUND);
+        !failed && (due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested))
     }
 
     async fn compact(&mut self) {
@@ -124,6 +128,7 @@ impl Keeping {
         match finished {
             Some(Err(error)) => {
                 shadow.set_checkpoint_due();
+                self.failed_at = Some(Instant::now());
                 tracing::debug!(%error, "compaction");
             }
             _ => self.compacted_at = Some(Instant::now()),
