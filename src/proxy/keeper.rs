@@ -113,7 +113,9 @@ impl Keeping {
             .is_none_or(|at| now.duration_since(at) >= BETWEEN);
         let quiet = now.duration_since(self.recorded_at) >= QUIET;
         // A whole snapshot on a disk that is full is not to be written at every turn.
-        let failed = self.failed_at.is_some_and(|at| now.duration_since(at) < ROUND);
+        let failed = self
+            .failed_at
+            .is_some_and(|at| now.duration_since(at) < ROUND);
         !failed && (due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested))
     }
 
