@@ -1,0 +1,124 @@
+//! How rosrescue stops, and what it keeps alive until then: signals end it in good order whatever hangs,
+//! with nothing left behind and nothing answered falsely.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::fs;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use support::{Mode, Robot, alive, eventually, holds, params};
+
+#[test]
+fn an_orderly_stop_leaves_nothing_behind() {
+    for signal in [Signal::TERM, Signal::INT] {
+        let mut robot = Robot::start(Mode::Core);
+        robot.client().set_param("/x", 1);
+        let master = robot.master_pid();
+        assert!(
+            robot.processes().len() >= 3,
+            "rosrescue, rosmaster and rosout: {:?}",
+            robot.processes()
+        );
+        robot.rescue.signal(signal);
+        assert_eq!(robot.rescue.wait().code(), Some(0));
+        assert!(!alive(master), "rosmaster is left behind");
+        assert_eq!(robot.scratch.survivors(), vec![], "{signal:?}");
+        assert!(robot.rescue.checkpoint().exists());
+    }
+    let mut robot = Robot::start(Mode::Proxy);
+    let master = robot.master_pid();
+    robot.rescue.signal(Signal::TERM);
+    assert_eq!(robot.rescue.wait().code(), Some(0));
+    assert!(alive(master), "the master of others is ended");
+}
+
+#[test]
+fn an_orderly_stop_in_an_outage_with_parked_calls() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.kill_master();
+    let client = robot.client();
+    let parked: Vec<_> = (0..5)
+        .map(|i| {
+            let client = client.clone();
+            thread::spawn(move || client.status("setParam", params!["/c", "/parked", i]))
+        })
+        .collect();
+    assert!(holds(Duration::from_millis(500), || parked
+        .iter()
+        .all(|call| !call.is_finished())));
+    let start = Instant::now();
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    assert!(
+        start.elapsed() < Duration::from_secs(15),
+        "{:?}",
+        start.elapsed()
+    );
+    for call in parked {
+        // Nothing did it, so nothing may say that it was done.
+        assert!(!matches!(call.join().unwrap(), Ok((1, ..))));
+    }
+    let checkpoint = fs::read_to_string(robot.rescue.checkpoint()).unwrap();
+    assert!(!checkpoint.contains("parked"), "{checkpoint}");
+}
+
+#[test]
+fn a_core_stops_even_if_its_master_hangs() {
+    let mut robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    support::stop(master);
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    eventually("the master that hangs is ended", || !alive(master));
+    assert_eq!(robot.scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_second_signal_ends_at_once() {
+    let mut robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    // An orderly stop has to wait for this one.
+    support::stop(master);
+    robot.rescue.signal(Signal::TERM);
+    thread::sleep(Duration::from_millis(50));
+    let start = Instant::now();
+    robot.rescue.signal(Signal::INT);
+    robot.rescue.wait();
+    assert!(
+        start.elapsed() < Duration::from_secs(3),
+        "{:?}",
+        start.elapsed()
+    );
+}
+
+/// rosout is kept alive; what it says for itself in the master is there again.
+#[test]
+fn a_core_keeps_rosout_alive() {
+    let robot = Robot::start(Mode::Core);
+    let before = robot.settled_state();
+    let rosout = |robot: &Robot| {
+        let processes = robot.scratch.survivors();
+        processes
+            .into_iter()
+            .find(|(_, command)| command.contains("rosout/rosout"))
+            .map(|(pid, _)| pid)
+    };
+    let old = rosout(&robot).expect("rosout runs");
+    support::signal(old, Signal::KILL);
+    eventually("another rosout runs", || {
+        rosout(&robot).is_some_and(|pid| pid != old)
+    });
+    eventually("it is registered", || {
+        let now = robot.settled_state();
+        now.publishers == before.publishers
+            && now.subscribers == before.subscribers
+            && now.nodes != before.nodes
+    });
+}
