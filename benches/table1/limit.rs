@@ -2,8 +2,6 @@
 //! and brought to the state by a single call.
 
 use std::{
-    fs,
-    process::{Child, Command, Stdio},
     thread::sleep,
     time::{Duration, Instant},
 };
@@ -12,7 +10,10 @@ use rosrescue::xmlrpc::{self, Call, Value};
 
 use crate::{
     robot::Robot,
-    support::{State, Wire, free_port, http_request, params},
+    shared::{
+        second::SecondMaster,
+        support::{State, Wire, free_port, http_request, params},
+    },
 };
 
 /// Pause between two looks at whether the port is open. A shorter one slows down what is waited for.
@@ -41,10 +42,11 @@ impl Limit {
 pub(crate) fn measure(robot: &Robot) -> Limit {
     let request = http_request(&injection(&robot.state()));
     let port = free_port();
-    let mut command = same_command(robot, port);
+    let log = robot.scratch.path("limit");
+    let mut command = SecondMaster::command(robot.master_pid(), port, &log);
 
     let begin = Instant::now();
-    let _master = Master(command.spawn().expect("a second rosmaster"));
+    let _master = SecondMaster::spawn(&mut command);
     let mut wire = loop {
         match Wire::connect("127.0.0.1", port) {
             Ok(wire) => break wire,
@@ -68,41 +70,6 @@ pub(crate) fn measure(robot: &Robot) -> Limit {
         start: ms(start),
         injection: ms(total.saturating_sub(start)),
     }
-}
-
-/// A process that ends with this value.
-struct Master(Child);
-
-impl Drop for Master {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// The command line and environment of the master that rosrescue runs, but for the port and the folder
-/// of its log.
-fn same_command(robot: &Robot, port: u16) -> Command {
-    let pid = robot.master_pid();
-    let read = |file: &str| {
-        let text = fs::read_to_string(format!("/proc/{pid}/{file}")).expect("the master's process");
-        let words = text.split_terminator('\0').map(str::to_owned);
-        words.collect::<Vec<_>>()
-    };
-    let mut arguments = read("cmdline");
-    let place = arguments.iter().position(|word| word == "-p").expect("-p") + 1;
-    arguments[place] = port.to_string();
-    let environment = read("environ");
-    let mut command = Command::new(&arguments[0]);
-    command
-        .args(&arguments[1..])
-        .env_clear()
-        .envs(environment.iter().filter_map(|pair| pair.split_once('=')))
-        .env("ROS_LOG_DIR", robot.scratch.path("limit"))
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null());
-    command
 }
 
 /// One multicall that makes `state` of an empty master's, in the order that disturbs nobody.

@@ -15,12 +15,10 @@
 )]
 
 mod limit;
-mod machine;
 mod robot;
+#[path = "../shared/mod.rs"]
+mod shared;
 mod table;
-
-#[path = "../../tests/support/mod.rs"]
-mod support;
 
 use clap::Parser;
 

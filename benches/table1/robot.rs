@@ -15,7 +15,7 @@ use rosrescue::{
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
-use crate::support::{
+use crate::shared::support::{
     Client, FakeNode, NODES, Process, Rescue, Scratch, Setup, State, encode_call, eventually,
     eventually_some, free_port, http_request, params, request, signal,
 };

@@ -2,8 +2,8 @@
 
 use crate::{
     limit::Limit,
-    machine,
     robot::{Kind, Recovery},
+    shared::machine,
 };
 
 /// The paper's Table 1, recovery alone: nodes and milliseconds.
