@@ -3,6 +3,8 @@
 //! The unmarshaller there is a stack machine that looks at tags one by one and hardly at how they
 //! lie inside each other. Clients live off that leniency, so this is the same machine.
 
+use std::borrow::Cow;
+
 use super::error::DecodeError;
 use super::number;
 use super::prolog::text_of;
@@ -85,15 +87,15 @@ struct Document {
 }
 
 fn unmarshal(body: &[u8], wanted: &'static str) -> Result<Document, DecodeError> {
-    let (text, start) = text_of(body)?;
-    let mut scanner = Scanner::new(&text, start, MAX_OPEN);
+    let text = text_of(body)?;
+    let mut scanner = Scanner::new(&text, MAX_OPEN);
     let mut machine = Unmarshaller::default();
     while let Some(event) = scanner.next()? {
         match event {
-            Event::Start(tag) => machine.start(tag, scanner.at())?,
-            Event::End(tag) => machine.end(tag, scanner.at())?,
-            Event::Text(piece) => machine.text.push(piece),
-            Event::Char(c) => machine.text.push_char(c),
+            Event::Start(tag) => machine.start(tag.name().0, scanner.at())?,
+            Event::End(tag) => machine.end(tag.name().0, scanner.at())?,
+            // Adding to no text borrows the piece; mostly there is but one.
+            Event::Text(piece) => machine.text += piece,
         }
     }
     let Some(kind) = machine.kind else {
@@ -112,47 +114,6 @@ fn unmarshal(body: &[u8], wanted: &'static str) -> Result<Document, DecodeError>
 enum Kind {
     Call,
     Fault,
-}
-
-/// Character data since the last start tag. Mostly that is one piece of the document.
-#[derive(Default)]
-struct Run<'a> {
-    first: &'a str,
-    /// Everything, `first` included, once there is more than one piece.
-    all: String,
-}
-
-impl<'a> Run<'a> {
-    fn clear(&mut self) {
-        self.first = "";
-        self.all.clear();
-    }
-
-    fn push(&mut self, piece: &'a str) {
-        if !self.all.is_empty() {
-            self.all.push_str(piece);
-        } else if self.first.is_empty() {
-            self.first = piece;
-        } else {
-            self.all.push_str(self.first);
-            self.all.push_str(piece);
-        }
-    }
-
-    fn push_char(&mut self, character: char) {
-        if self.all.is_empty() {
-            self.all.push_str(self.first);
-        }
-        self.all.push(character);
-    }
-
-    fn as_str(&self) -> &str {
-        if self.all.is_empty() {
-            self.first
-        } else {
-            &self.all
-        }
-    }
 }
 
 /// The elements that CPython's unmarshaller knows; it passes over all others.
@@ -209,7 +170,8 @@ struct Unmarshaller<'a> {
     stack: Vec<Value>,
     /// How long the stack was at the start of each open array and struct.
     marks: Vec<usize>,
-    text: Run<'a>,
+    /// Character data since the last start tag.
+    text: Cow<'a, str>,
     /// A `<value>` has begun and no element in it: so far it is an untyped string.
     is_bare: bool,
 }
@@ -225,7 +187,7 @@ impl Unmarshaller<'_> {
             }
             self.marks.push(self.stack.len());
         }
-        self.text.clear();
+        self.text = Cow::Borrowed("");
         if self.is_bare && tag.is_none() {
             let tag = name.to_owned();
             return Err(DecodeError::UnknownType { at, tag });
@@ -239,7 +201,7 @@ impl Unmarshaller<'_> {
             return Ok(());
         };
         let value = match tag {
-            Tag::Value if self.is_bare => Value::String(self.text.as_str().to_owned()),
+            Tag::Value if self.is_bare => Value::String(self.text.to_string()),
             Tag::Value => return Ok(()),
             Tag::Params => {
                 self.kind = Some(Kind::Call);
@@ -251,7 +213,7 @@ impl Unmarshaller<'_> {
             }
             Tag::MethodName => {
                 self.kind = Some(Kind::Call);
-                self.method = Some(self.text.as_str().to_owned());
+                self.method = Some(self.text.to_string());
                 return Ok(());
             }
             Tag::Array => {
@@ -259,7 +221,7 @@ impl Unmarshaller<'_> {
                 Value::Array(self.stack.split_off(mark))
             }
             Tag::Struct => self.end_struct(at)?,
-            _ => scalar(tag, self.text.as_str(), at)?,
+            _ => scalar(tag, &self.text, at)?,
         };
         self.stack.push(value);
         self.is_bare = false;

@@ -2,98 +2,77 @@
 
 use std::borrow::Cow;
 
-use super::error::DecodeError;
-use super::scan::is_space;
+use quick_xml::events::{BytesDecl, BytesStart, Event};
+use quick_xml::reader::Reader;
 
-/// The document's text, and where in it the XML declaration ends.
+use super::error::DecodeError;
+use super::scan::{checked_attributes, is_in_xml};
+
+/// The document's text behind a byte order mark.
 ///
 /// # Errors
 ///
 /// An encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython every
-/// codec with 8 bits), bytes that are not in it, or a bad declaration.
-pub(super) fn text_of(body: &[u8]) -> Result<(Cow<'_, str>, usize), DecodeError> {
-    const MARK: &[u8] = "\u{feff}".as_bytes();
-    let (body, marked) = match body.strip_prefix(MARK) {
-        Some(body) => (body, true),
-        None => (body, false),
+/// codec with 8 bits), bytes that are not in it, characters that are not in XML, or a bad
+/// declaration.
+pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
+    let encoding = match Reader::from_reader(body).read_event() {
+        Ok(Event::Decl(declaration)) => declared(&declaration)?,
+        _ => None,
     };
-    let (start, encoding) = match body {
-        [b'<', b'?', b'x', b'm', b'l', next, ..] if is_space(*next) || *next == b'?' => {
-            declared(body)?
-        }
-        _ => (0, None),
+    let name = encoding.unwrap_or_else(|| "UTF-8".to_owned());
+    let not_text = |at, encoding| DecodeError::NotText { at, encoding };
+    let marked = body.strip_prefix("\u{feff}".as_bytes());
+    let body = marked.unwrap_or(body);
+    let utf8 = || std::str::from_utf8(body).map_err(|e| not_text(e.valid_up_to(), "UTF-8"));
+    let text = match name.to_ascii_uppercase().as_str() {
+        "UTF-8" => Cow::Borrowed(utf8()?),
+        _ if marked.is_some() => return Err(DecodeError::Encoding { name }),
+        "US-ASCII" => match body.iter().position(|b| !b.is_ascii()) {
+            None => Cow::Borrowed(utf8()?),
+            Some(at) => return Err(not_text(at, "US-ASCII")),
+        },
+        "ISO-8859-1" if body.is_ascii() => Cow::Borrowed(utf8()?),
+        "ISO-8859-1" => body.iter().map(|&b| char::from(b)).collect(),
+        _ => return Err(DecodeError::Encoding { name }),
     };
-    let encoding = encoding.unwrap_or("UTF-8");
-    if encoding.eq_ignore_ascii_case("ISO-8859-1") && !marked {
-        if !body.is_ascii() {
-            let text = body.iter().map(|&b| char::from(b)).collect();
-            return Ok((Cow::Owned(text), start));
-        }
-    } else if encoding.eq_ignore_ascii_case("US-ASCII") && !marked {
-        if let Some(at) = body.iter().position(|b| !b.is_ascii()) {
-            let encoding = "US-ASCII";
-            return Err(DecodeError::NotText { at, encoding });
-        }
-    } else if !encoding.eq_ignore_ascii_case("UTF-8") {
-        let name = encoding.to_owned();
-        return Err(DecodeError::Encoding { name });
-    }
-    match std::str::from_utf8(body) {
-        Ok(text) => Ok((Cow::Borrowed(text), start)),
-        Err(error) => Err(DecodeError::NotText {
-            at: error.valid_up_to(),
-            encoding: "UTF-8",
-        }),
-    }
-}
-
-/// Reads `<?xml version="…" encoding="…" standalone="…"?>`: where it ends, and the encoding.
-fn declared(body: &[u8]) -> Result<(usize, Option<&str>), DecodeError> {
-    let bad = |what| DecodeError::Syntax { at: 0, what };
-    let Some(length) = body.windows(2).position(|w| w == b"?>") else {
-        return Err(bad("the XML declaration is not closed"));
-    };
-    let inside = body.get("<?xml".len()..length).unwrap_or_default();
-    let Ok(mut rest) = std::str::from_utf8(inside) else {
-        return Err(bad("a character that has no place in an XML declaration"));
-    };
-    let mut encoding = None;
-    for (index, wanted) in ["version", "encoding", "standalone"]
-        .into_iter()
-        .enumerate()
+    // A second mark is text, but quick-xml would pass over it.
+    let is_foreign = |c| !is_in_xml(c);
+    if let Some(at) = text
+        .find(is_foreign)
+        .or_else(|| text.starts_with('\u{feff}').then_some(0))
     {
-        let Some((value, behind)) = pseudo_attribute(rest, wanted) else {
-            if index == 0 {
-                return Err(bad("an XML declaration without a version"));
-            }
-            continue;
-        };
-        rest = behind;
-        match wanted {
-            "encoding" if !value.starts_with(|c: char| c.is_ascii_alphabetic()) => {
-                return Err(bad("an encoding without a name"));
-            }
-            "encoding" => encoding = Some(value),
-            "standalone" if value != "yes" && value != "no" => {
-                return Err(bad("standalone is neither yes nor no"));
-            }
-            _ => {}
-        }
+        let what = "a character that XML does not have";
+        return Err(DecodeError::Syntax { at, what });
     }
-    if !rest.bytes().all(is_space) {
-        return Err(bad("an XML declaration with something else in it"));
-    }
-    Ok((length + 2, encoding))
+    Ok(text)
 }
 
-/// ` name = "value"`: the value, and what is behind it.
-fn pseudo_attribute<'a>(text: &'a str, name: &str) -> Option<(&'a str, &'a str)> {
-    let space = |c: char| u8::try_from(c).is_ok_and(is_space);
-    let rest = text.strip_prefix(space)?.trim_start_matches(space);
-    let rest = rest.strip_prefix(name)?.trim_start_matches(space);
-    let rest = rest.strip_prefix('=')?.trim_start_matches(space);
-    let quote = rest.chars().next().filter(|c| matches!(c, '"' | '\''))?;
-    let (value, behind) = rest.get(1..)?.split_once(quote)?;
-    let fine = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_');
-    value.bytes().all(fine).then_some((value, behind))
+/// The encoding in `<?xml version="…" encoding="…" standalone="…"?>`.
+fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> {
+    let tag = BytesStart::from_content(&**declaration, "xml".len());
+    let attributes = checked_attributes(&tag, 0)?;
+    let mut names = ["version", "encoding", "standalone"].into_iter();
+    let is_plain = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_');
+    let is_fine = attributes.iter().all(|attribute| {
+        let (name, value) = (attribute.key.0, &attribute.value);
+        // Each name at most once, and in this order.
+        names.any(|next| next == name)
+            && value.bytes().all(is_plain)
+            && match name {
+                "encoding" => value.starts_with(|c: char| c.is_ascii_alphabetic()),
+                "standalone" => value == "yes" || value == "no",
+                _ => true,
+            }
+    });
+    if !is_fine
+        || attributes
+            .first()
+            .is_none_or(|first| first.key.0 != "version")
+    {
+        let what = "an XML declaration that is not as it should be";
+        return Err(DecodeError::Syntax { at: 0, what });
+    }
+    let encoding = attributes.iter().find(|it| it.key.0 == "encoding");
+    Ok(encoding.map(|it| it.value.clone().into_owned()))
 }

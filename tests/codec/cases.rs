@@ -154,6 +154,7 @@ pub(crate) fn mess() -> impl Strategy<Value = String> {
         "x:struct",
         "methodCall",
         "a b='c'",
+        "a b=\"&lt;'\" c = 'd>'",
     ]);
     let leaf = text.prop_map(str::to_owned);
     leaf.prop_recursive(6, 40, 5, move |inner| {
