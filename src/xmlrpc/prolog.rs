@@ -37,11 +37,8 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
         _ => return Err(DecodeError::Encoding { name }),
     };
     // A second mark is text, but quick-xml would pass over it.
-    let is_foreign = |c| !is_in_xml(c);
-    if let Some(at) = text
-        .find(is_foreign)
-        .or_else(|| text.starts_with('\u{feff}').then_some(0))
-    {
+    let second = text.starts_with('\u{feff}').then_some(0);
+    if let Some(at) = second.or_else(|| text.find(|c| !is_in_xml(c))) {
         let what = "a character that XML does not have";
         return Err(DecodeError::Syntax { at, what });
     }
@@ -59,17 +56,10 @@ fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> 
         // Each name at most once, and in this order.
         names.any(|next| next == name)
             && value.bytes().all(is_plain)
-            && match name {
-                "encoding" => value.starts_with(|c: char| c.is_ascii_alphabetic()),
-                "standalone" => value == "yes" || value == "no",
-                _ => true,
-            }
+            && (name != "standalone" || value == "yes" || value == "no")
     });
-    if !is_fine
-        || attributes
-            .first()
-            .is_none_or(|first| first.key.0 != "version")
-    {
+    let has_version = attributes.first().is_some_and(|it| it.key.0 == "version");
+    if !is_fine || !has_version {
         let what = "an XML declaration that is not as it should be";
         return Err(DecodeError::Syntax { at: 0, what });
     }

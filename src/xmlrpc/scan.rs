@@ -150,9 +150,10 @@ pub(super) fn checked_attributes<'t>(
     let check = |attribute: Attribute<'t>| {
         let name = attribute.key.0;
         check_name(name, at)?;
-        // The name is a part of `raw`; quick-xml would take it right behind another value.
-        let before = raw.get(..name.as_ptr().addr() - raw.as_ptr().addr());
-        if !before.is_some_and(|before| before.bytes().next_back().is_some_and(is_space)) {
+        // quick-xml takes a name right behind another value, too. Both are parts of `raw`.
+        let start = name.as_ptr().addr().wrapping_sub(raw.as_ptr().addr());
+        let before = raw.as_bytes().get(..start).and_then(<[u8]>::last);
+        if !before.is_some_and(|&byte| is_space(byte)) {
             return Err(bad("no space before an attribute"));
         }
         let value = unescape(&attribute.value).ok();
@@ -163,8 +164,7 @@ pub(super) fn checked_attributes<'t>(
         Ok(attribute)
     };
     tag.attributes()
-        .map(|it| it.map_err(|_| bad("an attribute without = or quotes, or twice")))
-        .map(|attribute| check(attribute?))
+        .map(|it| check(it.map_err(|_| bad("an attribute without = or quotes, or twice"))?))
         .collect()
 }
 
