@@ -1,6 +1,7 @@
 //! SIGKILL at any moment of a process that records on a real disk.
 
 use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -12,11 +13,8 @@ const FILE: &str = "ROSRESCUE_TEST_CHECKPOINT";
 
 /// The process that is killed: records without end, with syncs and compactions in between, and says
 /// the number of each record once it is recorded. Sets the parameter `n` to the record's number.
-#[test]
-#[ignore = "the child of the test below"]
-fn writer() {
-    let path = std::env::var_os(FILE).unwrap();
-    let (mut store, _) = Store::open(path.as_ref()).unwrap();
+fn write_until_killed(path: &Path) -> ! {
+    let (mut store, _) = Store::open(path).unwrap();
     let checkpoint = |seq: u64| {
         let mut checkpoint = Checkpoint {
             seq,
@@ -59,6 +57,10 @@ fn writer() {
 
 #[test]
 fn what_was_said_to_be_recorded_survives_a_kill() {
+    // The test starts itself as the process that is killed.
+    if let Some(path) = std::env::var_os(FILE) {
+        write_until_killed(path.as_ref());
+    }
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("c.yaml");
     let rounds = 40;
@@ -67,8 +69,7 @@ fn what_was_said_to_be_recorded_survives_a_kill() {
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args([
                 "--exact",
-                "writer",
-                "--ignored",
+                "what_was_said_to_be_recorded_survives_a_kill",
                 "--nocapture",
                 "--test-threads=1",
             ])
