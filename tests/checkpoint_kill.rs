@@ -1,5 +1,7 @@
 //! SIGKILL at any moment of a process that records on a real disk.
 
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test")]
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
