@@ -165,19 +165,21 @@ pub async fn run(
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     proxy.shadow.set_identity(pid, proxy.uri.clone());
-    if let Some(rosout) = rosout {
+    let halt = CancellationToken::new();
+    let duties = rosout.map(|rosout| {
         if port.is_none() {
             core_duties::seed_run_id(&proxy);
         }
-        tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()));
-    }
-    let halt = CancellationToken::new();
+        tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()))
+    });
     tokio::spawn({
-        let (proxy, halt) = (proxy.clone(), halt.clone());
+        let halt = halt.clone();
         async move {
             stop.cancelled().await;
-            // It still takes itself out of the master.
-            core_duties::stop(&proxy).await;
+            if let Some(duties) = duties {
+                // A panic of theirs is no reason not to stop.
+                let _ = duties.await;
+            }
             halt.cancel();
         }
     });

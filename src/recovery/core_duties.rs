@@ -46,7 +46,7 @@ pub fn seed_run_id(proxy: &Proxy) {
     }
 }
 
-/// Does the rest once the master is there, until `stop`.
+/// Does the rest once the master is there, until `stop`; then ends rosout.
 pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
     let duties = async {
         // They take their time: while the master starts, too.
@@ -74,6 +74,9 @@ pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
         ((), ()) = async { tokio::join!(duties, rosout) } => {}
         () = stop.cancelled() => {}
     }
+    stop.cancelled().await;
+    // Only now nobody starts another one. It still takes itself out of the master.
+    end_rosout(&proxy).await;
 }
 
 /// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
@@ -135,7 +138,7 @@ async fn living_rosout(proxy: &Proxy) -> Option<u32> {
 }
 
 /// Ends rosout in order.
-pub async fn stop(proxy: &Proxy) {
+async fn end_rosout(proxy: &Proxy) {
     let pid = proxy.rosout.load(Ordering::Relaxed);
     if pid != 0 && supervisor::runs(pid, "rosout") {
         supervisor::stop(pid, || !supervisor::runs(pid, "rosout")).await;
