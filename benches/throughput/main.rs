@@ -2,7 +2,7 @@
 //!
 //! `cargo bench --bench throughput` prints calls a second and how long a call takes as Markdown. Both
 //! masters are started in the same way and take turns; each client has one keep-alive connection and
-//! calls as fast as it is answered.
+//! calls as fast as it is answered. A plain relay before the bare master shows what any hop costs.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,6 +11,7 @@
     reason = "a bench ends at the first thing that goes wrong"
 )]
 
+mod relay;
 #[path = "../shared/mod.rs"]
 mod shared;
 
@@ -35,7 +36,7 @@ struct Options {
     /// Numbers of connections at the same time
     #[arg(long, value_name = "COUNT,…", value_delimiter = ',', default_values_t = [1, 8, 64])]
     connections: Vec<usize>,
-    /// Turns that each of the two has for each line of the table
+    /// Turns that each of the three has for each line of the table
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     turns: u32,
     /// Length of a turn in seconds
@@ -59,43 +60,37 @@ fn main() {
     let port = free_port();
     let mut command = SecondMaster::command(own, port, &scratch.path("bare"));
     let _bare = SecondMaster::spawn(&mut command);
-    let (bare, proxied) = (Client::new(port), rescue.client());
+    let bare = Client::new(port);
     eventually("the bare master answers", || bare.master_pid().is_some());
+    let relayed = Client::new(relay::start(port).expect("a relay"));
+    let proxied = rescue.client();
     for master in [&bare, &proxied] {
         master.set_param("/throughput/value", 1);
     }
 
     println!(
-        "On {}, {} turns of {} s each:\n",
-        machine::describe(),
-        options.turns,
-        options.seconds
+        "Calls a second; median and 99 % of their times in ms. On {}.\n",
+        machine::describe()
     );
     println!(
-        "| call | connections | bare: calls/s | rosrescue: calls/s | ratio | bare: median (99 %) ms | \
-         rosrescue: median (99 %) ms |"
+        "| call | connections | bare rosmaster | plain relay | rosrescue | rosrescue / bare |"
     );
-    println!("|---|--:|--:|--:|--:|--:|--:|");
+    println!("|---|--:|--:|--:|--:|--:|");
     for method in ["getPid", "getParam", "setParam", "registerPublisher"] {
         for &connections in &options.connections {
             let requests: Vec<_> = (0..connections)
                 .map(|number| request(method, number))
                 .collect();
-            let (mut without, mut with) = (Vec::new(), Vec::new());
+            let mut calls = [const { Vec::new() }; 3];
             for _ in 0..options.turns {
-                without.extend(turn(&bare, &requests, options.seconds));
-                with.extend(turn(&proxied, &requests, options.seconds));
+                for (master, calls) in [&bare, &relayed, &proxied].into_iter().zip(&mut calls) {
+                    calls.extend(turn(master, &requests, options.seconds));
+                }
             }
+            let ratio = calls[2].len() as f64 / calls[0].len() as f64;
             let seconds = options.seconds * f64::from(options.turns);
-            let rate = |calls: &[Duration]| calls.len() as f64 / seconds;
-            println!(
-                "| {method} | {connections} | {:.0} | {:.0} | {:.2} | {} | {} |",
-                rate(&without),
-                rate(&with),
-                rate(&with) / rate(&without),
-                spread(&mut without),
-                spread(&mut with),
-            );
+            let cells = calls.map(|calls| cell(calls, seconds)).join(" | ");
+            println!("| {method} | {connections} | {cells} | {ratio:.2} |");
         }
     }
 }
@@ -160,11 +155,12 @@ fn turn(master: &Client, requests: &[Vec<u8>], seconds: f64) -> Vec<Duration> {
     })
 }
 
-fn spread(calls: &mut [Duration]) -> String {
+fn cell(mut calls: Vec<Duration>, seconds: f64) -> String {
     calls.sort();
     let at = |share: f64| {
         let place = (calls.len() as f64 * share) as usize;
         calls[place.min(calls.len() - 1)].as_secs_f64() * 1e3
     };
-    format!("{:.2} ({:.2})", at(0.5), at(0.99))
+    let rate = calls.len() as f64 / seconds;
+    format!("{rate:.0}/s, {:.2}, {:.2}", at(0.5), at(0.99))
 }
