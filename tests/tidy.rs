@@ -1,4 +1,5 @@
-//! What no compiler checks: documents say what the program says, and the core does no IO.
+//! What no compiler checks: documents say what the program says, the core does no IO, files stay
+//! small.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,6 +13,9 @@ use std::{
     path::{Path, PathBuf},
     process::Command,
 };
+
+/// A longer file holds more than one idea.
+const LINES_MOST: usize = 500;
 
 /// The modules that do no IO, as `src/lib.rs` has them: a file or a folder each.
 const CORE: [&str; 5] = ["xmlrpc", "master", "lifecycle", "session", "record"];
@@ -223,4 +227,16 @@ fn the_core_does_no_io() {
         }
     }
     assert!(seen > CORE.len());
+}
+
+#[test]
+fn files_stay_small() {
+    for file in rust_files(&root().join("src")) {
+        let lines = read(&file).lines().count();
+        assert!(
+            lines <= LINES_MOST,
+            "{} has {lines} lines; split it by idea",
+            file.display()
+        );
+    }
 }
