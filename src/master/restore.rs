@@ -18,9 +18,6 @@ pub(super) struct Restore<'a> {
     found: &'a Master,
     /// How many of the target's topic types are in.
     types_in: usize,
-    /// Topics for which a subscriber was registered last: the answer holds the addresses of all their
-    /// publishers.
-    pub(super) answered: Vec<&'a str>,
 }
 
 impl<'a> Restore<'a> {
@@ -34,7 +31,6 @@ impl<'a> Restore<'a> {
             target,
             found,
             types_in: 0,
-            answered: Vec::new(),
         };
         restore.params();
         restore.nodes();
@@ -308,7 +304,6 @@ impl<'a> Restore<'a> {
                 let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
                 self.push("registerSubscriber", params);
             }
-            self.answered.push(topic);
         }
     }
 
