@@ -135,6 +135,7 @@ impl Rosmaster {
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
+        add_ros_paths(&mut command, &self.program, 2);
         // Loopback only: nodes come through us.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
@@ -201,6 +202,32 @@ pub fn rosout(uri: &str) -> Option<Command> {
         .stderr(Stdio::null())
         .process_group(0);
     Some(command)
+}
+
+/// A program of a ROS in `/opt/ros` finds its modules and libraries only with that ROS's paths, which
+/// `setup.bash` sets for a person and nobody sets for a service. `depth` is how far below the ROS's
+/// folder the program lies.
+fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
+    let Some(prefix) = program
+        .ancestors()
+        .nth(depth)
+        .filter(|p| p.starts_with(ROS_PREFIXES))
+    else {
+        return;
+    };
+    for (variable, folder) in [
+        ("PYTHONPATH", "lib/python3/dist-packages"),
+        ("LD_LIBRARY_PATH", "lib"),
+    ] {
+        let own = std::env::var_os(variable).unwrap_or_default();
+        let paths = [prefix.join(folder)]
+            .into_iter()
+            .chain(std::env::split_paths(&own));
+        let paths = paths.filter(|path| !path.as_os_str().is_empty());
+        if let Ok(joined) = std::env::join_paths(paths) {
+            command.env(variable, joined);
+        }
+    }
 }
 
 /// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `gone` says whether
@@ -324,6 +351,8 @@ fn bind_loopback(port: u16) -> io::Result<Socket> {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+
     use super::*;
 
     #[test]
@@ -333,6 +362,27 @@ mod tests {
         assert!(!is_free(port));
         drop(socket);
         assert!(is_free(port));
+    }
+
+    #[test]
+    fn a_ros_in_opt_gets_its_own_paths() {
+        let paths = |program: &str, depth| {
+            let mut command = Command::new(program);
+            add_ros_paths(&mut command, Path::new(program), depth);
+            let set = command.as_std().get_envs();
+            let set = set.filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
+            set.collect::<std::collections::HashMap<_, _>>()
+        };
+        let set = paths("/opt/ros/noetic/bin/rosmaster", 2);
+        let python = std::env::split_paths(&set[OsStr::new("PYTHONPATH")]).next();
+        assert_eq!(
+            python.unwrap(),
+            Path::new("/opt/ros/noetic/lib/python3/dist-packages")
+        );
+        let set = paths("/opt/ros/noetic/lib/rosout/rosout", 3);
+        let library = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).next();
+        assert_eq!(library.unwrap(), Path::new("/opt/ros/noetic/lib"));
+        assert!(paths("/usr/bin/rosmaster", 2).is_empty());
     }
 
     #[test]

@@ -1,0 +1,125 @@
+use super::*;
+use crate::xmlrpc::Value;
+
+fn shadow() -> Shadow {
+    let stats = Box::leak(Box::default());
+    Shadow::new(Master::default(), Session::default(), None, stats)
+}
+
+fn call(method: &str, params: &[&str]) -> Call {
+    Call::new(
+        method,
+        params.iter().map(|text| Value::from(*text)).collect(),
+    )
+}
+
+fn publish(topic: &str) -> Call {
+    call(
+        "registerPublisher",
+        &["/n", topic, "std_msgs/String", "http://n:1/"],
+    )
+}
+
+fn answered(call: &Call, mirror: &mut Master) -> Reply {
+    mirror.apply(call).reply
+}
+
+#[test]
+fn a_reply_of_a_master_that_was_succeeded_does_not_count() {
+    let shadow = shadow();
+    shadow.succeed();
+    let publish = publish("/t");
+    let reply = answered(&publish, &mut Master::default());
+    let now = Instant::now();
+    assert!(shadow.record(now, 1, &[(&publish, &reply)]).is_ok());
+    shadow.succeed();
+    let late = self::publish("/late");
+    assert!(shadow.record(now, 1, &[(&late, &reply)]).is_err());
+    assert_eq!(shadow.with_mirror(|mirror| mirror.counts().publishers), 1);
+}
+
+#[test]
+fn a_master_that_answers_otherwise_than_the_mirror_casts_doubt() {
+    let shadow = shadow();
+    let publish = publish("/t");
+    let now = Instant::now();
+    let right = answered(&publish, &mut Master::default());
+    let recorded = shadow.record(now, 0, &[(&publish, &right)]).unwrap();
+    assert!(!recorded.doubtful);
+    let strange: Value = vec![
+        Value::from(1),
+        "Registered".into(),
+        vec!["http://s:1/"].into(),
+    ]
+    .into();
+    let recorded = shadow
+        .record(now, 0, &[(&publish, &Reply::Value(strange))])
+        .unwrap();
+    assert!(recorded.doubtful);
+    assert_eq!(shadow.stats.divergences.value(), 1);
+}
+
+#[test]
+fn an_unregistration_in_an_outage_is_owed_until_paid_or_succeeded() {
+    let shadow = shadow();
+    let now = Instant::now();
+    for topic in ["/a", "/b"] {
+        let publish = publish(topic);
+        let reply = shadow.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
+        shadow.record(now, 0, &[(&publish, &reply)]).unwrap();
+    }
+    let bye = |topic| call("unregisterPublisher", &["/n", topic, "http://n:1/"]);
+    let reply = shadow.unregister(now, &bye("/a"));
+    let Reply::Value(reply) = reply else {
+        panic!("{reply:?}")
+    };
+    assert_eq!(
+        reply.as_array().and_then(<[Value]>::last),
+        Some(&Value::Int(1))
+    );
+    assert_eq!(shadow.owed(), [bye("/a")]);
+    shadow.unregister(now, &bye("/b"));
+    shadow.paid(1);
+    assert_eq!(shadow.owed(), [bye("/b")]);
+    assert_eq!(shadow.with_mirror(|mirror| mirror.counts().publishers), 0);
+    shadow.succeed();
+    assert_eq!(shadow.owed(), []);
+}
+
+#[test]
+fn who_the_master_is_outlasts_a_resync() {
+    let shadow = shadow();
+    shadow.set_identity(42, "http://us:1/".to_owned());
+    let get_pid = call("getPid", &["/n"]);
+    let before = shadow.answer(&get_pid);
+    let mut other = Master::default();
+    other.apply(&publish("/t"));
+    assert_ne!(shadow.adopt(other), Vec::<String>::new());
+    assert_eq!(shadow.answer(&get_pid), before);
+}
+
+#[test]
+fn topics_are_remembered_while_a_dead_master_may_owe_the_news() {
+    let shadow = shadow();
+    let start = Instant::now();
+    let subscribe = call(
+        "registerSubscriber",
+        &["/s", "/t", "std_msgs/String", "http://s:1/"],
+    );
+    for call in [&subscribe, &publish("/t"), &publish("/unheard")] {
+        let reply = shadow.with_mirror(|mirror| answered(call, &mut mirror.clone()));
+        shadow.record(start, 0, &[(call, &reply)]).unwrap();
+    }
+    assert_eq!(shadow.topics_noticed(start + NOTICE_MEMORY / 2), ["/t"]);
+    assert_eq!(
+        shadow.topics_noticed(start + NOTICE_MEMORY),
+        Vec::<String>::new()
+    );
+}
+
+#[test]
+fn long_replies_are_cut_at_a_character() {
+    let text = "ä".repeat(LOGGED_REPLY);
+    assert_eq!(cut(&text).len(), LOGGED_REPLY);
+    assert_eq!(cut("short"), "short");
+}
