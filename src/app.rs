@@ -37,7 +37,6 @@ use crate::{
         census::{self, Sign},
         core_duties,
         master_process::MasterProcess,
-        report::Counts,
     },
     ros_env::MasterUri,
     session::{self, Decision, Evidence},
@@ -185,7 +184,7 @@ pub async fn run(
     });
     let guard = Guard::new(proxy.clone(), gate_keeper, process, restored);
     let process = serve(&proxy, listeners, lane_runner, guard, &halt, || {
-        let counts = proxy.shadow.with_mirror(Counts::of);
+        let counts = proxy.shadow.with_mirror(Master::counts);
         say(&format!("{story}: {counts}"));
         say("ROS Rescue enabled. Master is now fault tolerant!!");
     })

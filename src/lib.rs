@@ -19,6 +19,7 @@
 //! * [`recovery`]: watching the master, examining and injecting, census and healing.
 //! * [`supervisor`]: the processes of rosmaster and rosout.
 //! * [`admin`]: the status page.
+//! * [`wait`]: waiting for what may not be there.
 //! * [`app`]: puts it all together.
 
 pub mod admin;
@@ -35,4 +36,5 @@ pub mod ros_env;
 pub mod session;
 pub mod store;
 pub mod supervisor;
+pub mod wait;
 pub mod xmlrpc;

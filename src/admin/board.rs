@@ -9,11 +9,9 @@ use serde::Serialize;
 use tokio::sync::watch;
 
 use crate::{
+    master::{Counts, Master},
     proxy::{Proxy, clients::Client},
-    recovery::{
-        census::Census,
-        report::{Counts, Report},
-    },
+    recovery::{census::Census, report::Report},
 };
 
 /// Where those who recover the master say how it goes.
@@ -119,7 +117,7 @@ impl Status {
             .into_iter()
             .map(|(name, _, value)| (name.to_owned(), value.into()));
         let unprotected = proxy.shadow.unprotected();
-        let state = proxy.shadow.with_mirror(Counts::of);
+        let state = proxy.shadow.with_mirror(Master::counts);
         let inner = proxy.board.lock();
         Self {
             version: env!("CARGO_PKG_VERSION"),

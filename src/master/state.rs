@@ -3,6 +3,7 @@
 use std::fmt;
 
 use indexmap::IndexMap;
+use serde::Serialize;
 use thiserror::Error;
 
 use super::names;
@@ -55,7 +56,7 @@ pub enum Notice {
 }
 
 /// How much a master holds.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
     /// Node references.
     pub nodes: usize,
@@ -69,6 +70,24 @@ pub struct Counts {
     pub params: usize,
     /// Subscriptions to parameters, each key counted.
     pub param_subscribers: usize,
+}
+
+impl fmt::Display for Counts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            nodes,
+            publishers,
+            subscribers,
+            services,
+            params,
+            param_subscribers,
+        } = self;
+        write!(
+            f,
+            "{nodes} nodes, {publishers} publishers, {subscribers} subscribers, {services} \
+             services, {params} parameters, {param_subscribers} parameter subscriptions"
+        )
+    }
 }
 
 /// Why a snapshot cannot be the state of a master.

@@ -21,6 +21,7 @@ use super::{
 use crate::{
     cli::Sync,
     master::{Kind, Master},
+    wait,
     xmlrpc::{self, Call, Reply},
 };
 
@@ -129,8 +130,8 @@ impl LaneRunner {
                     None => return,
                 },
                 () = gate.changed() => self.retry_at = None,
-                landed = landing(&mut self.flight) => self.landed(&proxy, landed),
-                () = sleep_until(self.retry_at) => self.retry_at = None,
+                landed = wait::for_some(self.flight.as_mut().map(|flight| &mut flight.landing)) => self.landed(&proxy, landed),
+                () = wait::until(self.retry_at) => self.retry_at = None,
                 () = tick(&mut resync) => self.resync_due = true,
             }
             while self.queue.len() < self.max_parked {
@@ -335,25 +336,11 @@ impl LaneRunner {
     }
 }
 
-async fn landing(flight: &mut Option<Flight>) -> Landed {
-    match flight {
-        Some(flight) => flight.landing.as_mut().await,
-        None => std::future::pending().await,
-    }
-}
-
 async fn tick(interval: &mut Option<tokio::time::Interval>) {
     match interval {
         Some(interval) => {
             interval.tick().await;
         }
-        None => std::future::pending().await,
-    }
-}
-
-async fn sleep_until(deadline: Option<tokio::time::Instant>) {
-    match deadline {
-        Some(deadline) => tokio::time::sleep_until(deadline).await,
         None => std::future::pending().await,
     }
 }

@@ -9,10 +9,10 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::report::{Counts, Outcome};
+use super::report::Outcome;
 use crate::{
     lifecycle::Input,
-    master::{FirstLook, Master, Plan},
+    master::{Counts, FirstLook, Master, Plan},
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
@@ -159,7 +159,7 @@ pub async fn examine(
         examination.look = start.elapsed();
     }
     examination.injection = start.elapsed().saturating_sub(examination.look);
-    examination.counts = proxy.shadow.with_mirror(Counts::of);
+    examination.counts = proxy.shadow.with_mirror(Master::counts);
     Ok(examination)
 }
 

@@ -29,6 +29,7 @@ use crate::{
         upstream::{ConnectError, Connection},
     },
     supervisor::SupervisorError,
+    wait,
     xmlrpc::Call,
 };
 
@@ -133,7 +134,7 @@ impl Guard {
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
-                () = pending(&mut self.ended) => {
+                () = wait::for_some(self.ended.as_mut()) => {
                     if matches!(self.keeper.state(), State::Shut(_)) {
                         let master = self.proxy.upstream.address();
                         self.say_waiting(&format!("{master} closes the connection unasked"));
@@ -145,17 +146,17 @@ impl Guard {
                     self.disconnect();
                     return Input::Exited;
                 }
-                done = pending(&mut self.step) => {
+                done = wait::for_some(self.step.as_mut()) => {
                     self.step = None;
                     if let Some(input) = self.done(done) {
                         return input;
                     }
                 }
-                () = sleep_until(self.probe_deadline) => {
+                () = wait::until(self.probe_deadline) => {
                     self.probe_deadline = None;
                     return Input::ProbeMissed;
                 }
-                () = sleep_until(wake) => return Input::Wake,
+                () = wait::until(wake) => return Input::Wake,
             }
         }
     }
@@ -407,23 +408,9 @@ async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     proxy.board.add_to_report(census, healed);
 }
 
-async fn pending<T>(future: &mut Option<Pin<Box<dyn Future<Output = T> + Send>>>) -> T {
-    match future {
-        Some(future) => future.as_mut().await,
-        None => std::future::pending().await,
-    }
-}
-
 async fn exited(process: &mut Option<MasterProcess>) {
     match process {
         Some(process) => process.exited().await,
-        None => std::future::pending().await,
-    }
-}
-
-async fn sleep_until(deadline: Option<tokio::time::Instant>) {
-    match deadline {
-        Some(deadline) => tokio::time::sleep_until(deadline).await,
         None => std::future::pending().await,
     }
 }

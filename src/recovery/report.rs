@@ -8,7 +8,7 @@ use std::{
 use serde::Serialize;
 
 use super::examine::Examination;
-use crate::{clock, master::Master};
+use crate::{clock, master::Counts};
 
 /// How the present master came to hold the state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -29,56 +29,6 @@ impl fmt::Display for Outcome {
             Self::Adopted => "a running master has been taken over",
             Self::Resumed => "the same master goes on",
         })
-    }
-}
-
-/// Sizes of a state.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Counts {
-    /// Nodes.
-    pub nodes: usize,
-    /// Registrations as publisher.
-    pub publishers: usize,
-    /// Registrations as subscriber.
-    pub subscribers: usize,
-    /// Services.
-    pub services: usize,
-    /// Parameters, counted as leaves of the tree.
-    pub params: usize,
-    /// Subscriptions to parameters.
-    pub param_subscribers: usize,
-}
-
-impl Counts {
-    /// The sizes of `state`.
-    pub fn of(state: &Master) -> Self {
-        let counts = state.counts();
-        Self {
-            nodes: counts.nodes,
-            publishers: counts.publishers,
-            subscribers: counts.subscribers,
-            services: counts.services,
-            params: counts.params,
-            param_subscribers: counts.param_subscribers,
-        }
-    }
-}
-
-impl fmt::Display for Counts {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            nodes,
-            publishers,
-            subscribers,
-            services,
-            params,
-            param_subscribers,
-        } = self;
-        write!(
-            f,
-            "{nodes} nodes, {publishers} publishers, {subscribers} subscribers, {services} \
-             services, {params} parameters, {param_subscribers} parameter subscriptions"
-        )
     }
 }
 

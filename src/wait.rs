@@ -1,0 +1,19 @@
+//! Waiting for what may not be there.
+
+use tokio::time::Instant;
+
+/// Sleeps until `deadline`; for ever without one.
+pub async fn until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// What `future` comes to; never without one. Cancel safe: the future stays where it is.
+pub async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
+    match future {
+        Some(future) => future.await,
+        None => std::future::pending().await,
+    }
+}
