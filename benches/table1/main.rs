@@ -77,6 +77,7 @@ fn row(kind: Kind, nodes: usize, kills: usize) -> Row {
         for _ in 0..KILLS_A_LIFE.min(kills - row.kills()) {
             robot.settle();
             let best = limit::measure(&robot);
+            robot.let_live();
             robot.settle();
             let ours = robot.kill_master();
             eprintln!("{kind}, {nodes} nodes: {ours:.1?}, the limit: {best:.1?}");

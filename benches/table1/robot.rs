@@ -122,6 +122,21 @@ impl Robot {
         serde_json::from_slice(&page.body).expect("JSON")
     }
 
+    /// Makes the master tell every subscriber of its publishers again, as in a life of hours: it keeps
+    /// a connection to each node that it has called, and closes them all when it dies.
+    pub(crate) fn let_live(&self) {
+        let (client, state) = (self.rescue.client(), self.state());
+        let of = |table: &[(String, String)], key: &str| {
+            let found = table.iter().find(|(name, _)| name == key);
+            found.map(|(_, value)| value.clone()).expect("a known name")
+        };
+        for (topic, nodes) in &state.publishers {
+            let node = nodes[0].as_str();
+            let (kind, api) = (of(&state.topic_types, topic), of(&state.nodes, node));
+            client.ok("registerPublisher", params![node, topic.as_str(), kind, api]);
+        }
+    }
+
     /// Waits until nothing of what was started or killed before is still at work.
     pub(crate) fn settle(&self) {
         sleep(SETTLE);
