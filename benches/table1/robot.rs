@@ -133,7 +133,10 @@ impl Robot {
         for (topic, nodes) in &state.publishers {
             let node = nodes[0].as_str();
             let (kind, api) = (of(&state.topic_types, topic), of(&state.nodes, node));
-            client.ok("registerPublisher", params![node, topic.as_str(), kind, api]);
+            client.ok(
+                "registerPublisher",
+                params![node, topic.as_str(), kind, api],
+            );
         }
     }
 
