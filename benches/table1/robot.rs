@@ -21,8 +21,9 @@ use crate::shared::support::{
 };
 
 /// After a recovery every node is asked for a sign of life. That delays no call, but it would be in
-/// the way of what is measured next on the same processor cores.
-const SETTLE: Duration = Duration::from_millis(500);
+/// the way of what is measured next on the same processor cores. Longer than the second between two
+/// probes: a robot at rest has been probed since its master last called a node.
+const SETTLE: Duration = Duration::from_millis(1500);
 
 /// A parameter that is set already.
 const PARAM: &str = "/table1";

@@ -55,6 +55,19 @@ pub struct FirstLook {
 }
 
 impl FirstLook {
+    /// What a look at a rosmaster that has just been started would show. Its process is `pid`.
+    pub fn at_new(pid: i32) -> Self {
+        Self {
+            pid,
+            marked: false,
+            publishers: IndexMap::new(),
+            subscribers: IndexMap::new(),
+            services: IndexMap::new(),
+            topic_types: IndexMap::new(),
+            params: Some(Struct::new()),
+        }
+    }
+
     /// The look itself: one multicall of `getPid`, `lookupNode` of the mark, `getSystemState`,
     /// `getTopicTypes` and `getParam('/')`. Changes nothing.
     pub fn call(mark: &Mark) -> Call {

@@ -115,17 +115,34 @@ pub fn prepare(proxy: &Arc<Proxy>) -> JoinHandle<Prepared> {
     })
 }
 
-/// Examines the master behind `connection`. `resumable`: this process has served it before, if it
-/// bears the mark.
+/// What is known of a master before it is examined.
+#[derive(Clone, Copy, Debug)]
+pub enum Known {
+    /// Nothing.
+    Nothing,
+    /// If it bears the mark, this process has served it before.
+    ServedIfMarked,
+    /// This process has just started it, as the successor of one that it served, on a loopback port
+    /// that was free: it is empty. That saves a look, and reading back would show if it were not.
+    New {
+        /// Its process id.
+        pid: i32,
+    },
+}
+
+/// Examines the master behind `connection`.
 pub async fn examine(
     proxy: &Arc<Proxy>,
     keeper: &Keeper,
     connection: &mut Connection,
-    resumable: bool,
+    known: Known,
     prepared: Option<JoinHandle<Prepared>>,
 ) -> Result<Examination, ExamineError> {
     let start = Instant::now();
-    let mut first = first_look(proxy, connection).await?;
+    let mut first = match known {
+        Known::New { pid } => FirstLook::at_new(pid),
+        Known::Nothing | Known::ServedIfMarked => first_look(proxy, connection).await?,
+    };
     // From here to the open gate the mirror must not change: the master is compared with it.
     if keeper.state() == State::Shut(StandIn::Unregistrations) {
         keeper.set(State::Shut(StandIn::Reads));
@@ -144,7 +161,7 @@ pub async fn examine(
     };
     if !first.marked() {
         inject(proxy, connection, first, prepared, start, &mut examination).await?;
-    } else if !resumable {
+    } else if matches!(known, Known::Nothing) {
         let previous = proxy.shadow.with_mirror(Clone::clone);
         let held = second_look(first, connection, &previous).await?;
         proxy.shadow.succeed();

@@ -20,6 +20,8 @@ pub struct MasterProcess {
     port: Option<u16>,
     /// Our child, while it has not been reported gone.
     child: Option<u32>,
+    /// Our child, while nobody has spoken to it.
+    new: Option<i32>,
     /// Ends of children.
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     /// What a command to spawn came to; to be fed to the lifecycle next.
@@ -33,6 +35,7 @@ impl MasterProcess {
             rosmaster,
             port: remembered,
             child: None,
+            new: None,
             ends: mpsc::channel(4),
             news: None,
         }
@@ -72,8 +75,14 @@ impl MasterProcess {
         });
         self.port = Some(port);
         self.child = Some(pid);
+        self.new = i32::try_from(pid).ok();
         self.news = Some(Input::Spawned);
         Ok(())
+    }
+
+    /// The process id of a master that was started and not asked for before.
+    pub fn take_new(&mut self) -> Option<i32> {
+        self.new.take()
     }
 
     /// The lifecycle is to hear that no master could be started.
@@ -93,6 +102,7 @@ impl MasterProcess {
                 Some((pid, how)) if Some(pid) == self.child => {
                     tracing::warn!(pid, how, "rosmaster has ended");
                     self.child = None;
+                    self.new = None;
                     return;
                 }
                 Some(_) => {}

@@ -16,7 +16,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use self::{
-    examine::{Examination, ExamineError, Prepared},
+    examine::{Examination, ExamineError, Known, Prepared},
     master_process::MasterProcess,
     report::{Outage, Outcome, Phases},
 };
@@ -26,6 +26,7 @@ use crate::{
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
+        pool::{VerifyError, connect_verified},
         upstream::{ConnectError, Connection},
     },
     supervisor::SupervisorError,
@@ -41,7 +42,7 @@ enum Done {
     Connected(Connection),
     NotConnected(ConnectError),
     Examined(Connection, Result<Examination, ExamineError>),
-    Probed(Connection, bool),
+    Probed(Result<Connection, VerifyError>),
 }
 
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
@@ -181,10 +182,16 @@ impl Guard {
                     return Ok(());
                 };
                 let (proxy, keeper) = (self.proxy.clone(), self.keeper.clone());
-                let (resumable, prepared) = (self.served, self.prepared.take());
+                let new = self.process.as_mut().and_then(MasterProcess::take_new);
+                let known = match (self.served, new) {
+                    (true, Some(pid)) => Known::New { pid },
+                    (true, None) => Known::ServedIfMarked,
+                    (false, _) => Known::Nothing,
+                };
+                let prepared = self.prepared.take();
                 self.step = Some(Box::pin(async move {
                     let examined =
-                        examine::examine(&proxy, &keeper, &mut connection, resumable, prepared);
+                        examine::examine(&proxy, &keeper, &mut connection, known, prepared);
                     let examined = examined.await;
                     Done::Examined(connection, examined)
                 }));
@@ -193,11 +200,11 @@ impl Guard {
                 // A probe that was missed goes on: its answer counts whenever it comes.
                 self.probe_deadline =
                     Some(tokio::time::Instant::now() + self.proxy.config.probe_timeout);
-                if let Some(mut connection) = self.connection.take() {
+                if self.step.is_none() {
+                    let proxy = self.proxy.clone();
                     self.step = Some(Box::pin(async move {
-                        let call = Call::new("getPid", vec!["/rosrescue".into()]);
-                        let answered = connection.call(&call).await.is_ok();
-                        Done::Probed(connection, answered)
+                        let fresh = connect_verified(&proxy.upstream, &proxy.mark).await;
+                        Done::Probed(fresh)
                     }));
                 }
             }
@@ -229,8 +236,7 @@ impl Guard {
         match done {
             Done::Connected(connection) => {
                 self.outage.port_open(Instant::now());
-                self.ended = Some(Box::pin(connection.ended()));
-                self.connection = Some(connection);
+                self.watch(connection);
                 Some(Input::Connected)
             }
             Done::NotConnected(error) => {
@@ -260,15 +266,27 @@ impl Guard {
                 }
                 Some(input)
             }
-            Done::Probed(connection, answered) => {
-                self.connection = Some(connection);
-                // Without an answer the connection has ended, which is told apart.
-                answered.then(|| {
-                    self.probe_deadline = None;
-                    Input::ProbeAnswered
-                })
+            // Another incarnation is there, and nobody has closed the connection to the one before.
+            Done::Probed(Err(VerifyError::Unmarked)) => {
+                self.disconnect();
+                Some(Input::ConnectionLost)
+            }
+            // Missed. If the master has just died, the connection before tells of it.
+            Done::Probed(Err(_)) => None,
+            Done::Probed(Ok(fresh)) => {
+                self.probe_deadline = None;
+                self.watch(fresh);
+                Some(Input::ProbeAnswered)
             }
         }
+    }
+
+    /// Keeps `connection` as the sentinel. It is renewed with each probe, because the kernel closes
+    /// the descriptors of a dying process one by one, the newest first, and a master has one for
+    /// each node that it has ever called.
+    fn watch(&mut self, connection: Connection) {
+        self.ended = Some(Box::pin(connection.ended()));
+        self.connection = Some(connection);
     }
 
     fn disconnect(&mut self) {
