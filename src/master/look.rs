@@ -219,6 +219,7 @@ impl FirstLook {
                 .clone()
                 .unwrap_or_else(|| previous.params().clone()),
             topic_types: self.topic_types.clone(),
+            had_services: previous.registry.had_services,
             ..Snapshot::default()
         };
         for caller_id in self.nodes(previous) {

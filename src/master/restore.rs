@@ -36,6 +36,7 @@ impl<'a> Restore<'a> {
         restore.nodes();
         restore.publishers();
         restore.services();
+        restore.had_services();
         restore.star_types();
         restore.subscribers();
         restore.types_before(target.topic_types.len());
@@ -227,6 +228,24 @@ impl<'a> Restore<'a> {
         }
     }
 
+    /// A master that has ever had a service answers an `unregisterService` with another message.
+    fn had_services(&mut self) {
+        if self.target.registry.had_services
+            && !self.model.registry.had_services
+            && let Some((helper, name)) = self.helper("/rosrescue")
+        {
+            self.take_and_give_up(helper, name);
+        }
+    }
+
+    fn take_and_give_up(&mut self, helper: String, service: String) {
+        let mut params = vec![helper.into(), service.into(), NO_API.into()];
+        let unregister = params.clone();
+        params.push(NO_API.into());
+        self.push("registerService", params);
+        self.push("unregisterService", unregister);
+    }
+
     /// Whether a service has a provider in the new master. Then it and who lost it are left out.
     fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
         let Some(found) = self.found.registry.services.get(service) else {
@@ -282,11 +301,7 @@ impl<'a> Restore<'a> {
         };
         self.lose(service, losers);
         if self.calls.len() > before {
-            let mut params = vec![helper.into(), name.into(), NO_API.into()];
-            let unregister = params.clone();
-            params.push(NO_API.into());
-            self.push("registerService", params);
-            self.push("unregisterService", unregister);
+            self.take_and_give_up(helper, name);
         }
     }
 

@@ -18,6 +18,9 @@ pub struct Snapshot {
     pub subscribers: IndexMap<String, Vec<String>>,
     /// The provider of each service.
     pub services: IndexMap<String, ServiceEntry>,
+    /// Whether any service was ever registered. Where there is none it shows in a message of
+    /// `unregisterService`, and nowhere else.
+    pub had_services: bool,
     /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as the master's do.
     pub param_subscribers: IndexMap<String, Vec<String>>,
     /// The parameter tree.

@@ -272,6 +272,7 @@ impl Master {
             publishers: registry.publishers.clone(),
             subscribers: registry.subscribers.clone(),
             services: registry.services.clone(),
+            had_services: registry.had_services,
             param_subscribers: registry.param_subscribers.clone(),
             params: self.params.tree().clone(),
         }
@@ -307,8 +308,9 @@ impl Master {
             };
             nodes.insert(caller_id, node);
         }
-        let had_services =
-            !snapshot.services.is_empty() || nodes.values().any(|node| !node.services.is_empty());
+        let had_services = snapshot.had_services
+            || !snapshot.services.is_empty()
+            || nodes.values().any(|node| !node.services.is_empty());
         for (kind, registrations) in [
             (Shared::Publishers, &snapshot.publishers),
             (Shared::Subscribers, &snapshot.subscribers),
@@ -405,6 +407,7 @@ impl PartialEq for Master {
             && a.publishers.iter().eq(&b.publishers)
             && a.subscribers.iter().eq(&b.subscribers)
             && a.services.iter().eq(&b.services)
+            && a.had_services == b.had_services
             && a.param_subscribers.iter().eq(&b.param_subscribers)
             && self.topic_types.iter().eq(&other.topic_types)
             && self.params.tree().iter().eq(other.params.tree())

@@ -50,6 +50,9 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         text_line(out, "    node: ", &service.node);
         text_line(out, "    api: ", &service.api);
     });
+    if snapshot.had_services {
+        out.extend_from_slice(b"had_services: true\n");
+    }
     section_of_lines(
         out,
         "param_subscribers",
@@ -185,6 +188,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         topic_types: entries(document, "topic_types", string)?,
         publishers: entries(document, "publishers", texts)?,
         subscribers: entries(document, "subscribers", texts)?,
+        had_services: document.swap_remove("had_services") == Some(Value::Bool(true)),
         services: entries(document, "services", |value| {
             let mut service = structure(value)?;
             Some(ServiceEntry {

@@ -67,6 +67,7 @@ fn with_params(params: Struct) -> Checkpoint {
                     api: "rosrpc://h:2".to_owned(),
                 },
             )]),
+            had_services: true,
             param_subscribers: IndexMap::from([("/p/".to_owned(), ids(&["~"]))]),
             params,
         },

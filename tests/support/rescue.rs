@@ -2,7 +2,7 @@
 
 use std::ffi::OsStr;
 use std::ops::{Deref, DerefMut};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use super::patience::eventually;
@@ -78,6 +78,29 @@ impl Setup {
         self
     }
 
+    /// As if the computer had been booted with `boot_id`: a private mount shows it in place of the
+    /// kernel's own.
+    fn in_boot(&mut self, boot_id: &Path) {
+        const SHOW: &str = r#"mount --bind "$0" /proc/sys/kernel/random/boot_id && exec "$@""#;
+        let mut command = Command::new("unshare");
+        if !rustix::process::geteuid().is_root() {
+            command.arg("--map-root-user");
+        }
+        command.args(["--mount", "sh", "-c", SHOW]).arg(boot_id);
+        command.arg(self.command.get_program());
+        command.args(self.command.get_args());
+        for (key, value) in self.command.get_envs() {
+            match value {
+                Some(value) => command.env(key, value),
+                None => command.env_remove(key),
+            };
+        }
+        if let Some(folder) = self.command.get_current_dir() {
+            command.current_dir(folder);
+        }
+        self.command = command;
+    }
+
     /// Starts it and waits until it serves a living master.
     #[track_caller]
     pub(crate) fn start(self) -> Rescue {
@@ -134,6 +157,14 @@ impl Rescue {
         assert!(self.process.exited().is_some(), "rosrescue still runs");
         self.assert_no_panic();
         self.process = Process::start("rosrescue, again", &mut self.setup.command);
+    }
+
+    /// Starts it again as after a reboot of its computer, `boot_id` being a file that holds the new
+    /// boot's id; waits for nothing.
+    #[track_caller]
+    pub(crate) fn start_after_reboot(&mut self, boot_id: &Path) {
+        self.setup.in_boot(boot_id);
+        self.start_again();
     }
 
     #[track_caller]
