@@ -230,3 +230,27 @@ fn a_running_system_is_taken_over() {
     listener.assert_no_message_lost("/talker");
     talker.assert_no_link_lost();
 }
+
+#[test]
+fn a_system_with_a_parameter_that_spoils_the_others_is_taken_over() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let bare = master.client();
+    bare.set_param("/gain", 3);
+    bare.set_param("/arm/speed", 1.5);
+    bare.set_param("/arm/poison", Value::BigInt("9999999999".to_owned()));
+    assert_eq!(bare.param("/arm/speed"), Some(1.5.into()));
+
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    let dead = master.pid();
+    master.kill();
+    let _master = Rosmaster::start_at(&scratch, master.port);
+    let client = rescue.client();
+    eventually("rosrescue names the new master", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    eventually("what could be read is back", || {
+        client.param("/gain") == Some(3.into()) && client.param("/arm/speed") == Some(1.5.into())
+    });
+    assert!(client.param("/arm").is_some(), "nothing spoils it any more");
+}

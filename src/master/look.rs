@@ -68,6 +68,17 @@ impl FirstLook {
         }
     }
 
+    /// Whether the parameters are known.
+    pub fn has_params(&self) -> bool {
+        self.params.is_some()
+    }
+
+    /// The same look, with parameters that were read otherwise.
+    pub fn with_params(mut self, params: Struct) -> Self {
+        self.params = Some(params);
+        self
+    }
+
     /// The look itself: one multicall of `getPid`, `lookupNode` of the mark, `getSystemState`,
     /// `getTopicTypes` and `getParam('/')`. Changes nothing.
     pub fn call(mark: &Mark) -> Call {

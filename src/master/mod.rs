@@ -2,7 +2,8 @@
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`kind`] and [`accepted`]: what a call may do, and what of it a master has done.
-//! * [`Mark`] and [`FirstLook`]: recognising a master, and learning the state of an unknown one.
+//! * [`Mark`], [`FirstLook`] and [`Salvage`]: recognising a master, and learning the state of an
+//!   unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
 //! * [`difference`]: what two states do not have in common, for people.
 //!
@@ -24,6 +25,7 @@ mod plan;
 mod python;
 mod registry;
 mod restore;
+mod salvage;
 mod snapshot;
 mod state;
 #[cfg(test)]
@@ -37,5 +39,6 @@ pub use look::{FirstLook, NotAMaster};
 pub use mark::Mark;
 pub use names::CALLER_ID;
 pub use plan::{Mismatch, Plan, Skipped};
+pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master, Notice};
