@@ -56,6 +56,9 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
         }
     });
     words.order("services", &a.services, &b.services);
+    if a.had_services != b.had_services {
+        words.say(|| "only one of both has ever had a service".to_owned());
+    }
     let (a, b) = (&mirror.topic_types, &master.topic_types);
     words.map("the type of", a, b, |words, topic, a, b| {
         if a != b {
