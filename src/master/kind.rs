@@ -1,5 +1,7 @@
 //! What sort of call a call is.
 
+use std::collections::BTreeSet;
+
 use super::api;
 use super::multicall::{self, Entry};
 use crate::xmlrpc::{Call, Value};
@@ -89,6 +91,34 @@ fn kind_within(method: &str, params: &[Value], levels: usize) -> Kind {
     if entries.is_empty() { Kind::Read } else { kind }
 }
 
+/// The caller ids whose registrations this call may change; for a multicall, those of its entries,
+/// nested ones too. A call that only sets or deletes parameters touches nobody's.
+pub fn registrants(call: &Call) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    registrants_within(&call.method, &call.params, multicall::DEEPEST, &mut found);
+    found
+}
+
+fn registrants_within(method: &str, params: &[Value], levels: usize, found: &mut BTreeSet<String>) {
+    if method != multicall::METHOD {
+        let registers = api::method(method).is_some_and(|method| method.kind.mutates())
+            && !matches!(method, "setParam" | "deleteParam");
+        if let Some(caller_id) = params.first().and_then(Value::as_str)
+            && registers
+        {
+            found.insert(caller_id.to_owned());
+        }
+        return;
+    }
+    if let (Ok(entries), Some(levels)) = (multicall::entries(params), levels.checked_sub(1)) {
+        for element in entries.iter() {
+            if let Entry::Call { method, params } = Entry::new(element) {
+                registrants_within(method, &params, levels, found);
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -113,6 +143,20 @@ mod tests {
         assert_eq!(of(&["setParam", "shutdown", "nonsense"]), Kind::Shutdown);
         let nested = Call::multicall([Call::multicall([call("subscribeParam")]), call("getPid")]);
         assert_eq!(kind(&nested), Kind::Mutate);
+    }
+
+    #[test]
+    fn whose_registrations_a_call_may_change() {
+        let by = |method: &str, caller: &str| Call::new(method, vec![caller.into()]);
+        let of = |call: &Call| registrants(call).into_iter().collect::<Vec<_>>();
+        assert_eq!(of(&by("registerService", "/a")), ["/a"]);
+        assert_eq!(of(&by("subscribeParam", "/a")), ["/a"]);
+        for method in ["setParam", "deleteParam", "getSystemState", "nonsense"] {
+            assert!(of(&by(method, "/a")).is_empty(), "{method}");
+        }
+        let inner = Call::multicall([by("unregisterPublisher", "/b"), by("setParam", "/c")]);
+        let outer = Call::multicall([inner, by("registerPublisher", "/a")]);
+        assert_eq!(of(&outer), ["/a", "/b"]);
     }
 
     #[test]

@@ -34,7 +34,7 @@ mod tests;
 pub use accepted::{Accepted, accepted};
 pub use api::Outcome;
 pub use difference::difference;
-pub use kind::{Kind, kind};
+pub use kind::{Kind, kind, registrants};
 pub use look::{FirstLook, NotAMaster};
 pub use mark::Mark;
 pub use names::CALLER_ID;

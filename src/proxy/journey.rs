@@ -1,6 +1,6 @@
 //! What travels through the lane, how calls are packed together, and what comes back.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use bytes::Bytes;
 use thiserror::Error;
@@ -12,7 +12,7 @@ use super::{
     upstream::{CallError, Head, RawReply},
 };
 use crate::{
-    master::Kind,
+    master::{self, Kind},
     xmlrpc::{self, Call, Reply, Struct, Value},
 };
 
@@ -49,9 +49,18 @@ pub struct LaneItem {
 }
 
 impl LaneItem {
-    /// The caller id: calls of one caller keep their order.
+    /// The caller id, for messages.
     pub fn caller(&self) -> Option<&str> {
         self.call.as_ref()?.params.first()?.as_str()
+    }
+
+    /// The nodes whose registrations the call may change. What cannot be decoded has none that we
+    /// know of.
+    pub fn registrants(&self) -> BTreeSet<String> {
+        self.call
+            .as_ref()
+            .map(master::registrants)
+            .unwrap_or_default()
     }
 
     /// Whether it may travel in a multicall with others. Only calls whose reply holds no parameter

@@ -2,13 +2,13 @@
 //! is the order in which the master ran them. Calls that queue up travel together.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeSet, VecDeque},
     pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{Semaphore, SemaphorePermit, mpsc, oneshot};
 
 use super::{
     Proxy,
@@ -31,27 +31,41 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// A call that gets no reply so often is given up and its connection closed: a master that breaks
 /// off each reply must not hold up the lane for ever.
 const ATTEMPTS: u32 = 3;
-/// Calls that wait between the clients and the queue.
+/// Calls between the clients and the queue. The runner never lets them wait.
 const CHANNEL: usize = 64;
 
 /// The way into the lane.
 #[derive(Clone, Debug)]
 pub struct Lane {
     items: mpsc::Sender<LaneItem>,
+    /// Places for calls that wait. Unregistrations have their own: they are answered even if all
+    /// other places are taken.
+    places: Arc<[Semaphore; 2]>,
 }
 
 impl Lane {
-    /// Puts a call in the queue. None: the gate is shut and there is no room.
-    pub(super) async fn submit(&self, gate: &Gate, item: LaneItem) -> Option<()> {
-        match self.items.try_send(item) {
-            Ok(()) => Some(()),
-            Err(mpsc::error::TrySendError::Full(item))
-                if matches!(gate.state(), State::Open { .. }) =>
-            {
-                self.items.send(item).await.ok()
-            }
-            Err(_) => None,
+    /// A place for a call of this kind, to be held until it is answered or given up. None: all are
+    /// taken and the gate is shut. While it is open, a place is waited for.
+    pub(super) async fn place(&self, gate: &Gate, kind: Kind) -> Option<SemaphorePermit<'_>> {
+        let [unregistrations, others] = &*self.places;
+        let places = match kind {
+            Kind::Unregister => unregistrations,
+            _ => others,
+        };
+        if let Ok(place) = places.try_acquire() {
+            return Some(place);
         }
+        let mut gate = gate.clone();
+        tokio::select! {
+            place = places.acquire() => place.ok(),
+            () = gate.shut_for(Duration::ZERO) => None,
+        }
+    }
+
+    /// Puts a call in the queue.
+    pub(super) async fn submit(&self, item: LaneItem) {
+        // The runner is gone only when rosrescue stops; the answer's sender is dropped then.
+        let _ = self.items.send(item).await;
     }
 
     /// Makes a call of rosrescue's own, recorded as any other. None if the master never answers.
@@ -73,8 +87,11 @@ impl Lane {
     }
 }
 
-/// Makes a lane; the second part is to be run.
+/// Makes a lane in which `max_parked` calls may wait, and as many unregistrations; the second part is to
+/// be run.
 pub fn lane(max_parked: usize) -> (Lane, LaneRunner) {
+    // Without a place nobody could pass the open gate either.
+    let max_parked = max_parked.max(1);
     let (tx, rx) = mpsc::channel(CHANNEL);
     let runner = LaneRunner {
         items: rx,
@@ -85,7 +102,8 @@ pub fn lane(max_parked: usize) -> (Lane, LaneRunner) {
         resync_due: false,
         retry_at: None,
     };
-    (Lane { items: tx }, runner)
+    let places = Arc::new([max_parked, max_parked].map(Semaphore::new));
+    (Lane { items: tx, places }, runner)
 }
 
 /// What a flight brings back.
@@ -123,9 +141,8 @@ impl LaneRunner {
         let mut gate = proxy.gate.clone();
         let mut resync = proxy.config.resync_interval.map(tokio::time::interval);
         loop {
-            let room = self.queue.len() < self.max_parked;
             tokio::select! {
-                item = self.items.recv(), if room => match item {
+                item = self.items.recv() => match item {
                     Some(item) => self.queue.push_back(item),
                     None => return,
                 },
@@ -134,20 +151,24 @@ impl LaneRunner {
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = tick(&mut resync) => self.resync_due = true,
             }
-            while self.queue.len() < self.max_parked {
-                let Ok(item) = self.items.try_recv() else {
-                    break;
-                };
+            while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
             }
-            // A client that has gone away, or was sent away, will ask again.
-            self.queue.retain(|item| !item.answer.is_closed());
+            self.forget_abandoned();
             match gate.look() {
                 State::Open { incarnation } => self.depart(&proxy, incarnation),
                 State::Shut(StandIn::Unregistrations) => self.unregister(&proxy),
                 State::Shut(_) => {}
             }
         }
+    }
+
+    /// A client that has gone away, or was sent away, will ask again; but nobody says twice that it
+    /// unregisters.
+    fn forget_abandoned(&mut self) {
+        let crowded = self.queue.len() > 2 * self.max_parked;
+        self.queue
+            .retain(|item| !item.answer.is_closed() || (item.kind == Kind::Unregister && !crowded));
     }
 
     /// Starts the next flight, if there is none and something to carry.
@@ -307,27 +328,22 @@ impl LaneRunner {
         }
     }
 
-    /// Answers unregistrations from the mirror, unless their caller has an earlier call under way.
+    /// Answers unregistrations from the mirror, unless registrations of the same nodes are under way
+    /// before them.
     fn unregister(&mut self, proxy: &Arc<Proxy>) {
         let flying = self.flight.as_ref().map_or(&[][..], |flight| &flight.items);
-        let mut busy: Vec<String> = flying
-            .iter()
-            .filter_map(LaneItem::caller)
-            .map(str::to_owned)
-            .collect();
+        let mut busy: BTreeSet<String> = flying.iter().flat_map(LaneItem::registrants).collect();
         let mut waiting = VecDeque::with_capacity(self.queue.len());
         for item in self.queue.drain(..) {
-            let caller = item.caller().unwrap_or_default();
+            let registrants = item.registrants();
             match &item.call {
-                Some(call)
-                    if item.kind == Kind::Unregister && !busy.iter().any(|b| b == caller) =>
-                {
+                Some(call) if item.kind == Kind::Unregister && busy.is_disjoint(&registrants) => {
                     let reply = proxy.shadow.unregister(Instant::now(), call);
                     proxy.stats.stood_in.count();
                     let _ = item.answer.send(Answer::Made(reply));
                 }
                 _ => {
-                    busy.push(caller.to_owned());
+                    busy.extend(registrants);
                     waiting.push_back(item);
                 }
             }

@@ -160,6 +160,12 @@ async fn answer(
             read(proxy, head, body, call.as_ref(), kind).await
         }
         (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
+            let Some(_place) = proxy.lane.place(&proxy.gate, kind).await else {
+                proxy.stats.hold_expired.count();
+                return Err(Closed(
+                    "too many calls wait for the master, see --max-parked",
+                ));
+            };
             let (tx, rx) = oneshot::channel();
             let item = LaneItem {
                 raw: Some((head, body)),
@@ -168,12 +174,7 @@ async fn answer(
                 answer: tx,
                 attempts: 0,
             };
-            if proxy.lane.submit(&proxy.gate, item).await.is_none() {
-                proxy.stats.hold_expired.count();
-                return Err(Closed(
-                    "too many calls wait for the master, see --max-parked",
-                ));
-            }
+            proxy.lane.submit(item).await;
             await_lane(proxy, pace, rx).await
         }
     }

@@ -198,6 +198,25 @@ impl Robot {
         self.await_recovery(dead);
     }
 
+    /// The status page; nothing while rosrescue is not there.
+    pub(crate) fn status(&self) -> Option<serde_json::Value> {
+        let page = super::rpc::request("GET /status.json HTTP/1.1", &[], b"");
+        let page = self.client().exchange(&page).ok()?;
+        serde_json::from_slice(&page.body).ok()
+    }
+
+    /// Whether the gate is open.
+    pub(crate) fn is_open(&self) -> bool {
+        self.status().is_some_and(|status| status["open"] == true)
+    }
+
+    /// A counter of the status page.
+    #[track_caller]
+    pub(crate) fn counter(&self, name: &str) -> u64 {
+        let status = self.status().expect("a status page");
+        status["counters"][name].as_u64().expect("a counter")
+    }
+
     /// Ids of all processes of this robot.
     pub(crate) fn processes(&self) -> BTreeSet<u32> {
         self.scratch
