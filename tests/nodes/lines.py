@@ -3,6 +3,8 @@
     ready NAME              the node is registered and at work
     sent N                  talker: message N has been published
     got PUBLISHER N         listener: message N of PUBLISHER has arrived
+    gap PUBLISHER M N       listener that says only some messages: behind M came N, which is not the next
+    pause PUBLISHER MS      such a listener: the longest time between two messages since the last such line
     links N                 talker, listener: the number of live TCPROS links is now N
     update TOPIC URI...     listener: a publisherUpdate with these publishers came
     called N                service server: the Nth call was answered

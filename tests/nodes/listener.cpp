@@ -1,4 +1,11 @@
 // Subscribes to `chatter` and says each message, each change of its links and each publisherUpdate.
+// Usage: listener [EVERY]
+//
+// With EVERY it says each EVERYth message of a publisher, the first one, and every gap between two.
+#include <algorithm>
+#include <cstdlib>
+#include <map>
+
 #include <ros/callback_queue.h>
 #include <ros/ros.h>
 #include <ros/topic_manager.h>
@@ -20,18 +27,56 @@ static void on_update(XmlRpc::XmlRpcValue& params, XmlRpc::XmlRpcValue& result)
   ros::TopicManager::instance()->pubUpdateCallback(params, result);
 }
 
+struct Last
+{
+  unsigned long number;
+  ros::WallTime at;
+  double longest;
+};
+
+static unsigned long every = 0;
+static std::map<std::string, Last> lasts;
+
+// Says of the messages what matters, where there are too many to say them all.
+static void summarise(const std::string& name, unsigned long number)
+{
+  const ros::WallTime now = ros::WallTime::now();
+  const bool first = lasts.count(name) == 0;
+  if (first)
+    lasts[name] = { number - 1, now, 0.0 };
+  Last& last = lasts[name];
+  last.longest = std::max(last.longest, (now - last.at).toSec());
+  if (number != last.number + 1)
+    say("gap " + name + " " + std::to_string(last.number) + " " + std::to_string(number));
+  if (first || number % every == 0)
+  {
+    say("got " + name + " " + std::to_string(number));
+    say("pause " + name + " " + std::to_string(last.longest * 1e3));
+    last.longest = 0.0;
+  }
+  last.number = number;
+  last.at = now;
+}
+
 static void on_message(const std_msgs::StringConstPtr& message)
 {
-  say("got " + message->data);
+  const std::string& text = message->data;
+  const size_t space = text.find(' ');
+  if (every == 0)
+    say("got " + text);
+  else
+    summarise(text.substr(0, space), std::strtoul(text.c_str() + space, nullptr, 10));
 }
 
 int main(int argc, char** argv)
 {
   ros::init(argc, argv, "listener");
+  if (argc > 1)
+    every = std::strtoul(argv[1], nullptr, 10);
   ros::NodeHandle node;
   ros::XMLRPCManager::instance()->unbind("publisherUpdate");
   ros::XMLRPCManager::instance()->bind("publisherUpdate", on_update);
-  subscriber = node.subscribe("chatter", 1000, on_message);
+  subscriber = node.subscribe("chatter", 0, on_message, ros::TransportHints().tcpNoDelay());
   say("ready " + ros::this_node::getName());
   uint32_t links = 0;
   while (ros::ok())

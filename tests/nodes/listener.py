@@ -1,8 +1,13 @@
 #!/usr/bin/python3
 """Subscribes to `chatter` and says each message, each change of its links and each publisherUpdate.
+Usage: listener.py [EVERY]
+
+With EVERY it says each EVERYth message of a publisher, the first one, and every gap between two.
 
 rospy has no call-back for links of a subscriber, so this wraps the places where it makes and ends them.
 """
+
+import time
 
 import rospy
 import rospy.impl.masterslave
@@ -10,6 +15,27 @@ import rospy.impl.tcpros_base
 from std_msgs.msg import String
 
 from lines import say
+
+
+class Summary:
+    """Says of the messages what matters, where there are too many to say them all."""
+
+    def __init__(self, every):
+        self.every = every
+        self.last = {}
+
+    def on_message(self, message):
+        name, _, number = message.data.partition(" ")
+        number, now = int(number), time.monotonic()
+        before, at, longest = self.last.get(name, (number - 1, now, 0.0))
+        longest = max(longest, now - at)
+        if number != before + 1:
+            say("gap", name, before, number)
+        if number % self.every == 0 or name not in self.last:
+            say("got", name, number)
+            say("pause", name, "%.3f" % (longest * 1e3))
+            longest = 0.0
+        self.last[name] = (number, now, longest)
 
 
 def watch_updates():
@@ -53,10 +79,12 @@ def watch_links(subscriber):
 def main():
     watch_updates()
     watch_reconnects()
+    arguments = rospy.myargv()
     rospy.init_node("listener")
-    subscriber = rospy.Subscriber(
-        "chatter", String, lambda message: say("got", message.data), queue_size=None
-    )
+    on_message = lambda message: say("got", message.data)
+    if len(arguments) > 1:
+        on_message = Summary(int(arguments[1])).on_message
+    subscriber = rospy.Subscriber("chatter", String, on_message, queue_size=None)
     watch_links(subscriber)
     say("ready", rospy.get_name())
     rospy.spin()

@@ -1,4 +1,6 @@
-// Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ]
+// Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ [quiet]]
+//
+// A quiet one does not say what it has sent. Nothing is thrown away when a listener is slow.
 #include <cstdlib>
 #include <ros/ros.h>
 #include <std_msgs/String.h>
@@ -16,8 +18,9 @@ int main(int argc, char** argv)
 {
   ros::init(argc, argv, "talker");
   const double hz = argc > 1 ? std::atof(argv[1]) : 50.0;
+  const bool quiet = argc > 2 && std::string(argv[2]) == "quiet";
   ros::NodeHandle node;
-  publisher = node.advertise<std_msgs::String>("chatter", 1000, on_link, on_link);
+  publisher = node.advertise<std_msgs::String>("chatter", 0, on_link, on_link);
   say("ready " + ros::this_node::getName());
   ros::Rate rate(hz);
   for (unsigned long number = 1; ros::ok(); ++number)
@@ -25,7 +28,8 @@ int main(int argc, char** argv)
     std_msgs::String message;
     message.data = ros::this_node::getName() + " " + std::to_string(number);
     publisher.publish(message);
-    say("sent " + std::to_string(number));
+    if (!quiet)
+      say("sent " + std::to_string(number));
     ros::spinOnce();
     rate.sleep();
   }

@@ -1,5 +1,8 @@
 #!/usr/bin/python3
-"""Publishes `std_msgs/String` "NAME N" on `chatter`, numbered from 1. Usage: talker.py [HZ]"""
+"""Publishes `std_msgs/String` "NAME N" on `chatter`, numbered from 1. Usage: talker.py [HZ [quiet]]
+
+A quiet one does not say what it has sent. Nothing is thrown away when a listener is slow.
+"""
 
 import rospy
 from std_msgs.msg import String
@@ -24,9 +27,10 @@ class Links(rospy.SubscribeListener):
 def main():
     arguments = rospy.myargv()
     hz = float(arguments[1]) if len(arguments) > 1 else 50.0
+    quiet = "quiet" in arguments
     rospy.init_node("talker")
     links = Links()
-    publisher = rospy.Publisher("chatter", String, subscriber_listener=links, queue_size=1000)
+    publisher = rospy.Publisher("chatter", String, subscriber_listener=links, queue_size=0)
     links.publisher = publisher
     say("ready", rospy.get_name())
     number = 0
@@ -34,7 +38,8 @@ def main():
     while not rospy.is_shutdown():
         number += 1
         publisher.publish("%s %d" % (rospy.get_name(), number))
-        say("sent", number)
+        if not quiet:
+            say("sent", number)
         try:
             rate.sleep()
         except rospy.ROSInterruptException:

@@ -136,6 +136,19 @@ impl Node {
         }
     }
 
+    /// Panics unless a listener that says only some messages has seen no gap between those of
+    /// `publisher`. Answers how many came at least.
+    #[track_caller]
+    pub(crate) fn assert_no_gap(&self, publisher: &str) -> u64 {
+        let messages = self.messages(publisher);
+        let [first, .., last] = messages.as_slice() else {
+            panic!("hardly a message of {publisher} came: {messages:?}");
+        };
+        let gaps = self.said("gap");
+        assert!(gaps.is_empty(), "{gaps:?}\n{}", self.process.log());
+        last - first + 1
+    }
+
     /// Panics if the number of links ever went down.
     #[track_caller]
     pub(crate) fn assert_no_link_lost(&self) {
