@@ -3,7 +3,7 @@
 use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
-use super::{Checkpoint, EncodeError, Entry, Session, yaml};
+use super::{Checkpoint, EncodeError, Entry, Session, frame, yaml};
 use crate::master::{ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
@@ -240,7 +240,7 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
 fn seq(document: &Struct) -> Result<u64, String> {
     match document.get("seq") {
         Some(Value::Int(number)) => u64::try_from(*number).ok(),
-        Some(Value::BigInt(digits)) => digits.parse().ok(),
+        Some(Value::BigInt(digits)) => frame::count(digits),
         _ => None,
     }
     .ok_or_else(|| "`seq` is no number".to_owned())

@@ -28,6 +28,10 @@ const HEADER_BYTES_MAX: usize = 256;
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
+/// Generations and records are counted on from what a file says, and no count gets beyond this: a
+/// higher number was never written, and adding to it could overflow.
+const COUNT_MAX: u64 = u64::MAX / 2;
+
 /// Ties the records of a file to its snapshot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp(u32);
@@ -91,6 +95,11 @@ fn hex(digits: &[u8]) -> Option<u32> {
         };
         Some(number << 4 | u32::from(digit))
     })
+}
+
+/// The number of a generation or a record.
+pub(super) fn count(digits: &str) -> Option<u64> {
+    digits.parse().ok().filter(|count| *count <= COUNT_MAX)
 }
 
 /// What the first line says.
@@ -201,8 +210,8 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     };
     let header = (|| {
         Some(Header {
-            generation: field("generation")?.parse().ok()?,
-            seq: field("seq")?.parse().ok()?,
+            generation: count(field("generation")?)?,
+            seq: count(field("seq")?)?,
             snapshot: field("snapshot")?.parse().ok()?,
             crc: hex(field("crc32c")?.as_bytes())?,
             stamp: Stamp(stamp),
@@ -373,6 +382,6 @@ fn open_line(line: &[u8]) -> Option<(u64, Stamp, &[u8])> {
     let stamp = Stamp(hex(mark.strip_prefix(b" #")?)?);
     let rest = body.strip_prefix(RECORD_START)?;
     let digits = rest.split(|&byte| byte == b',').next()?;
-    let seq = std::str::from_utf8(digits).ok()?.parse().ok()?;
+    let seq = count(std::str::from_utf8(digits).ok()?)?;
     Some((seq, stamp, body))
 }

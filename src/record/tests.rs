@@ -76,3 +76,32 @@ fn bits_of_a_large_file_flipped_are_noticed() {
     let step = std::env::var("ROSRESCUE_FLIP_STEP").map(|step| step.parse().unwrap());
     assert_flips_noticed(step.unwrap_or(FLIP_STEP));
 }
+
+/// A whole file, as far as its check sums say, whose numbers are at the end of all numbers.
+#[test]
+fn numbers_that_cannot_be_counted_on_are_damage() {
+    let checkpoint = |seq| Checkpoint {
+        seq,
+        ..Checkpoint::default()
+    };
+    let most = u64::MAX / 2;
+    let header = |seq, generation| {
+        let bytes = encode_checkpoint(&checkpoint(seq), generation)
+            .unwrap()
+            .bytes;
+        decode(&bytes).unwrap().checkpoint
+    };
+    assert_eq!(header(most, most), Ok(checkpoint(most)));
+    assert_eq!(header(most, most + 1), Err(SnapshotError::Header));
+    assert_eq!(header(u64::MAX, 1), Err(SnapshotError::Header));
+    let encoded = encode_checkpoint(&checkpoint(0), 1).unwrap();
+    for (seq, whole) in [(most, true), (most + 1, false), (u64::MAX, false)] {
+        let entry = Entry::Session(Session::default());
+        let line = encode_record(&Record { seq, entry }, encoded.stamp).unwrap();
+        let decoded = decode(&[encoded.bytes.as_slice(), &line].concat()).unwrap();
+        assert_eq!(
+            (decoded.records.len() == 1, decoded.damaged.is_empty()),
+            (whole, whole)
+        );
+    }
+}

@@ -153,8 +153,12 @@ fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, byte
         expected = begun.saturating_add(1);
     }
     let torn = present.torn.clone();
+    // Above every number that either file bears, whether or not its record could be used: what is
+    // left of a file may lie beside later generations, and must not pass for their records.
+    let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
+    let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
     Found {
-        seq: expected - 1,
+        seq: seen.max(expected - 1),
         generation: previous
             .and_then(generation)
             .max(generation(present))

@@ -245,3 +245,31 @@ fn a_folder_that_cannot_be_made_is_named() {
         "{text}"
     );
 }
+
+#[test]
+fn a_fallback_of_a_later_history_adds_nothing_to_the_next_generation() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 0);
+    let mut copy = fs::read(&path).unwrap();
+    store.begin(&checkpoint(0)).unwrap();
+    for nth in 1..=5 {
+        store.append(&[entry(nth)]).unwrap();
+    }
+    store.begin(&checkpoint(5)).unwrap();
+    drop(store);
+    // An old copy, damaged too, beside the fallback of what came after it.
+    copy[200] ^= 4;
+    fs::write(&path, copy).unwrap();
+    let (mut store, loaded) = Store::open(&path).unwrap();
+    assert!(!loaded.unwrap().damage.is_empty());
+    let restored = checkpoint(store.seq());
+    store.begin(&restored).unwrap();
+    drop(store);
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert_eq!(
+        (loaded.checkpoint, loaded.records),
+        (Some(restored), vec![])
+    );
+    assert!(loaded.exact, "{:?}", loaded.damage);
+}
