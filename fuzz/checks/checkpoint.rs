@@ -1,0 +1,211 @@
+//! What holds of any bytes that are found as a checkpoint.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use rosrescue::master::Master;
+use rosrescue::record::{self, Checkpoint, Entry, Record};
+use rosrescue::session::rebuild;
+use rosrescue::store::{Loaded, Storage, Store};
+use rosrescue::xmlrpc::Call;
+
+/// Parts the present file from its previous generation, which may follow it.
+const PREVIOUS: &[u8] = b"=== previous generation ===\n";
+
+const MAGIC: &str = "# rosrescue checkpoint v1 ";
+const RECORD_START: &[u8] = b"- {seq: ";
+
+/// Loads the bytes as they are, and with all check sums put right, as a fuzzer could never do it.
+pub(crate) fn check(bytes: &[u8]) {
+    let at = position(bytes, PREVIOUS);
+    let (present, previous) = match at {
+        Some(at) => (&bytes[..at], Some(&bytes[at + PREVIOUS.len()..])),
+        None => (bytes, None),
+    };
+    load(present, previous);
+    load(&sealed(present), previous.map(sealed).as_deref());
+}
+
+fn position(bytes: &[u8], what: &[u8]) -> Option<usize> {
+    bytes.windows(what.len()).position(|window| window == what)
+}
+
+/// The file with a first line and with records whose check sums hold.
+fn sealed(bytes: &[u8]) -> Vec<u8> {
+    let Some(end) = bytes.iter().position(|&byte| byte == b'\n') else {
+        return bytes.to_vec();
+    };
+    let (first, rest) = bytes.split_at(end + 1);
+    let Some(fields) = std::str::from_utf8(first)
+        .ok()
+        .and_then(|line| line.strip_prefix(MAGIC))
+    else {
+        return bytes.to_vec();
+    };
+    let field = |name| fields.split(' ').find(|field| field.starts_with(name));
+    let journal = b"\njournal:\n";
+    let length = position(rest, journal).map_or(rest.len(), |at| at + journal.len());
+    let (snapshot, records) = rest.split_at(length);
+    let mut out = format!(
+        "{MAGIC}{} {} snapshot={length} crc32c={:08x} header=",
+        field("generation=").unwrap_or("generation=1"),
+        field("seq=").unwrap_or("seq=0"),
+        crc32c::crc32c(snapshot),
+    )
+    .into_bytes();
+    let stamp = crc32c::crc32c(&out);
+    out.extend_from_slice(format!("{stamp:08x}\n").as_bytes());
+    out.extend_from_slice(snapshot);
+    for line in records.split_inclusive(|&byte| byte == b'\n') {
+        let body = line.windows(2).rposition(|window| window == b" #");
+        match body.and_then(|end| line.get(..end)) {
+            Some(body) if line.starts_with(RECORD_START) && line.ends_with(b"\n") => {
+                let start = out.len();
+                out.extend_from_slice(body);
+                out.extend_from_slice(format!(" #{stamp:08x}").as_bytes());
+                let check = crc32c::crc32c(&out[start..]);
+                out.extend_from_slice(format!(" {check:08x}\n").as_bytes());
+            }
+            _ => out.extend_from_slice(line),
+        }
+    }
+    out
+}
+
+/// Panics if loading does, or if what was loaded is not what comes back when it is written.
+fn load(present: &[u8], previous: Option<&[u8]>) {
+    if let Ok(decoded) = record::decode(present) {
+        decoded.records.iter().for_each(check_record);
+    }
+    let path = Path::new("/c/latest-chkpt.yaml");
+    let memory = Memory::default();
+    memory.put(path, present);
+    if let Some(previous) = previous {
+        memory.put(Path::new("/c/latest-chkpt.yaml.previous"), previous);
+    }
+    let Ok((mut store, Some(loaded))) = Store::open_on(memory.clone(), path) else {
+        return;
+    };
+    let Loaded {
+        checkpoint,
+        records,
+        ..
+    } = loaded;
+    let (mirror, session, _) = rebuild(checkpoint, records.clone());
+    let snapshot = mirror.snapshot();
+    assert_eq!(Master::from_snapshot(snapshot.clone()), Ok(mirror));
+
+    let expected = Checkpoint {
+        seq: store.seq(),
+        session: session.unwrap_or_default(),
+        snapshot,
+    };
+    store
+        .begin(&expected)
+        .expect("what was loaded can be written");
+    let call = Call::new("deleteParam", vec!["/n".into(), "/p".into()]);
+    let entries = [Entry::Call(call), Entry::Session(expected.session.clone())];
+    store.append(&entries).expect("records can follow it");
+    drop(store);
+
+    let (store, loaded) = Store::open_on(memory, path).expect("our own file can be opened");
+    let loaded = loaded.expect("our own file is there");
+    assert!(loaded.exact && loaded.torn.is_none(), "{loaded:?}");
+    assert_eq!(loaded.damage, Vec::<String>::new());
+    assert_eq!(store.seq(), expected.seq + 2);
+    assert_eq!(loaded.checkpoint, Some(expected));
+    let found: Vec<_> = loaded.records.into_iter().map(|it| it.entry).collect();
+    assert_eq!(found, entries);
+}
+
+fn check_record(record: &Record) {
+    let fresh = record::encode_checkpoint(&Checkpoint::default(), 1).expect("an empty state");
+    let line = record::encode_record(record, fresh.stamp).expect("what was read can be written");
+    let again = record::decode(&[fresh.bytes, line].concat()).expect("our own file");
+    assert_eq!(again.records.as_slice(), std::slice::from_ref(record));
+}
+
+type File = Arc<Mutex<Vec<u8>>>;
+
+/// A disk that never fails and forgets nothing.
+#[derive(Clone, Default)]
+struct Memory(Arc<Mutex<BTreeMap<PathBuf, File>>>);
+
+impl Memory {
+    fn put(&self, path: &Path, bytes: &[u8]) {
+        let file = Arc::new(Mutex::new(bytes.to_vec()));
+        self.0.lock().unwrap().insert(path.to_owned(), file);
+    }
+
+    fn file(&self, path: &Path) -> io::Result<File> {
+        let files = self.0.lock().unwrap();
+        let file = files.get(path).cloned();
+        file.ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+}
+
+impl Storage for Memory {
+    type File = File;
+    type Lock = ();
+
+    fn locate(&self, path: &Path) -> io::Result<PathBuf> {
+        Ok(path.to_owned())
+    }
+
+    fn lock(&self, _: &Path) -> io::Result<Result<(), Option<u32>>> {
+        Ok(Ok(()))
+    }
+
+    fn read(&self, path: &Path, _: u64) -> io::Result<Vec<u8>> {
+        Ok(self.file(path)?.lock().unwrap().clone())
+    }
+
+    fn create(&self, path: &Path) -> io::Result<File> {
+        self.put(path, b"");
+        self.file(path)
+    }
+
+    fn append(&self, file: &File, bytes: &[u8]) -> io::Result<usize> {
+        file.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn sync(&self, _: &File) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let file = self.file(from)?;
+        let mut files = self.0.lock().unwrap();
+        files.remove(from);
+        files.insert(to.to_owned(), file);
+        Ok(())
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<bool> {
+        let file = self.file(from)?;
+        self.0.lock().unwrap().insert(to.to_owned(), file);
+        Ok(true)
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        let removed = self.0.lock().unwrap().remove(path);
+        removed
+            .map(drop)
+            .ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+
+    fn sync_dir(&self, _: &Path) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn list(&self, folder: &Path) -> io::Result<Vec<String>> {
+        let files = self.0.lock().unwrap();
+        let within = files.keys().filter(|path| path.starts_with(folder));
+        Ok(within
+            .filter_map(|path| Some(path.file_name()?.to_str()?.to_owned()))
+            .collect())
+    }
+}

@@ -1,0 +1,88 @@
+//! What holds of any bytes that come as XML-RPC.
+
+use rosrescue::master::{self, Master};
+use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_call, encode_reply};
+
+/// Panics if decoding does, or if what was decoded is not what comes out of its own encoding.
+pub(crate) fn check(bytes: &[u8]) {
+    if let Ok(call) = decode_call(bytes) {
+        assert_eq!(decode_call(&encode_call(&call)), Ok(call.clone()));
+        // Whatever it is, the mirror has an answer to it, and the answer can be sent.
+        master::kind(&call);
+        let mut mirror = Master::default();
+        let reply = mirror.apply(&call).reply;
+        master::accepted(&Master::default(), &call, &reply);
+        assert!(decode_reply(&encode_reply(&reply)).is_ok(), "{reply:?}");
+        assert_eq!(
+            Master::from_snapshot(mirror.snapshot()).as_ref(),
+            Ok(&mirror)
+        );
+    }
+    if let Ok(reply) = decode_reply(bytes) {
+        check_reply(&reply);
+    }
+}
+
+fn check_reply(reply: &Reply) {
+    let again = decode_reply(&encode_reply(reply));
+    match reply {
+        Reply::Fault { text, .. } if is_kept(text) => assert_eq!(again.as_ref(), Ok(reply)),
+        Reply::Fault { .. } => assert!(again.is_ok()),
+        Reply::Value(value) => {
+            // As a parameter it is written in our own form, which keeps everything.
+            let call = Call::new("m", vec![value.clone()]);
+            assert_eq!(decode_call(&encode_call(&call)), Ok(call));
+            match form(value, 1) {
+                Form::Kept => assert_eq!(again.as_ref(), Ok(reply)),
+                Form::Altered => assert!(again.is_ok()),
+                Form::Refused => assert!(matches!(again, Ok(Reply::Fault { code: 1, .. }))),
+                Form::Spoiled => {}
+            }
+        }
+    }
+}
+
+/// What becomes of a value in a reply, which is written as CPython writes it; the later the worse.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+enum Form {
+    /// It arrives as it is.
+    Kept,
+    /// A carriage return arrives as a line feed.
+    Altered,
+    /// A date that holds markup: CPython does not escape it.
+    Spoiled,
+    /// CPython does not write it.
+    Refused,
+}
+
+fn form(value: &Value, level: usize) -> Form {
+    match value {
+        Value::Nil | Value::BigInt(_) => Form::Refused,
+        // From here on CPython is near its recursion limit, and may or may not write it.
+        _ if level > 480 => Form::Spoiled,
+        Value::String(text) if !is_kept(text) => Form::Altered,
+        Value::DateTime(text) if text.contains(['&', '<', '>', '\r']) => Form::Spoiled,
+        Value::Array(elements) => elements
+            .iter()
+            .map(|element| form(element, level + 1))
+            .max()
+            .unwrap_or(Form::Kept),
+        Value::Struct(members) => members
+            .iter()
+            .map(|(name, member)| {
+                let name = if is_kept(name) {
+                    Form::Kept
+                } else {
+                    Form::Altered
+                };
+                form(member, level + 1).max(name)
+            })
+            .max()
+            .unwrap_or(Form::Kept),
+        _ => Form::Kept,
+    }
+}
+
+fn is_kept(text: &str) -> bool {
+    !text.contains('\r')
+}
