@@ -8,7 +8,7 @@ use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
     Method, Request, Response, StatusCode,
     body::{Body, Incoming},
-    header::{CONTENT_ENCODING, CONTENT_TYPE, SERVER},
+    header::{CONTENT_ENCODING, CONTENT_TYPE, SERVER, USER_AGENT},
 };
 use thiserror::Error;
 use tokio::sync::{SemaphorePermit, oneshot};
@@ -42,6 +42,12 @@ const SMALL_BODY: usize = 64 << 10;
 /// A master that takes longer to say its process id is answered for: roslaunch waits 5 s for that,
 /// and then starts a master of its own on our port.
 const IDENTITY_TIME: Duration = Duration::from_secs(1);
+/// How long a `setParam` of roscpp is held. `ros::param::set` keeps a lock until the master answers, and
+/// says that it failed under that lock: if another thread of the node has said anything meanwhile, the
+/// two wait for each other for ever. It has no time limit of its own.
+const ROSCPP_SET_PARAM_HOLD: Duration = Duration::from_secs(24 * 3600);
+/// What roscpp calls itself.
+const ROSCPP: &[u8] = b"XMLRPC++";
 /// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
 const BODY_TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
@@ -101,6 +107,10 @@ async fn post(
     if let Err(refusal) = door::check_post(request.headers(), &proxy.names) {
         return Ok(refuse(&proxy, peer, &refusal));
     }
+    let roscpp = request
+        .headers()
+        .get(USER_AGENT)
+        .is_some_and(|agent| agent.as_bytes().starts_with(ROSCPP));
     let head = Head {
         path: request.uri().to_string(),
         encoding: request.headers().get(CONTENT_ENCODING).cloned(),
@@ -132,13 +142,18 @@ async fn post(
         proxy.stats.undecoded.count();
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
     }
-    answer(&proxy, peer, pace, head, body, call).await
+    let hold = match &call {
+        Some(call) if roscpp && call.method == "setParam" => ROSCPP_SET_PARAM_HOLD,
+        _ => proxy.config.hold,
+    };
+    answer(&proxy, peer, pace, hold, head, body, call).await
 }
 
 async fn answer(
     proxy: &Arc<Proxy>,
     peer: SocketAddr,
     pace: &Pace,
+    hold: Duration,
     head: Head,
     body: Bytes,
     call: Option<Call>,
@@ -175,7 +190,7 @@ async fn answer(
                 attempts: 0,
             };
             proxy.lane.submit(item).await;
-            await_lane(proxy, pace, rx).await
+            await_lane(proxy, pace, hold, rx).await
         }
     }
 }
@@ -235,6 +250,7 @@ async fn read(
 async fn await_lane(
     proxy: &Arc<Proxy>,
     pace: &Pace,
+    hold: Duration,
     mut answered: oneshot::Receiver<Answer>,
 ) -> Result<HttpReply, Closed> {
     let mut gate = proxy.gate.clone();
@@ -254,7 +270,7 @@ async fn await_lane(
             Ok(Answer::Made(reply)) => Ok(xml(&reply)),
             Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
         },
-        () = gate.shut_for(proxy.config.hold) => {
+        () = gate.shut_for(hold) => {
             proxy.stats.hold_expired.count();
             Err(Closed("the master did not come back in time, see --hold"))
         }

@@ -10,6 +10,9 @@
     called N                service server: the Nth call was answered
     reply NAME              service client: the server that calls itself NAME answered
     value JSON              parameter user: what the cached parameter is now (null if unset)
+    reads N                 parameter reader: N times it was read
+    done WHAT               late node: it has got through
+    again TEXT              late node: its user has to make the call again
     failed TEXT             something that should have worked did not
 
 The roscpp nodes say the same (lines.h). `tests/support/node.rs` reads it.

@@ -61,7 +61,7 @@ impl Robot {
             master_port,
             scratch,
         };
-        if mode == Mode::Core {
+        if mode == Mode::Core && !options.contains(&"--no-rosout") {
             eventually("rosout is at work", || {
                 State::try_read(&robot.bare()).is_ok_and(|state| state.knows("/rosout"))
             });

@@ -113,6 +113,15 @@ impl State {
         rest
     }
 
+    /// This state with the parameters of another.
+    pub(crate) fn with_params_of(&self, other: &Self) -> Self {
+        Self {
+            params: other.params.clone(),
+            param_names: other.param_names.clone(),
+            ..self.clone()
+        }
+    }
+
     /// Whether `node` has any registration.
     pub(crate) fn knows(&self, node: &str) -> bool {
         self.nodes.iter().any(|(name, _)| name == node)

@@ -1,0 +1,61 @@
+#!/usr/bin/python3
+"""At SIGUSR1 it publishes, subscribes, offers a service and sets a parameter, all at the same time, and says
+when each is done. It says `again` when a call fails that its user has to make again.
+"""
+
+import signal
+import threading
+import time
+
+import rospy
+from roscpp.srv import GetLoggers, GetLoggersResponse
+from std_msgs.msg import String
+
+from lines import say
+
+kept = []
+
+
+def set_param():
+    """rospy tells its user of a failure, and does not try again itself."""
+    while not rospy.is_shutdown():
+        try:
+            return rospy.set_param("~late", 1)
+        except Exception as error:
+            say("again", type(error).__name__, error)
+            time.sleep(0.2)
+
+
+STEPS = {
+    "set": set_param,
+    "publish": lambda: kept.append(rospy.Publisher("~published", String, queue_size=1)),
+    "subscribe": lambda: kept.append(rospy.Subscriber("~subscribed", String, lambda _message: None)),
+    "offer": lambda: kept.append(rospy.Service("~offered", GetLoggers, lambda _request: GetLoggersResponse([]))),
+}
+
+
+def step(name):
+    """Does one of the steps."""
+    try:
+        STEPS[name]()
+        say("done", name)
+    except Exception as error:
+        say("failed", name, type(error).__name__, error)
+
+
+def start(_signal, _frame):
+    """Does all of them."""
+    for name in STEPS:
+        threading.Thread(target=step, args=(name,), daemon=True).start()
+
+
+def main():
+    rospy.init_node("late")
+    signal.signal(signal.SIGUSR1, start)
+    say("ready", rospy.get_name())
+    while not rospy.is_shutdown():
+        time.sleep(0.05)
+
+
+if __name__ == "__main__":
+    main()

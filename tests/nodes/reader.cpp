@@ -1,0 +1,31 @@
+// Reads a parameter again and again with a default that it should never get, from before it is registered.
+// Usage: reader KEY
+#include <thread>
+
+#include <ros/ros.h>
+
+#include "lines.h"
+
+static void read_all_the_time(const std::string& key)
+{
+  for (unsigned long count = 1;; ++count)
+  {
+    int value = -1;
+    ros::param::param(key, value, -1);
+    if (value == -1)
+      say("failed it got its default");
+    if (count % 10 == 0)
+      say("reads " + std::to_string(count));
+    ros::WallDuration(0.02).sleep();
+  }
+}
+
+int main(int argc, char** argv)
+{
+  ros::init(argc, argv, "reader");
+  std::thread(read_all_the_time, std::string(argv[1])).detach();
+  ros::NodeHandle node;
+  say("ready " + ros::this_node::getName());
+  ros::spin();
+  std::_Exit(0);
+}

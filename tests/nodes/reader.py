@@ -1,0 +1,43 @@
+#!/usr/bin/python3
+"""Reads a parameter again and again with a default that it should never get. Usage: reader.py KEY
+
+It begins before it is a node: a held registration blocks every other call of a rospy process.
+"""
+
+import rospy
+
+from lines import say
+
+DEFAULT = -1
+
+
+def read(key, count):
+    """Reads once and says how often it has."""
+    try:
+        value = rospy.get_param(key, DEFAULT)
+        if value == DEFAULT or rospy.has_param("/not/there"):
+            say("failed", "it got its default")
+    except Exception as error:  # what a node would die of must be seen by the test
+        say("failed", type(error).__name__, error)
+    if count % 10 == 0:
+        say("reads", count)
+
+
+def main():
+    key = rospy.myargv()[1]
+    for count in range(1, 21):
+        read(key, count)
+    rospy.init_node("reader")
+    say("ready", rospy.get_name())
+    rate = rospy.Rate(50)
+    while not rospy.is_shutdown():
+        count += 1
+        read(key, count)
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            break
+
+
+if __name__ == "__main__":
+    main()

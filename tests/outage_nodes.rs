@@ -1,0 +1,242 @@
+//! What real nodes and tools meet while there is no master: those that read, those that begin and end
+//! meanwhile, and those whose calls are held for longer than a call is held.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::time::{Duration, Instant};
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+use support::{Library, Mode, Node, Process, Robot, Tool, eventually, holds, ros_command};
+
+const LIBRARIES: [(Library, &str); 2] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
+
+/// Starts a node of each library, named with its suffix, and does not wait for it.
+fn spawn_both(robot: &Robot, node: &str, name: &str, arguments: &[&str]) -> [Node; 2] {
+    LIBRARIES.map(|(library, suffix)| {
+        let name = format!("__name:={name}_{suffix}");
+        robot.spawn_node(library, node, &[arguments, &[name.as_str()]].concat())
+    })
+}
+
+fn await_ready(nodes: &mut [Node]) {
+    for node in nodes {
+        node.wait_line("`ready`", |line| line.starts_with("ready "));
+    }
+}
+
+/// A node whose `getParam` fails goes on with its default, and a robot drives with the wrong gains.
+#[test]
+fn whoever_reads_notices_nothing() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let mut readers = spawn_both(&robot, "reader", "reader", &["/gain"]);
+    let mut others = spawn_both(&robot, "server", "server", &[]);
+    await_ready(&mut readers);
+    await_ready(&mut others);
+    let count = |node: &Node| node.said("reads").last().map_or(0, |n| n.parse().unwrap());
+    let read_on = |nodes: &[Node], more: u64| {
+        for node in nodes {
+            let before: u64 = count(node);
+            eventually("a node reads on", || count(node) >= before + more);
+        }
+    };
+    let listings: [&[&str]; 6] = [
+        &["rosnode", "list"],
+        &["rosnode", "info", "/server_cpp"],
+        &["rostopic", "list", "-v"],
+        &["rosservice", "list"],
+        &["rosparam", "list"],
+        &["rosparam", "get", "/gain"],
+    ];
+    let list = |robot: &Robot| {
+        listings.map(|run| {
+            let tool = Tool::run(&robot.scratch, robot.port(), run[0], &run[1..]);
+            assert!(tool.status.success(), "{run:?}: {}", tool.stderr);
+            assert!(!tool.stdout.is_empty(), "{run:?}");
+            tool.stdout
+        })
+    };
+    let before = robot.settled_state();
+    let listed = list(&robot);
+    let dead = robot.master_pid();
+
+    robot.kill_master();
+    read_on(&readers, 50);
+    let mut late = spawn_both(&robot, "reader", "late", &["/gain"]);
+    for node in &late {
+        eventually("a node that starts reads its parameters", || {
+            count(node) >= 20
+        });
+    }
+    assert_eq!(listed, list(&robot), "what the tools say");
+    let mut command = ros_command(&robot.scratch, "rosparam", robot.port());
+    let mut setting = Process::start("rosparam set", command.args(["set", "/gain", "8"]));
+    assert!(holds(Duration::from_secs(1), || setting.exited().is_none()));
+    for node in &late {
+        assert_eq!(
+            node.said("ready"),
+            Vec::<String>::new(),
+            "nobody registers without a master"
+        );
+    }
+    read_on(&readers, 50);
+
+    robot.revive_master();
+    robot.await_recovery(dead);
+    assert_eq!(setting.wait().code(), Some(0));
+    assert_eq!(robot.bare().param("/gain"), Some(Value::Int(8)));
+    await_ready(&mut late);
+    read_on(&readers, 20);
+    read_on(&late, 20);
+    for node in readers.iter().chain(&late) {
+        assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
+    }
+    let now = robot.settled_state();
+    let now = now.without_node("/late_py").without_node("/late_cpp");
+    assert_eq!(before.nodes, now.nodes);
+    assert_eq!(before.publishers, now.publishers);
+    assert_eq!(before.services, now.services);
+}
+
+/// Calls that are held longer than `--hold` are closed, and made again by who made them.
+#[test]
+fn calls_get_through_after_twenty_seconds_without_a_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let mut nodes = spawn_both(&robot, "late", "late", &[]);
+    await_ready(&mut nodes);
+    robot.settled_state();
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+    for node in &nodes {
+        node.signal(Signal::USR1);
+    }
+    assert!(holds(Duration::from_secs(20), || nodes.iter().all(
+        |node| node.said("done").is_empty() && node.said("failed").is_empty()
+    )));
+    assert!(
+        robot.counter("hold_expired") > 0,
+        "no call was held for too long"
+    );
+    robot.revive_master();
+    robot.await_recovery(dead);
+    for node in &nodes {
+        eventually("everything has got through", || {
+            let mut done = node.said("done");
+            done.sort();
+            done == ["offer", "publish", "set", "subscribe"]
+        });
+        assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
+        println!("{:?}", node.said("again"));
+    }
+    // roscpp's users never hear of it.
+    assert_eq!(nodes[1].said("again"), Vec::<String>::new());
+    let (state, bare) = (robot.state(), robot.bare());
+    for (_, suffix) in LIBRARIES {
+        let name = format!("/late_{suffix}");
+        assert_eq!(
+            state.publishers_of(&format!("{name}/published")),
+            [name.as_str()]
+        );
+        assert_eq!(
+            state.subscribers_of(&format!("{name}/subscribed")),
+            [name.as_str()]
+        );
+        let offered = (format!("{name}/offered"), vec![name.clone()]);
+        assert!(state.services.contains(&offered), "{state}");
+        assert_eq!(bare.param(&format!("{name}/late")), Some(Value::Int(1)));
+    }
+}
+
+/// What a node says for itself when it starts waits for the master; a node that ends before that is not
+/// registered after its end.
+#[test]
+fn nodes_that_start_and_end_without_a_master_leave_nothing() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let mut leaving = spawn_both(&robot, "talker", "leaving", &[]);
+    let mut staying = spawn_both(&robot, "listener", "staying", &[]);
+    await_ready(&mut leaving);
+    await_ready(&mut staying);
+    for node in &staying {
+        node.wait_messages("/leaving_py", 5);
+        node.wait_messages("/leaving_cpp", 5);
+    }
+    let before = robot.settled_state();
+    let after = before
+        .without_node("/leaving_py")
+        .without_node("/leaving_cpp");
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+
+    // A node that is there and ends says so at once, and is believed.
+    for node in &mut leaving {
+        let start = Instant::now();
+        node.signal(Signal::INT);
+        node.wait();
+        assert!(
+            start.elapsed() < Duration::from_secs(20),
+            "{:?}",
+            start.elapsed()
+        );
+    }
+    let now = support::State::read(&robot.client());
+    assert!(
+        !now.knows("/leaving_py") && !now.knows("/leaving_cpp"),
+        "{now}"
+    );
+
+    // Nodes that are not there yet are killed, or asked to end, while their registrations are parked.
+    let mut brief = [
+        spawn_both(&robot, "talker", "killed", &[]),
+        spawn_both(&robot, "talker", "ended", &[]),
+    ];
+    let names = ["/killed_py", "/killed_cpp", "/ended_py", "/ended_cpp"];
+    eventually("their registrations wait", || {
+        let status = robot.status().expect("a status page");
+        let clients = status["clients"].as_array().unwrap();
+        names
+            .iter()
+            .all(|name| clients.iter().any(|client| client["caller_id"] == *name))
+    });
+    for (nodes, signal) in brief.iter_mut().zip([Signal::KILL, Signal::INT]) {
+        for node in nodes {
+            node.signal(signal);
+        }
+    }
+    // rospy runs its signal handler within the call that is held, where it waits for that call's own lock:
+    // such a node ends as roslaunch ends it.
+    let [killed, [ended_py, ended_cpp]] = &mut brief;
+    assert!(holds(Duration::from_secs(1), || ended_py
+        .exited()
+        .is_none()));
+    ended_py.signal(Signal::KILL);
+    for node in killed.iter_mut().chain([&mut *ended_py]) {
+        node.wait();
+    }
+    robot.revive_master();
+    robot.await_recovery(dead);
+    ended_cpp.wait();
+    robot.await_state(&after_types(&after, &robot), "when all have ended");
+    assert!(holds(Duration::from_secs(2), || {
+        let now = robot.state();
+        names.iter().all(|name| !now.knows(name))
+    }));
+}
+
+/// `state` with the topic types that the master holds now: a node that ended may have left one.
+fn after_types(state: &support::State, robot: &Robot) -> support::State {
+    support::State {
+        topic_types: robot.state().topic_types,
+        ..state.clone()
+    }
+}
