@@ -111,6 +111,7 @@ fn whoever_reads_notices_nothing() {
 #[test]
 fn calls_get_through_after_twenty_seconds_without_a_master() {
     let mut robot = Robot::start(Mode::Proxy);
+    robot.client().set_param("/gain", 7);
     let mut nodes = spawn_both(&robot, "late", "late", &[]);
     await_ready(&mut nodes);
     robot.settled_state();
@@ -120,9 +121,11 @@ fn calls_get_through_after_twenty_seconds_without_a_master() {
     for node in &nodes {
         node.signal(Signal::USR1);
     }
-    assert!(holds(Duration::from_secs(20), || nodes.iter().all(
-        |node| node.said("done").is_empty() && node.said("failed").is_empty()
-    )));
+    // roscpp reads a parameter that it cannot subscribe to without its cache: the value is right.
+    let quiet = |node: &Node| {
+        node.said("failed").is_empty() && node.said("done").iter().all(|done| done == "read")
+    };
+    assert!(holds(Duration::from_secs(20), || nodes.iter().all(quiet)));
     assert!(
         robot.counter("hold_expired") > 0,
         "no call was held for too long"
@@ -133,7 +136,7 @@ fn calls_get_through_after_twenty_seconds_without_a_master() {
         eventually("everything has got through", || {
             let mut done = node.said("done");
             done.sort();
-            done == ["offer", "publish", "set", "subscribe"]
+            done == ["offer", "publish", "read", "set", "subscribe"]
         });
         assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
         println!("{:?}", node.said("again"));

@@ -1,7 +1,30 @@
 //! What the benches share.
 
 pub(crate) mod machine;
+#[allow(dead_code, reason = "not every bench compares with it")]
 pub(crate) mod second;
 
 #[path = "../../tests/support/mod.rs"]
 pub(crate) mod support;
+
+use clap::{Args, Parser};
+
+/// The options of a bench, and what Cargo adds to them.
+#[derive(Debug, Parser)]
+struct Arguments<T: Args> {
+    #[command(flatten)]
+    options: T,
+    /// What `cargo bench` passes
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+/// What `bench` is to measure; nothing if it runs as a test.
+pub(crate) fn options<T: Args>(bench: &str) -> Option<T> {
+    let arguments = Arguments::<T>::parse();
+    if !arguments.bench {
+        println!("nothing is measured in a test; run `cargo bench --bench {bench}`");
+        return None;
+    }
+    Some(arguments.options)
+}

@@ -20,7 +20,7 @@ mod robot;
 mod shared;
 mod table;
 
-use clap::Parser;
+use clap::Args;
 
 use crate::{
     robot::{Kind, Robot},
@@ -31,7 +31,7 @@ use crate::{
 const KILLS_A_LIFE: usize = 5;
 
 /// Measures the paper's Table 1 with the real rosmaster.
-#[derive(Debug, Parser)]
+#[derive(Debug, Args)]
 struct Options {
     /// Numbers of nodes
     #[arg(long, value_name = "COUNT,…", value_delimiter = ',')]
@@ -43,17 +43,12 @@ struct Options {
     /// Kills for each number of real rospy nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     real: usize,
-    /// What `cargo bench` passes
-    #[arg(long, hide = true)]
-    bench: bool,
 }
 
 fn main() {
-    let options = Options::parse();
-    if !options.bench {
-        println!("nothing is measured in a test; run `cargo bench --bench table1`");
+    let Some(options) = shared::options::<Options>("table1") else {
         return;
-    }
+    };
     let kinds = [
         (Kind::Synthetic, options.synthetic),
         (Kind::Real, options.real),

@@ -21,7 +21,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use clap::Parser;
+use clap::Args;
 use rosrescue::xmlrpc::Value;
 
 use crate::shared::{
@@ -31,7 +31,7 @@ use crate::shared::{
 };
 
 /// Compares rosrescue with a bare rosmaster.
-#[derive(Debug, Parser)]
+#[derive(Debug, Args)]
 struct Options {
     /// Numbers of connections at the same time
     #[arg(long, value_name = "COUNT,…", value_delimiter = ',', default_values_t = [1, 8, 64])]
@@ -42,17 +42,12 @@ struct Options {
     /// Length of a turn in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 1.0)]
     seconds: f64,
-    /// What `cargo bench` passes
-    #[arg(long, hide = true)]
-    bench: bool,
 }
 
 fn main() {
-    let options = Options::parse();
-    if !options.bench {
-        println!("nothing is measured in a test; run `cargo bench --bench throughput`");
+    let Some(options) = shared::options::<Options>("throughput") else {
         return;
-    }
+    };
     let scratch = Scratch::new();
     let master_port = free_port();
     let rescue = Setup::core(&scratch, master_port).start();

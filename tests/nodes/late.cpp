@@ -1,5 +1,5 @@
-// At SIGUSR1 it publishes, subscribes, offers a service and sets a parameter, all at the same time, and says
-// when each is done. roscpp itself tries again what fails.
+// At SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into
+// its cache, all at the same time, and says when each is done. roscpp itself tries again what fails.
 #include <atomic>
 #include <csignal>
 #include <functional>
@@ -49,6 +49,7 @@ int main(int argc, char** argv)
       step("publish", [&] { return bool(publisher = node.advertise<std_msgs::String>("published", 1)); });
       step("subscribe", [&] { return bool(subscriber = node.subscribe("subscribed", 1, on_message)); });
       step("offer", [&] { return bool(server = node.advertiseService("offered", answer)); });
+      step("read", [&] { int gain = -1; return node.getParamCached("/gain", gain) && gain == 7; });
       step("set", [&] { node.setParam("late", 1); return true; });
     }
     ros::getGlobalCallbackQueue()->callAvailable(ros::WallDuration(0.05));

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""At SIGUSR1 it publishes, subscribes, offers a service and sets a parameter, all at the same time, and says
-when each is done. It says `again` when a call fails that its user has to make again.
+"""At SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into
+its cache, all at the same time, and says when each is done. It says `again` when a call fails that its user has to make again.
 """
 
 import signal
@@ -16,21 +16,28 @@ from lines import say
 kept = []
 
 
-def set_param():
-    """rospy tells its user of a failure, and does not try again itself."""
+def insist(call):
+    """rospy tells the user of these calls of a failure, and does not try again itself."""
     while not rospy.is_shutdown():
         try:
-            return rospy.set_param("~late", 1)
+            return call()
         except Exception as error:
             say("again", type(error).__name__, error)
             time.sleep(0.2)
 
 
+def read_gain():
+    """Fails unless it reads what is set."""
+    if rospy.get_param_cached("/gain", None) != 7:
+        say("failed", "it got its default")
+
+
 STEPS = {
-    "set": set_param,
+    "set": lambda: insist(lambda: rospy.set_param("~late", 1)),
     "publish": lambda: kept.append(rospy.Publisher("~published", String, queue_size=1)),
     "subscribe": lambda: kept.append(rospy.Subscriber("~subscribed", String, lambda _message: None)),
     "offer": lambda: kept.append(rospy.Service("~offered", GetLoggers, lambda _request: GetLoggersResponse([]))),
+    "read": lambda: insist(read_gain),
 }
 
 
