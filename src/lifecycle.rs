@@ -8,6 +8,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+mod suspicion;
+
+pub use suspicion::{InFlight, Suspicion, Trial};
+
 /// Deaths older than this no longer count towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);
 /// So many deaths within [`DEATH_MEMORY`] are answered by a new master at once.
@@ -16,6 +20,9 @@ const DEATHS_AT_ONCE: usize = 5;
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause of a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// A master that has served for so long ends a crash loop. One that always lived longer could not
+/// die more than [`DEATHS_AT_ONCE`] times within [`DEATH_MEMORY`].
+const CALM: Duration = Duration::from_secs(10);
 /// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
 /// seconds; a rosmaster whose port was taken stays alive without ever listening.
 const START_LIMIT: Duration = Duration::from_secs(30);
@@ -57,7 +64,10 @@ pub enum Input {
     /// The connection to the master has ended.
     ConnectionLost,
     /// The master holds the whole state.
-    Examined,
+    Examined {
+        /// It is not the incarnation that was served before.
+        new: bool,
+    },
     /// What listens there does not answer as a master does.
     NotAMaster,
     /// The master answered a probe in time.
@@ -122,6 +132,8 @@ pub enum Action {
     Kill,
     /// Say that the master dies again and again; so many deaths within a minute.
     ReportCrashLoop(usize),
+    /// Say that it no longer does.
+    ReportCalm,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -155,6 +167,15 @@ pub struct Lifecycle {
     seeking_since: Option<Instant>,
     /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
     deaths: VecDeque<Instant>,
+    /// How many deaths there have been.
+    total_deaths: u64,
+    /// More than [`DEATHS_AT_ONCE`] within [`DEATH_MEMORY`], and no master has lived for [`CALM`]
+    /// since.
+    crash_loop: bool,
+    /// When the gate was opened; none while it is shut.
+    serving_since: Option<Instant>,
+    /// A master of others has closed its connection, and it is not known yet whether it died.
+    lost: bool,
     missed: u32,
     timer: Option<(Instant, Timer)>,
 }
@@ -169,6 +190,10 @@ impl Lifecycle {
             child: None,
             seeking_since: None,
             deaths: VecDeque::new(),
+            total_deaths: 0,
+            crash_loop: false,
+            serving_since: None,
+            lost: false,
             missed: 0,
             timer: None,
         }
@@ -176,12 +201,19 @@ impl Lifecycle {
 
     /// When to feed [`Input::Wake`]; ask again after every input.
     pub fn deadline(&self) -> Option<Instant> {
-        self.timer.map(|(at, _)| at)
+        let timer = self.timer.map(|(at, _)| at);
+        timer.into_iter().chain(self.calm_at()).min()
     }
 
-    /// Deaths within the last minute.
-    pub fn recent_deaths(&self) -> usize {
-        self.deaths.len()
+    /// When a crash loop will be over, unless the master dies before.
+    fn calm_at(&self) -> Option<Instant> {
+        let since = self.serving_since.filter(|_| self.crash_loop)?;
+        Some(since + CALM)
+    }
+
+    /// Deaths of masters that were noticed since the start.
+    pub fn deaths(&self) -> u64 {
+        self.total_deaths
     }
 
     /// Takes in what happened at `now`; answers what is to be done, in order.
@@ -205,15 +237,25 @@ impl Lifecycle {
             }
             // It died while it was being examined, or it closes every connection: not in a rush.
             Input::ConnectionLost if self.phase == Phase::Examining => {
-                self.connect_later(now, false)
+                let mut actions = self.connect_later(now, false);
+                if self.supervision == Supervision::Theirs {
+                    actions.extend(self.their_death(now));
+                }
+                actions
             }
-            Input::ConnectionLost => self.lost(now, Cause::ConnectionLost, vec![Action::Connect]),
-            Input::Examined => {
+            Input::ConnectionLost => {
+                self.lost = self.supervision == Supervision::Theirs;
+                self.lost(now, Cause::ConnectionLost, vec![Action::Connect])
+            }
+            Input::Examined { new } => {
+                let died = std::mem::take(&mut self.lost) && new;
                 self.phase = Phase::Serving;
                 self.seeking_since = None;
+                self.serving_since = Some(now);
                 self.missed = 0;
                 self.timer = Some((now + self.probing.interval, Timer::Probe));
-                vec![Action::OpenGate]
+                let report = if died { self.their_death(now) } else { None };
+                std::iter::once(Action::OpenGate).chain(report).collect()
             }
             Input::ProbeAnswered => {
                 self.missed = 0;
@@ -234,6 +276,10 @@ impl Lifecycle {
                 self.child = None;
                 let spawn = self.spawn(now);
                 self.lost(now, Cause::Exited, spawn)
+            }
+            Input::Wake if self.calm_at().is_some_and(|at| at <= now) => {
+                self.crash_loop = false;
+                vec![Action::ReportCalm]
             }
             Input::Wake => match self.timer.take() {
                 Some((at, timer)) if at > now => {
@@ -263,6 +309,7 @@ impl Lifecycle {
 
     fn seek(&mut self, now: Instant) {
         self.phase = Phase::Seeking;
+        self.serving_since = None;
         self.timer = None;
         self.seeking_since.get_or_insert(now);
     }
@@ -291,7 +338,14 @@ impl Lifecycle {
                 // Its end is reported as `Exited`, which spawns the next one.
                 vec![Action::Kill]
             }
-            _ => self.connect_later(now, false),
+            _ => {
+                let mut actions = self.connect_later(now, false);
+                if std::mem::take(&mut self.lost) {
+                    // Whoever closed the connection no longer listens.
+                    actions.extend(self.their_death(now));
+                }
+                actions
+            }
         }
     }
 
@@ -333,6 +387,27 @@ impl Lifecycle {
 
     /// A master has died and is ours to replace.
     fn spawn(&mut self, now: Instant) -> Vec<Action> {
+        self.count_death(now);
+        let pause = self.pause_before_spawn();
+        if pause.is_zero() {
+            self.timer = None;
+            return vec![Action::Spawn];
+        }
+        self.timer = Some((now + pause, Timer::Spawn));
+        vec![Action::ReportCrashLoop(self.deaths.len())]
+    }
+
+    /// A master of others has died. They may start the next one as fast as they like: a crash loop
+    /// is said once.
+    fn their_death(&mut self, now: Instant) -> Option<Action> {
+        self.lost = false;
+        let said = self.crash_loop;
+        self.count_death(now);
+        (self.crash_loop && !said).then_some(Action::ReportCrashLoop(self.deaths.len()))
+    }
+
+    fn count_death(&mut self, now: Instant) {
+        self.total_deaths += 1;
         self.deaths.push_back(now);
         while self
             .deaths
@@ -341,13 +416,7 @@ impl Lifecycle {
         {
             self.deaths.pop_front();
         }
-        let pause = self.pause_before_spawn();
-        if pause.is_zero() {
-            self.timer = None;
-            return vec![Action::Spawn];
-        }
-        self.timer = Some((now + pause, Timer::Spawn));
-        vec![Action::ReportCrashLoop(self.deaths.len())]
+        self.crash_loop |= self.deaths.len() > DEATHS_AT_ONCE;
     }
 
     fn pause_before_spawn(&self) -> Duration {

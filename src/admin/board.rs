@@ -14,6 +14,9 @@ use crate::{
     recovery::{census::Census, report::Report},
 };
 
+/// Most records set aside that are named.
+const SET_ASIDE_MOST: usize = 1000;
+
 /// Where those who recover the master say how it goes.
 #[derive(Debug, Default)]
 pub struct Board {
@@ -25,7 +28,9 @@ pub struct Board {
 struct Inner {
     open: bool,
     crash_loop: bool,
+    deaths: u64,
     recoveries: u64,
+    set_aside: Vec<String>,
     report: Option<Report>,
 }
 
@@ -51,6 +56,19 @@ impl Board {
     /// The master dies again and again, or no longer.
     pub fn set_crash_loop(&self, crash_loop: bool) {
         self.lock().crash_loop = crash_loop;
+    }
+
+    /// So many masters have died.
+    pub fn set_deaths(&self, deaths: u64) {
+        self.lock().deaths = deaths;
+    }
+
+    /// A record has been set aside because each new master died of it.
+    pub fn add_set_aside(&self, record: String) {
+        let set_aside = &mut self.lock().set_aside;
+        if set_aside.len() < SET_ASIDE_MOST {
+            set_aside.push(record);
+        }
     }
 
     /// A master has been examined.
@@ -93,6 +111,11 @@ pub struct Status {
     pub open: bool,
     /// Whether it dies again and again.
     pub crash_loop: bool,
+    /// Masters that have died since the start.
+    pub deaths: u64,
+    /// What was set aside since the start because each new master died of it; kept in files beside
+    /// the checkpoint.
+    pub set_aside: Vec<String>,
     /// The checkpoint file.
     pub checkpoint: String,
     /// Why the state is not recorded; none if all is well.
@@ -125,6 +148,8 @@ impl Status {
             master: proxy.upstream.address().to_string(),
             open: inner.open,
             crash_loop: inner.crash_loop,
+            deaths: inner.deaths,
+            set_aside: inner.set_aside.clone(),
             checkpoint: proxy.config.checkpoint.display().to_string(),
             unprotected,
             state,
@@ -151,6 +176,9 @@ impl fmt::Display for Status {
                 f,
                 "                crash loop: the master dies again and again"
             )?;
+        }
+        if !self.set_aside.is_empty() {
+            writeln!(f, "set aside       {}", self.set_aside.join(", "))?;
         }
         let protection = self.unprotected.as_deref().map_or_else(
             || "protected".to_owned(),

@@ -100,6 +100,18 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
         "masters examined",
         status.recoveries as f64,
     );
+    add(
+        "master_deaths_total",
+        "counter",
+        "masters that have died",
+        status.deaths as f64,
+    );
+    add(
+        "set_aside",
+        "gauge",
+        "records set aside because each new master died of them",
+        status.set_aside.len() as f64,
+    );
     let counts = status.state;
     add("nodes", "gauge", "nodes registered", counts.nodes as f64);
     add("params", "gauge", "parameters set", counts.params as f64);

@@ -5,6 +5,7 @@
 //! * [`Mark`], [`FirstLook`] and [`Salvage`]: recognising a master, and learning the state of an
 //!   unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
+//! * [`Careful`]: the same entry by entry, for masters that die of it.
 //! * [`difference`]: what two states do not have in common, for people.
 //!
 //! Everything follows rosmaster 1.15.15 under Python 3.11, function by function; its quirks are
@@ -12,6 +13,7 @@
 
 mod accepted;
 mod api;
+mod careful;
 mod checks;
 mod difference;
 mod kind;
@@ -33,6 +35,7 @@ mod tests;
 
 pub use accepted::{Accepted, accepted};
 pub use api::Outcome;
+pub use careful::{Careful, Step, Told};
 pub use difference::difference;
 pub use kind::{Kind, kind, registrants};
 pub use look::{FirstLook, NotAMaster};

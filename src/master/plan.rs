@@ -262,7 +262,7 @@ impl Plan {
 
 /// Reads that show everything a master in the target state can show, but for addresses that it was
 /// given in the same call.
-fn reads(model: &Master, found: &Master) -> Vec<Call> {
+pub(super) fn reads(model: &Master, found: &Master) -> Vec<Call> {
     let own = |method| Call::new(method, vec![CALLER_ID.into()]);
     let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
     // A single value that cannot be returned would fault the whole multicall.

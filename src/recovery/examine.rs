@@ -1,7 +1,7 @@
 //! Brings a connected master to the mirror's state, or the mirror to the master's.
 
 use std::{
-    sync::Arc,
+    sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
@@ -9,10 +9,10 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::report::Outcome;
+use super::{report::Outcome, set_aside};
 use crate::{
-    lifecycle::Input,
-    master::{Counts, FirstLook, Master, Plan},
+    lifecycle::{InFlight, Input, Trial},
+    master::{CALLER_ID, Careful, Counts, FirstLook, Master, Plan},
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
@@ -72,12 +72,42 @@ pub struct Examination {
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
+    /// What was set aside because each new master died of it.
+    pub set_aside: Vec<String>,
     /// Where it differs nevertheless.
     pub mismatches: Vec<String>,
     /// How long the look took.
     pub look: Duration,
     /// How long the injection took.
     pub injection: Duration,
+}
+
+/// What the master is at; outlives the examination, which ends with the master.
+#[derive(Clone, Debug, Default)]
+pub struct Progress(Arc<Mutex<InFlight>>);
+
+impl Progress {
+    fn set(&self, at: InFlight) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = at;
+    }
+
+    /// What it was at; nothing from now on.
+    pub fn take(&self) -> InFlight {
+        std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// How an examination is to go.
+#[derive(Debug)]
+pub struct Manner {
+    /// What is known of the master.
+    pub known: Known,
+    /// The injection into an empty master, made ready.
+    pub prepared: Option<JoinHandle<Prepared>>,
+    /// How to inject carefully, if that is to be done.
+    pub trial: Option<Trial>,
+    /// Where to say what the master is at.
+    pub progress: Progress,
 }
 
 /// An injection into an empty master, made ready while the new master starts.
@@ -135,11 +165,10 @@ pub async fn examine(
     proxy: &Arc<Proxy>,
     keeper: &Keeper,
     connection: &mut Connection,
-    known: Known,
-    prepared: Option<JoinHandle<Prepared>>,
+    manner: Manner,
 ) -> Result<Examination, ExamineError> {
     let start = Instant::now();
-    let mut first = match known {
+    let mut first = match manner.known {
         Known::New { pid } => FirstLook::at_new(pid),
         Known::Nothing | Known::ServedIfMarked => first_look(proxy, connection).await?,
     };
@@ -155,13 +184,14 @@ pub async fn examine(
         pid: first.pid(),
         counts: Counts::default(),
         skipped: Vec::new(),
+        set_aside: Vec::new(),
         mismatches: Vec::new(),
         look: start.elapsed(),
         injection: Duration::ZERO,
     };
     if !first.marked() {
-        inject(proxy, connection, first, prepared, start, &mut examination).await?;
-    } else if matches!(known, Known::Nothing) {
+        inject(proxy, connection, first, manner, start, &mut examination).await?;
+    } else if matches!(manner.known, Known::Nothing) {
         let previous = proxy.shadow.with_mirror(Clone::clone);
         let held = second_look(first, connection, &previous).await?;
         proxy.shadow.succeed();
@@ -197,14 +227,14 @@ async fn inject(
     proxy: &Arc<Proxy>,
     connection: &mut Connection,
     first: FirstLook,
-    prepared: Option<JoinHandle<Prepared>>,
+    manner: Manner,
     start: Instant,
     examination: &mut Examination,
 ) -> Result<(), ExamineError> {
     proxy.shadow.succeed();
     let target = || proxy.shadow.with_mirror(Clone::clone);
     let empty = first.is_empty();
-    let ready = match prepared {
+    let ready = match manner.prepared {
         Some(prepared) if empty => prepared.await.ok(),
         _ => None,
     };
@@ -220,6 +250,19 @@ async fn inject(
     } else {
         Outcome::Injected
     };
+    if let Some(trial) = &manner.trial {
+        let progress = &manner.progress;
+        return inject_carefully(
+            proxy,
+            connection,
+            found,
+            trial,
+            progress,
+            start,
+            examination,
+        )
+        .await;
+    }
     let version = proxy.shadow.version();
     let mut next = ready
         .filter(|ready| ready.version == version)
@@ -232,7 +275,9 @@ async fn inject(
             complete,
             ..
         } = next;
+        manner.progress.set(InFlight::Whole);
         let raw = within(INJECTION_LIMIT, connection.forward(&Head::default(), body)).await?;
+        manner.progress.take();
         examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
         // The reply is long, and everybody waits: it is decoded only if it differs from the
         // predicted one at all.
@@ -266,6 +311,87 @@ async fn inject(
         if round == ROUNDS {
             proxy.shadow.adopt(found);
         }
+    }
+    Ok(())
+}
+
+/// Injects entry by entry, because masters have died of it.
+async fn inject_carefully(
+    proxy: &Arc<Proxy>,
+    connection: &mut Connection,
+    mut found: Master,
+    trial: &Trial,
+    progress: &Progress,
+    start: Instant,
+    examination: &mut Examination,
+) -> Result<(), ExamineError> {
+    let target = proxy.shadow.with_mirror(Clone::clone);
+    let tested = trial.tested.as_ref().map(|(call, _)| call);
+    for round in 1..=ROUNDS {
+        progress.set(InFlight::NoRecord);
+        let plan = Careful::new(&target, &found, &proxy.mark, &trial.left_out, tested);
+        examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
+        examination.mismatches.clear();
+        let mut index = 0;
+        for step in plan.steps() {
+            if step.tested
+                && let Some((_, age)) = trial.tested
+            {
+                outlive(connection, start, age).await?;
+            }
+            if step.record {
+                progress.set(InFlight::Record {
+                    call: step.call.clone(),
+                    index,
+                    age: start.elapsed(),
+                });
+                index += 1;
+            }
+            let reply = within(INJECTION_LIMIT, connection.call(&step.call)).await?;
+            progress.set(InFlight::NoRecord);
+            if reply != step.predicted {
+                let text = format!("{} was answered otherwise than predicted", step.call.method);
+                examination.mismatches.push(text);
+            }
+        }
+        if examination.mismatches.is_empty() {
+            progress.take();
+            // Only now is it known that the rest is harmless.
+            examination.set_aside = set_aside::set_aside(proxy, plan.left_out());
+            if plan.expected() == &target {
+                pay_owed(proxy, connection).await?;
+            } else {
+                proxy.shadow.adopt(plan.expected().clone());
+            }
+            proxy.stats.injections.count();
+            return Ok(());
+        }
+        tracing::error!(
+            round,
+            mismatches = ?examination.mismatches,
+            "the master differs from what was injected"
+        );
+        let first = first_look(proxy, connection).await?;
+        found = second_look(first, connection, plan.expected()).await?;
+    }
+    progress.take();
+    proxy.shadow.adopt(found);
+    Ok(())
+}
+
+/// Waits until the master is of this `age`, and keeps it from closing an idle connection.
+async fn outlive(
+    connection: &mut Connection,
+    start: Instant,
+    age: Duration,
+) -> Result<(), ExamineError> {
+    let sign_of_life = Call::new("getPid", vec![CALLER_ID.into()]);
+    while let Some(rest) = age
+        .checked_sub(start.elapsed())
+        .filter(|rest| !rest.is_zero())
+    {
+        tokio::time::sleep(rest.min(Duration::from_millis(500))).await;
+        within(INJECTION_LIMIT, connection.call(&sign_of_life)).await?;
     }
     Ok(())
 }

@@ -5,6 +5,7 @@ pub mod core_duties;
 pub mod examine;
 pub mod master_process;
 pub mod report;
+mod set_aside;
 
 use std::{
     pin::Pin,
@@ -16,12 +17,12 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use self::{
-    examine::{Examination, ExamineError, Known, Prepared},
+    examine::{Examination, ExamineError, Known, Prepared, Progress},
     master_process::MasterProcess,
     report::{Outage, Outcome, Phases},
 };
 use crate::{
-    lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, Suspicion},
     master::Kind,
     proxy::{
         Proxy,
@@ -60,6 +61,9 @@ pub struct Guard {
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
     prepared: Option<JoinHandle<Prepared>>,
+    suspicion: Suspicion,
+    /// What the master is at while it is examined.
+    progress: Progress,
     outage: Outage,
     /// This process has served a master.
     served: bool,
@@ -91,6 +95,8 @@ impl Guard {
             step: None,
             probe_deadline: None,
             prepared: None,
+            suspicion: Suspicion::default(),
+            progress: Progress::default(),
             outage: Outage::begin(Instant::now(), "start"),
             served: false,
             known: restored,
@@ -112,7 +118,10 @@ impl Guard {
             .is_some_and(MasterProcess::is_remembered);
         let mut input = Input::Start { remembered };
         loop {
-            for action in self.lifecycle.on(Instant::now(), input) {
+            self.suspect(input);
+            let actions = self.lifecycle.on(Instant::now(), input);
+            self.proxy.board.set_deaths(self.lifecycle.deaths());
+            for action in actions {
                 tracing::debug!(?input, ?action, "lifecycle");
                 self.carry_out(action)?;
             }
@@ -123,6 +132,24 @@ impl Guard {
                 Some(news) => news,
                 None => self.next_input(&stop).await,
             };
+        }
+    }
+
+    /// Takes note of what a master died at.
+    fn suspect(&mut self, input: Input) {
+        match input {
+            Input::ConnectionLost | Input::Exited | Input::Unreachable => {
+                let careful = self.suspicion.trial().is_some();
+                self.suspicion.died(self.progress.take());
+                if !careful && self.suspicion.trial().is_some() {
+                    tracing::warn!(
+                        "masters die while they are given the state: it is given entry by entry, \
+                         to find the one that they die of"
+                    );
+                }
+            }
+            Input::NotAMaster => drop(self.progress.take()),
+            _ => {}
         }
     }
 
@@ -168,7 +195,9 @@ impl Guard {
                 self.disconnect();
                 // Whatever comes of it: the one before may have gone to a master that died then.
                 let proxy = &self.proxy;
-                self.prepared.get_or_insert_with(|| examine::prepare(proxy));
+                if self.suspicion.trial().is_none() {
+                    self.prepared.get_or_insert_with(|| examine::prepare(proxy));
+                }
                 let proxy = self.proxy.clone();
                 self.step = Some(Box::pin(async move {
                     match proxy.upstream.connect().await {
@@ -183,15 +212,18 @@ impl Guard {
                 };
                 let (proxy, keeper) = (self.proxy.clone(), self.keeper.clone());
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
-                let known = match (self.served, new) {
-                    (true, Some(pid)) => Known::New { pid },
-                    (true, None) => Known::ServedIfMarked,
-                    (false, _) => Known::Nothing,
+                let manner = examine::Manner {
+                    known: match (self.served, new) {
+                        (true, Some(pid)) => Known::New { pid },
+                        (true, None) => Known::ServedIfMarked,
+                        (false, _) => Known::Nothing,
+                    },
+                    prepared: self.prepared.take(),
+                    trial: self.suspicion.trial(),
+                    progress: self.progress.clone(),
                 };
-                let prepared = self.prepared.take();
                 self.step = Some(Box::pin(async move {
-                    let examined =
-                        examine::examine(&proxy, &keeper, &mut connection, known, prepared);
+                    let examined = examine::examine(&proxy, &keeper, &mut connection, manner);
                     let examined = examined.await;
                     Done::Examined(connection, examined)
                 }));
@@ -220,13 +252,23 @@ impl Guard {
             }
             Action::ReportCrashLoop(deaths) => {
                 self.proxy.board.set_crash_loop(true);
-                let words = self.process.as_ref().map(MasterProcess::last_words);
-                tracing::error!(
-                    deaths,
-                    last_words = words.unwrap_or_default(),
-                    "crash loop: the master has died {deaths} times within a minute; it is \
-                     restarted with growing pauses"
-                );
+                match self.process.as_ref().map(MasterProcess::last_words) {
+                    Some(last_words) => tracing::error!(
+                        deaths,
+                        last_words,
+                        "crash loop: the master has died {deaths} times within a minute; it is \
+                         restarted with growing pauses"
+                    ),
+                    None => tracing::error!(
+                        deaths,
+                        "crash loop: the master has died {deaths} times within a minute; whoever \
+                         starts it has its last words"
+                    ),
+                }
+            }
+            Action::ReportCalm => {
+                self.proxy.board.set_crash_loop(false);
+                tracing::info!("the crash loop is over: the master lives");
             }
         }
         Ok(())
@@ -248,8 +290,14 @@ impl Guard {
             }
             Done::Examined(connection, Ok(examination)) => {
                 self.connection = Some(connection);
+                let new = examination.outcome != Outcome::Resumed;
+                if examination.outcome == Outcome::Injected {
+                    self.suspicion.survived();
+                }
+                // Whatever it dies of from now on, it is not the injection.
+                self.progress.take();
                 self.report(examination);
-                Some(Input::Examined)
+                Some(Input::Examined { new })
             }
             Done::Examined(_, Err(error)) => {
                 self.disconnect();
@@ -330,7 +378,6 @@ impl Guard {
         let incarnation = self.proxy.shadow.incarnation();
         self.keeper.set(State::Open { incarnation });
         self.proxy.board.set_open(true);
-        self.proxy.board.set_crash_loop(false);
     }
 
     fn spawn(&mut self) -> Result<(), SupervisorError> {

@@ -62,6 +62,8 @@ pub struct Report {
     pub restored: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
+    /// What was set aside because each new master died of it.
+    pub set_aside: Vec<String>,
     /// Where the master, read back, differs from what was injected. Should be empty.
     pub mismatches: Vec<String>,
     /// Nodes that were found dead and taken out.
@@ -119,6 +121,7 @@ impl Outage {
             },
             restored: examination.counts,
             skipped: examination.skipped,
+            set_aside: examination.set_aside,
             mismatches: examination.mismatches,
             removed: Vec::new(),
             suspects: Vec::new(),
