@@ -50,7 +50,9 @@ impl Patient {
             node.publish(&client, "/camera", "std_msgs/String");
             node.publish(&client, &format!("/topic{i}"), "std_msgs/UInt64");
             node.subscribe(&client, "/camera", "std_msgs/String");
-            node.subscribe(&client, "/nobody", "std_msgs/Bool");
+            if i == 0 {
+                node.subscribe(&client, "/nobody", "std_msgs/Bool");
+            }
             node.offer(&client, &format!("/service{i}"));
             node.watch_param(&client, "/robot");
         }
@@ -236,7 +238,7 @@ fn a_master_that_dies_only_when_it_is_given_the_state() {
 
 #[test]
 fn five_deaths_in_a_row_during_recovery() {
-    for sickness in ["registration 7", "registration 20", "call 12", "call 30"] {
+    for sickness in ["registration 7", "registration 14", "call 12", "call 21"] {
         let patient = Patient::new(&[]);
         let call = {
             let client = patient.client();
@@ -320,14 +322,14 @@ fn a_parameter_that_kills() {
 fn registrations_that_kill() {
     let cases: [(&str, &[&str]); 3] = [
         ("/service1", &["the service `/service1` of `/node1`"]),
-        // The type of the topic goes with those who would bring it.
+        // The type of the topic goes with who would bring it.
         ("/topic0", &["the publisher `/node0` of `/topic0`"]),
         (
             "/nobody",
             &[
                 "the subscriber `/node0` of `/nobody`",
-                "the subscriber `/node1` of `/nobody`",
-                "the subscriber `/node2` of `/nobody`",
+                // It comes before its turn, for the order of the types.
+                "the type of the topic `/nobody`",
             ],
         ),
     ];

@@ -86,24 +86,24 @@ fn state() -> Vec<Call> {
     for i in 0..5 {
         // Addresses of an unusable scheme: nobody can be called back, so nobody is found dead.
         let (node, api) = (format!("/n{i}"), format!("rosrpc://n{i}:1/"));
-        for j in 0..20 {
+        for j in 0..16 {
             add(
                 "registerPublisher",
-                &[&node, &format!("/t{i}_{}", j % 17), "a/B", &api],
+                &[&node, &format!("/t{i}_{}", j % 14), "a/B", &api],
             );
             add(
                 "registerSubscriber",
                 &[&node, &format!("/t{j}_{i}"), "a/B", &api],
             );
         }
-        for j in 0..15 {
+        for j in 0..3 {
             let service_api = format!("rosrpc://n{i}:{j}");
             add(
                 "registerService",
                 &[&node, &format!("/s{i}_{j}"), &service_api, &api],
             );
         }
-        for j in 0..6 {
+        for j in 0..5 {
             add("subscribeParam", &[&node, &api, &format!("/p{j}")]);
         }
     }
@@ -154,7 +154,10 @@ fn at_every_call() {
     ward.live();
     before.assert_same(&State::read(&ward.bare()), "at the end");
     println!("{} calls in an injection", number - LOOK - 1);
-    assert!(number - LOOK > 250, "the injection had only {number} calls");
+    assert!(
+        number - LOOK >= 300,
+        "the injection had only {number} calls"
+    );
     ward.assert_nothing_set_aside();
 }
 
@@ -188,17 +191,17 @@ fn a_record_that_kills_the_masters_of_others() {
     let pid = ward.bare().master_pid().unwrap();
     ward.zygote.kill(pid);
     for _ in 0..4 {
-        ward.die("name /s2_7");
+        ward.die("name /s2_1");
     }
     assert_eq!(status(&client)["crash_loop"], false);
-    let pid = ward.zygote.start(ward.port, "name /s2_7");
+    let pid = ward.zygote.start(ward.port, "name /s2_1");
     ward.await_open(pid);
     let mut after = before.clone();
-    after.services.retain(|(name, _)| name != "/s2_7");
-    after.service_apis.retain(|(name, _)| name != "/s2_7");
+    after.services.retain(|(name, _)| name != "/s2_1");
+    after.service_apis.retain(|(name, _)| name != "/s2_1");
     after.assert_same(&State::read(&ward.bare()), "without the service that kills");
     let status = status(&client);
-    assert_eq!(status["set_aside"][0], "the service `/s2_7` of `/n2`");
+    assert_eq!(status["set_aside"][0], "the service `/s2_1` of `/n2`");
     assert_eq!(status["deaths"], 5);
     assert_eq!(
         status["crash_loop"], false,

@@ -11,7 +11,8 @@
 //! aside without the proof that the rest is harmless.
 //!
 //! Whatever speaks against a suspect clears all: a death in between, or at an entry that has been
-//! survived before. So do more than [`CONVICTED_MOST`] records, since then it is not the records.
+//! survived before. So do records of more than [`CONVICTED_MOST`] topics, services and parameters,
+//! since then it is not the records.
 
 use std::time::Duration;
 
@@ -19,7 +20,7 @@ use crate::xmlrpc::Call;
 
 /// So many masters in a row must have died in an injection before it is done carefully.
 const DEATHS_BEFORE_CARE: u32 = 2;
-/// Most records that are left out at a time.
+/// Records of so many topics, services and parameters are left out at a time, at most.
 pub(super) const CONVICTED_MOST: usize = 5;
 /// How long the pause of a test is at least.
 const PAUSE_LEAST: Duration = Duration::from_millis(250);
@@ -100,7 +101,10 @@ impl Suspicion {
         let before = self.suspect.take();
         if before.as_ref().is_some_and(|of| of.call == suspect.call) {
             self.convicted.push(suspect);
-            if self.convicted.len() > CONVICTED_MOST {
+            let mut subjects: Vec<_> = self.convicted.iter().map(|of| subject(&of.call)).collect();
+            subjects.sort_unstable();
+            subjects.dedup();
+            if subjects.len() > CONVICTED_MOST {
                 self.clear();
             }
             return;
@@ -121,6 +125,16 @@ impl Suspicion {
         self.suspect = None;
         self.convicted.clear();
     }
+}
+
+/// The topic, service or parameter that a call is about.
+fn subject(call: &Call) -> Option<&str> {
+    let index = if call.method == "subscribeParam" {
+        2
+    } else {
+        1
+    };
+    call.params.get(index)?.as_str()
 }
 
 #[cfg(test)]

@@ -370,11 +370,9 @@ fn chance_hardly_ever_condemns() {
 
 #[test]
 fn too_many_records_that_kill_are_no_records() {
-    let target = state([10, 10, 0, 0, 0]);
-    let poison = records(&target)
-        .into_iter()
-        .take(CONVICTED_MOST + 1)
-        .collect();
+    let target = state([2, 0, CONVICTED_MOST + 1, 0, 0]);
+    let mut poison = records(&target);
+    poison.retain(|record| record.method == "registerService");
     let sickness = Sickness::Poison(poison);
     let mut suspicion = Suspicion::default();
     let (_, whole) = lives(&mut suspicion, &target, &sickness, 40);
