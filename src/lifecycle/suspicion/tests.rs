@@ -24,8 +24,8 @@ enum Sickness {
     Poison(Vec<Call>),
     /// The call of this number, whatever it is.
     Count(Counted, usize),
-    /// Its age.
-    Age(Duration),
+    /// Its age, not the same in each life.
+    Age([Duration; 4]),
     /// A call in each life, by its number.
     Chance(Vec<usize>),
     Healthy,
@@ -67,7 +67,7 @@ impl Life<'_> {
             Sickness::Count(Counted::Method(name), most) => {
                 counted(&|call| call.method == *name) == *most
             }
-            Sickness::Age(most) => self.age >= *most,
+            Sickness::Age(most) => self.age >= most[self.number % most.len()],
             Sickness::Chance(numbers) => numbers.get(self.number) == Some(&self.made.len()),
             Sickness::Healthy => false,
         }
@@ -331,11 +331,13 @@ proptest! {
     #[test]
     fn a_master_that_ages_is_never_believed(
         sizes in sizes(),
-        micros in 100_000..140_000_u64,
+        micros in 100_000..110_000_u64,
+        // Some of them are just as much later as the calls take that precede a test.
+        later in [0..1_u64, 0..1, 0..1, 12_700..13_100],
         deaths in 1..12_usize,
     ) {
         let target = state(sizes);
-        let sickness = Sickness::Age(Duration::from_micros(micros));
+        let sickness = Sickness::Age(later.map(|later| Duration::from_micros(micros + later)));
         let mut suspicion = Suspicion::default();
         let (_, whole) = lives(&mut suspicion, &target, &sickness, deaths);
         let whole = whole.or_else(|| lives(&mut suspicion, &target, &Sickness::Healthy, 1).1);
@@ -365,7 +367,7 @@ fn chance_hardly_ever_condemns() {
         let (_, whole) = lives(&mut suspicion, &target, &sickness, 8);
         wrong += usize::from(!whole.expect("a whole life").1.is_empty());
     }
-    assert!(wrong * 50 < runs, "{wrong} of {runs}");
+    assert!(wrong * 100 < runs, "{wrong} of {runs}");
 }
 
 #[test]
