@@ -19,7 +19,7 @@ use crate::{
     cli::Restore,
     clock,
     config::{Config, MasterConfig},
-    master::{Mark, Master},
+    master::{CALLER_ID, Mark, Master},
     proxy::{
         Proxy,
         clients::Clients,
@@ -33,10 +33,10 @@ use crate::{
     },
     record::Session,
     recovery::{
-        Guard,
-        census::{self, Sign},
-        core_duties,
+        Guard, Nodes, core_duties,
         master_process::MasterProcess,
+        node::{self, Sign},
+        nodes,
     },
     ros_env::MasterUri,
     session::{self, Decision, Evidence},
@@ -160,6 +160,7 @@ pub async fn run(
         stats,
         rosout: AtomicU32::new(0),
         board: Board::default(),
+        nodes: Nodes::default(),
         config,
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
@@ -220,6 +221,7 @@ async fn serve(
     }
     tasks.spawn(lane_runner.run(proxy.clone()));
     tasks.spawn(keeper::keep(proxy.clone(), stop.clone()));
+    tasks.spawn(nodes::watch(proxy.clone()));
     let mut guard = tokio::spawn(guard.run(stop.clone()));
     let opening = async {
         proxy.board.first_opening().await;
@@ -361,11 +363,11 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
 
 /// Whether any node of `state` answers.
 async fn any_alive(state: &Master) -> bool {
-    let call = Call::new("getPid", vec!["/rosrescue".into()]);
+    let call = Call::new("getPid", vec![CALLER_ID.into()]);
     let mut questions = JoinSet::new();
     for (_, api) in state.nodes() {
         let (api, call) = (api.to_owned(), call.clone());
-        questions.spawn(async move { census::ask(&api, &call, LIFE_SIGN).await == Sign::Alive });
+        questions.spawn(async move { node::ask(&api, &call, LIFE_SIGN).await == Sign::Alive });
     }
     while let Some(alive) = questions.join_next().await {
         if alive.unwrap_or(false) {

@@ -163,6 +163,16 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub census_timeout: u64,
+    /// How often every node is asked whether it lives, so that one that was killed does not stay
+    /// registered for ever, in seconds; 0 for only after a recovery, as ROS has it
+    #[arg(
+        long,
+        env = "ROSRESCUE_REAP_DEAD_NODES",
+        value_name = "SECONDS",
+        default_value_t = 0.0
+    )]
+    #[arg(allow_negative_numbers = true)]
+    pub reap_dead_nodes: f64,
     /// How often the mirror is compared with the master, for writes that reached it past the proxy,
     /// in seconds; 0 for never (it is compared at each connect and after each doubt anyway)
     #[arg(

@@ -17,7 +17,7 @@ use crate::{
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
-/// File descriptors that clients do not get: the census opens 128 at a time.
+/// File descriptors that clients do not get: census and letters open up to 192 at a time.
 const RESERVED_FILES: u64 = 192;
 
 /// A command line that is well formed and still cannot be meant. Exit status 2.
@@ -85,6 +85,8 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the census.
     pub census_timeout: Duration,
+    /// Pause between two censuses while all is well, if there are to be any.
+    pub reap_interval: Option<Duration>,
     /// Pause between two comparisons of the mirror with the master, if there are to be any.
     pub resync_interval: Option<Duration>,
     /// Connections to the master for reads.
@@ -212,6 +214,12 @@ impl Config {
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
             census_timeout: Duration::from_millis(args.census_timeout),
+            reap_interval: Some(seconds(
+                "--reap-dead-nodes",
+                args.reap_dead_nodes,
+                86_400.0,
+            )?)
+            .filter(|interval| !interval.is_zero()),
             resync_interval: Some(seconds(
                 "--resync-interval",
                 args.resync_interval,

@@ -8,6 +8,7 @@
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
 //! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
+//! * [`census`]: what is to be made of what a node says of itself; who is suspect.
 //! * [`session`]: whether a checkpoint's session goes on.
 //! * [`record`]: the checkpoint's snapshot and records to and from bytes.
 //!
@@ -24,6 +25,7 @@
 
 pub mod admin;
 pub mod app;
+pub mod census;
 pub mod cli;
 pub mod clock;
 pub mod config;

@@ -17,3 +17,13 @@ pub async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
         None => std::future::pending().await,
     }
 }
+
+/// The next tick of an interval; for ever without one. Cancel safe.
+pub async fn tick(interval: &mut Option<tokio::time::Interval>) {
+    match interval {
+        Some(interval) => {
+            interval.tick().await;
+        }
+        None => std::future::pending().await,
+    }
+}

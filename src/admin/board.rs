@@ -78,13 +78,20 @@ impl Board {
         inner.report = Some(report);
     }
 
-    /// What census and healing found after the last recovery.
-    pub fn add_to_report(&self, census: Census, healed: Vec<String>) {
-        if let Some(report) = &mut self.lock().report {
-            report.removed = census.removed;
-            report.suspects = census.suspects;
-            report.healed = healed;
-        }
+    /// What census and healing found after the last recovery. Answers with the whole report.
+    pub fn add_to_report(
+        &self,
+        census: Census,
+        healed: Vec<String>,
+        suspects: Vec<String>,
+    ) -> Option<Report> {
+        let mut inner = self.lock();
+        let report = inner.report.as_mut()?;
+        report.removed = census.removed;
+        report.mended = census.mended;
+        report.suspects = suspects;
+        report.healed = healed;
+        Some(report.clone())
     }
 
     /// The process id of the last master that was examined.
@@ -122,6 +129,8 @@ pub struct Status {
     pub unprotected: Option<String>,
     /// What the mirror holds.
     pub state: Counts,
+    /// Nodes that do not answer now and are not known to be dead.
+    pub suspects: Vec<String>,
     /// Masters examined since the start.
     pub recoveries: u64,
     /// The last one.
@@ -141,6 +150,7 @@ impl Status {
             .map(|(name, _, value)| (name.to_owned(), value.into()));
         let unprotected = proxy.shadow.unprotected();
         let state = proxy.shadow.with_mirror(Master::counts);
+        let suspects = proxy.nodes.suspects(&proxy.shadow);
         let inner = proxy.board.lock();
         Self {
             version: env!("CARGO_PKG_VERSION"),
@@ -153,6 +163,7 @@ impl Status {
             checkpoint: proxy.config.checkpoint.display().to_string(),
             unprotected,
             state,
+            suspects,
             recoveries: inner.recoveries,
             last_recovery: inner.report.clone(),
             clients: proxy.clients.list(),
@@ -186,6 +197,9 @@ impl fmt::Display for Status {
         );
         writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
         writeln!(f, "state           {}", self.state)?;
+        if !self.suspects.is_empty() {
+            writeln!(f, "suspect         {}", self.suspects.join(", "))?;
+        }
         if let Some(report) = &self.last_recovery {
             writeln!(
                 f,
@@ -197,6 +211,7 @@ impl fmt::Display for Status {
                 ("not injected", &report.skipped),
                 ("differs", &report.mismatches),
                 ("removed", &report.removed),
+                ("mended", &report.mended),
                 ("suspect", &report.suspects),
                 ("healed", &report.healed),
             ] {

@@ -30,6 +30,7 @@ mod restore;
 mod salvage;
 mod snapshot;
 mod state;
+mod tell;
 #[cfg(test)]
 mod tests;
 
@@ -45,3 +46,4 @@ pub use plan::{Mismatch, Plan, Skipped};
 pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master, Notice};
+pub use tell::{is_plain_topic, registrant};

@@ -149,7 +149,7 @@ impl LaneRunner {
                 () = gate.changed() => self.retry_at = None,
                 landed = wait::for_some(self.flight.as_mut().map(|flight| &mut flight.landing)) => self.landed(&proxy, landed),
                 () = wait::until(self.retry_at) => self.retry_at = None,
-                () = tick(&mut resync) => self.resync_due = true,
+                () = wait::tick(&mut resync) => self.resync_due = true,
             }
             while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
@@ -182,6 +182,15 @@ impl LaneRunner {
         }
         if self.flight.is_some() || self.retry_at.is_some() {
             return;
+        }
+        // A registration of our own was right when it was sent off; by now the node may have come
+        // back at another address, and must not be shut down for it.
+        while let Some(own) = self.queue.front()
+            && own.raw.is_none()
+            && own.call.as_ref().is_some_and(|call| bumps(proxy, call))
+            && let Some(own) = self.queue.pop_front()
+        {
+            let _ = own.answer.send(Answer::Close);
         }
         let items = if self.resync_due {
             Vec::new()
@@ -331,6 +340,8 @@ impl LaneRunner {
     /// Answers unregistrations from the mirror, unless registrations of the same nodes are under way
     /// before them.
     fn unregister(&mut self, proxy: &Arc<Proxy>) {
+        let parked = self.queue.iter().filter_map(|item| item.call.as_ref());
+        proxy.shadow.note_parked(parked);
         let flying = self.flight.as_ref().map_or(&[][..], |flight| &flight.items);
         let mut busy: BTreeSet<String> = flying.iter().flat_map(LaneItem::registrants).collect();
         let mut waiting = VecDeque::with_capacity(self.queue.len());
@@ -352,13 +363,13 @@ impl LaneRunner {
     }
 }
 
-async fn tick(interval: &mut Option<tokio::time::Interval>) {
-    match interval {
-        Some(interval) => {
-            interval.tick().await;
-        }
-        None => std::future::pending().await,
-    }
+/// Whether the master would shut a node down because of `call`, or of an entry of it.
+fn bumps(proxy: &Proxy, call: &Call) -> bool {
+    let entries = call.entries();
+    proxy.shadow.with_mirror(|mirror| {
+        let mut calls = entries.iter().chain([call]);
+        calls.any(|call| mirror.displaced_by(call).is_some())
+    })
 }
 
 /// One journey. The future owns what it needs, so that dropping it ends it.

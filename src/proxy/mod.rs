@@ -1,5 +1,6 @@
 //! Between the nodes and the master: listener, door, gate, lane, pool, mirror.
 
+pub mod activity;
 pub mod clients;
 pub mod door;
 pub mod gate;
@@ -19,7 +20,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32};
 
 use tokio::sync::Semaphore;
 
-use crate::{admin::Board, config::Config, master::Mark};
+use crate::{admin::Board, config::Config, master::Mark, recovery::Nodes};
 
 /// What every part of the proxy works with.
 pub struct Proxy {
@@ -55,4 +56,6 @@ pub struct Proxy {
     pub rosout: AtomicU32,
     /// What people and monitors are told.
     pub board: Board,
+    /// What is known of the nodes beyond their registrations.
+    pub nodes: Nodes,
 }

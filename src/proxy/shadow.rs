@@ -7,25 +7,19 @@
 use std::{
     collections::HashSet,
     sync::{Mutex, MutexGuard, PoisonError},
-    time::{Duration, Instant},
+    time::Instant,
 };
 
-use indexmap::IndexMap;
 use tokio::sync::{Notify, watch};
 
-use super::stats::Stats;
+use super::{activity::Activity, stats::Stats};
 use crate::{
-    master::{self, Master, Notice},
+    master::{self, Master},
     record::{Checkpoint, Entry, Session},
     store::Store,
     xmlrpc::{Call, Reply},
 };
 
-/// How long before an outage a change may lie whose notices the dead master still owed. Its three
-/// notifier threads can be held up by nodes that cannot be reached.
-const NOTICE_MEMORY: Duration = Duration::from_secs(30);
-/// Topics remembered for that.
-const NOTICE_TOPICS: usize = 4096;
 /// Replies in a log line are cut to so many bytes.
 const LOGGED_REPLY: usize = 300;
 
@@ -49,6 +43,8 @@ pub struct Shadow {
     durable: watch::Sender<u64>,
     /// Wakes the keeper of the checkpoint.
     pub work: Notify,
+    /// Wakes those who tell nodes the news.
+    pub news: Notify,
 }
 
 struct Inner {
@@ -66,8 +62,7 @@ struct Inner {
     /// Unregistrations taken while the gate was shut: the same incarnation, should it come back,
     /// has not heard of them.
     owed: Vec<Call>,
-    /// Topics whose publishers changed, and when last.
-    noticed: IndexMap<String, Instant>,
+    activity: Activity,
     diverged: HashSet<String>,
 }
 
@@ -88,7 +83,7 @@ impl Shadow {
             version: 0,
             checkpoint_due: false,
             owed: Vec::new(),
-            noticed: IndexMap::new(),
+            activity: Activity::default(),
             diverged: HashSet::new(),
         };
         Self {
@@ -96,6 +91,7 @@ impl Shadow {
             stats,
             durable: watch::channel(0).0,
             work: Notify::new(),
+            news: Notify::new(),
         }
     }
 
@@ -153,7 +149,7 @@ impl Shadow {
             let accepted = master::accepted(&inner.mirror, call, reply);
             recorded.doubtful |= !accepted.certain;
             for (call, reply) in accepted.calls {
-                let outcome = inner.apply(now, &call);
+                let outcome = inner.apply(now, &call, &self.news);
                 if outcome != reply {
                     recorded.doubtful = true;
                     self.stats.divergences.count();
@@ -174,7 +170,7 @@ impl Shadow {
     /// Records and applies a call of our own before there is any master.
     pub fn seed(&self, call: &Call) {
         let mut inner = self.lock();
-        inner.apply(Instant::now(), call);
+        inner.apply(Instant::now(), call, &self.news);
         inner.append(&[Entry::Call(call.clone())]);
     }
 
@@ -182,7 +178,7 @@ impl Shadow {
     /// master would.
     pub fn unregister(&self, now: Instant, call: &Call) -> Reply {
         let mut inner = self.lock();
-        let reply = inner.apply(now, call);
+        let reply = inner.apply(now, call, &self.news);
         let accepted = master::accepted(&inner.mirror, call, &reply).calls;
         let entries: Vec<_> = accepted
             .iter()
@@ -203,6 +199,7 @@ impl Shadow {
         let mut inner = self.lock();
         inner.incarnation += 1;
         inner.owed.clear();
+        inner.activity.forget_displaced();
     }
 
     /// The incarnation that replies must come from.
@@ -245,15 +242,27 @@ impl Shadow {
         difference
     }
 
-    /// Topics whose publishers changed so shortly before now that a master which died since may
-    /// have owed its subscribers the news.
-    pub fn topics_noticed(&self, now: Instant) -> Vec<String> {
-        let inner = self.lock();
-        let recent = inner
-            .noticed
-            .iter()
-            .filter(|(_, at)| now.duration_since(**at) < NOTICE_MEMORY);
-        recent.map(|(topic, _)| topic.clone()).collect()
+    /// Works with the mirror and what calls did to it of late.
+    pub fn with_activity<T>(&self, work: impl FnOnce(&Master, &mut Activity) -> T) -> T {
+        let mut inner = self.lock();
+        let Inner {
+            mirror, activity, ..
+        } = &mut *inner;
+        work(mirror, activity)
+    }
+
+    /// Calls are parked: which of them take the name of a node at another address?
+    pub fn note_parked<'a>(&self, calls: impl Iterator<Item = &'a Call>) {
+        let mut inner = self.lock();
+        let mut new = false;
+        for call in calls {
+            if let Some((node, api)) = inner.mirror.displaced_by(call) {
+                new |= inner.activity.displace(node, api);
+            }
+        }
+        if new {
+            self.news.notify_one();
+        }
     }
 
     /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
@@ -324,18 +333,15 @@ impl Shadow {
 }
 
 impl Inner {
-    fn apply(&mut self, now: Instant, call: &Call) -> Reply {
+    fn apply(&mut self, now: Instant, call: &Call, news: &Notify) -> Reply {
         let outcome = self.mirror.apply(call);
         self.version += 1;
-        for notice in outcome.notices {
-            if let Notice::PublisherUpdate { topic, .. } = notice {
-                self.noticed.insert(topic, now);
-            }
-        }
-        if self.noticed.len() > NOTICE_TOPICS {
-            self.noticed
-                .retain(|_, at| now.duration_since(*at) < NOTICE_MEMORY);
-            self.noticed.truncate(NOTICE_TOPICS);
+        let registered = |node: &str| self.mirror.api_of(node).is_some();
+        if self
+            .activity
+            .applied(now, call, outcome.notices, registered)
+        {
+            news.notify_one();
         }
         outcome.reply
     }

@@ -164,26 +164,9 @@ impl Upstream {
             Ok(Err(error)) => return Err(unreachable(error)),
             Ok(Ok(stream)) => stream,
         };
-        stream.set_nodelay(true).map_err(unreachable)?;
-        let (sender, driver) = hyper::client::conn::http1::Builder::new()
-            .title_case_headers(true)
-            .handshake(TokioIo::new(stream))
+        Connection::over(stream, &address, self.instance.clone(), MAX_REPLY)
             .await
-            .map_err(|error| unreachable(io::Error::other(error)))?;
-        let (end, ended) = watch::channel(());
-        tokio::spawn(async move {
-            // Its error, if any, is also that of the call under way.
-            let _ = driver.await;
-            drop(end);
-        });
-        let host = HeaderValue::from_str(&address.authority())
-            .map_err(|error| unreachable(io::Error::other(error)))?;
-        Ok(Connection {
-            sender,
-            ended,
-            host,
-            instance: self.instance.clone(),
-        })
+            .map_err(unreachable)
     }
 }
 
@@ -194,9 +177,40 @@ pub struct Connection {
     ended: watch::Receiver<()>,
     host: HeaderValue,
     instance: HeaderValue,
+    max_reply: usize,
 }
 
 impl Connection {
+    /// A connection to the server at `address` over `stream`. Replies of more than `max_reply` bytes
+    /// are not taken.
+    pub async fn over(
+        stream: TcpStream,
+        address: &MasterUri,
+        instance: HeaderValue,
+        max_reply: usize,
+    ) -> io::Result<Self> {
+        stream.set_nodelay(true)?;
+        let (sender, driver) = hyper::client::conn::http1::Builder::new()
+            .title_case_headers(true)
+            .handshake(TokioIo::new(stream))
+            .await
+            .map_err(io::Error::other)?;
+        let (end, ended) = watch::channel(());
+        tokio::spawn(async move {
+            // Its error, if any, is also that of the call under way.
+            let _ = driver.await;
+            drop(end);
+        });
+        let host = HeaderValue::from_str(&address.authority()).map_err(io::Error::other)?;
+        Ok(Self {
+            sender,
+            ended,
+            host,
+            instance,
+            max_reply,
+        })
+    }
+
     /// Whether the connection is known to have ended.
     pub fn is_closed(&self) -> bool {
         self.sender.is_closed()
@@ -236,7 +250,7 @@ impl Connection {
             Err(error) => return Err(CallError::MaybeSent(error)),
         };
         let (parts, body) = reply.into_parts();
-        let body = Limited::new(body, MAX_REPLY)
+        let body = Limited::new(body, self.max_reply)
             .collect()
             .await
             .map_err(CallError::BrokenReply)?;

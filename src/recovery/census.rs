@@ -1,65 +1,50 @@
-//! After a recovery, beside traffic: which nodes still live, and who has not heard the news.
+//! The census: which nodes still live, whether they are the ones that registered, and in what the
+//! mirror differs from what they say.
 //!
 //! Nothing here may hold up a call: a roscpp node that is itself inside a parked registration
 //! cannot answer us before that call is through.
 
-use std::{sync::Arc, time::Duration};
-
-use hyper::header::HeaderValue;
-use tokio::{sync::Semaphore, task::JoinSet};
-
-use crate::{
-    master::Kind,
-    proxy::{
-        Proxy,
-        upstream::{ConnectError, Upstream},
-    },
-    ros_env::MasterUri,
-    xmlrpc::{Call, Reply, Value},
+use std::{
+    collections::BTreeSet,
+    sync::Arc,
+    time::{Duration, Instant},
 };
 
-/// Nodes asked at the same time. Each takes a file descriptor for at most the deadline.
-const AT_ONCE: usize = 128;
+use tokio::{
+    sync::{Semaphore, SemaphorePermit},
+    task::JoinSet,
+};
 
-/// A list that changes all the time is told so often; the master tells each change too.
-const ROUNDS: u32 = 10;
+use super::{
+    healing,
+    node::{self, Interview, Sign},
+    nodes::Nodes,
+};
+use crate::{
+    census::{Mending, Name, Registration, Verdict, judge},
+    master::{CALLER_ID, Kind, Mark, Master},
+    proxy::{
+        Proxy,
+        activity::{Activity, Letter},
+        gate::State,
+    },
+    ros_env::MasterUri,
+    xmlrpc::{Call, Reply},
+};
 
-/// What a node said to a question.
-#[derive(Debug, PartialEq, Eq)]
-pub enum Sign {
-    /// It answered.
-    Alive,
-    /// Its port refuses: the process is gone.
-    Dead,
-    /// No answer in time, or none that makes sense. That is no proof of death.
-    Silent,
-}
+/// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
+const AT_ONCE: usize = 64;
+/// Pause before a node is asked again about what is to be taken from it.
+const SECOND_QUESTION: Duration = Duration::from_millis(1200);
+/// A node that says something else each time is asked so often.
+const QUESTIONS: u32 = 4;
 
-/// Makes `call` to the node at `api` and waits for a sign of life for at most `limit`.
-pub async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
-    ask_for(api, call, limit).await.0
-}
+static PERMITS: Semaphore = Semaphore::const_new(AT_ONCE);
 
-/// As [`ask`], with the value that the node returned.
-pub async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
-    let Ok(address) = MasterUri::parse(api) else {
-        return (Sign::Silent, None);
-    };
-    let question = async {
-        let name = HeaderValue::from_static("to-a-node");
-        let mut connection = match Upstream::new(address, name).connect().await {
-            Ok(connection) => connection,
-            Err(ConnectError::Refused { .. }) => return (Sign::Dead, None),
-            Err(ConnectError::Unreachable { .. }) => return (Sign::Silent, None),
-        };
-        match connection.call(call).await {
-            Ok(Reply::Value(Value::Array(answer))) => (Sign::Alive, answer.into_iter().nth(2)),
-            Ok(_) | Err(_) => (Sign::Silent, None),
-        }
-    };
-    tokio::time::timeout(limit, question)
-        .await
-        .unwrap_or((Sign::Silent, None))
+/// The right to ask a node.
+pub(super) async fn permit() -> Option<SemaphorePermit<'static>> {
+    // Never closed.
+    PERMITS.acquire().await.ok()
 }
 
 /// What a census found.
@@ -67,127 +52,289 @@ pub async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<V
 pub struct Census {
     /// Nodes that are dead and have been taken out, through the master, so that others are told.
     pub removed: Vec<String>,
-    /// Nodes that did not answer.
-    pub suspects: Vec<String>,
+    /// Registrations that were added or taken back, because the node itself says so.
+    pub mended: Vec<String>,
 }
 
-/// Asks every node for a sign of life and takes out the dead ones.
-pub async fn census(proxy: &Arc<Proxy>) -> Census {
-    let nodes: Vec<(String, String)> = proxy.shadow.with_mirror(|mirror| {
-        mirror
-            .nodes()
-            .map(|(id, api)| (id.to_owned(), api.to_owned()))
-            .collect()
+/// What a visit to one port came to.
+#[derive(Debug)]
+pub(super) struct Outcome {
+    pub(super) sign: Sign,
+    /// Who was registered there.
+    pub(super) names: Vec<String>,
+    pub(super) removed: Vec<String>,
+    pub(super) mended: Vec<String>,
+}
+
+/// What follows a recovery that took place since `outage`, beside traffic: who did not hear the news
+/// is told, and the census is taken.
+pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
+    let under_way = Nodes::begin_census(&proxy);
+    let mut gate = proxy.gate.clone();
+    while !matches!(gate.look(), State::Open { .. }) {
+        gate.changed().await;
+    }
+    let incarnation = proxy.shadow.incarnation();
+    let (topics, params) = proxy.shadow.with_activity(|_, activity| {
+        (
+            activity.topics_noticed(outage),
+            activity.params_noticed(outage),
+        )
     });
-    let call = Call::new("getPid", vec!["/rosrescue".into()]);
-    let limit = proxy.config.census_timeout;
-    let permits = Arc::new(Semaphore::new(AT_ONCE));
-    let mut questions = JoinSet::new();
-    for (node, api) in nodes {
-        let (call, permits) = (call.clone(), permits.clone());
-        questions.spawn(async move {
-            // Never closed.
-            let _permit = permits.acquire().await;
-            let sign = ask(&api, &call, limit).await;
-            (node, api, sign)
-        });
+    let mut healed = topics;
+    healed.retain(|topic| healing::tell_subscribers(&proxy, topic));
+    healed.sort();
+    for (api, key) in params {
+        healing::send(&proxy, &api, Letter::Param(key));
+    }
+    // What nodes say in parked calls is newer than what they say to us.
+    barrier(&proxy).await;
+    let census = census(&proxy).await;
+    drop(under_way);
+    if proxy.shadow.incarnation() != incarnation {
+        // The next recovery reports.
+        return;
+    }
+    let suspects = proxy.nodes.suspects(&proxy.shadow);
+    if let Some(report) = proxy.board.add_to_report(census, healed, suspects) {
+        tracing::info!(
+            cause = report.cause,
+            total_ms = report.phases.total_ms,
+            skipped = ?report.skipped,
+            removed = ?report.removed,
+            mended = ?report.mended,
+            healed = ?report.healed,
+            suspects = ?report.suspects,
+            "recovery is complete: {}",
+            report.restored
+        );
+    }
+}
+
+/// Returns when the calls that are in the lane now have travelled.
+async fn barrier(proxy: &Proxy) {
+    let last = Call::new("getPid", vec![CALLER_ID.into()]);
+    // Its answer does not matter.
+    proxy.lane.call(last, Kind::Mutate).await;
+}
+
+/// Asks every node, all at the same time.
+pub async fn census(proxy: &Arc<Proxy>) -> Census {
+    let apis: BTreeSet<String> = proxy.shadow.with_mirror(|mirror| {
+        let nodes = mirror.nodes().filter(|(name, _)| !Mark::is_ours(name));
+        let apis = nodes.map(|(_, api)| api.to_owned());
+        // What nobody can call, the master cannot either.
+        apis.filter(|api| MasterUri::parse(api).is_ok()).collect()
+    });
+    let mut visits = JoinSet::new();
+    for api in apis {
+        let proxy = proxy.clone();
+        visits.spawn(async move { visit(&proxy, &api).await });
     }
     let mut census = Census::default();
-    while let Some(answer) = questions.join_next().await {
-        let Ok((node, api, sign)) = answer else {
-            continue;
-        };
-        match sign {
-            Sign::Alive => {}
-            Sign::Silent => census.suspects.push(node),
+    while let Some(outcome) = visits.join_next().await {
+        if let Ok(outcome) = outcome {
+            census.removed.extend(outcome.removed);
+            census.mended.extend(outcome.mended);
+        }
+    }
+    census.removed.sort();
+    census.mended.sort();
+    census
+}
+
+/// Who is registered at `api`.
+pub(super) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<Name> {
+    let nodes = mirror.nodes().filter(|(_, at)| *at == api);
+    let names = nodes.map(|(node, _)| Name {
+        known_pid: activity.pid_of(node, api),
+        registered: activity.deeds(node).registered,
+        node: node.to_owned(),
+    });
+    names.collect()
+}
+
+/// Asks what is behind `api` until it is clear what is to be made of it.
+pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
+    let mut outcome = Outcome {
+        sign: Sign::Silent,
+        names: Vec::new(),
+        removed: Vec::new(),
+        mended: Vec::new(),
+    };
+    let mut before = Findings::default();
+    for question in 0..QUESTIONS {
+        if question > 0 {
+            tokio::time::sleep(SECOND_QUESTION).await;
+        }
+        let asked = Asked::new(proxy, api);
+        if asked.names.is_empty() {
+            proxy.nodes.clear(proxy, api);
+            break;
+        }
+        let permit = permit().await;
+        let interview = node::interview(api, proxy.config.census_timeout).await;
+        drop(permit);
+        outcome.sign = interview.sign;
+        outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
+        match interview.sign {
+            Sign::Silent => {
+                proxy.nodes.suspect(proxy, api);
+                break;
+            }
             Sign::Dead => {
-                if remove(proxy, &node, &api).await {
-                    census.removed.push(node);
+                for name in &asked.names {
+                    if remove(proxy, name, api).await {
+                        outcome.removed.push(name.node.clone());
+                    }
+                }
+                proxy.nodes.clear(proxy, api);
+                break;
+            }
+            Sign::Alive => {
+                if proxy.nodes.clear(proxy, api) {
+                    // Whatever was to be told meanwhile.
+                    healing::tell_all(proxy, api);
+                }
+            }
+        }
+        let findings = asked.findings(proxy, api, &interview);
+        findings.act(proxy, api, &before, &mut outcome).await;
+        if findings.is_settled() {
+            break;
+        }
+        before = findings;
+    }
+    outcome
+}
+
+/// The names at a port before the question, with the numbers of their last deeds.
+struct Asked {
+    names: Vec<Name>,
+    unregistered: Vec<u64>,
+}
+
+/// What an answer means.
+#[derive(Default)]
+struct Findings {
+    strangers: Vec<Name>,
+    mendings: Vec<(Name, Verdict, Mending)>,
+}
+
+impl Asked {
+    fn new(proxy: &Proxy, api: &str) -> Self {
+        proxy.shadow.with_activity(|mirror, activity| {
+            let names = names_at(mirror, activity, api);
+            let last = names.iter().map(|name| activity.deeds(&name.node));
+            Self {
+                unregistered: last.map(|deeds| deeds.unregistered).collect(),
+                names,
+            }
+        })
+    }
+
+    /// What is to be made of the answer, for those who have done nothing since the question.
+    fn findings(&self, proxy: &Proxy, api: &str, interview: &Interview) -> Findings {
+        let Interview { pid, claims, .. } = interview;
+        let mut findings = Findings::default();
+        proxy.shadow.with_activity(|mirror, activity| {
+            let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
+            let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
+            for ((name, unregistered), verdict) in judged {
+                let deeds = activity.deeds(&name.node);
+                if mirror.api_of(&name.node) != Some(api) || deeds.registered != name.registered {
+                    continue;
+                }
+                if verdict == Verdict::Stranger {
+                    findings.strangers.push(name.clone());
+                    continue;
+                }
+                if let Some(pid) = *pid {
+                    activity.remember_pid(&name.node, api, name.registered, pid);
+                }
+                // Of two who may be meant, neither is mended.
+                let sure = verdict == Verdict::Itself || self.names.len() == 1;
+                if let Some(claims) = claims
+                    && sure
+                    && deeds.unregistered == *unregistered
+                {
+                    let mending = Mending::new(mirror, &name.node, claims);
+                    findings.mendings.push((name.clone(), verdict, mending));
+                }
+            }
+        });
+        findings
+    }
+}
+
+impl Findings {
+    fn is_settled(&self) -> bool {
+        let mut mendings = self.mendings.iter();
+        self.strangers.is_empty() && mendings.all(|(_, _, mending)| mending.is_empty())
+    }
+
+    /// Does what is sure; what is to be taken from a node must have been found before, too.
+    async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut Outcome) {
+        for name in &self.strangers {
+            if before.strangers.contains(name) && remove(proxy, name, api).await {
+                outcome.removed.push(name.node.clone());
+            }
+        }
+        for (name, verdict, mending) in &self.mendings {
+            let mut found = before.mendings.iter();
+            let found = found.find(|(found, _, _)| found.node == name.node);
+            let confirmed = |list: fn(&Mending) -> &Vec<Registration>, one: &Registration| {
+                found.is_some_and(|(_, _, mending)| list(mending).iter().any(|it| it.is_same(one)))
+            };
+            let certain = *verdict == Verdict::Itself;
+            for one in &mending.missing {
+                if certain || confirmed(|mending| &mending.missing, one) {
+                    let call = one.register(&name.node, api);
+                    mend(proxy, one, name, call, Kind::Mutate, outcome).await;
+                }
+            }
+            for one in &mending.extra {
+                if confirmed(|mending| &mending.extra, one) {
+                    let call = one.unregister(&name.node, api);
+                    mend(proxy, one, name, call, Kind::Unregister, outcome).await;
                 }
             }
         }
     }
-    census.removed.sort();
-    census.suspects.sort();
-    census
 }
 
-/// Unregisters a dead node as it would have done itself. Not if it has another address by now:
-/// then it has come back.
-async fn remove(proxy: &Proxy, node: &str, api: &str) -> bool {
-    let calls = proxy.shadow.with_mirror(|mirror| {
-        let same = mirror.nodes().any(|(id, now)| id == node && now == api);
-        if same {
-            mirror.unregister_calls(node)
-        } else {
-            Vec::new()
-        }
-    });
-    if calls.is_empty() {
-        return false;
-    }
-    proxy
-        .lane
-        .call(Call::multicall(calls), Kind::Unregister)
-        .await
-        .is_some()
-}
-
-/// Sends the full list of publishers to each subscriber of `topics`; answers the topics that had
-/// any. A node does nothing with a list that it knows already.
-pub async fn heal(proxy: &Arc<Proxy>, topics: Vec<String>) -> Vec<String> {
-    let permits = Arc::new(Semaphore::new(AT_ONCE));
-    let mut tasks = JoinSet::new();
-    for topic in topics {
-        let (publishers, subscribers) = lists(proxy, &topic);
-        if subscribers.is_empty() {
-            continue;
-        }
-        let (proxy, permits) = (proxy.clone(), permits.clone());
-        tasks.spawn(async move {
-            tell(&proxy, &permits, &topic, publishers, subscribers).await;
-            topic
-        });
-    }
-    let mut healed: Vec<String> = tasks.join_all().await;
-    healed.sort();
-    healed
-}
-
-/// Tells all until the list is the same before and after: the master may have told them a newer
-/// one meanwhile, which ours must not outlast.
-async fn tell(
-    proxy: &Arc<Proxy>,
-    permits: &Arc<Semaphore>,
-    topic: &str,
-    mut publishers: Vec<String>,
-    mut subscribers: Vec<String>,
+/// Makes a call for a node that has not done anything itself meanwhile.
+async fn mend(
+    proxy: &Proxy,
+    one: &Registration,
+    name: &Name,
+    call: Call,
+    kind: Kind,
+    outcome: &mut Outcome,
 ) {
-    for _ in 0..ROUNDS {
-        let list: Vec<Value> = publishers.iter().cloned().map(Value::String).collect();
-        let params = vec!["/master".into(), topic.into(), Value::Array(list)];
-        let call = Call::new("publisherUpdate", params);
-        let mut letters = JoinSet::new();
-        for api in subscribers {
-            let (call, permits) = (call.clone(), permits.clone());
-            let limit = proxy.config.census_timeout;
-            letters.spawn(async move {
-                // Never closed.
-                let _permit = permits.acquire().await;
-                ask(&api, &call, limit).await;
-            });
-        }
-        letters.join_all().await;
-        let (now, interested) = lists(proxy, topic);
-        if now == publishers {
-            return;
-        }
-        (publishers, subscribers) = (now, interested);
+    // In a multicall it travels alone, see the lane: it must not bump anybody.
+    let reply = proxy.lane.call(Call::multicall([call]), kind).await;
+    if let Some(Reply::Value(_)) = reply {
+        let sign = if kind == Kind::Mutate { '+' } else { '-' };
+        outcome
+            .mended
+            .push(format!("{sign} {}", one.describe(&name.node)));
     }
 }
 
-fn lists(proxy: &Proxy, topic: &str) -> (Vec<String>, Vec<String>) {
-    proxy
-        .shadow
-        .with_mirror(|mirror| (mirror.publishers_of(topic), mirror.subscribers_of(topic)))
+/// Unregisters a node as it would have done itself. Not if it has another address by now, or has
+/// registered something since it was asked: then it has come back.
+async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
+    // What it has on its way to the master comes first.
+    barrier(proxy).await;
+    let calls = proxy.shadow.with_activity(|mirror, activity| {
+        let same = mirror.api_of(&name.node) == Some(api)
+            && activity.deeds(&name.node).registered == name.registered;
+        same.then(|| mirror.unregister_calls(&name.node))
+    });
+    let Some(calls) = calls.filter(|calls| !calls.is_empty()) else {
+        return false;
+    };
+    let call = Call::multicall(calls);
+    proxy.lane.call(call, Kind::Unregister).await.is_some()
 }

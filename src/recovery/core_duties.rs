@@ -7,7 +7,7 @@ use std::{
 
 use tokio_util::sync::CancellationToken;
 
-use super::census::{self, Sign};
+use super::node::{self, Sign};
 use crate::{
     master::Kind,
     proxy::Proxy,
@@ -131,7 +131,7 @@ async fn living_rosout(proxy: &Proxy) -> Option<u32> {
         .shadow
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
     let call = Call::new("getPid", vec![CALLER_ID.into()]);
-    match census::ask_for(&api, &call, proxy.config.census_timeout).await {
+    match node::ask_for(&api, &call, proxy.config.census_timeout).await {
         (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }

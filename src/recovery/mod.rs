@@ -3,9 +3,14 @@
 pub mod census;
 pub mod core_duties;
 pub mod examine;
+pub mod healing;
 pub mod master_process;
+pub mod node;
+pub mod nodes;
 pub mod report;
 mod set_aside;
+
+pub use nodes::Nodes;
 
 use std::{
     pin::Pin,
@@ -23,7 +28,6 @@ use self::{
 };
 use crate::{
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision, Suspicion},
-    master::Kind,
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
@@ -428,7 +432,7 @@ impl Guard {
         let resumed = report.outcome == Outcome::Resumed;
         self.proxy.board.set_report(report);
         if !resumed {
-            tokio::spawn(after_recovery(self.proxy.clone(), since));
+            tokio::spawn(census::after_recovery(self.proxy.clone(), since));
         }
     }
 
@@ -453,24 +457,6 @@ impl Guard {
             self.said = Some((text, now));
         }
     }
-}
-
-/// Census and healing, beside traffic.
-async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
-    let mut gate = proxy.gate.clone();
-    while !matches!(gate.look(), State::Open { .. }) {
-        gate.changed().await;
-    }
-    // Parked calls first. This one waits behind them; its answer does not matter.
-    let last = Call::new("getPid", vec!["/rosrescue".into()]);
-    proxy.lane.call(last, Kind::Mutate).await;
-    let noticed = proxy.shadow.topics_noticed(outage);
-    let census = census::census(&proxy).await;
-    let healed = census::heal(&proxy, noticed).await;
-    if !census.removed.is_empty() || !census.suspects.is_empty() || !healed.is_empty() {
-        tracing::info!(removed = ?census.removed, suspects = ?census.suspects, ?healed, "census");
-    }
-    proxy.board.add_to_report(census, healed);
 }
 
 async fn exited(process: &mut Option<MasterProcess>) {

@@ -68,6 +68,8 @@ pub struct Report {
     pub mismatches: Vec<String>,
     /// Nodes that were found dead and taken out.
     pub removed: Vec<String>,
+    /// Registrations that were added (`+`) or taken back (`-`), because the node itself says so.
+    pub mended: Vec<String>,
     /// Nodes that did not answer and were kept.
     pub suspects: Vec<String>,
     /// Topics whose subscribers were sent the full list of publishers.
@@ -124,6 +126,7 @@ impl Outage {
             set_aside: examination.set_aside,
             mismatches: examination.mismatches,
             removed: Vec::new(),
+            mended: Vec::new(),
             suspects: Vec::new(),
             healed: Vec::new(),
         }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::proxy::activity::NOTICE_MEMORY;
 use crate::xmlrpc::Value;
 
 fn shadow() -> Shadow {
@@ -110,11 +111,9 @@ fn topics_are_remembered_while_a_dead_master_may_owe_the_news() {
         let reply = shadow.with_mirror(|mirror| answered(call, &mut mirror.clone()));
         shadow.record(start, 0, &[(call, &reply)]).unwrap();
     }
-    assert_eq!(shadow.topics_noticed(start + NOTICE_MEMORY / 2), ["/t"]);
-    assert_eq!(
-        shadow.topics_noticed(start + NOTICE_MEMORY),
-        Vec::<String>::new()
-    );
+    let noticed = |now| shadow.with_activity(|_, activity| activity.topics_noticed(now));
+    assert_eq!(noticed(start + NOTICE_MEMORY / 2), ["/t"]);
+    assert_eq!(noticed(start + NOTICE_MEMORY), Vec::<String>::new());
 }
 
 #[test]

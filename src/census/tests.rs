@@ -1,0 +1,132 @@
+use super::*;
+
+fn call(method: &str, params: &[&str]) -> Call {
+    Call::new(
+        method,
+        params.iter().map(|text| Value::from(*text)).collect(),
+    )
+}
+
+fn publish(master: &mut Master, node: &str, topic: &str, api: &str) {
+    master.apply(&call("registerPublisher", &[node, topic, "x/Y", api]));
+}
+
+fn subscribe(master: &mut Master, node: &str, topic: &str, api: &str) {
+    master.apply(&call("registerSubscriber", &[node, topic, "x/Y", api]));
+}
+
+fn list(topics: &[&str]) -> Value {
+    let entry = |topic: &&str| Value::from(vec![Value::from(*topic), "x/Y".into()]);
+    Value::Array(topics.iter().map(entry).collect())
+}
+
+fn claims(publications: &[&str], subscriptions: &[&str]) -> Claims {
+    Claims::read(&list(publications), &list(subscriptions)).unwrap()
+}
+
+fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
+    Name {
+        node: node.to_owned(),
+        known_pid,
+        registered,
+    }
+}
+
+/// The verdicts on `/a` and `/b`, which are registered at one port: `/a` publishes /ta, `/b` /tb.
+fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<Verdict> {
+    let mut master = Master::default();
+    for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
+        publish(&mut master, node, topic, "http://n:1/");
+        publish(&mut master, node, "/rosout", "http://n:1/");
+    }
+    let names = [name("/a", known[0], 1), name("/b", known[1], 2)];
+    judge(&master, &names, Some(pid), claims)
+}
+
+#[test]
+fn another_process_id_is_another_node() {
+    use Verdict::{Itself, Stranger};
+    assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Stranger, Itself]);
+    // One process may well bear two names.
+    assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
+    // The process id outweighs the topics: it is that node, whatever it has done since.
+    let other = claims(&["/tb"], &[]);
+    assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
+}
+
+#[test]
+fn other_topics_are_another_node() {
+    use Verdict::{Itself, Stranger, Unknown};
+    let of_b = claims(&["/rosout", "/tb"], &["/clock"]);
+    assert_eq!(verdicts([None, None], 1, Some(&of_b)), [Stranger, Itself]);
+    let neither = claims(&["/tc"], &[]);
+    assert_eq!(
+        verdicts([None, None], 1, Some(&neither)),
+        [Stranger, Stranger]
+    );
+    // What all nodes have is no evidence, and neither is nothing.
+    let common = claims(&["/rosout"], &["/clock", "/tf"]);
+    assert_eq!(verdicts([None, None], 1, Some(&common)), [Unknown, Unknown]);
+    assert_eq!(verdicts([None, None], 1, None), [Unknown, Unknown]);
+}
+
+#[test]
+fn a_port_has_one_node_behind_it() {
+    let mut master = Master::default();
+    publish(&mut master, "/a", "/rosout", "http://n:1/");
+    publish(&mut master, "/b", "/tb", "http://n:1/");
+    let said = claims(&["/tb"], &[]);
+    let judge = |a, b| {
+        let names = [name("/a", None, a), name("/b", None, b)];
+        judge(&master, &names, Some(1), Some(&said))
+    };
+    assert_eq!(judge(1, 2), [Verdict::Stranger, Verdict::Itself]);
+    // A process that took a second name, or an order that is not known: kept.
+    assert_eq!(judge(2, 1), [Verdict::Unknown, Verdict::Itself]);
+    assert_eq!(judge(0, 0), [Verdict::Unknown, Verdict::Itself]);
+}
+
+#[test]
+fn claims_that_no_node_would_make_are_not_read() {
+    let fine = list(&["/t"]);
+    for odd in [
+        Value::Nil,
+        Value::from("x"),
+        Value::from(vec![Value::from("/t")]),
+        list(&["t"]),
+        list(&["/t/"]),
+        list(&["/a b"]),
+        list(&["/"]),
+        Value::from(vec![Value::from(vec![Value::from("/t"), 1.into()])]),
+    ] {
+        assert_eq!(Claims::read(&odd, &fine), None, "{odd:?}");
+        assert_eq!(Claims::read(&fine, &odd), None, "{odd:?}");
+    }
+}
+
+#[test]
+fn the_difference_is_what_one_side_lacks() {
+    let mut master = Master::default();
+    for topic in ["/both", "/gone"] {
+        publish(&mut master, "/a", topic, "http://n:1/");
+        subscribe(&mut master, "/a", topic, "http://n:1/");
+    }
+    publish(&mut master, "/other", "/new", "http://o:1/");
+    let said = claims(&["/both", "/new"], &["/both"]);
+    let mending = Mending::new(&master, "/a", &said);
+    let words =
+        |of: &[Registration]| -> Vec<String> { of.iter().map(|one| one.describe("/a")).collect() };
+    assert_eq!(words(&mending.missing), ["/a publishes /new"]);
+    assert_eq!(
+        words(&mending.extra),
+        ["/a publishes /gone", "/a subscribes /gone"]
+    );
+    for one in &mending.missing {
+        master.apply(&one.register("/a", "http://n:1/"));
+    }
+    for one in &mending.extra {
+        master.apply(&one.unregister("/a", "http://n:1/"));
+    }
+    assert!(Mending::new(&master, "/a", &said).is_empty());
+    assert_eq!(master.publishers_of("/new"), ["http://o:1/", "http://n:1/"]);
+}

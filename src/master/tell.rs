@@ -1,0 +1,149 @@
+//! What a master would tell a node of its state as it is now.
+
+use super::registry::Shared;
+use super::{Master, names, python};
+use crate::xmlrpc::{Call, Struct, Value};
+
+/// The caller id under which rosmaster calls nodes.
+const MASTER: &str = "/master";
+
+impl Master {
+    /// The `publisherUpdate` with the full list of a topic's publishers.
+    pub fn publisher_update(&self, topic: &str) -> Call {
+        let publishers = self.publishers_of(topic).into_iter().map(Value::String);
+        let list = Value::Array(publishers.collect());
+        Call::new("publisherUpdate", vec![MASTER.into(), topic.into(), list])
+    }
+
+    /// The `paramUpdate` with the value under `key`, which ends in a slash; an empty struct for what
+    /// is not set, as rosmaster has it. None for a value that rosmaster cannot send either.
+    pub fn param_update(&self, key: &str) -> Option<Call> {
+        let value = self.params.get(key);
+        let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
+        if python::param_error(&value).is_some() {
+            return None;
+        }
+        let params = vec![MASTER.into(), key.into(), value];
+        Some(Call::new("paramUpdate", params))
+    }
+
+    /// Whether anything is set under `key`, which may end in a slash.
+    pub fn is_set(&self, key: &str) -> bool {
+        self.params.has(key)
+    }
+
+    /// The parameter keys that a node subscribes, each with a trailing slash.
+    pub fn param_subscriptions(&self, caller_id: &str) -> impl Iterator<Item = &str> {
+        let node = self.registry.nodes.get(caller_id);
+        node.into_iter()
+            .flat_map(|node| &node.param_subscriptions)
+            .map(String::as_str)
+    }
+
+    /// Whether a node at `api` subscribes a topic.
+    pub fn subscribes(&self, api: &str, topic: &str) -> bool {
+        let nodes = self.registry.shared(Shared::Subscribers).get(topic);
+        self.any_at(api, nodes)
+    }
+
+    /// Whether a node at `api` subscribes a key that `key` is in, or that is in `key`.
+    pub fn subscribes_param(&self, api: &str, key: &str) -> bool {
+        let subscribers = self.registry.shared(Shared::ParamSubscribers).iter();
+        let mut related = subscribers.filter(|(subscribed, _)| {
+            key.starts_with(subscribed.as_str()) || subscribed.starts_with(key)
+        });
+        related.any(|(_, nodes)| self.any_at(api, Some(nodes)))
+    }
+
+    fn any_at(&self, api: &str, nodes: Option<&Vec<String>>) -> bool {
+        nodes
+            .into_iter()
+            .flatten()
+            .any(|node| self.api_of(node) == Some(api))
+    }
+
+    /// Whether a `call` that registers something would take the name of a node at another address:
+    /// the master would shut that node down. The node, and the address that it has.
+    pub fn displaced_by(&self, call: &Call) -> Option<(String, String)> {
+        let (node, api) = registrant(call)?;
+        let held = self.api_of(node).filter(|held| *held != api)?;
+        Some((node.to_owned(), held.to_owned()))
+    }
+}
+
+/// Caller id and address of the node that `call` registers something for.
+pub fn registrant(call: &Call) -> Option<(&str, &str)> {
+    let at = match call.method.as_str() {
+        "registerPublisher" | "registerSubscriber" | "registerService" => 3,
+        "subscribeParam" => 1,
+        _ => return None,
+    };
+    Some((
+        call.params.first()?.as_str()?,
+        call.params.get(at)?.as_str()?,
+    ))
+}
+
+/// Whether a node can have registered a topic of this name as it is: global and canonical.
+pub fn is_plain_topic(topic: &str) -> bool {
+    topic.len() > 1
+        && topic.starts_with('/')
+        && !names::has_illegal_chars(topic)
+        && names::canonicalize(topic) == topic
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(method: &str, params: &[&str]) -> Call {
+        Call::new(
+            method,
+            params.iter().map(|text| Value::from(*text)).collect(),
+        )
+    }
+
+    #[test]
+    fn what_is_told_is_what_the_notices_say() {
+        let mut master = Master::default();
+        master.apply(&call(
+            "registerSubscriber",
+            &["/s", "/t", "*", "http://s:1/"],
+        ));
+        master.apply(&call("subscribeParam", &["/s", "http://s:1/", "/a"]));
+        let publish = call("registerPublisher", &["/p", "/t", "x/Y", "http://p:1/"]);
+        let told = master.apply(&publish).notices;
+        let update = master.publisher_update("/t");
+        let list = update.params.get(2).unwrap().as_array().unwrap();
+        assert_eq!(list, [Value::from("http://p:1/")]);
+        assert_eq!(told.len(), 1);
+        assert!(master.subscribes("http://s:1/", "/t") && !master.subscribes("http://p:1/", "/t"));
+
+        let set = Call::new("setParam", vec!["/x".into(), "/a/b".into(), 7.into()]);
+        let told = master.apply(&set).notices;
+        let super::super::Notice::ParamUpdate { key, value, .. } = told.first().unwrap() else {
+            panic!("{told:?}");
+        };
+        let update = master.param_update(key).unwrap();
+        assert_eq!(update.params.get(2), Some(value));
+        assert!(master.subscribes_param("http://s:1/", key));
+        assert!(!master.subscribes_param("http://s:1/", "/b/"));
+        let gone = master.param_update("/not/there/").unwrap();
+        assert_eq!(gone.params.get(2), Some(&Value::Struct(Struct::new())));
+    }
+
+    #[test]
+    fn a_node_is_displaced_by_its_name_at_another_address() {
+        let mut master = Master::default();
+        let publish = |api: &str| call("registerPublisher", &["/p", "/t", "x/Y", api]);
+        assert_eq!(master.displaced_by(&publish("http://p:1/")), None);
+        master.apply(&publish("http://p:1/"));
+        assert_eq!(master.displaced_by(&publish("http://p:1/")), None);
+        let displaced = Some(("/p".to_owned(), "http://p:1/".to_owned()));
+        assert_eq!(master.displaced_by(&publish("http://p:2/")), displaced);
+        let watch = call("subscribeParam", &["/p", "http://p:2/", "/k"]);
+        assert_eq!(master.displaced_by(&watch), displaced);
+        let gone = call("unregisterPublisher", &["/p", "/t", "http://p:2/"]);
+        assert_eq!(master.displaced_by(&gone), None);
+    }
+}

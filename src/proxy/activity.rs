@@ -1,0 +1,331 @@
+//! What calls did of late: what nodes may not have heard of, and who registered when.
+
+use std::{
+    collections::HashMap,
+    time::{Duration, Instant},
+};
+
+use indexmap::{IndexMap, IndexSet};
+
+use crate::{
+    master::{self, Notice},
+    xmlrpc::{Call, Value},
+};
+
+/// How long before an outage a change may lie whose notices the dead master still owed. Its three
+/// notifier threads can be held up by nodes that cannot be reached.
+pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
+/// Topics, and parameters of one node, remembered for that; and news at the same time.
+const NOTICES: usize = 4096;
+/// So many nodes may be remembered that are not registered any more.
+const NODES: usize = 1024;
+/// Levels of multicalls that are looked into.
+const LEVELS: usize = 8;
+
+/// Something that a node may be told.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Letter {
+    /// The full list of a topic's publishers.
+    Topic(String),
+    /// The value of a parameter. The key ends in a slash.
+    Param(String),
+}
+
+/// When a node's registrations last changed, as numbers that grow with every call: equal numbers
+/// mean that nothing came between.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Deeds {
+    /// It registered something.
+    pub registered: u64,
+    /// Something of it was unregistered.
+    pub unregistered: u64,
+}
+
+/// A process id that was behind a node's port.
+#[derive(Clone, Debug)]
+struct Pid {
+    api: String,
+    registered: u64,
+    pid: i32,
+}
+
+/// What calls did of late. Bounded.
+#[derive(Debug, Default)]
+pub struct Activity {
+    count: u64,
+    topics: IndexMap<String, Instant>,
+    /// By address and key.
+    params: IndexMap<(String, String), Instant>,
+    deeds: HashMap<String, Deeds>,
+    /// Nodes that are no more are forgotten when `deeds` is longer than this.
+    prune_at: usize,
+    pids: HashMap<String, Pid>,
+    /// Nodes that registered and have not been asked for their process id since, and when.
+    strangers: IndexMap<String, Instant>,
+    /// Nodes with the address that a parked registration is about to take their name from.
+    displaced: IndexSet<(String, String)>,
+    displaced_seen: usize,
+    /// Whether news are collected.
+    telling: bool,
+    /// Address and letter; all subscribers of a topic if there is no address.
+    news: IndexSet<(Option<String>, Letter)>,
+}
+
+impl Activity {
+    /// A call has been applied, with these notices. `registered` says of a node whether the mirror
+    /// knows it. Answers whether there are news.
+    pub(super) fn applied(
+        &mut self,
+        now: Instant,
+        call: &Call,
+        notices: Vec<Notice>,
+        registered: impl Fn(&str) -> bool,
+    ) -> bool {
+        self.note(now, call, LEVELS);
+        if self.deeds.len() > self.prune_at.max(NODES) {
+            self.prune(registered);
+        }
+        let before = self.news.len();
+        for notice in notices {
+            match notice {
+                Notice::PublisherUpdate { topic, .. } => {
+                    if self.telling && self.news.len() < NOTICES {
+                        self.news.insert((None, Letter::Topic(topic.clone())));
+                    }
+                    self.topics.insert(topic, now);
+                }
+                Notice::ParamUpdate { to, key, .. } => {
+                    if self.telling && self.news.len() < NOTICES {
+                        self.news
+                            .insert((Some(to.clone()), Letter::Param(key.clone())));
+                    }
+                    self.params.insert((to, key), now);
+                }
+                Notice::Shutdown { .. } => {}
+            }
+        }
+        forget(&mut self.topics, now);
+        forget(&mut self.params, now);
+        self.news.len() > before
+    }
+
+    fn note(&mut self, now: Instant, call: &Call, levels: usize) {
+        if call.method == "system.multicall" {
+            for entry in call.entries() {
+                if levels > 0 {
+                    self.note(now, &entry, levels - 1);
+                }
+            }
+            return;
+        }
+        let Some(caller) = call.params.first().and_then(Value::as_str) else {
+            return;
+        };
+        self.count += 1;
+        if master::registrant(call).is_some() {
+            self.deeds.entry(caller.to_owned()).or_default().registered = self.count;
+            if self.strangers.len() < NOTICES {
+                self.strangers.insert(caller.to_owned(), now);
+            }
+        } else if call.method.starts_with("un") {
+            self.deeds
+                .entry(caller.to_owned())
+                .or_default()
+                .unregistered = self.count;
+        }
+    }
+
+    fn prune(&mut self, registered: impl Fn(&str) -> bool) {
+        self.deeds.retain(|node, _| registered(node));
+        self.pids.retain(|node, _| registered(node));
+        self.strangers.retain(|node, _| registered(node));
+        self.prune_at = 2 * self.deeds.len();
+    }
+
+    /// When the registrations of `node` last changed.
+    pub fn deeds(&self, node: &str) -> Deeds {
+        self.deeds.get(node).copied().unwrap_or_default()
+    }
+
+    /// Topics whose publishers changed so shortly before `now`, or since, that a master which died
+    /// then may have owed its subscribers the news.
+    pub fn topics_noticed(&self, now: Instant) -> Vec<String> {
+        recent(&self.topics, now).cloned().collect()
+    }
+
+    /// As [`Self::topics_noticed`]: parameters, each as the address of a subscriber and a key.
+    pub fn params_noticed(&self, now: Instant) -> Vec<(String, String)> {
+        recent(&self.params, now).cloned().collect()
+    }
+
+    /// Collects news from now on, or no longer. Answers whether that changes anything.
+    pub fn set_telling(&mut self, telling: bool) -> bool {
+        if !telling {
+            self.news.clear();
+        }
+        std::mem::replace(&mut self.telling, telling) != telling
+    }
+
+    /// The news since the last time: to whom, all subscribers if that is left open, and what.
+    pub fn take_news(&mut self) -> IndexSet<(Option<String>, Letter)> {
+        std::mem::take(&mut self.news)
+    }
+
+    /// `pid` is behind `api`, at which `node` is registered, and was asked for after the deed that
+    /// `registered` numbers.
+    pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
+        if self.deeds(node).registered == registered {
+            self.strangers.shift_remove(node);
+            let api = api.to_owned();
+            let pid = Pid {
+                api,
+                registered,
+                pid,
+            };
+            self.pids.insert(node.to_owned(), pid);
+        }
+    }
+
+    /// The process id of `node` at `api`, if somebody asked since it last registered something: a
+    /// process that takes an old port under the same name registers first.
+    pub fn pid_of(&self, node: &str, api: &str) -> Option<i32> {
+        let pid = self.pids.get(node)?;
+        (pid.api == api && pid.registered == self.deeds(node).registered).then_some(pid.pid)
+    }
+
+    /// Nodes that last registered something at `before` or earlier, and have not been asked for
+    /// their process id since. Each is named once.
+    pub fn take_strangers(&mut self, before: Instant) -> Vec<String> {
+        let ripe = |_: &String, at: &mut Instant| *at <= before;
+        let mut taken = Vec::new();
+        self.strangers.retain(|node, at| {
+            let ripe = ripe(node, at);
+            if ripe {
+                taken.push(node.clone());
+            }
+            !ripe
+        });
+        taken
+    }
+
+    /// A call is parked that would take the name of `node`, which is registered at `api`. Answers
+    /// whether that is new.
+    pub(super) fn displace(&mut self, node: String, api: String) -> bool {
+        self.displaced.len() < NOTICES && self.displaced.insert((node, api))
+    }
+
+    /// What was displaced since the last time.
+    pub fn take_displaced(&mut self) -> Vec<(String, String)> {
+        let new = self.displaced.iter().skip(self.displaced_seen);
+        let new: Vec<_> = new.cloned().collect();
+        self.displaced_seen = self.displaced.len();
+        new
+    }
+
+    /// A new incarnation: what was parked travels.
+    pub(super) fn forget_displaced(&mut self) {
+        self.displaced.clear();
+        self.displaced_seen = 0;
+    }
+}
+
+fn recent<K>(notices: &IndexMap<K, Instant>, now: Instant) -> impl Iterator<Item = &K> {
+    let recent = notices.iter();
+    let recent = recent.filter(move |(_, at)| now.duration_since(**at) < NOTICE_MEMORY);
+    recent.map(|(key, _)| key)
+}
+
+fn forget<K: std::hash::Hash + Eq>(notices: &mut IndexMap<K, Instant>, now: Instant) {
+    if notices.len() > NOTICES {
+        notices.retain(|_, at| now.duration_since(*at) < NOTICE_MEMORY);
+        notices.truncate(NOTICES);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(method: &str, params: &[&str]) -> Call {
+        let params = params.iter().map(|text| Value::from(*text));
+        Call::new(method, params.collect())
+    }
+
+    fn publish(node: &str, topic: &str) -> Call {
+        call("registerPublisher", &[node, topic, "x/Y", "http://n:1/"])
+    }
+
+    fn apply(activity: &mut Activity, now: Instant, call: &Call) {
+        activity.applied(now, call, Vec::new(), |_| true);
+    }
+
+    #[test]
+    fn a_process_id_is_known_until_the_node_registers_again() {
+        let now = Instant::now();
+        let mut activity = Activity::default();
+        apply(&mut activity, now, &publish("/a", "/t"));
+        let registered = activity.deeds("/a").registered;
+        activity.remember_pid("/a", "http://n:1/", registered, 7);
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some(7));
+        assert_eq!(activity.pid_of("/a", "http://n:2/"), None);
+        let gone = call("unregisterPublisher", &["/a", "/t", "http://n:1/"]);
+        apply(&mut activity, now, &gone);
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some(7));
+        apply(&mut activity, now, &Call::multicall([publish("/a", "/u")]));
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), None);
+        // An answer to a question that was asked before is too old.
+        activity.remember_pid("/a", "http://n:1/", registered, 7);
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), None);
+    }
+
+    #[test]
+    fn a_new_node_is_to_be_asked_once_after_its_last_registration() {
+        let start = Instant::now();
+        let second = Duration::from_secs(1);
+        let mut activity = Activity::default();
+        apply(&mut activity, start, &publish("/a", "/t"));
+        apply(&mut activity, start + second, &publish("/a", "/u"));
+        let none = Vec::<String>::new();
+        assert_eq!(activity.take_strangers(start), none);
+        assert_eq!(activity.take_strangers(start + second), ["/a"]);
+        assert_eq!(activity.take_strangers(start + second), none);
+    }
+
+    #[test]
+    fn news_are_collected_only_while_somebody_tells_them() {
+        let now = Instant::now();
+        let mut activity = Activity::default();
+        let notice = || {
+            vec![Notice::PublisherUpdate {
+                to: "http://s:1/".to_owned(),
+                topic: "/t".to_owned(),
+                publishers: Vec::new(),
+            }]
+        };
+        let publish = publish("/a", "/t");
+        assert!(!activity.applied(now, &publish, notice(), |_| true));
+        assert!(activity.take_news().is_empty());
+        activity.set_telling(true);
+        assert!(activity.applied(now, &publish, notice(), |_| true));
+        let expected = (None, Letter::Topic("/t".to_owned()));
+        assert_eq!(
+            activity.take_news().into_iter().collect::<Vec<_>>(),
+            [expected]
+        );
+        assert_eq!(activity.topics_noticed(now), ["/t"]);
+    }
+
+    #[test]
+    fn what_is_displaced_is_named_once_in_an_outage() {
+        let mut activity = Activity::default();
+        let displace =
+            |activity: &mut Activity| activity.displace("/a".to_owned(), "http://n:1/".to_owned());
+        assert!(displace(&mut activity) && !displace(&mut activity));
+        assert_eq!(activity.take_displaced().len(), 1);
+        assert!(!displace(&mut activity));
+        assert_eq!(activity.take_displaced().len(), 0);
+        activity.forget_displaced();
+        assert!(displace(&mut activity));
+        assert_eq!(activity.take_displaced().len(), 1);
+    }
+}
