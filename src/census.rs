@@ -97,21 +97,30 @@ pub fn judge(
 ) -> Vec<Verdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
-    let by_topics = |node: &str| {
+    // How many of its topics are said, and whether those are all.
+    let match_of = |node: &str| {
         let held = mirror.publications(node).chain(mirror.subscriptions(node));
-        let mut held = held.filter(|topic| !COMMON.contains(topic)).peekable();
-        if held.peek().is_none() || said.is_empty() {
-            return Verdict::Unknown;
-        }
-        match held.any(|topic| said.contains(&topic)) {
-            true => Verdict::Itself,
-            false => Verdict::Stranger,
-        }
+        let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
+        let count = held.iter().filter(|topic| said.contains(topic)).count();
+        let comparable = !held.is_empty() && !said.is_empty();
+        comparable.then_some((count, count == held.len()))
     };
-    let verdicts = names.iter().map(|name| match (name.known_pid, pid) {
+    let matches: Vec<_> = names.iter().map(|name| match_of(&name.node)).collect();
+    let fitting = names.iter().zip(&matches);
+    let fitting = fitting.filter(|(_, found)| found.is_some_and(|(_, all)| all));
+    let last_fitting = fitting.map(|(name, _)| name.registered).max();
+    let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
+        None => Verdict::Unknown,
+        Some((0, _)) => Verdict::Stranger,
+        // It shares topics with the one that came after it.
+        Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Stranger,
+        Some(_) => Verdict::Itself,
+    };
+    let verdicts = names.iter().zip(&matches);
+    let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
         (Some(known), Some(pid)) if known == pid => Verdict::Itself,
         (Some(_), Some(_)) => Verdict::Stranger,
-        _ => by_topics(&name.node),
+        _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
     // A port has one process behind it: who registered with it before the one that is there is gone.

@@ -71,6 +71,24 @@ fn other_topics_are_another_node() {
 }
 
 #[test]
+fn of_two_that_share_topics_the_one_that_fits_is_there() {
+    use Verdict::{Itself, Stranger};
+    let mut master = Master::default();
+    for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
+        publish(&mut master, node, topic, "http://n:1/");
+        subscribe(&mut master, node, "/shared", "http://n:1/");
+    }
+    let judge = |publications: &[&str]| {
+        let names = [name("/a", None, 1), name("/b", None, 2)];
+        let said = claims(publications, &["/shared"]);
+        judge(&master, &names, Some(1), Some(&said))
+    };
+    assert_eq!(judge(&["/tb"]), [Stranger, Itself]);
+    assert_eq!(judge(&["/ta", "/tb"]), [Itself, Itself], "two names");
+    assert_eq!(judge(&[]), [Itself, Itself], "who of them is not clear");
+}
+
+#[test]
 fn a_port_has_one_node_behind_it() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/rosout", "http://n:1/");

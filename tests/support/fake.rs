@@ -26,6 +26,8 @@ struct Inner {
     released: Condvar,
     publications: Mutex<BTreeMap<String, String>>,
     subscriptions: Mutex<BTreeMap<String, String>>,
+    /// The process id that it says, if that is not the test's.
+    pid: Mutex<Option<i32>>,
 }
 
 /// A node without TCPROS: an XML-RPC server that answers what a node must answer, truthfully, and
@@ -40,15 +42,29 @@ pub(crate) struct FakeNode {
 
 impl FakeNode {
     pub(crate) fn start(name: &str) -> Self {
+        Self::start_at(name, 0)
+    }
+
+    /// Starts one at `port`, such as that of a node that has ended; 0 for any.
+    pub(crate) fn start_at(name: &str, port: u16) -> Self {
         let inner = Arc::new(Inner::default());
         let state = Arc::clone(&inner);
-        let server = Server::start(move |stream| serve_node(&state, stream));
+        let server = Server::start_at(port, move |stream| serve_node(&state, stream));
         Self {
             name: name.to_owned(),
             api: format!("http://127.0.0.1:{}/", server.port),
             inner,
             server,
         }
+    }
+
+    pub(crate) fn port(&self) -> u16 {
+        self.server.port
+    }
+
+    /// It says that it is this process.
+    pub(crate) fn claim_pid(&self, pid: i32) {
+        *lock(&self.inner.pid) = Some(pid);
     }
 
     /// What the master (or rosrescue) sent, without the questions that everybody asks.
@@ -188,7 +204,10 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
             )
         };
         let value = match call.method.as_str() {
-            "getPid" => Value::Int(i32::try_from(std::process::id()).unwrap()),
+            "getPid" => {
+                let own = i32::try_from(std::process::id()).unwrap();
+                Value::Int(lock(&inner.pid).unwrap_or(own))
+            }
             "getPublications" => pairs(&inner.publications),
             "getSubscriptions" => pairs(&inner.subscriptions),
             "requestTopic" => Value::Array(Vec::new()),
@@ -281,17 +300,23 @@ struct Server {
     port: u16,
     done: Arc<AtomicBool>,
     open: Arc<Mutex<Vec<TcpStream>>>,
+    thread: Option<thread::JoinHandle<()>>,
 }
 
 impl Server {
     fn start(serve: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
-        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        Self::start_at(0, serve)
+    }
+
+    fn start_at(port: u16, serve: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
+            .unwrap_or_else(|error| panic!("port {port}: {error}"));
         let port = listener.local_addr().unwrap().port();
         let done = Arc::new(AtomicBool::new(false));
         let open = Arc::new(Mutex::new(Vec::new()));
         let serve = Arc::new(serve);
         let (stop, connections) = (Arc::clone(&done), Arc::clone(&open));
-        thread::spawn(move || {
+        let thread = thread::spawn(move || {
             for stream in listener.incoming().flatten() {
                 if stop.load(Ordering::SeqCst) {
                     break;
@@ -312,7 +337,12 @@ impl Server {
                 });
             }
         });
-        Self { port, done, open }
+        Self {
+            port,
+            done,
+            open,
+            thread: Some(thread),
+        }
     }
 }
 
@@ -320,6 +350,10 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.done.store(true, Ordering::SeqCst);
         let _ = TcpStream::connect((Ipv4Addr::LOCALHOST, self.port));
+        // From here on the port refuses.
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
         for stream in lock(&self.open).drain(..) {
             let _ = stream.shutdown(Shutdown::Both);
         }

@@ -28,6 +28,7 @@ mod rpc;
 mod scratch;
 mod sick;
 mod state;
+mod status;
 mod twins;
 
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
@@ -42,6 +43,7 @@ pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request}
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use sick::{SICK_ROSMASTER, Sickness, Zygote, page, status};
 pub(crate) use state::State;
+pub(crate) use status::{names, status};
 pub(crate) use twins::{Twins, assert_form};
 
 /// `value` for a message, cut where it becomes long.

@@ -1,0 +1,286 @@
+//! No node is ever told to shut down that a master which never died would have let live: neither a
+//! node that came back under its name at another address, nor one that has the old address now.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::sync::atomic::{AtomicI32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+use support::{Client, FakeNode, Library, Mode, Robot, State, eventually, eventually_some, params};
+
+/// How often each thing is done. `ROSRESCUE_TEST_ROUNDS` says otherwise. A core restarts a master at
+/// once for the first five deaths within a minute only.
+fn rounds(mode: Mode, usual: usize) -> usize {
+    let rounds = std::env::var("ROSRESCUE_TEST_ROUNDS");
+    match mode {
+        Mode::Core => 4,
+        Mode::Proxy => rounds.map_or(usual, |text| text.parse().unwrap()),
+    }
+}
+
+#[track_caller]
+fn assert_innocent(node: &FakeNode, round: usize) {
+    assert_eq!(
+        node.heard("shutdown"),
+        Vec::<Vec<Value>>::new(),
+        "{} in round {round}",
+        node.name
+    );
+}
+
+/// Makes the node a process of its own, and registers this and that.
+fn claim(node: &FakeNode, client: &Client) {
+    static PIDS: AtomicI32 = AtomicI32::new(1_000_000);
+    node.claim_pid(PIDS.fetch_add(1, Ordering::Relaxed));
+    node.publish(client, &format!("{}/topic", node.name), "std_msgs/String");
+    node.subscribe(client, "/shared", "std_msgs/String");
+    node.offer(client, &format!("{}/service", node.name));
+}
+
+/// The master's death, with what `meanwhile` does to the nodes until the new master is there.
+fn outage<T>(robot: &mut Robot, meanwhile: impl FnOnce(&Client) -> T) -> T {
+    let dead = robot.master_pid();
+    robot.kill_master();
+    let result = meanwhile(&robot.client());
+    robot.revive_master();
+    robot.await_recovery(dead);
+    result
+}
+
+/// Whatever a thread calls is parked; it is answered after the outage.
+type Parked = thread::JoinHandle<FakeNode>;
+
+fn parked(client: &Client, node: FakeNode) -> Parked {
+    let client = client.clone();
+    thread::spawn(move || {
+        claim(&node, &client);
+        node
+    })
+}
+
+/// Waits until rosrescue has parked `count` calls more than before.
+#[track_caller]
+fn await_parked(client: &Client, before: u64, count: u64) {
+    eventually("the calls are parked", || counter(client) >= before + count);
+}
+
+fn counter(client: &Client) -> u64 {
+    support::status(client)["counters"]["parked"]
+        .as_u64()
+        .unwrap()
+}
+
+#[test]
+fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        let client = robot.client();
+        let witness = FakeNode::start("/witness");
+        witness.subscribe(&client, "/phoenix/topic", "std_msgs/String");
+        let mut node = FakeNode::start("/phoenix");
+        claim(&node, &client);
+        for round in 0..rounds(mode, 50) {
+            node = outage(&mut robot, |client| {
+                // The old one is dead, or still there: then it is told to make way, as ever.
+                let old = node;
+                let before = counter(client);
+                let new = FakeNode::start("/phoenix");
+                let old = (round % 2 == 1).then_some(old);
+                let api = new.api.clone();
+                let parked = parked(client, new);
+                // Core's master may be back before we look.
+                if mode == Mode::Proxy {
+                    await_parked(client, before, 1);
+                }
+                (parked, old, api)
+            })
+            .finish(&robot, round);
+            assert_innocent(&witness, round);
+        }
+        eventually("the witness knows the last one", || {
+            witness.updates("/phoenix/topic").last() == Some(&vec![node.api.clone()])
+        });
+    }
+}
+
+trait Finish {
+    fn finish(self, robot: &Robot, round: usize) -> FakeNode;
+}
+
+impl Finish for (Parked, Option<FakeNode>, String) {
+    fn finish(self, robot: &Robot, round: usize) -> FakeNode {
+        let (parked, old, api) = self;
+        let node = parked.join().unwrap();
+        assert_innocent(&node, round);
+        assert_eq!(api_of(robot, &node.name), Some(api), "round {round}");
+        if let Some(old) = old {
+            eventually("the old one is told to make way", || {
+                old.heard("shutdown").len() == 1
+            });
+        }
+        let state = robot.state();
+        assert_eq!(state.publishers_of("/phoenix/topic"), ["/phoenix"]);
+        node
+    }
+}
+
+fn api_of(robot: &Robot, node: &str) -> Option<String> {
+    let api = robot.bare().ask("lookupNode", params!["/test", node])?;
+    api.as_str().map(str::to_owned)
+}
+
+/// A node dies, comes back at another port, and then its old port goes to somebody else: all in one
+/// outage. When the parked registration reaches the new master it would shut down whoever is at the
+/// old port; a master that never died would have done so while nobody was there.
+#[test]
+fn who_has_the_port_of_a_node_that_moved_on_stays() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    for round in 0..rounds(Mode::Proxy, 50) {
+        let old = FakeNode::start("/moving");
+        claim(&old, &client);
+        let port = old.port();
+        let (moved, heir) = outage(&mut robot, |client| {
+            drop(old);
+            let before = counter(client);
+            let moved = parked(client, FakeNode::start("/moving"));
+            await_parked(client, before, 1);
+            eventually("rosrescue has seen that nobody is at the old port", || {
+                State::try_read(client).is_ok_and(|state| !state.knows("/moving"))
+            });
+            let heir = FakeNode::start_at(&format!("/heir{round}"), port);
+            (moved, parked(client, heir))
+        });
+        let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
+        assert_innocent(&moved, round);
+        assert_innocent(&heir, round);
+        let state = robot.state();
+        assert_eq!(state.publishers_of("/moving/topic"), ["/moving"]);
+        assert!(state.knows(&heir.name), "round {round}\n{state}");
+        for node in [&moved, &heir] {
+            node.unpublish(&client, &format!("{}/topic", node.name));
+            node.unsubscribe(&client, "/shared");
+            node.withdraw(&client, &format!("{}/service", node.name));
+        }
+    }
+}
+
+/// The old port goes to somebody else first, and then the node comes back elsewhere. Here even a
+/// master that never died shuts down the new owner of the port; rosrescue need not.
+#[test]
+fn who_had_the_port_before_the_node_moved_on_stays_too() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    for round in 0..rounds(Mode::Proxy, 50) {
+        let old = FakeNode::start("/moving");
+        claim(&old, &client);
+        let port = old.port();
+        let (moved, heir) = outage(&mut robot, |client| {
+            drop(old);
+            let before = counter(client);
+            let heir = FakeNode::start_at(&format!("/heir{round}"), port);
+            heir.claim_publication(&format!("{}/topic", heir.name), Some("std_msgs/String"));
+            let heir = parked(client, heir);
+            await_parked(client, before, 1);
+            let moved = parked(client, FakeNode::start("/moving"));
+            await_parked(client, before, 2);
+            eventually(
+                "rosrescue has seen that another node is at the port",
+                || State::try_read(client).is_ok_and(|state| !state.knows("/moving")),
+            );
+            (moved, heir)
+        });
+        let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
+        assert_innocent(&moved, round);
+        assert_innocent(&heir, round);
+        for node in [&moved, &heir] {
+            node.unpublish(&client, &format!("{}/topic", node.name));
+            node.unsubscribe(&client, "/shared");
+            node.withdraw(&client, &format!("{}/service", node.name));
+        }
+    }
+}
+
+/// A node dies and its port goes to another one; nobody comes back.
+#[test]
+fn who_has_the_port_of_a_dead_node_stays() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        let client = robot.client();
+        let mut node = FakeNode::start("/first");
+        claim(&node, &client);
+        for round in 0..rounds(mode, 25) {
+            let heir = format!("/heir{round}");
+            let port = node.port();
+            let name = node.name.clone();
+            let parked = outage(&mut robot, |client| {
+                drop(node);
+                parked(client, FakeNode::start_at(&heir, port))
+            });
+            node = parked.join().unwrap();
+            eventually("the dead one is taken out", || {
+                State::try_read(&robot.bare()).is_ok_and(|state| !state.knows(&name))
+            });
+            assert_innocent(&node, round);
+            assert!(robot.state().knows(&heir), "round {round}");
+        }
+    }
+}
+
+/// A master that is back already knows a newer node of a name when rosrescue comes to look.
+#[test]
+fn what_the_new_master_knows_already_wins() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let mut old = FakeNode::start("/both");
+    claim(&old, &client);
+    for round in 0..rounds(Mode::Proxy, 15) {
+        let dead = robot.master_pid();
+        support::stop(robot.rescue.pid());
+        robot.kill_master();
+        robot.revive_master();
+        let new = FakeNode::start("/both");
+        claim(&new, &robot.bare());
+        robot.rescue.signal(Signal::CONT);
+        robot.await_recovery(dead);
+        assert_eq!(api_of(&robot, "/both"), Some(new.api.clone()));
+        assert_innocent(&old, round);
+        assert_innocent(&new, round);
+        old = new;
+    }
+}
+
+/// Real nodes that are killed and started again under their names while there is no master.
+#[test]
+fn real_nodes_that_are_restarted_in_the_outage_stay() {
+    for library in [Library::Rospy, Library::Roscpp] {
+        let mut robot = Robot::start(Mode::Core);
+        let mut talker = robot.node(library, "talker", &[]);
+        let listener = robot.node(library, "listener", &[]);
+        listener.wait_messages("/talker", 5);
+        for _ in 0..3 {
+            let dead = robot.master_pid();
+            robot.kill_master();
+            talker.kill();
+            let start = Instant::now();
+            talker = robot.node(library, "talker", &[]);
+            robot.await_recovery(dead);
+            listener.wait_messages("/talker", 20);
+            let alive = eventually_some("a while has passed", || {
+                let ended = talker.exited();
+                (ended.is_some() || start.elapsed() > Duration::from_secs(4)).then_some(ended)
+            });
+            assert_eq!(alive, None, "{library:?}: the new talker was shut down");
+        }
+    }
+}

@@ -1,0 +1,21 @@
+//! What rosrescue says of itself.
+
+use serde_json::Value;
+
+use super::rpc::Client;
+
+/// The page `/status.json`.
+#[track_caller]
+pub(crate) fn status(client: &Client) -> Value {
+    let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    let response = client.exchange(get).expect("the status page");
+    serde_json::from_slice(&response.body).expect("JSON")
+}
+
+/// The names in a list of the status.
+pub(crate) fn names(list: &Value) -> Vec<String> {
+    let list = list.as_array().cloned().unwrap_or_default();
+    list.iter()
+        .map(|name| name.as_str().expect("a name").to_owned())
+        .collect()
+}
