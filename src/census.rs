@@ -81,8 +81,11 @@ pub enum Verdict {
 pub struct Name {
     /// The caller id.
     pub node: String,
-    /// The process id that was behind the port after it registered, if somebody asked then.
+    /// The process id that was behind the port when somebody last asked.
     pub known_pid: Option<i32>,
+    /// Whether it has registered something since then: it may be another process by now, which took
+    /// the port under the same name.
+    pub registered_since: bool,
     /// A number that is the larger the later it last registered something; 0 if that is not known.
     pub registered: u64,
 }
@@ -119,7 +122,7 @@ pub fn judge(
     let verdicts = names.iter().zip(&matches);
     let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
         (Some(known), Some(pid)) if known == pid => Verdict::Itself,
-        (Some(_), Some(_)) => Verdict::Stranger,
+        (Some(_), Some(_)) if !name.registered_since => Verdict::Stranger,
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();

@@ -35,6 +35,7 @@ ros_missing() {
     need python3-yaml /usr/bin/python3 -c 'import yaml'
     need rosout ros_has_rosout
     need g++ command -v g++
+    need iproute2 command -v ip
     need pkg-config command -v pkg-config
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs

@@ -82,11 +82,13 @@ impl Board {
     pub fn add_to_report(
         &self,
         census: Census,
+        census_ms: f64,
         healed: Vec<String>,
         suspects: Vec<String>,
     ) -> Option<Report> {
         let mut inner = self.lock();
         let report = inner.report.as_mut()?;
+        report.census_ms = Some(census_ms);
         report.removed = census.removed;
         report.mended = census.mended;
         report.suspects = suspects;

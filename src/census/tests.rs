@@ -28,6 +28,7 @@ fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
     Name {
         node: node.to_owned(),
         known_pid,
+        registered_since: false,
         registered,
     }
 }
@@ -52,6 +53,21 @@ fn another_process_id_is_another_node() {
     // The process id outweighs the topics: it is that node, whatever it has done since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
+}
+
+#[test]
+fn a_node_that_registered_since_may_be_another_process() {
+    let mut master = Master::default();
+    publish(&mut master, "/a", "/ta", "http://n:1/");
+    let judge = |pid, topic: &str| {
+        let mut name = name("/a", Some(1), 1);
+        name.registered_since = true;
+        let said = claims(&[topic], &[]);
+        judge(&master, &[name], Some(pid), Some(&said))
+    };
+    assert_eq!(judge(1, "/new"), [Verdict::Itself], "the same process");
+    assert_eq!(judge(2, "/ta"), [Verdict::Itself], "restarted");
+    assert_eq!(judge(2, "/new"), [Verdict::Stranger]);
 }
 
 #[test]

@@ -186,11 +186,11 @@ impl Activity {
         }
     }
 
-    /// The process id of `node` at `api`, if somebody asked since it last registered something: a
-    /// process that takes an old port under the same name registers first.
-    pub fn pid_of(&self, node: &str, api: &str) -> Option<i32> {
-        let pid = self.pids.get(node)?;
-        (pid.api == api && pid.registered == self.deeds(node).registered).then_some(pid.pid)
+    /// The process id that was last behind `api`, at which `node` is registered, and whether the node
+    /// has registered something since: a process that takes an old port under the same name does.
+    pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
+        let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
+        Some((pid.pid, pid.registered != self.deeds(node).registered))
     }
 
     /// Nodes that last registered something at `before` or earlier, and have not been asked for
@@ -260,22 +260,22 @@ mod tests {
     }
 
     #[test]
-    fn a_process_id_is_known_until_the_node_registers_again() {
+    fn a_process_id_is_sure_until_the_node_registers_again() {
         let now = Instant::now();
         let mut activity = Activity::default();
         apply(&mut activity, now, &publish("/a", "/t"));
         let registered = activity.deeds("/a").registered;
         activity.remember_pid("/a", "http://n:1/", registered, 7);
-        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some(7));
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
         assert_eq!(activity.pid_of("/a", "http://n:2/"), None);
         let gone = call("unregisterPublisher", &["/a", "/t", "http://n:1/"]);
         apply(&mut activity, now, &gone);
-        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some(7));
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
         apply(&mut activity, now, &Call::multicall([publish("/a", "/u")]));
-        assert_eq!(activity.pid_of("/a", "http://n:1/"), None);
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
         // An answer to a question that was asked before is too old.
-        activity.remember_pid("/a", "http://n:1/", registered, 7);
-        assert_eq!(activity.pid_of("/a", "http://n:1/"), None);
+        activity.remember_pid("/a", "http://n:1/", registered, 8);
+        assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
     }
 
     #[test]

@@ -19,6 +19,7 @@ use super::{
     healing,
     node::{self, Interview, Sign},
     nodes::Nodes,
+    report,
 };
 use crate::{
     census::{Mending, Name, Registration, Verdict, judge},
@@ -74,6 +75,7 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     while !matches!(gate.look(), State::Open { .. }) {
         gate.changed().await;
     }
+    let start = Instant::now();
     let incarnation = proxy.shadow.incarnation();
     let (topics, params) = proxy.shadow.with_activity(|_, activity| {
         (
@@ -96,10 +98,15 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
         return;
     }
     let suspects = proxy.nodes.suspects(&proxy.shadow);
-    if let Some(report) = proxy.board.add_to_report(census, healed, suspects) {
+    let census_ms = report::ms(start.elapsed());
+    if let Some(report) = proxy
+        .board
+        .add_to_report(census, census_ms, healed, suspects)
+    {
         tracing::info!(
             cause = report.cause,
             total_ms = report.phases.total_ms,
+            census_ms,
             skipped = ?report.skipped,
             removed = ?report.removed,
             mended = ?report.mended,
@@ -146,10 +153,14 @@ pub async fn census(proxy: &Arc<Proxy>) -> Census {
 /// Who is registered at `api`.
 pub(super) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<Name> {
     let nodes = mirror.nodes().filter(|(_, at)| *at == api);
-    let names = nodes.map(|(node, _)| Name {
-        known_pid: activity.pid_of(node, api),
-        registered: activity.deeds(node).registered,
-        node: node.to_owned(),
+    let names = nodes.map(|(node, _)| {
+        let pid = activity.pid_of(node, api);
+        Name {
+            node: node.to_owned(),
+            known_pid: pid.map(|(pid, _)| pid),
+            registered_since: pid.is_some_and(|(_, since)| since),
+            registered: activity.deeds(node).registered,
+        }
     });
     names.collect()
 }
@@ -276,7 +287,10 @@ impl Findings {
     /// Does what is sure; what is to be taken from a node must have been found before, too.
     async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut Outcome) {
         for name in &self.strangers {
-            if before.strangers.contains(name) && remove(proxy, name, api).await {
+            let mut earlier = before.strangers.iter();
+            let again =
+                earlier.any(|found| found.node == name.node && found.registered == name.registered);
+            if again && remove(proxy, name, api).await {
                 outcome.removed.push(name.node.clone());
             }
         }

@@ -58,6 +58,8 @@ pub struct Report {
     pub master_pid: i32,
     /// How long it took.
     pub phases: Phases,
+    /// From the open gate to the end of the census, in milliseconds; none while it lasts.
+    pub census_ms: Option<f64>,
     /// What the master holds now.
     pub restored: Counts,
     /// What was not injected, and why.
@@ -74,6 +76,11 @@ pub struct Report {
     pub suspects: Vec<String>,
     /// Topics whose subscribers were sent the full list of publishers.
     pub healed: Vec<String>,
+}
+
+/// A duration in milliseconds, to a hundredth.
+pub(super) fn ms(duration: Duration) -> f64 {
+    (duration.as_secs_f64() * 1e5).round() / 1e2
 }
 
 /// The time since which calls have not passed.
@@ -105,7 +112,6 @@ impl Outage {
 
     /// The report of an outage that ends now with `examination`.
     pub fn report(&self, now: Instant, examination: Examination) -> Report {
-        let ms = |duration: Duration| (duration.as_secs_f64() * 1e5).round() / 1e2;
         let total = now.duration_since(self.since);
         let absence = self
             .port_open
@@ -121,6 +127,7 @@ impl Outage {
                 injection_ms: ms(examination.injection),
                 total_ms: ms(total),
             },
+            census_ms: None,
             restored: examination.counts,
             skipped: examination.skipped,
             set_aside: examination.set_aside,

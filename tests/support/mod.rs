@@ -18,6 +18,7 @@
 
 mod fake;
 mod kinds;
+mod netns;
 mod node;
 mod patience;
 mod process;
@@ -33,6 +34,7 @@ mod twins;
 
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
 pub(crate) use kinds::{kinds, sorted};
+pub(crate) use netns::Netns;
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
 pub(crate) use process::{Process, alive, signal, stop};

@@ -1,0 +1,248 @@
+//! After an outage the registrations are what the living nodes say, and everybody has heard of every
+//! change, wherever in its work the master died.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::path::Path;
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+use support::{
+    FakeNode, Library, Mode, NODES, Robot, State, eventually, holds, names, params, status,
+};
+
+/// How many times the last element of `list` is at its end.
+fn repeats<T: PartialEq>(list: &[T]) -> usize {
+    list.iter()
+        .rev()
+        .take_while(|it| Some(*it) == list.last())
+        .count()
+}
+
+/// The paper's case 2 at every point: after the change of state, before each of the callbacks, and
+/// with more and with fewer threads than callbacks.
+fn the_master_dies_at_every_callback(workers: &str, points: std::ops::RangeInclusive<usize>) {
+    let program = Path::new(NODES).join("fragile_master.py");
+    let mut robot = Robot::start_with(
+        Mode::Core,
+        &["--rosmaster", program.to_str().unwrap(), "-w", workers],
+    );
+    let client = robot.client();
+    let fakes: Vec<_> = (0..4)
+        .map(|i| FakeNode::start(&format!("/subscriber{i}")))
+        .collect();
+    for fake in &fakes {
+        fake.subscribe(&client, "/chatter", "std_msgs/String");
+    }
+    let real = [Library::Rospy, Library::Roscpp]
+        .map(|library| robot.node(library, "listener", &[&format!("__name:={library:?}")]));
+    let mut publishers = Vec::new();
+    for point in points {
+        let dead = robot.master_pid();
+        let file = robot.scratch.path("die-at");
+        std::fs::write(&file, format!("publisherUpdate {point}")).unwrap();
+        let publisher = FakeNode::start(&format!("/publisher{point}"));
+        publisher.publish(&client, "/chatter", "std_msgs/String");
+        publishers.push(publisher);
+        let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
+        robot.await_recovery(dead);
+        assert!(!file.exists(), "the master did not die at point {point}");
+        eventually(&format!("all know the publishers, point {point}"), || {
+            let told = fakes.iter().all(|fake| {
+                let updates = fake.updates("/chatter");
+                updates.last() == Some(&all)
+            });
+            told && real
+                .iter()
+                .all(|node| node.updates("/chatter").last() == Some(&all))
+        });
+        // Once from the master at most, and once from us; here also because the call travelled again.
+        assert!(holds(Duration::from_millis(300), || fakes
+            .iter()
+            .all(|fake| repeats(&fake.updates("/chatter")) <= 4)));
+        // No list comes after a longer one.
+        for fake in &fakes {
+            let updates = fake.updates("/chatter");
+            assert!(updates.is_sorted_by_key(Vec::len), "{updates:?}");
+        }
+    }
+    for node in fakes.iter().chain(&publishers) {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+    }
+    drop(real);
+    robot.kill_master();
+}
+
+#[test]
+fn case_2_before_and_at_the_first_callbacks() {
+    the_master_dies_at_every_callback("16", 0..=3);
+}
+
+#[test]
+fn case_2_at_the_last_callbacks() {
+    the_master_dies_at_every_callback("16", 4..=6);
+}
+
+#[test]
+fn case_2_with_the_three_threads_of_a_usual_master_first_callbacks() {
+    the_master_dies_at_every_callback("3", 0..=3);
+}
+
+#[test]
+fn case_2_with_the_three_threads_of_a_usual_master_last_callbacks() {
+    the_master_dies_at_every_callback("3", 4..=6);
+}
+
+/// The same for parameters: who has cached one is told of a change that the dead master still owed.
+#[test]
+fn the_master_dies_at_every_callback_of_a_parameter() {
+    let program = Path::new(NODES).join("fragile_master.py");
+    let robot = Robot::start_with(
+        Mode::Core,
+        &["--rosmaster", program.to_str().unwrap(), "-w", "3"],
+    );
+    let client = robot.client();
+    client.set_param("/gain", -1);
+    let fakes = ["/user0", "/user1"].map(FakeNode::start);
+    for fake in &fakes {
+        fake.watch_param(&client, "/gain");
+    }
+    let real = [Library::Rospy, Library::Roscpp].map(|library| {
+        let name = format!("__name:={library:?}");
+        robot.node(library, "param_user", &["/gain", &name])
+    });
+    for point in 0..=4 {
+        let dead = robot.master_pid();
+        let file = robot.scratch.path("die-at");
+        std::fs::write(&file, format!("paramUpdate {point}")).unwrap();
+        client.set_param("/gain", point);
+        robot.await_recovery(dead);
+        assert!(!file.exists(), "the master did not die at point {point}");
+        eventually(&format!("all know the parameter, point {point}"), || {
+            let told = fakes.iter().all(|fake| {
+                let heard = fake.heard("paramUpdate");
+                heard.last().is_some_and(|told| {
+                    told[1] == Value::from("/gain/") && told[2] == Value::Int(point)
+                })
+            });
+            let value = point.to_string();
+            told && real
+                .iter()
+                .all(|node| node.said("value").last() == Some(&value))
+        });
+    }
+    for node in &real {
+        assert_eq!(node.said("failed"), Vec::<String>::new());
+    }
+}
+
+/// A registration that the master lost, and one whose end it never heard of.
+#[test]
+fn what_living_nodes_say_is_mended() {
+    for library in [Library::Rospy, Library::Roscpp] {
+        let mut robot = Robot::start(Mode::Proxy);
+        let client = robot.client();
+        let talker = robot.node(library, "talker", &[]);
+        let listener = robot.node(library, "listener", &[]);
+        let server = robot.node(library, "server", &[]);
+        listener.wait_messages("/talker", 5);
+        // The census of this one gets to know who is who.
+        robot.crash_master();
+        let before = robot.settled_state();
+        eventually("the census is over", || {
+            status(&client)["last_recovery"]["census_ms"].is_number()
+        });
+        let api = |node: &str| {
+            let api = client.ok("lookupNode", params!["/test", node]);
+            api.as_str().unwrap().to_owned()
+        };
+        let (talks, listens) = (api("/talker"), api("/listener"));
+        client.ok(
+            "unregisterPublisher",
+            params!["/talker", "/chatter", talks.as_str()],
+        );
+        client.ok(
+            "unregisterSubscriber",
+            params!["/listener", "/chatter", listens.as_str()],
+        );
+        let ghost = params!["/talker", "/ghost", "std_msgs/String", talks.as_str()];
+        client.ok("registerPublisher", ghost);
+        let ghost = params!["/listener", "/haunted", "std_msgs/String", listens.as_str()];
+        client.ok("registerSubscriber", ghost);
+        robot.crash_master();
+        eventually("the registrations are what the nodes say", || {
+            let Ok(state) = State::try_read(&robot.bare()) else {
+                return false;
+            };
+            state.publishers_of("/chatter") == ["/talker"]
+                && state.subscribers_of("/chatter") == ["/listener"]
+                && state.publishers_of("/ghost").is_empty()
+                && state.subscribers_of("/haunted").is_empty()
+        });
+        let after = robot.settled_state();
+        let after = after.without_type("/ghost").without_type("/haunted");
+        before.assert_same(&after, "when the registrations have been mended");
+        let mended = [
+            "+ /listener subscribes /chatter",
+            "+ /talker publishes /chatter",
+            "- /listener subscribes /haunted",
+            "- /talker publishes /ghost",
+        ];
+        eventually("the report says so", || {
+            names(&status(&client)["last_recovery"]["mended"]) == mended
+        });
+        let late = robot.node(library, "listener", &["__name:=late"]);
+        late.wait_messages("/talker", 5);
+        for node in [&talker, &listener, &server] {
+            node.assert_no_link_lost();
+        }
+    }
+}
+
+/// Nodes that cannot be asked, or answer nonsense, are left as they are.
+#[test]
+fn nodes_that_answer_nonsense_are_left_alone() {
+    use rosrescue::xmlrpc::Reply;
+    use support::{Client, FakeMaster};
+
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let answers = [
+        Value::Array(vec![1.into(), "".into(), Value::Int(7)]),
+        Value::Array(vec![1.into(), "".into(), params![params!["x", "y"]].into()]),
+        Value::Array(vec![1.into(), "".into(), params![params!["/a", 1]].into()]),
+        Value::Array(vec![0.into(), "no".into(), Value::Array(Vec::new())]),
+        Value::Array(Vec::new()),
+        Value::from("what?"),
+    ];
+    let nodes: Vec<_> = answers
+        .iter()
+        .map(|answer| {
+            let bytes = FakeMaster::proper(&Reply::Value(answer.clone()));
+            FakeMaster::start(move |_| bytes.clone())
+        })
+        .collect();
+    for (i, node) in nodes.iter().enumerate() {
+        let (name, api) = (format!("/odd{i}"), Client::new(node.port()).uri());
+        let topic = format!("/topic{i}");
+        let params = params![name.as_str(), topic.as_str(), "std_msgs/String", api];
+        client.ok("registerPublisher", params);
+    }
+    let before = robot.settled_state();
+    robot.crash_master();
+    let mut last = None;
+    let same = holds(Duration::from_secs(5), || {
+        last = Some(robot.state());
+        last.as_ref() == Some(&before)
+    });
+    if !same {
+        before.assert_same(&last.unwrap(), "after the census");
+    }
+}

@@ -1,0 +1,73 @@
+#!/usr/bin/python3
+"""A real rosmaster that dies between changing its state and telling nodes of the change.
+
+`$ROS_HOME/die-at` says where, as `TASK N`: TASK is publisherUpdate (of the topic /chatter) or
+paramUpdate (of the key /gain). With N = 0 it dies before any callback of the next change is queued, else
+as the Nth callback is about to be sent. The file is removed then, so the next master lives.
+"""
+
+import os
+import threading
+
+import rosmaster
+import rosmaster.master_api as api
+
+_lock = threading.Lock()
+_sent = {"publisherUpdate": 0, "paramUpdate": 0}
+
+
+def maybe_die(task, point):
+    """Dies if this is where it should. `point` is None for the next callback."""
+    path = os.path.join(os.environ["ROS_HOME"], "die-at")
+    with _lock:
+        try:
+            with open(path) as file:
+                wanted, number = file.read().split()
+        except FileNotFoundError:
+            return
+        if wanted != task:
+            return
+        if point is None:
+            _sent[task] += 1
+            point = _sent[task]
+        if point == int(number):
+            os.unlink(path)
+            os._exit(1)
+
+
+def before(original, task, point, concerns):
+    def wrapped(*arguments):
+        if concerns(*arguments):
+            maybe_die(task, point)
+        return original(*arguments)
+
+    return wrapped
+
+
+handler = api.ROSMasterHandler
+handler._notify_topic_subscribers = before(
+    handler._notify_topic_subscribers,
+    "publisherUpdate",
+    0,
+    lambda _self, topic, _publishers, subscribers: topic == "/chatter" and subscribers,
+)
+api.publisher_update_task = before(
+    api.publisher_update_task,
+    "publisherUpdate",
+    None,
+    lambda _api, topic, _publishers: topic == "/chatter",
+)
+handler._notify_param_subscribers = before(
+    handler._notify_param_subscribers,
+    "paramUpdate",
+    0,
+    lambda _self, updates: any(key == "/gain/" for _subscribers, key, _value in updates),
+)
+handler.param_update_task = before(
+    handler.param_update_task,
+    "paramUpdate",
+    None,
+    lambda _self, _id, _api, key, _value: key == "/gain/",
+)
+
+rosmaster.rosmaster_main()

@@ -1,0 +1,113 @@
+//! A computer of its own beyond a cable: a network namespace, from which and to which packets can be
+//! made to vanish. Needs root and iproute2.
+
+use std::process::Command;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+/// A network namespace with a veth to this one. Both go on drop.
+#[derive(Debug)]
+pub(crate) struct Netns {
+    name: String,
+    near: String,
+    net: String,
+}
+
+/// Runs `ip`; panics with what it says.
+#[track_caller]
+fn ip(words: &str) {
+    let output = Command::new("ip").args(words.split(' ')).output();
+    let output = output.expect("`ip`: tests/run.sh installs iproute2");
+    assert!(
+        output.status.success(),
+        "ip {words}: {}(network namespaces need root)",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+impl Netns {
+    #[track_caller]
+    pub(crate) fn new() -> Self {
+        static COUNT: AtomicU8 = AtomicU8::new(0);
+        let number = COUNT.fetch_add(1, Ordering::Relaxed);
+        let pid = std::process::id();
+        // Networks of test processes that run at the same time differ in all likelihood.
+        let net = format!(
+            "10.{}.{}",
+            64 + (pid >> 6) % 128,
+            (pid & 63) * 4 + u32::from(number) % 4
+        );
+        let near = format!("rr{pid}n{number}");
+        let far = format!("rr{pid}f{number}");
+        let name = format!("rosrescue-{pid}-{number}");
+        let this = Self {
+            name: name.clone(),
+            near: near.clone(),
+            net: net.clone(),
+        };
+        ip(&format!("netns add {name}"));
+        ip(&format!(
+            "link add {near} type veth peer name {far} netns {name}"
+        ));
+        ip(&format!("addr add {net}.1/24 dev {near}"));
+        ip(&format!("link set {near} up"));
+        ip(&format!("-n {name} link set lo up"));
+        for host in 2..40 {
+            ip(&format!("-n {name} addr add {net}.{host}/24 dev {far}"));
+        }
+        ip(&format!("-n {name} link set {far} up"));
+        this
+    }
+
+    /// Our own address, as the other side sees it.
+    pub(crate) fn near(&self) -> String {
+        format!("{}.1", self.net)
+    }
+
+    /// An address of the other side. There are those from 2 to 39.
+    pub(crate) fn far(&self, host: u8) -> String {
+        format!("{}.{host}", self.net)
+    }
+
+    /// Packets to that address vanish from now on.
+    pub(crate) fn cut(&self, host: u8) {
+        let Self { near, net, .. } = self;
+        // A permanent entry for an Ethernet address that nobody has.
+        ip(&format!(
+            "neigh replace {net}.{host} lladdr 02:00:00:00:00:99 dev {near} nud permanent"
+        ));
+    }
+
+    /// Packets to that address arrive again.
+    pub(crate) fn mend(&self, host: u8) {
+        ip(&format!("neigh del {}.{host} dev {}", self.net, self.near));
+    }
+
+    /// `command`, to be run on the other side.
+    pub(crate) fn inside(&self, command: &Command) -> Command {
+        let mut inside = Command::new("ip");
+        inside.args(["netns", "exec", &self.name]);
+        inside.arg(command.get_program()).args(command.get_args());
+        for (key, value) in command.get_envs() {
+            match value {
+                Some(value) => inside.env(key, value),
+                None => inside.env_remove(key),
+            };
+        }
+        if let Some(folder) = command.get_current_dir() {
+            inside.current_dir(folder);
+        }
+        inside
+    }
+}
+
+impl Drop for Netns {
+    fn drop(&mut self) {
+        // The veth goes with the namespace once its last process has ended, and at once by name.
+        let _ = Command::new("ip")
+            .args(["link", "del", &self.near])
+            .output();
+        let _ = Command::new("ip")
+            .args(["netns", "del", &self.name])
+            .output();
+    }
+}
