@@ -36,7 +36,6 @@ use crate::{
     },
     supervisor::SupervisorError,
     wait,
-    xmlrpc::Call,
 };
 
 /// A message about a state that lasts is repeated after this time.

@@ -43,7 +43,7 @@ pub(crate) use robot::{Mode, Robot};
 pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, ros_command};
 pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request};
 pub(crate) use scratch::{Scratch, free_port};
-pub(crate) use sick::{SICK_ROSMASTER, Sickness, Zygote, page, status};
+pub(crate) use sick::{SICK_ROSMASTER, Sickness, Zygote, page};
 pub(crate) use state::State;
 pub(crate) use status::{names, status};
 pub(crate) use twins::{Twins, assert_form};

@@ -117,8 +117,3 @@ pub(crate) fn page(client: &Client, path: &str) -> String {
     let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
     client.exchange(request.as_bytes()).unwrap().text()
 }
-
-/// `/status.json`.
-pub(crate) fn status(client: &Client) -> serde_json::Value {
-    serde_json::from_str(&page(client, "/status.json")).unwrap()
-}
