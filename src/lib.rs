@@ -7,7 +7,8 @@
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
 //! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
-//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
+//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts, which record masters
+//!   die of.
 //! * [`census`]: what is to be made of what a node says of itself; who is suspect.
 //! * [`session`]: whether a checkpoint's session goes on.
 //! * [`record`]: the checkpoint's snapshot and records to and from bytes.

@@ -19,6 +19,13 @@ ros_has_rosout() {
     return 1
 }
 
+has_libfaketime() {
+    for library in /usr/lib/*/faketime/libfaketimeMT.so.1; do
+        [ ! -r "$library" ] || return 0
+    done
+    return 1
+}
+
 # The packages of what does not work here. `python3` may be another one than ROS was made for.
 ros_missing() {
     need() { # PACKAGES CHECK...
@@ -39,6 +46,7 @@ ros_missing() {
     need pkg-config command -v pkg-config
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs
+    need libfaketime has_libfaketime
 }
 
 ros_packages=$(ros_missing | tr '\n' ' ')

@@ -236,6 +236,35 @@ fn the_core_does_no_io() {
     assert!(seen > CORE.len());
 }
 
+/// Decisions hang on the monotonic clock: the wall clock is read in one place, for people.
+#[test]
+fn only_the_clock_reads_the_wall_clock() {
+    let mut readers = Vec::new();
+    for file in rust_files(&root().join("src")) {
+        let Some(code) = code(&file) else { continue };
+        let words = [
+            "SystemTime",
+            "UNIX_EPOCH",
+            "wall_clock",
+            "CLOCK_REALTIME",
+            "ClockId",
+        ];
+        if words.iter().any(|word| code.contains(word)) {
+            readers.push(file);
+        }
+    }
+    assert_eq!(readers, [root().join("src/clock.rs")]);
+    // Who asks it: for reports and the start of a session, both read by people only.
+    let mut users = Vec::new();
+    for file in rust_files(&root().join("src")) {
+        let code = code(&file).unwrap_or_default();
+        users.extend(code.contains("wall_time()").then_some(file));
+    }
+    users.sort();
+    let expected = ["app.rs", "clock.rs", "recovery/report.rs"];
+    assert_eq!(users, expected.map(|name| root().join("src").join(name)));
+}
+
 #[test]
 fn files_stay_small() {
     for file in rust_files(&root().join("src")) {

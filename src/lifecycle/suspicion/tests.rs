@@ -96,7 +96,7 @@ fn holds(call: &Call, record: &Call) -> bool {
 /// What one life came to.
 enum Ended {
     Died(InFlight),
-    Whole { state: Master, left_out: Vec<Call> },
+    Whole(Box<Master>, Vec<Call>),
 }
 
 fn live(suspicion: &Suspicion, target: &Master, sickness: &Sickness, number: usize) -> Ended {
@@ -129,10 +129,7 @@ fn live(suspicion: &Suspicion, target: &Master, sickness: &Sickness, number: usi
                 return Ended::Died(InFlight::Whole);
             }
         }
-        return Ended::Whole {
-            state: plan.expected().clone(),
-            left_out: Vec::new(),
-        };
+        return Ended::Whole(plan.expected().clone().into(), Vec::new());
     };
     let tested = trial.tested.as_ref().map(|(call, _)| call);
     let plan = Careful::new(target, &Master::default(), &mark, &trial.left_out, tested);
@@ -159,10 +156,7 @@ fn live(suspicion: &Suspicion, target: &Master, sickness: &Sickness, number: usi
         }
         index += usize::from(step.record);
     }
-    Ended::Whole {
-        state: plan.expected().clone(),
-        left_out: plan.left_out().to_vec(),
-    }
+    Ended::Whole(plan.expected().clone().into(), plan.left_out().to_vec())
 }
 
 fn call(method: &str, params: &[&str]) -> Call {
@@ -229,9 +223,9 @@ fn lives(
     for number in 0..most {
         match live(suspicion, target, sickness, number) {
             Ended::Died(at) => suspicion.died(at),
-            Ended::Whole { state, left_out } => {
+            Ended::Whole(state, left_out) => {
                 suspicion.survived();
-                return (number, Some((state, left_out)));
+                return (number, Some((*state, left_out)));
             }
         }
     }
