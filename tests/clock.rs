@@ -14,7 +14,7 @@ mod support;
 use std::fs;
 use std::path::PathBuf;
 use std::thread;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use support::{
     Client, FakeNode, Rescue, Rosmaster, SICK_ROSMASTER, Scratch, Setup, Sickness, State, alive,
@@ -128,8 +128,7 @@ impl Robot {
     /// What rosrescue's last report takes for the time of the outage, less the right time.
     fn clock_error(&self) -> f64 {
         let report = &status(&self.client())["last_recovery"];
-        let right = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-        report["detected_at"].as_f64().unwrap() - right.as_secs_f64()
+        report["detected_at"].as_f64().unwrap() - rosrescue::clock::wall_time()
     }
 }
 
