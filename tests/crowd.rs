@@ -16,7 +16,6 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value};
-use rustix::process::Signal;
 use support::{
     Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, holds, http_request,
     params, tree,
@@ -91,7 +90,16 @@ fn say(wire: &mut Wire, calls: &[(&str, Vec<Value>)]) -> Answers {
 
 #[test]
 fn two_hundred_clients_call_when_the_outage_begins() {
-    let mut robot = Robot::start(Mode::Proxy);
+    when_the_outage_begins(Mode::Proxy);
+}
+
+#[test]
+fn two_hundred_clients_call_when_the_own_master_dies() {
+    when_the_outage_begins(Mode::Core);
+}
+
+fn when_the_outage_begins(mode: Mode) {
+    let mut robot = Robot::start(mode);
     let client = robot.client();
     let present = FakeNode::start("/present");
     present.publish(&client, "/present/topic", "std_msgs/String");
@@ -102,7 +110,17 @@ fn two_hundred_clients_call_when_the_outage_begins() {
     for (node, number) in nodes.iter().zip(0..CROWD) {
         match number % 4 {
             0 => client.set_param(&format!("{}/gain", node.name), number),
-            1 => node.publish(&client, &format!("{}/old", node.name), "std_msgs/String"),
+            1 => {
+                let old = format!("{}/old", node.name);
+                node.publish(&client, &old, "std_msgs/String");
+                node.claim_publication(&old, None);
+            }
+            2 => {
+                for topic in ["new0", "new1", "new2"] {
+                    let topic = format!("{}/{topic}", node.name);
+                    node.claim_publication(&topic, Some("std_msgs/String"));
+                }
+            }
             _ => {}
         }
     }
@@ -113,8 +131,7 @@ fn two_hundred_clients_call_when_the_outage_begins() {
         .map(|(number, node)| start(&client, calls_of(number, &node.api), &barrier))
         .collect();
     barrier.wait();
-    support::signal(dead, Signal::KILL);
-    robot.kill_master();
+    robot.kill_master_at_once(dead);
 
     // Nobody who reads or leaves waits for a master.
     let (quick, patient): (Vec<_>, Vec<_>) = crowd
@@ -285,6 +302,7 @@ fn a_parked_multicall_keeps_nobody_from_leaving() {
     let late = park(vec![Call::new("registerPublisher", params)]);
 
     // At once, although multicalls are parked.
+    nodes[1].claim_publication("/topic", None);
     let leave = Call::multicall([unregister(&nodes[1], "/topic")]).params;
     let answer = client.call("system.multicall", leave).unwrap();
     let Reply::Value(Value::Array(answers)) = answer else {

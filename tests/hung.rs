@@ -69,6 +69,7 @@ fn a_proxy_stands_in_for_a_hung_master_and_nothing_is_done_twice() {
         waiting.push(call("setParam", params!["/test", "/parked", number]));
     }
     let coming = FakeNode::start("/coming");
+    coming.claim_publication("/topic", Some("std_msgs/String"));
     let params = params!["/coming", "/topic", "std_msgs/String", coming.api.as_str()];
     waiting.push(call("registerPublisher", params));
 

@@ -136,6 +136,7 @@ impl Subject {
         let listener = master.node("listener", &["20"]);
         listener.wait_messages("/talker", 3);
         let node = FakeNode::start("/pauses");
+        node.claim_publication("/pauses/topic", Some("std_msgs/String"));
         let topic = params![
             "/pauses",
             "/pauses/topic",

@@ -342,6 +342,9 @@ impl LaneRunner {
     fn unregister(&mut self, proxy: &Arc<Proxy>) {
         let parked = self.queue.iter().filter_map(|item| item.call.as_ref());
         proxy.shadow.note_parked(parked);
+        if !self.queue.iter().any(|item| item.kind == Kind::Unregister) {
+            return;
+        }
         let flying = self.flight.as_ref().map_or(&[][..], |flight| &flight.items);
         let mut busy: BTreeSet<String> = flying.iter().flat_map(LaneItem::registrants).collect();
         let mut waiting = VecDeque::with_capacity(self.queue.len());

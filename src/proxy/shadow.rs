@@ -20,6 +20,8 @@ use crate::{
     xmlrpc::{Call, Reply},
 };
 
+/// Unregistrations that take nothing away are remembered beside so many others.
+const OWED_IDLY: usize = 1000;
 /// Replies in a log line are cut to so many bytes.
 const LOGGED_REPLY: usize = 300;
 
@@ -175,19 +177,26 @@ impl Shadow {
     }
 
     /// Takes an unregistration while the gate is shut: records it, applies it, and answers as the
-    /// master would.
+    /// master would. One that takes nothing away is not recorded, and is remembered within limits: it
+    /// may be said without end. It may mean a registration whose reply was lost with an earlier
+    /// rosrescue, and which the master that comes back has run.
     pub fn unregister(&self, now: Instant, call: &Call) -> Reply {
         let mut inner = self.lock();
+        let before = inner.mirror.counts();
         let reply = inner.apply(now, call, &self.news);
+        let idle = inner.mirror.counts() == before;
+        if idle && (inner.owed.len() >= OWED_IDLY || inner.owed.contains(call)) {
+            return reply;
+        }
         let accepted = master::accepted(&inner.mirror, call, &reply).calls;
-        let entries: Vec<_> = accepted
-            .iter()
-            .map(|(call, _)| Entry::Call(call.clone()))
-            .collect();
+        if !idle {
+            let entries = accepted.iter().map(|(call, _)| Entry::Call(call.clone()));
+            let entries: Vec<_> = entries.collect();
+            inner.append(&entries);
+        }
         inner
             .owed
             .extend(accepted.into_iter().map(|(call, _)| call));
-        inner.append(&entries);
         drop(inner);
         self.work.notify_one();
         reply

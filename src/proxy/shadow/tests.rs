@@ -87,6 +87,33 @@ fn an_unregistration_in_an_outage_is_owed_until_paid_or_succeeded() {
     assert_eq!(shadow.owed(), []);
 }
 
+/// Also what the mirror knows nothing of, for the master that comes back may know it.
+#[test]
+fn what_takes_nothing_away_is_owed_within_limits() {
+    let shadow = shadow();
+    let now = Instant::now();
+    let bye = |number: usize| {
+        call(
+            "unregisterPublisher",
+            &["/n", &format!("/t{number}"), "http://n:1/"],
+        )
+    };
+    for _ in 0..3 {
+        shadow.unregister(now, &bye(0));
+    }
+    assert_eq!(shadow.owed(), [bye(0)]);
+    for number in 0..2 * OWED_IDLY {
+        shadow.unregister(now, &bye(number));
+    }
+    assert_eq!(shadow.owed().len(), OWED_IDLY);
+    let publish = publish("/late");
+    let reply = shadow.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
+    shadow.record(now, 0, &[(&publish, &reply)]).unwrap();
+    let last = call("unregisterPublisher", &["/n", "/late", "http://n:1/"]);
+    shadow.unregister(now, &last);
+    assert_eq!(shadow.owed().last(), Some(&last));
+}
+
 #[test]
 fn who_the_master_is_outlasts_a_resync() {
     let shadow = shadow();
