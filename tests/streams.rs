@@ -178,6 +178,10 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
             &["50", &format!("__name:=client_{suffix}")],
         )
     });
+    let mut readers = LIBRARIES.map(|(library, suffix)| {
+        let name = format!("__name:=reader_{suffix}");
+        robot.node(library, "reader", &["/speed", &name])
+    });
     answered(&clients);
     robot.settled_state();
     let before = registrations(&robot);
@@ -187,6 +191,14 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
     }
     answered(&clients);
     assert_eq!(failures(&clients), Vec::<String>::new());
+    assert_eq!(failures(&readers), Vec::<String>::new());
+    for reader in &readers {
+        let reads = reader
+            .said("reads")
+            .last()
+            .map_or(0, |n| n.parse().unwrap());
+        assert!(reads > 10 * KILLS, "{reads} reads");
+    }
     for user in &users {
         let heard: Vec<_> = (0..=KILLS).map(|speed| speed.to_string()).collect();
         assert_eq!(user.said("value"), heard);
@@ -194,8 +206,8 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
     }
     streams.assert_whole(&robot);
 
-    // A client that looks for a service while rosrescue is not there finds nobody: it is no part of this.
-    for client in &mut clients {
+    // Who looks for a service, or reads, while rosrescue is not there finds nobody: that is no part of this.
+    for client in clients.iter_mut().chain(&mut readers) {
         client.signal(Signal::INT);
         client.wait();
     }
@@ -217,7 +229,7 @@ fn nothing_is_lost_when_the_own_master_dies_a_hundred_times_and_rosrescue_twenty
     let streams = Streams::start(&robot);
     let _server = robot.node(Library::Roscpp, "server", &[]);
     let users = [robot.node(Library::Roscpp, "param_user", &["/speed"])];
-    let clients = [robot.node(Library::Rospy, "client", &["50"])];
+    let clients = [robot.node(Library::Rospy, "client", &["20"])];
     answered(&clients);
     robot.settled_state();
     let before = registrations(&robot);
