@@ -64,7 +64,16 @@ fn a_proxy_stands_in_for_a_hung_master_and_nothing_is_done_twice() {
         waiting
     };
     let mut waiting = vec![call("setParam", params!["/test", "/flying", 1])];
+    let reading = thread::spawn({
+        let client = client.clone();
+        move || client.param("/gain")
+    });
     eventually("the gate is shut", || !robot.is_open());
+    assert_eq!(
+        reading.join().unwrap(),
+        Some(Value::Int(7)),
+        "it asked before the gate was shut"
+    );
     for number in 1..=3 {
         waiting.push(call("setParam", params!["/test", "/parked", number]));
     }
@@ -120,6 +129,36 @@ fn a_proxy_stands_in_for_a_hung_master_and_nothing_is_done_twice() {
             .with_params_of(&before),
         "but for what was called",
     );
+}
+
+/// What was unregistered while the master did not answer is unregistered in the master that goes on.
+#[test]
+fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
+    let robot = Robot::start_with(Mode::Proxy, &PROBES);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+        node.subscribe(&client, "/other", "std_msgs/String");
+        node.offer(&client, &format!("{}/service", node.name));
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let pid = robot.master_pid();
+    support::stop(pid);
+    // Whether the answer comes at once or when the master goes on: it is a promise.
+    let unregistering = thread::spawn(move || {
+        leaving.unpublish(&client, "/topic");
+        leaving.unsubscribe(&client, "/other");
+        leaving.withdraw(&client, "/leaving/service");
+        leaving
+    });
+    holds(Duration::from_secs(3), || !unregistering.is_finished());
+    support::signal(pid, Signal::CONT);
+    let _leaving = unregistering.join().unwrap();
+    robot.await_gate();
+    robot.await_state(&after, "when the master went on");
+    assert_eq!(robot.client().master_pid(), Some(pid));
+    after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
 /// Nobody says twice that it unregisters. If nobody answered, it is done all the same: by the next master,

@@ -1,6 +1,5 @@
 //! What happens around an outage beside the paper's cases: calls in the gap, parameter subscriptions
-//! and services of real nodes, a master that hangs, restarts that nobody saw, and rosrescue's own
-//! restarts.
+//! and services of real nodes, and restarts that nobody saw.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,19 +16,9 @@ use std::time::{Duration, Instant};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use rustix::process::Signal;
 use support::{
-    FakeNode, Library, Mode, Robot, State, alive, encode_call, eventually, holds, http_request,
-    kinds, params, tree,
+    FakeNode, Library, Mode, Robot, State, encode_call, eventually, holds, http_request, kinds,
+    params, tree,
 };
-
-/// Options with which a master that hangs is found within a second.
-const QUICK_PROBES: [&str; 6] = [
-    "--probe-interval",
-    "100",
-    "--probe-timeout",
-    "300",
-    "--probe-count",
-    "2",
-];
 
 #[test]
 fn cached_parameters_of_rospy_follow_after_the_crash() {
@@ -241,71 +230,6 @@ fn a_call_is_not_held_for_ever_and_never_answered_falsely() {
     robot.await_gate();
     robot.client().set_param("/late", 2);
     assert_eq!(robot.bare().param("/late"), Some(Value::Int(2)));
-}
-
-#[test]
-fn a_core_replaces_a_master_that_hangs() {
-    let robot = Robot::start_with(Mode::Core, &QUICK_PROBES);
-    let client = robot.client();
-    client.set_param("/kept", "yes");
-    let before = robot.settled_state();
-    let hung = robot.master_pid();
-    support::stop(hung);
-    robot.await_recovery(hung);
-    eventually("the master that hangs is ended", || !alive(hung));
-    before.assert_same(&robot.state(), "after the hung master was replaced");
-}
-
-#[test]
-fn a_proxy_waits_for_a_master_that_hangs() {
-    let robot = Robot::start_with(Mode::Proxy, &QUICK_PROBES);
-    let client = robot.client();
-    client.set_param("/kept", "yes");
-    let before = robot.settled_state();
-    let pid = robot.master_pid();
-    support::stop(pid);
-    let waiting = thread::spawn({
-        let client = client.clone();
-        move || client.status("setParam", params!["/test", "/waits", 1])
-    });
-    if !holds(Duration::from_secs(2), || !waiting.is_finished()) {
-        panic!("the master hangs and yet: {:?}", waiting.join().unwrap());
-    }
-    support::signal(pid, Signal::CONT);
-    assert_eq!(waiting.join().unwrap().expect("the call is answered").0, 1);
-    client.ok("deleteParam", params!["/test", "/waits"]);
-    before.assert_same(&robot.state(), "after the master went on");
-    assert_eq!(client.master_pid(), Some(pid));
-}
-
-/// What was unregistered while the master did not answer is unregistered in the master that goes on.
-#[test]
-fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
-    let robot = Robot::start_with(Mode::Proxy, &QUICK_PROBES);
-    let client = robot.client();
-    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
-    for node in [&leaving, &staying] {
-        node.publish(&client, "/topic", "std_msgs/String");
-        node.subscribe(&client, "/other", "std_msgs/String");
-        node.offer(&client, &format!("{}/service", node.name));
-    }
-    let after = robot.settled_state().without_node("/leaving");
-    let pid = robot.master_pid();
-    support::stop(pid);
-    // Whether the answer comes at once or when the master goes on: it is a promise.
-    let unregistering = thread::spawn(move || {
-        leaving.unpublish(&client, "/topic");
-        leaving.unsubscribe(&client, "/other");
-        leaving.withdraw(&client, "/leaving/service");
-        leaving
-    });
-    holds(Duration::from_secs(3), || !unregistering.is_finished());
-    support::signal(pid, Signal::CONT);
-    let _leaving = unregistering.join().unwrap();
-    robot.await_gate();
-    robot.await_state(&after, "when the master went on");
-    assert_eq!(robot.client().master_pid(), Some(pid));
-    after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
 #[test]

@@ -175,7 +175,7 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
         robot.node(
             library,
             "client",
-            &["50", &format!("__name:=client_{suffix}")],
+            &["20", &format!("__name:=client_{suffix}")],
         )
     });
     let mut readers = LIBRARIES.map(|(library, suffix)| {
