@@ -4,8 +4,10 @@
 //! Without evidence a node is what it is registered as: a robot that loses a healthy node is worse
 //! off than one that keeps a dead one.
 
+mod repeats;
 mod suspects;
 
+pub use repeats::Repeats;
 pub use suspects::Suspects;
 
 use std::collections::BTreeMap;

@@ -44,7 +44,7 @@ pub struct CoreArgs {
     /// Threads with which rosmaster tells nodes of changes; more than roscore's 3, so that nodes
     /// that cannot be reached do not hold up the others
     #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT")]
-    #[arg(default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,
     /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none
     #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS")]

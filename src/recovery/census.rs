@@ -6,7 +6,10 @@
 
 use std::{
     collections::BTreeSet,
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -184,8 +187,9 @@ pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
             break;
         }
         let permit = permit().await;
+        let waiting = Waiting::new(&proxy.nodes.unanswered);
         let interview = node::interview(api, proxy.config.census_timeout).await;
-        drop(permit);
+        drop((permit, waiting));
         outcome.sign = interview.sign;
         outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
         match interview.sign {
@@ -217,6 +221,22 @@ pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
         before = findings;
     }
     outcome
+}
+
+/// Counts a question for as long as it has no answer.
+struct Waiting<'a>(&'a AtomicUsize);
+
+impl<'a> Waiting<'a> {
+    fn new(count: &'a AtomicUsize) -> Self {
+        count.fetch_add(1, Ordering::Relaxed);
+        Self(count)
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// The names at a port before the question, with the numbers of their last deeds.

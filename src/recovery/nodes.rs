@@ -16,7 +16,7 @@ use super::{
     node::{self, Sign},
 };
 use crate::{
-    census::{Suspects, Verdict},
+    census::{Repeats, Suspects, Verdict},
     proxy::{
         Proxy,
         activity::Letter,
@@ -43,6 +43,8 @@ pub struct Nodes {
     suspects: Mutex<Suspects>,
     /// Recoveries whose census is not over.
     censuses: AtomicUsize,
+    /// Nodes that are being asked and have not answered yet.
+    pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
 
@@ -133,11 +135,19 @@ pub async fn watch(proxy: Arc<Proxy>) {
         .config
         .reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
+    let mut repeats = Repeats::default();
     loop {
         let next = proxy.nodes.lock().next().map(Into::into);
         tokio::select! {
-            () = proxy.shadow.news.notified() => tell_news(&proxy),
+            () = proxy.shadow.news.notified() => tell_news(&proxy, &mut repeats),
             () = wait::until(next) => ask_suspects(&proxy),
+            () = wait::until(repeats.next().map(Into::into)) => {
+                let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
+                let holding_up = unanswered || !proxy.nodes.lock().is_empty();
+                for topic in repeats.due(Instant::now(), holding_up) {
+                    healing::tell_subscribers(&proxy, &topic);
+                }
+            }
             // A suspect that is new may be due before the others.
             () = proxy.nodes.changed.notified() => {}
             _ = round.tick() => get_acquainted(&proxy),
@@ -150,7 +160,7 @@ pub async fn watch(proxy: Arc<Proxy>) {
     }
 }
 
-fn tell_news(proxy: &Arc<Proxy>) {
+fn tell_news(proxy: &Arc<Proxy>, repeats: &mut Repeats) {
     let (news, displaced) = proxy
         .shadow
         .with_activity(|_, activity| (activity.take_news(), activity.take_displaced()));
@@ -159,6 +169,7 @@ fn tell_news(proxy: &Arc<Proxy>) {
             (Some(api), letter) => healing::send(proxy, &api, letter),
             (None, Letter::Topic(topic)) => {
                 healing::tell_subscribers(proxy, &topic);
+                repeats.changed(&topic, Instant::now());
             }
             (None, Letter::Param(_)) => {}
         }

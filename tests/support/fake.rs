@@ -139,6 +139,11 @@ impl FakeNode {
         };
     }
 
+    /// As [`Self::claim_publication`], for a topic that it subscribes.
+    pub(crate) fn claim_subscription(&self, topic: &str, topic_type: &str) {
+        lock(&self.inner.subscriptions).insert(topic.to_owned(), topic_type.to_owned());
+    }
+
     /// Its address for services. Nobody answers there in TCPROS.
     pub(crate) fn service_api(&self) -> String {
         format!("rosrpc://127.0.0.1:{}", self.server.port)

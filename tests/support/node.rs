@@ -69,6 +69,15 @@ impl Node {
         node
     }
 
+    /// Runs a node by `command` and waits until it is at work.
+    #[track_caller]
+    pub(crate) fn run(command: &mut Command) -> Self {
+        let process = Process::start(format!("{command:?}"), command);
+        let mut node = Self { process };
+        node.wait_line("`ready`", |line| line.starts_with("ready "));
+        node
+    }
+
     /// The rest of every line that begins with `word`.
     pub(crate) fn said(&self, word: &str) -> Vec<String> {
         let start = format!("{word} ");

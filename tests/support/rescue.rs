@@ -67,6 +67,12 @@ impl Setup {
         self
     }
 
+    /// Runs it by another command, which `wrap` makes of its own.
+    pub(crate) fn wrapped(mut self, wrap: impl FnOnce(&Command) -> Command) -> Self {
+        self.command = wrap(&self.command);
+        self
+    }
+
     pub(crate) fn at_port(mut self, port: u16) -> Self {
         self.port = port;
         self

@@ -1,0 +1,322 @@
+//! Nodes that cannot be reached, because packets to them vanish or their names do not resolve, hold up
+//! nobody; and as soon as they can be reached again they are whole.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::net::UdpSocket;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use support::{
+    Client, FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually,
+    eventually_some, free_port, holds, names, params, status,
+};
+
+/// Nodes that cannot be reached, and others.
+const UNREACHABLE: u8 = 20;
+const LIVING: usize = 18;
+/// By then a living subscriber knows a new publisher.
+const SOON: Duration = Duration::from_secs(1);
+
+/// The living half: fakes, and a real node of each library.
+struct Living {
+    fakes: Vec<FakeNode>,
+    real: [Node; 2],
+}
+
+impl Living {
+    fn start(robot: &Robot) -> Self {
+        let client = robot.client();
+        let fakes = (0..LIVING).map(|i| FakeNode::start(&format!("/living{i}")));
+        let fakes: Vec<_> = fakes.collect();
+        for fake in &fakes {
+            fake.subscribe(&client, "/chatter", "std_msgs/String");
+        }
+        let real = [Library::Rospy, Library::Roscpp].map(|library| {
+            let name = format!("__name:={}", format!("{library:?}").to_lowercase());
+            robot.node(library, "listener", &[&name])
+        });
+        Self { fakes, real }
+    }
+
+    /// How long it takes each to hear of a publisher that registers now.
+    #[track_caller]
+    fn hear_of(&self, publisher: &FakeNode, client: &Client) -> Vec<Duration> {
+        let start = Instant::now();
+        publisher.publish(client, "/chatter", "std_msgs/String");
+        let mut heard = vec![None; LIVING + 2];
+        eventually("every living subscriber hears of a publisher", || {
+            for (i, heard) in heard.iter_mut().enumerate() {
+                if heard.is_none() {
+                    let updates = match i.checked_sub(LIVING) {
+                        None => self.fakes[i].updates("/chatter"),
+                        Some(real) => self.real[real].updates("/chatter"),
+                    };
+                    let knows = updates.iter().any(|list| list.contains(&publisher.api));
+                    *heard = knows.then(|| start.elapsed());
+                }
+            }
+            heard.iter().all(Option::is_some)
+        });
+        heard.into_iter().flatten().collect()
+    }
+}
+
+/// Median and maximum in milliseconds.
+fn summary(times: &[Duration]) -> (f64, f64) {
+    let mut times: Vec<_> = times.iter().map(|time| time.as_secs_f64() * 1e3).collect();
+    times.sort_by(f64::total_cmp);
+    (times[times.len() / 2], times[times.len() - 1])
+}
+
+/// How long it takes from the new master's open port to the open gate, in milliseconds, when the
+/// master dies: the rest is the start of a Python program.
+#[track_caller]
+fn crash(robot: &mut Robot) -> f64 {
+    let before = status(&robot.client())["recoveries"].as_u64();
+    robot.crash_master();
+    eventually_some("the recovery is reported", || {
+        let status = status(&robot.client());
+        let new = status["recoveries"].as_u64() > before;
+        let phase = |name: &str| status["last_recovery"]["phases"][name].as_f64();
+        new.then(|| Some(phase("total_ms")? - phase("absence_ms")?))?
+    })
+}
+
+fn twenty_of_forty_are_unreachable(mode: Mode) {
+    let net = Netns::new();
+    let mut robot = Robot::start(mode);
+    let client = robot.client();
+    let living = Living::start(&robot);
+    let without = [crash(&mut robot), crash(&mut robot)];
+    for host in 10..10 + UNREACHABLE {
+        net.cut(host);
+        let (name, api) = (
+            format!("/gone{host}"),
+            format!("http://{}:4711/", net.far(host)),
+        );
+        let api = api.as_str();
+        client.ok(
+            "registerSubscriber",
+            params![name.as_str(), "/chatter", "std_msgs/String", api],
+        );
+        client.ok("subscribeParam", params![name.as_str(), api, "/gain"]);
+    }
+    let before = robot.settled_state();
+    let with = [crash(&mut robot), crash(&mut robot)];
+
+    // At once, when nobody knows yet who is suspect; and later, when it is known.
+    let mut publishers: Vec<FakeNode> = Vec::new();
+    let mut tell = |count: usize| {
+        let mut times = Vec::new();
+        for _ in 0..count {
+            let publisher = FakeNode::start(&format!("/publisher{}", publishers.len()));
+            times.extend(living.hear_of(&publisher, &client));
+            publishers.push(publisher);
+        }
+        times
+    };
+    let at_once = tell(5);
+    eventually("the unreachable ones are suspect", || {
+        names(&status(&client)["suspects"]).len() == usize::from(UNREACHABLE)
+    });
+    let later = tell(5);
+    let (median, most) = summary(&at_once);
+    let (median_later, most_later) = summary(&later);
+    println!(
+        "{mode:?}: told after {median:.1} ms (most {most:.1}) at once, {median_later:.1} ms (most \
+         {most_later:.1}) later; the master restored in {with:.1?} ms with and {without:.1?} ms without \
+         unreachable nodes"
+    );
+    let least = |times: [f64; 2]| times[0].min(times[1]);
+    for times in [at_once, later] {
+        assert!(times.iter().all(|time| *time < SOON), "{times:?}");
+    }
+    // Both are the start of a Python program on a busy computer.
+    assert!(
+        least(with) < least(without) * 1.5 + 50.0,
+        "{with:?} {without:?}"
+    );
+    // Parameters reach the living, too, and nobody was taken out or disturbed.
+    let state = robot.state();
+    for host in 10..10 + UNREACHABLE {
+        assert!(state.knows(&format!("/gone{host}")));
+    }
+    assert_eq!(
+        before.subscribers_of("/chatter"),
+        state.subscribers_of("/chatter")
+    );
+    let watcher = FakeNode::start("/watcher");
+    watcher.watch_param(&client, "/gain");
+    let start = Instant::now();
+    client.set_param("/gain", 7);
+    eventually("a living node is told of a parameter", || {
+        !watcher.heard("paramUpdate").is_empty()
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    // A list that the master sends late does not stand for long.
+    let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
+    eventually("all know all publishers", || {
+        let fakes = living.fakes.iter().map(|fake| fake.updates("/chatter"));
+        let real = living.real.iter().map(|node| node.updates("/chatter"));
+        fakes
+            .chain(real)
+            .all(|updates| updates.last() == Some(&all))
+    });
+    for fake in &living.fakes {
+        let updates = fake.updates("/chatter");
+        // A core has more threads than there are nodes to hold them up.
+        assert!(
+            mode == Mode::Proxy || updates.is_sorted_by_key(Vec::len),
+            "{updates:?}"
+        );
+        assert_eq!(fake.heard("shutdown").len(), 0);
+    }
+}
+
+#[test]
+fn living_subscribers_are_told_soon_in_core_mode() {
+    twenty_of_forty_are_unreachable(Mode::Core);
+}
+
+/// With the three threads and without the timeout that rosmaster has when nobody says otherwise.
+#[test]
+fn living_subscribers_are_told_soon_in_proxy_mode() {
+    twenty_of_forty_are_unreachable(Mode::Proxy);
+}
+
+/// Real nodes behind a cable that is cut during an outage, and mended later.
+#[test]
+fn a_node_that_can_be_reached_again_is_whole() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
+    let rescue = setup.args(["--census-timeout", "1000"]).start();
+    let client = rescue.client();
+    let port = rescue.port();
+    let nodes = [(2, Library::Rospy), (3, Library::Roscpp)].map(|(host, library)| {
+        let mut command = library.command(&scratch, port, "listener");
+        let name = format!("__name:={}", format!("{library:?}").to_lowercase());
+        command
+            .arg(name)
+            .env("ROS_IP", net.far(host))
+            .env("ROS_MASTER_URI", format!("http://{}:{port}", net.near()));
+        Node::run(&mut net.inside(&command))
+    });
+    for host in [2, 3] {
+        net.cut(host);
+    }
+    let dead = client.master_pid().expect("a master");
+    support::signal(dead, rustix::process::Signal::KILL);
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let suspects = || names(&status(&client)["suspects"]);
+    eventually("both are suspect", || suspects() == ["/roscpp", "/rospy"]);
+    let knows = |node: &Node| {
+        let updates = node.updates("/chatter");
+        updates.last() == Some(&vec![publisher.api.clone()])
+    };
+    // Longer than the supervised rosmaster tries.
+    assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
+    for host in [2, 3] {
+        net.mend(host);
+    }
+    eventually("both know the publisher", || nodes.iter().all(knows));
+    eventually("nobody is suspect any more", || suspects().is_empty());
+}
+
+/// A name server that never answers, for one process: `unshare` gives it a resolv.conf of its own.
+#[test]
+fn names_that_resolve_slowly_or_not_at_all_delay_nobody() {
+    let scratch = Scratch::new();
+    let id = std::process::id();
+    let server = format!("127.{}.{}.53", 64 + (id >> 8) % 128, id & 255);
+    let silent =
+        UdpSocket::bind((server.as_str(), 53)).expect("root, and the port of name servers");
+    let resolv = scratch.path("resolv.conf");
+    std::fs::write(&resolv, format!("nameserver {server}\noptions timeout:5\n")).unwrap();
+    let setup = Setup::core(&scratch, free_port()).wrapped(|own| {
+        let mut command = Command::new("unshare");
+        command
+            .args(["--mount", "sh", "-c"])
+            .arg(r#"mount --bind "$0" /etc/resolv.conf && exec "$@""#)
+            .arg(&resolv)
+            .arg(own.get_program())
+            .args(own.get_args())
+            .current_dir(scratch.path(""));
+        for (key, value) in own.get_envs() {
+            match value {
+                Some(value) => command.env(key, value),
+                None => command.env_remove(key),
+            };
+        }
+        command
+    });
+    let rescue = setup.start();
+    let client = rescue.client();
+    for i in 0..40 {
+        let (name, api) = (format!("/slow{i}"), format!("http://slow{i}.test:4711/"));
+        client.ok(
+            "registerSubscriber",
+            params![name.as_str(), "/chatter", "std_msgs/String", api],
+        );
+    }
+    let living = FakeNode::start("/living");
+    // By a name that the computer knows itself.
+    let api = format!("http://localhost:{}/", living.port());
+    living.claim_subscription("/chatter", "std_msgs/String");
+    client.ok(
+        "registerSubscriber",
+        params!["/living", "/chatter", "std_msgs/String", api],
+    );
+    let dead = client.master_pid().expect("a master");
+    support::signal(dead, rustix::process::Signal::KILL);
+    let start = Instant::now();
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let parked = start.elapsed();
+    eventually("the living subscriber is told", || {
+        living.updates("/chatter").last() == Some(&vec![publisher.api.clone()])
+    });
+    let told = start.elapsed() - parked;
+    println!("recovery and registration {parked:?}, told {told:?} later");
+    assert!(parked < Duration::from_secs(4), "{parked:?}");
+    assert!(told < SOON, "{told:?}");
+    // While the lookups are under way: calls pass, and so do new publishers.
+    for i in 0..50 {
+        let start = Instant::now();
+        client.set_param("/n", i);
+        assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    }
+    eventually("the slow ones are suspect, and only they", || {
+        names(&status(&client)["suspects"]).len() == 40
+    });
+    let second = FakeNode::start("/second");
+    let start = Instant::now();
+    second.publish(&client, "/chatter", "std_msgs/String");
+    eventually("the living subscriber is told of the second", || {
+        living
+            .updates("/chatter")
+            .last()
+            .is_some_and(|list| list.len() == 2)
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    assert_eq!(living.heard("shutdown").len(), 0);
+    // Nobody waits for a name server at the end either.
+    let mut rescue = rescue;
+    let start = Instant::now();
+    rescue.terminate();
+    assert!(
+        start.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        start.elapsed()
+    );
+    drop(silent);
+}
