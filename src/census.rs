@@ -121,9 +121,15 @@ pub fn judge(
         Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Stranger,
         Some(_) => Verdict::Itself,
     };
+    // Who took a port may have been asked in the name of the one before.
+    let of_pid = names.iter().filter(|name| name.known_pid == pid);
+    let last_of_pid = of_pid.map(|name| name.registered).max();
     let verdicts = names.iter().zip(&matches);
     let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
-        (Some(known), Some(pid)) if known == pid => Verdict::Itself,
+        (Some(known), Some(pid)) if known == pid => match by_topics(name, found) {
+            Verdict::Stranger if last_of_pid > Some(name.registered) => Verdict::Stranger,
+            _ => Verdict::Itself,
+        },
         (Some(_), Some(_)) if !name.registered_since => Verdict::Stranger,
         _ => by_topics(name, found),
     });

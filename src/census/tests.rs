@@ -50,6 +50,10 @@ fn another_process_id_is_another_node() {
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Stranger, Itself]);
     // One process may well bear two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
+    // But it may have been asked before it registered, in the name of the one before it.
+    let of_b = claims(&["/tb"], &[]);
+    let both = verdicts([Some(2), Some(2)], 2, Some(&of_b));
+    assert_eq!(both, [Stranger, Itself]);
     // The process id outweighs the topics: it is that node, whatever it has done since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);

@@ -346,8 +346,16 @@ async fn mend(
     kind: Kind,
     outcome: &mut Outcome,
 ) {
+    if proxy.nodes.is_forbidden(&call) {
+        return;
+    }
     // In a multicall it travels alone, see the lane: it must not bump anybody.
-    let reply = proxy.lane.call(Call::multicall([call]), kind).await;
+    let alone = Call::multicall([call.clone()]);
+    let reply = proxy.lane.call(alone, kind).await;
+    if reply.is_none() {
+        // One master after the other took it and never answered.
+        proxy.nodes.forbid(&call);
+    }
     if let Some(Reply::Value(_)) = reply {
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
         outcome

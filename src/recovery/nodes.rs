@@ -1,6 +1,7 @@
 //! What is known of the nodes beyond their registrations, and the watch over it.
 
 use std::{
+    collections::HashSet,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicUsize, Ordering},
@@ -24,7 +25,7 @@ use crate::{
         shadow::Shadow,
     },
     wait,
-    xmlrpc::Call,
+    xmlrpc::{Call, Value},
 };
 
 /// A node is asked for its process id so long after it last registered something: starting nodes
@@ -41,6 +42,8 @@ pub struct Nodes {
     /// Letters under way.
     pub(super) post: Post,
     suspects: Mutex<Suspects>,
+    /// Registrations that masters died of: method, node and topic.
+    deadly: Mutex<HashSet<Vec<String>>>,
     /// Recoveries whose census is not over.
     censuses: AtomicUsize,
     /// Nodes that are being asked and have not answered yet.
@@ -56,6 +59,18 @@ impl Nodes {
     /// Whether the node at `api` is a suspect.
     pub fn is_suspect(&self, api: &str) -> bool {
         self.lock().contains(api)
+    }
+
+    /// A master died of this call: it is not made again to mend what a node says.
+    pub(super) fn forbid(&self, call: &Call) {
+        let mut deadly = self.deadly.lock().unwrap_or_else(PoisonError::into_inner);
+        deadly.insert(essence(call));
+    }
+
+    /// Whether [`Nodes::forbid`] was told so.
+    pub(super) fn is_forbidden(&self, call: &Call) -> bool {
+        let deadly = self.deadly.lock().unwrap_or_else(PoisonError::into_inner);
+        deadly.contains(&essence(call))
     }
 
     /// The names of the suspects.
@@ -115,6 +130,15 @@ impl Nodes {
         proxy.nodes.update_telling(proxy);
         CensusUnderWay(proxy.clone())
     }
+}
+
+/// What a registration is about, whatever its type and address.
+fn essence(call: &Call) -> Vec<String> {
+    let subject = call.params.iter().take(2).filter_map(Value::as_str);
+    std::iter::once(call.method.as_str())
+        .chain(subject)
+        .map(str::to_owned)
+        .collect()
 }
 
 /// The census of a recovery.
@@ -182,7 +206,7 @@ fn tell_news(proxy: &Arc<Proxy>, repeats: &mut Repeats) {
 fn ask_suspects(proxy: &Arc<Proxy>) {
     let registered = proxy.shadow.with_mirror(|mirror| {
         let apis = mirror.nodes().map(|(_, api)| api.to_owned());
-        apis.collect::<std::collections::HashSet<_>>()
+        apis.collect::<HashSet<_>>()
     });
     let due = {
         let mut suspects = proxy.nodes.lock();

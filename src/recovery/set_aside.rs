@@ -24,6 +24,9 @@ pub(super) fn set_aside(proxy: &Proxy, calls: &[Call]) -> Vec<String> {
             })
             .map_err(|error| error.to_string()),
     };
+    for call in calls {
+        proxy.nodes.forbid(call);
+    }
     let names: Vec<_> = calls.iter().map(|call| Told(call).to_string()).collect();
     for name in &names {
         match &kept {
