@@ -294,7 +294,7 @@ impl Guard {
             Done::Examined(connection, Ok(examination)) => {
                 self.connection = Some(connection);
                 let new = examination.outcome != Outcome::Resumed;
-                if examination.outcome == Outcome::Injected {
+                if new {
                     self.suspicion.survived();
                 }
                 // Whatever it dies of from now on, it is not the injection.

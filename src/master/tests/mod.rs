@@ -1,5 +1,6 @@
 //! The model on its own. That it is rosmaster's equal is for `tests/differential.rs`.
 
+mod careful;
 mod looking;
 mod params;
 mod planning;
