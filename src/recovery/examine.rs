@@ -247,6 +247,8 @@ async fn inject(
     let takes_over = !found.is_empty() && proxy.shadow.with_mirror(Master::is_empty);
     examination.outcome = if takes_over {
         Outcome::Adopted
+    } else if proxy.shadow.with_mirror(Master::is_empty) {
+        Outcome::Begun
     } else {
         Outcome::Injected
     };

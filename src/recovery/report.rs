@@ -14,6 +14,8 @@ use crate::{clock, master::Counts};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
+    /// An empty master, and nothing to bring to it: a session begins.
+    Begun,
     /// A new incarnation was brought to the mirror's state.
     Injected,
     /// The mirror took over what a running master holds.
@@ -25,6 +27,7 @@ pub enum Outcome {
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
+            Self::Begun => "an empty master is served",
             Self::Injected => "the master has been restored",
             Self::Adopted => "a running master has been taken over",
             Self::Resumed => "the same master goes on",
