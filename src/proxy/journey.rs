@@ -167,36 +167,67 @@ pub enum TravelError {
     Look(#[from] LookError),
 }
 
+/// Whether the master writes its own address into the reply: `getUri`, alone or in a multicall.
+pub fn asks_uri(call: &Call) -> bool {
+    fn asks(method: Option<&Value>, params: Option<&Value>) -> bool {
+        match method.and_then(Value::as_str) {
+            Some("getUri") => true,
+            Some("system.multicall") => {
+                let entries = params.and_then(Value::as_array).and_then(<[Value]>::first);
+                entries.is_some_and(|entries| entries.as_array().is_some_and(any))
+            }
+            _ => false,
+        }
+    }
+    fn any(entries: &[Value]) -> bool {
+        let mut entries = entries.iter().filter_map(Value::as_struct);
+        entries.any(|entry| asks(entry.get("methodName"), entry.get("params")))
+    }
+    match call.method.as_str() {
+        "getUri" => true,
+        "system.multicall" => call
+            .params
+            .first()
+            .and_then(Value::as_array)
+            .is_some_and(any),
+        _ => false,
+    }
+}
+
 /// Puts our own address where the master wrote its own: into replies to `getUri`, alone or in a
 /// multicall. None if there is nothing to change.
 pub fn rewrite_uri(call: &Call, reply: &Reply, uri: &str) -> Option<Reply> {
     let Reply::Value(value) = reply else {
         return None;
     };
-    let value = match call.method.as_str() {
-        "getUri" => rewritten(value, uri)?,
+    rewrite(&call.method, &call.params, value, uri).map(Reply::Value)
+}
+
+fn rewrite(method: &str, params: &[Value], value: &Value, uri: &str) -> Option<Value> {
+    match method {
+        "getUri" => rewritten(value, uri),
         "system.multicall" => {
-            let entries = call.params.first()?.as_array()?;
+            let entries = params.first()?.as_array()?;
             let mut results = value.as_array()?.to_vec();
             let mut changed = false;
             for (entry, result) in entries.iter().zip(&mut results) {
-                let method = entry
-                    .as_struct()
-                    .and_then(|entry: &Struct| entry.get("methodName"));
-                if method.and_then(Value::as_str) == Some("getUri")
+                let entry = entry.as_struct();
+                let member = |name| entry.and_then(|entry: &Struct| entry.get(name));
+                if let Some(method) = member("methodName").and_then(Value::as_str)
                     && let Value::Array(one) = result
                     && let [value] = one.as_mut_slice()
-                    && let Some(new) = rewritten(value, uri)
                 {
-                    *value = new;
-                    changed = true;
+                    let params = member("params").and_then(Value::as_array);
+                    if let Some(new) = rewrite(method, params.unwrap_or_default(), value, uri) {
+                        *value = new;
+                        changed = true;
+                    }
                 }
             }
-            changed.then_some(Value::Array(results))?
+            changed.then_some(Value::Array(results))
         }
-        _ => return None,
-    };
-    Some(Reply::Value(value))
+        _ => None,
+    }
 }
 
 fn rewritten(value: &Value, uri: &str) -> Option<Value> {
@@ -315,5 +346,14 @@ mod tests {
         };
         let reply = rewrite_uri(&both, &results("http://m:1/"), "http://us:2/");
         assert_eq!(reply, Some(results("http://us:2/")));
+        let nested = Call::multicall([both.clone()]);
+        let within = |reply: Reply| match reply {
+            Reply::Value(value) => Reply::Value(vec![Value::Array(vec![value])].into()),
+            fault => fault,
+        };
+        let reply = rewrite_uri(&nested, &within(results("http://m:1/")), "http://us:2/");
+        assert_eq!(reply, Some(within(results("http://us:2/"))));
+        assert!(asks_uri(&both) && asks_uri(&nested));
+        assert!(!asks_uri(&Call::multicall([Call::new("getPid", vec![])])));
     }
 }

@@ -182,6 +182,10 @@ async fn answer(
                 ));
             };
             let (tx, rx) = oneshot::channel();
+            let names_uri = call
+                .as_ref()
+                .filter(|call| journey::asks_uri(call))
+                .cloned();
             let item = LaneItem {
                 raw: Some((head, body)),
                 call,
@@ -190,7 +194,7 @@ async fn answer(
                 attempts: 0,
             };
             proxy.lane.submit(item).await;
-            await_lane(proxy, pace, hold, rx).await
+            await_lane(proxy, pace, hold, rx, names_uri.as_ref()).await
         }
     }
 }
@@ -252,6 +256,7 @@ async fn await_lane(
     pace: &Pace,
     hold: Duration,
     mut answered: oneshot::Receiver<Answer>,
+    names_uri: Option<&Call>,
 ) -> Result<HttpReply, Closed> {
     let mut gate = proxy.gate.clone();
     if matches!(gate.state(), State::Shut(_)) {
@@ -266,8 +271,11 @@ async fn await_lane(
     };
     tokio::select! {
         answer = &mut answered => match answer {
-            Ok(Answer::Raw(raw)) => Ok(plain(raw)),
-            Ok(Answer::Made(reply)) => Ok(xml(&reply)),
+            Ok(Answer::Raw(raw)) => Ok(forwarded(proxy, names_uri, raw)),
+            Ok(Answer::Made(reply)) => {
+                let ours = names_uri.and_then(|it| journey::rewrite_uri(it, &reply, &proxy.uri));
+                Ok(xml(ours.as_ref().unwrap_or(&reply)))
+            }
             Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
         },
         () = gate.shut_for(hold) => {
@@ -278,11 +286,10 @@ async fn await_lane(
     }
 }
 
-/// A master's reply to a read, with our address for its own.
+/// A master's reply, with our address for its own.
 fn forwarded(proxy: &Proxy, call: Option<&Call>, raw: RawReply) -> HttpReply {
-    let names_uri = call.is_some_and(|call| call.method == "system.multicall");
-    if names_uri
-        && let (Some(call), Ok(reply)) = (call, xmlrpc::decode_reply(&raw.body))
+    if let Some(call) = call.filter(|call| journey::asks_uri(call))
+        && let Ok(reply) = xmlrpc::decode_reply(&raw.body)
         && let Some(rewritten) = journey::rewrite_uri(call, &reply, &proxy.uri)
     {
         return xml(&rewritten);

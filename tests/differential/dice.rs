@@ -13,19 +13,21 @@ pub(crate) struct Cast {
     pub(crate) poison: bool,
     /// Whether parameters may be of the wrong kind and number, and multicalls malformed.
     pub(crate) errors: bool,
+    /// Whether the master is asked for its process id.
+    pub(crate) process: bool,
 }
 
 pub(crate) const CALLERS: &[&str] = &[
     "/n0", "/n1", "/n2", "/n0", "/n1", "/n2", "/ns/n3", "/ns/n3", "plain", "a/b", "", "/a//b",
     "/x/", "/o d",
 ];
-const NAMES: &[&str] = &[
+pub(crate) const NAMES: &[&str] = &[
     "/t0", "/t1", "/t2", "/t3", "/t4", "/t5", "/ns/t6", "t0", "t7", "~t", "/t0/", "//t1//", "/n0/t",
 ];
 const ODD_NAMES: &[&str] = &[
     "//", "~", "/", "", "a b", "a:b", "é/ü", "~~", "~/x", "t/~", "/*",
 ];
-const KEYS: &[&str] = &[
+pub(crate) const KEYS: &[&str] = &[
     "/a", "/a/b", "/a/b/c", "/a/d", "/b", "/b/c/", "a", "~p", "/ns/p", "//a//b", "/d/e/f/g", "c",
 ];
 const ODD_KEYS: &[&str] = &[
@@ -212,7 +214,10 @@ impl Dice {
                 params.push(self.pick(CALLERS).into());
                 "lookupNode"
             }
-            96..=98 => self.pick(READS),
+            96..=98 => match self.pick(READS) {
+                "getPid" if !cast.process => "getUri",
+                read => read,
+            },
             99 => {
                 // `shutdown` with two parameters would work.
                 params.truncate(self.below(2));

@@ -1,7 +1,18 @@
-//! The model against real rosmasters: random sequences of calls must be answered alike, leave the
-//! same state, cause the same callbacks, and be brought whole to a fresh rosmaster by one call.
+//! The model against the real thing: random sequences of calls must be answered alike, leave the same
+//! state, and cause the same callbacks. Once with a bare rosmaster, whose state is brought whole to
+//! a fresh one on the way; and once through rosrescue, with a rosmaster that is killed again and
+//! again, while the model is a master that never crashed.
 //!
-//! `ROSRESCUE_SEQUENCES` sets how many sequences are run, `ROSRESCUE_SEED` where they begin.
+//! A sequence that fails is made as short as possible and printed. The variables are:
+//!
+//! | variable | |
+//! |---|---|
+//! | `ROSRESCUE_SEQUENCES` | how many sequences with a bare rosmaster |
+//! | `ROSRESCUE_CRASH_SEQUENCES` | how many through rosrescue; every [`CORE_EACH`]th with `core` |
+//! | `ROSRESCUE_CALLS` | calls of each |
+//! | `ROSRESCUE_CRASHES` | crashes of each that goes through rosrescue |
+//! | `ROSRESCUE_SEED` | the first sequence's number; the others follow it |
+//! | `ROSRESCUE_SCRIPT` | a file with a printed sequence: nothing but that is played |
 
 #![allow(
     clippy::expect_used,
@@ -10,25 +21,37 @@
     reason = "a test fails by panicking"
 )]
 
+mod crashes;
 mod dice;
+mod direct;
 mod nodes;
+mod oracle;
 mod real;
+mod script;
+mod shrinking;
+mod stage;
+#[path = "../support/mod.rs"]
+mod support;
 
-use std::collections::BTreeSet;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
 
-use dice::{CALLERS, Cast, Dice};
+use crashes::Tally;
 use nodes::Node;
 use real::Rosmaster;
-use rosrescue::master::{
-    FirstLook, Mark, Master, NotAMaster, Notice, Plan, Skipped, accepted, difference,
-};
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use script::{Script, Step, shrink, simpler};
+use stage::Failure;
 
-/// Sequences by default: about a minute on two cores.
-const SEQUENCES: u64 = 120;
-
-/// Calls of a sequence.
-const CALLS: usize = 80;
+const SEQUENCES: u64 = 300;
+const CRASH_SEQUENCES: u64 = 60;
+const CALLS: u64 = 200;
+const CRASHES: u64 = 3;
+/// A core takes a while to start.
+const CORE_EACH: u64 = 6;
+/// Nodes that listen.
+const NODES: usize = 5;
+/// Runs that are worth a shorter script.
+const PATIENCE: usize = 300;
 
 fn number(name: &str, default: u64) -> u64 {
     match std::env::var(name) {
@@ -37,249 +60,101 @@ fn number(name: &str, default: u64) -> u64 {
     }
 }
 
-#[test]
-fn random_sequences_are_answered_alike_and_brought_back_whole() {
-    let nodes: Vec<Node> = (0..5).map(|_| Node::start()).collect();
-    let mut apis: Vec<String> = nodes.iter().map(|node| node.api.clone()).collect();
-    apis.push("rosrpc://h:1".to_owned());
-    let sequences = number("ROSRESCUE_SEQUENCES", SEQUENCES);
-    let first = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
-    let mut spare = Rosmaster::start();
-    let mut compared = 0;
-    let mut carried: Option<(Rosmaster, Master)> = None;
-    for seed in first..first + sequences {
-        println!("seed {seed}");
-        let mut dice = Dice(seed);
-        let mut cast = Cast {
-            apis: apis.clone(),
-            poison: dice.once_in(3),
-            errors: !dice.once_in(4),
-        };
-        // A master that was brought to a state goes on as one that came there by itself.
-        let go_on = dice.once_in(2) && !cast.poison;
-        let (mut real, mut model) = match carried.take().filter(|_| go_on) {
-            Some(carried) => carried,
-            None => {
-                let real = std::mem::replace(&mut spare, Rosmaster::start()).ready();
-                (real, Master::default())
-            }
-        };
-        model.set_identity(real.pid, real.uri.clone());
-        let notices = play(&mut dice, &cast, CALLS, &mut real, &mut model);
-        if !cast.poison {
-            hear(&nodes, seed, &mut real, &mut model, notices);
-        } else {
-            settle(&nodes, seed, &mut real, &mut model);
-        }
-        same_reads(&mut real, &mut model.clone());
-        look(&mut real, &model);
-        cast.poison = false;
-
-        let mut fresh = std::mem::replace(&mut spare, Rosmaster::start()).ready();
-        let mut found = Master::default();
-        found.set_identity(fresh.pid, fresh.uri.clone());
-        let mut told = told_nobody(&cast);
-        if dice.once_in(3) {
-            told = play(&mut dice, &cast, 15, &mut fresh, &mut found);
-        }
-        let plan = Plan::new(&model, &found, &Mark::new("test"));
-        let reply = fresh.call(plan.call());
-        assert_eq!(plan.verify(&reply), Ok(()), "{:?}", plan.skipped());
-        let notices = found.clone().apply(plan.call()).notices;
-        assert!(
-            !notices
-                .iter()
-                .any(|notice| matches!(notice, Notice::Shutdown { .. }))
-        );
-        assert!(!found.is_empty() || notices.is_empty(), "{notices:?}");
-        let is_complete = |notice: &Notice| match notice {
-            Notice::PublisherUpdate {
-                topic, publishers, ..
-            } => *publishers == plan.expected().publishers_of(topic),
-            _ => true,
-        };
-        assert!(notices.iter().all(is_complete), "{notices:?}");
-        note(&mut told, &notices);
-        let mut expected = plan.expected().clone();
-        let cannot_be = |skipped: &Skipped| {
-            matches!(skipped, Skipped::Param { .. } | Skipped::Unnameable { .. })
-        };
-        assert!(
-            !found.is_empty() || plan.skipped().iter().all(cannot_be),
-            "{:?}",
-            plan.skipped()
-        );
-        if found.is_empty() && plan.skipped().is_empty() {
-            compared += 1;
-            assert_eq!(difference(&model, &expected), Vec::<String>::new());
-        }
-        hear(&nodes, seed, &mut fresh, &mut expected, told);
-        same_reads(&mut fresh, &mut expected.clone());
-        carried = Some((fresh, expected));
-    }
-    println!("{compared} of {sequences} states were compared whole after their injection");
+/// The sequence that is to be played alone, if there is one.
+fn given() -> Option<Script> {
+    let path = std::env::var("ROSRESCUE_SCRIPT").ok()?;
+    Some(Script::parse(&std::fs::read_to_string(path).unwrap()))
 }
 
-type Expected = Vec<(String, Vec<Call>)>;
-
-fn told_nobody(cast: &Cast) -> Expected {
-    cast.apis
-        .iter()
-        .map(|api| (api.clone(), Vec::new()))
-        .collect()
+fn nodes() -> Vec<Node> {
+    (0..NODES).map(|_| Node::start()).collect()
 }
 
-fn note(told: &mut Expected, notices: &[Notice]) {
-    for (to, call) in notices.iter().map(nodes::as_call) {
-        if let Some((_, calls)) = told.iter_mut().find(|(api, _)| api == to) {
-            calls.push(call);
-        }
-    }
-}
-
-/// Plays a sequence to both; gives what the nodes must hear.
-fn play(
-    dice: &mut Dice,
-    cast: &Cast,
-    calls: usize,
-    real: &mut Rosmaster,
-    model: &mut Master,
-) -> Expected {
-    let mut told = told_nobody(cast);
-    for step in 0..calls {
-        let call = dice.call(cast, 2);
-        let before = model.clone();
-        let reply = real.call(&call);
-        let outcome = model.apply(&call);
-        assert_eq!(outcome.reply, reply, "step {step}: {call:?}");
-        note(&mut told, &outcome.notices);
-        let mut mirror = before.clone();
-        let accepted = accepted(&before, &call, &reply);
-        for (call, _) in &accepted.calls {
-            mirror.apply(call);
-        }
-        let words = difference(&mirror, model);
-        assert_eq!(
-            words,
-            Vec::<String>::new(),
-            "step {step}: {call:?} answered {reply:?}"
-        );
-    }
-    told
-}
-
-/// Makes every node hear one last thing, and compares what they heard before it.
-fn hear(nodes: &[Node], seed: u64, real: &mut Rosmaster, model: &mut Master, expected: Expected) {
-    let heard = settle(nodes, seed, real, model);
-    for (node, (heard, last)) in nodes.iter().zip(heard) {
-        let (_, mut calls) = expected
-            .iter()
-            .find(|(api, _)| *api == node.api)
-            .unwrap()
-            .clone();
-        calls.extend(last);
-        let heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
-        for (index, (heard, expected)) in heard.iter().zip(&calls).enumerate() {
-            assert_eq!(heard, expected, "callback {index} to {}", node.api);
-        }
-        assert_eq!(heard.len(), calls.len(), "callbacks to {}", node.api);
-    }
-}
-
-/// What every node heard up to a last thing, and what the settling itself added to it.
-fn settle(
-    nodes: &[Node],
-    seed: u64,
-    real: &mut Rosmaster,
-    model: &mut Master,
-) -> Vec<(Vec<Call>, Vec<Call>)> {
-    let topic = format!("/last{seed}");
-    let mut notices = Vec::new();
-    let mut both = |call: Call| {
-        let outcome = model.apply(&call);
-        assert_eq!(outcome.reply, real.call(&call), "{call:?}");
-        notices.extend(outcome.notices);
-    };
-    let call = |method: &str, params: &[&str]| {
-        Call::new(method, params.iter().map(|text| (*text).into()).collect())
-    };
-    let listeners: Vec<String> = (0..nodes.len()).map(|i| format!("/listener{i}")).collect();
-    for (name, node) in listeners.iter().zip(nodes) {
-        both(call(
-            "registerSubscriber",
-            &[name, &topic, "a/B", &node.api],
-        ));
-    }
-    both(call(
-        "registerPublisher",
-        &["/last", &topic, "a/B", "http://last"],
-    ));
-    for (name, node) in listeners.iter().zip(nodes) {
-        both(call("unregisterSubscriber", &[name, &topic, &node.api]));
-    }
-    both(call(
-        "unregisterPublisher",
-        &["/last", &topic, "http://last"],
-    ));
-    let is_last = |call: &Call| call.params.get(1) == Some(&Value::from(topic.as_str()));
-    let mine = |node: &Node| {
-        let told = notices
-            .iter()
-            .map(nodes::as_call)
-            .filter(|(to, _)| *to == node.api);
-        told.map(|(_, call)| call).collect()
-    };
-    nodes
-        .iter()
-        .map(|node| (node.take(is_last), mine(node)))
-        .collect()
-}
-
-/// Every read that a client may send, of everything that was ever named.
-fn same_reads(real: &mut Rosmaster, model: &mut Master) {
-    let own = |method: &str| Call::new(method, vec!["/test".into()]);
-    let mut calls: Vec<Call> = ["getSystemState", "getTopicTypes", "getParamNames"]
-        .map(own)
-        .into();
-    let one = |caller: &str, method: &str, name: &str| {
-        Call::new(method, vec![caller.into(), name.into()])
-    };
-    calls.push(one("/test", "getPublishedTopics", ""));
-    calls.push(one("/test", "getPublishedTopics", "/ns"));
-    calls.push(one("/test", "getParam", "/"));
-    calls.extend(
-        model
-            .params()
-            .keys()
-            .map(|key| one("/test", "getParam", key))
-            .filter(|call| call.params.get(1) != Some(&Value::from(""))),
+/// Plays `script`, and if that fails a shorter one and panics.
+fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), Failure>) {
+    let Err(first) = run(script) else { return };
+    eprintln!("{what} fails, and is made shorter now: {first}");
+    nodes::HURRIED.store(true, Ordering::Relaxed);
+    let mut why = first;
+    let steps = shrink(&script.steps, simpler, PATIENCE, |steps: &[Step]| {
+        let steps = steps.to_vec();
+        let shorter = Script { steps, ..*script };
+        run(&shorter).map_err(|failure| why = failure).is_err()
+    });
+    let shortest = Script { steps, ..*script };
+    panic!(
+        "{what} fails. Put this into a file, and its path into ROSRESCUE_SCRIPT:\n\n{}\n{why}",
+        shortest.print()
     );
-    let nodes: BTreeSet<String> = CALLERS
-        .iter()
-        .map(|caller| (*caller).to_owned())
-        .chain(model.nodes().map(|(caller_id, _)| caller_id.to_owned()))
-        .collect();
-    calls.extend(nodes.iter().map(|node| one(node, "lookupNode", "~")));
-    calls.extend(nodes.iter().map(|node| one("/a//x", "lookupNode", node)));
-    let services = model.snapshot().services.into_keys();
-    calls.extend(services.map(|service| one("/test", "lookupService", &service)));
-    for call in calls {
-        assert_eq!(model.apply(&call).reply, real.call(&call), "{call:?}");
-    }
 }
 
-/// A look at the real master, with the model as the state known before, must show the model.
-fn look(real: &mut Rosmaster, model: &Master) {
-    let mark = Mark::new("none");
-    let look = match FirstLook::decode(&real.call(&FirstLook::call(&mark))) {
-        Err(NotAMaster::ParamsUnreadable { .. }) => {
-            FirstLook::decode(&real.call(&FirstLook::call_without_params(&mark)))
+#[test]
+fn a_bare_rosmaster_answers_as_the_model_does() {
+    let nodes = nodes();
+    let mut spare = Rosmaster::start();
+    if let Some(script) = given() {
+        if !script
+            .steps
+            .iter()
+            .any(|it| matches!(it, Step::Crash { .. }))
+        {
+            direct::run(&script, &nodes, &mut spare).unwrap();
         }
-        look => look,
-    };
-    let look = look.unwrap();
-    assert_eq!((look.pid(), look.marked()), (real.pid, false));
-    let second: Option<Reply> = look.second_call(model).map(|call| real.call(&call));
-    let found = look.into_master(second.as_ref(), model).unwrap();
-    assert_eq!(difference(model, &found), Vec::<String>::new());
+        return;
+    }
+    let calls = usize::try_from(number("ROSRESCUE_CALLS", CALLS)).unwrap();
+    let first = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
+    let count = number("ROSRESCUE_SEQUENCES", SEQUENCES);
+    let (start, mut played) = (Instant::now(), 0);
+    for seed in first..first + count {
+        let script = direct::script(seed, calls, NODES);
+        hold(&format!("seed {seed}"), &script, |script| {
+            direct::run(script, &nodes, &mut spare)
+        });
+        played += script.calls();
+    }
+    println!(
+        "{count} sequences, {played} calls, seeds from {first}, {:?}",
+        start.elapsed()
+    );
+}
+
+#[test]
+fn through_rosrescue_no_crash_of_the_master_can_be_told() {
+    let nodes = nodes();
+    let mut tally = Tally::default();
+    if let Some(script) = given() {
+        for core in [false, true] {
+            if script
+                .steps
+                .iter()
+                .any(|it| matches!(it, Step::Crash { .. }))
+            {
+                crashes::run(&script, &nodes, core, &mut tally).unwrap();
+            }
+        }
+        return;
+    }
+    let calls = usize::try_from(number("ROSRESCUE_CALLS", CALLS)).unwrap();
+    let crashes = usize::try_from(number("ROSRESCUE_CRASHES", CRASHES)).unwrap();
+    let first = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
+    let count = number("ROSRESCUE_CRASH_SEQUENCES", CRASH_SEQUENCES);
+    let (start, mut played) = (Instant::now(), 0);
+    for seed in first..first + count {
+        let script = crashes::script(seed, calls, crashes, NODES);
+        let core = seed % CORE_EACH == 0;
+        let what = format!(
+            "seed {seed} with {crashes} crashes{}",
+            if core { " of core" } else { "" }
+        );
+        hold(&what, &script, |script| {
+            crashes::run(script, &nodes, core, &mut tally)
+        });
+        played += script.calls();
+    }
+    let Tally { crashes, spared } = tally;
+    println!(
+        "{count} sequences, {played} calls, {crashes} crashes, {spared} left out, seeds from {first}, {:?}",
+        start.elapsed()
+    );
 }

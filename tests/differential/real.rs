@@ -1,35 +1,36 @@
 //! A real rosmaster, and talking to it.
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
-/// Longest wait for a rosmaster to answer.
-const START: Duration = Duration::from_secs(30);
+use crate::support::free_port;
+
+/// Longest wait for an answer: of a rosmaster that starts, or while another one takes its place.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A rosmaster of its own, ended when this is dropped.
 pub(crate) struct Rosmaster {
     process: Child,
-    port: u16,
-    connection: Option<BufReader<TcpStream>>,
-    pub(crate) pid: i32,
-    pub(crate) uri: String,
+    pub(crate) port: u16,
     _scratch: tempfile::TempDir,
 }
 
 impl Rosmaster {
     /// Starts one without waiting for it.
     pub(crate) fn start() -> Self {
+        Self::start_at(free_port())
+    }
+
+    /// Starts one at `port` without waiting for it.
+    pub(crate) fn start_at(port: u16) -> Self {
         let scratch = tempfile::tempdir().unwrap();
         // The default configuration's stream handler imports rospy, which doubles the start.
         let logging = scratch.path().join("logging.conf");
         std::fs::write(&logging, LOGGING).unwrap();
-        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = listener.local_addr().unwrap().port();
-        drop(listener);
         let process = Command::new("/usr/bin/python3")
             .args(["/usr/bin/rosmaster", "--core", "-p", &port.to_string()])
             .env_clear()
@@ -48,19 +49,16 @@ impl Rosmaster {
         Self {
             process,
             port,
-            connection: None,
-            pid: 0,
-            uri: String::new(),
             _scratch: scratch,
         }
     }
 
-    /// Waits until it answers.
-    pub(crate) fn ready(mut self) -> Self {
-        let deadline = Instant::now() + START;
-        let connection = loop {
-            match TcpStream::connect(("127.0.0.1", self.port)) {
-                Ok(connection) => break connection,
+    /// A connection, once it answers.
+    pub(crate) fn ready(&mut self) -> Wire {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            match Wire::connect(self.port) {
+                Ok(wire) => return wire,
                 Err(error) => {
                     let ended = self.process.try_wait().unwrap();
                     assert!(ended.is_none(), "rosmaster ended at its start: {ended:?}");
@@ -68,45 +66,72 @@ impl Rosmaster {
                         Instant::now() < deadline,
                         "rosmaster does not listen: {error}"
                     );
-                    std::thread::sleep(Duration::from_millis(10));
+                    std::thread::sleep(Duration::from_millis(5));
                 }
             }
-        };
-        connection.set_nodelay(true).unwrap();
-        connection.set_read_timeout(Some(START)).unwrap();
-        self.connection = Some(BufReader::new(connection));
-        let mut ask = |method: &str| {
-            let reply = self.call(&Call::new(method, vec!["/test".into()]));
-            match reply {
-                Reply::Value(Value::Array(mut answer)) => answer.pop().unwrap(),
-                other => panic!("{method}: {other:?}"),
-            }
-        };
-        let (pid, uri) = (ask("getPid"), ask("getUri"));
-        self.pid = pid.as_int().unwrap();
-        self.uri = uri.as_str().unwrap().to_owned();
-        self
+        }
     }
 
-    /// Sends a call and reads the reply.
-    pub(crate) fn call(&mut self, call: &Call) -> Reply {
-        let body = encode_call(call);
-        let connection = self.connection.as_mut().expect("not ready");
-        let head = format!(
-            "POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
-            body.len()
-        );
-        let request = [head.as_bytes(), &body].concat();
-        connection.get_mut().write_all(&request).unwrap();
-        let body = read_message(connection).expect("rosmaster closed the connection");
-        decode_reply(&body).expect("a reply that cannot be decoded")
+    /// SIGKILL, and the end of the process.
+    pub(crate) fn kill(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
     }
 }
 
 impl Drop for Rosmaster {
     fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
+        self.kill();
+    }
+}
+
+/// A client's connection to a master.
+pub(crate) struct Wire {
+    stream: BufReader<TcpStream>,
+}
+
+impl Wire {
+    pub(crate) fn connect(port: u16) -> std::io::Result<Self> {
+        let stream = TcpStream::connect(("127.0.0.1", port))?;
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        Ok(Self {
+            stream: BufReader::new(stream),
+        })
+    }
+
+    /// Sends a call and does not wait for the reply.
+    pub(crate) fn send(&mut self, call: &Call) -> Result<(), String> {
+        let body = encode_call(call);
+        let head = format!(
+            "POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
+            body.len()
+        );
+        let request = [head.as_bytes(), &body].concat();
+        let sent = self.stream.get_mut().write_all(&request);
+        sent.map_err(|error| format!("the call cannot be sent: {error}"))
+    }
+
+    /// The reply to the call that was sent.
+    pub(crate) fn receive(&mut self) -> Result<Reply, String> {
+        let body = read_message(&mut self.stream).ok_or("no answer")?;
+        decode_reply(&body).map_err(|error| error.to_string())
+    }
+
+    /// Sends a call and reads the reply.
+    pub(crate) fn call(&mut self, call: &Call) -> Result<Reply, String> {
+        self.send(call)?;
+        self.receive()
+    }
+
+    /// Process id and address of the master.
+    pub(crate) fn identity(&mut self) -> (i32, String) {
+        let mut ask = |method: &str| match self.call(&Call::new(method, vec!["/test".into()])) {
+            Ok(Reply::Value(Value::Array(mut answer))) => answer.pop().unwrap(),
+            other => panic!("{method}: {other:?}"),
+        };
+        let (pid, uri) = (ask("getPid"), ask("getUri"));
+        (pid.as_int().unwrap(), uri.as_str().unwrap().to_owned())
     }
 }
 

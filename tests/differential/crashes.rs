@@ -1,0 +1,220 @@
+//! The model, which never crashes, against rosrescue before a rosmaster that does.
+
+use std::time::{Duration, Instant};
+
+use rosrescue::master::{FirstLook, Mark, Master, Plan};
+use rosrescue::xmlrpc::Call;
+use rustix::process::Signal;
+
+use crate::dice::{Cast, Dice};
+use crate::nodes::{Node, patience};
+use crate::real::{Rosmaster, Wire};
+use crate::script::{Script, Step, node_api};
+use crate::stage::{CLIENTS, Failure, Stage};
+use crate::support::{Rescue, Scratch, Setup, free_port, signal};
+
+/// A sequence with so many crashes.
+pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> Script {
+    let mut dice = Dice(seed);
+    let mut cast = Cast {
+        apis: (0..nodes).map(node_api).collect(),
+        // What a master cannot return does not survive it.
+        poison: false,
+        errors: !dice.once_in(4),
+        // Another master is another process.
+        process: false,
+    };
+    cast.apis.push("rosrpc://h:1".to_owned());
+    let mut steps: Vec<_> = (0..calls)
+        .map(|_| Step::Call {
+            by: dice.below(CLIENTS),
+            call: dice.call(&cast, 2),
+        })
+        .collect();
+    for _ in 0..crashes {
+        let in_flight = dice.once_in(2);
+        let at = dice.below(steps.len() + 1);
+        steps.insert(at, Step::Crash { in_flight });
+    }
+    Script {
+        poison: false,
+        steps,
+    }
+}
+
+/// rosrescue and what is behind it.
+struct Rig {
+    /// rosrescue's own child if there is none here.
+    master: Option<Rosmaster>,
+    master_port: u16,
+    /// The process id of a master that was killed.
+    killed: i32,
+    rescue: Rescue,
+    _scratch: Scratch,
+}
+
+impl Rig {
+    /// With `core`, rosrescue runs the master and rosout itself.
+    fn start(core: bool) -> Self {
+        let scratch = Scratch::new();
+        let master_port = free_port();
+        let (setup, master) = match core {
+            true => (Setup::core(&scratch, master_port), None),
+            false => {
+                let mut master = Rosmaster::start_at(master_port);
+                drop(master.ready());
+                (Setup::proxy(&scratch, master_port), Some(master))
+            }
+        };
+        // Calls are parked as long as a busy computer needs.
+        let rescue = setup.args(["--hold", "60"]).start();
+        Self {
+            master,
+            master_port,
+            killed: 0,
+            rescue,
+            _scratch: scratch,
+        }
+    }
+
+    fn wire(&self) -> Wire {
+        Wire::connect(self.rescue.port()).expect("rosrescue listens all the time")
+    }
+
+    /// The state that the sequence starts from: that of a core holds rosout and three parameters.
+    fn state(&self) -> Master {
+        let mut wire = self.wire();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        let mut model = Master::default();
+        while self.master.is_none() && !is_complete(&model) {
+            assert!(Instant::now() < deadline, "core is never complete");
+            let look = wire.call(&FirstLook::call(&Mark::new("none"))).unwrap();
+            let look = FirstLook::decode(&look).unwrap();
+            let nothing = Master::default();
+            let second = look
+                .second_call(&nothing)
+                .map(|call| wire.call(&call).unwrap());
+            // A rosout that registers between the two looks is seen by the next.
+            model = look
+                .into_master(second.as_ref(), &nothing)
+                .unwrap_or_default();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let (pid, uri) = wire.identity();
+        model.set_identity(pid, uri);
+        model
+    }
+
+    /// SIGKILL for the master. Another one is on its way when this returns.
+    fn crash(&mut self) -> Result<(), Failure> {
+        if let Some(master) = &mut self.master {
+            master.kill();
+            *master = Rosmaster::start_at(self.master_port);
+            return Ok(());
+        }
+        let deadline = Instant::now() + patience();
+        let mut wire = self.wire();
+        loop {
+            let (pid, _) = wire.identity();
+            if pid != self.killed {
+                signal(u32::try_from(pid).unwrap(), Signal::KILL);
+                self.killed = pid;
+                return Ok(());
+            }
+            if Instant::now() > deadline {
+                return Err("core starts no other master".to_owned());
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+/// Whether core has done all that roscore does.
+fn is_complete(model: &Master) -> bool {
+    let keys = ["run_id", "rosversion", "rosdistro"];
+    keys.iter().all(|key| model.params().contains_key(*key))
+        && model.counts().services == 2
+        && !model.publishers_of("/rosout_agg").is_empty()
+        && !model.subscribers_of("/rosout").is_empty()
+}
+
+/// What a run was.
+#[derive(Default)]
+pub(crate) struct Tally {
+    pub(crate) crashes: u32,
+    /// Crashes left out, since not everything could have been brought back.
+    pub(crate) spared: u32,
+}
+
+/// Plays a sequence through rosrescue.
+pub(crate) fn run(
+    script: &Script,
+    nodes: &[Node],
+    core: bool,
+    tally: &mut Tally,
+) -> Result<(), Failure> {
+    let mut rig = Rig::start(core);
+    let model = rig.state();
+    let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
+    let mut stage = Stage::new(nodes, wires, model);
+    let mut in_flight = false;
+    for (nth, step) in script.steps.iter().enumerate() {
+        let done = match step {
+            Step::Call { by, call } => {
+                let call = stage.real(call);
+                let by = by % CLIENTS;
+                match std::mem::take(&mut in_flight) {
+                    false => stage.call(by, &call),
+                    true => crash_under(&mut rig, &mut stage, by, &call, nth),
+                }
+            }
+            Step::Crash { .. } if !is_restorable(&stage.model) => {
+                tally.spared += 1;
+                Ok(())
+            }
+            Step::Crash { in_flight: during } => {
+                tally.crashes += 1;
+                in_flight = *during;
+                // What was queued is heard before; a crash loses it, which is nobody's fault.
+                stage.settle().and_then(|()| {
+                    let repeats = stage.repeats.get_or_insert_default();
+                    repeats.crash(&stage.model);
+                    if *during { Ok(()) } else { rig.crash() }
+                })
+            }
+            Step::Successor(_) => Ok(()),
+        };
+        done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
+    }
+    let end = stage.settle().and_then(|()| {
+        let mut wire = rig.wire();
+        stage.same_reads(&mut wire)?;
+        let mut behind = Wire::connect(rig.master_port).map_err(|error| error.to_string())?;
+        stage
+            .same_reads(&mut behind)
+            .map_err(|why| format!("the master behind: {why}"))
+    });
+    end.map_err(|why| format!("at the end: {why}"))
+}
+
+/// Sends a call and kills the master some moment after.
+fn crash_under(
+    rig: &mut Rig,
+    stage: &mut Stage<'_>,
+    by: usize,
+    call: &Call,
+    nth: usize,
+) -> Result<(), Failure> {
+    stage.wires[by].send(call)?;
+    let micros = Dice(nth as u64).next() % 2_000;
+    std::thread::sleep(Duration::from_micros(micros));
+    rig.crash()?;
+    let reply = stage.wires[by].receive()?;
+    stage.answered(call, &reply, true)
+}
+
+/// Whether a master can be brought to that state whole.
+fn is_restorable(model: &Master) -> bool {
+    let plan = Plan::new(model, &Master::default(), &Mark::new("test"));
+    plan.skipped().is_empty()
+}

@@ -1,0 +1,168 @@
+//! The model against a bare rosmaster.
+
+use rosrescue::master::{FirstLook, Mark, Master, NotAMaster, Notice, Plan, Skipped, difference};
+use rosrescue::xmlrpc::Call;
+
+use crate::dice::{Cast, Dice};
+use crate::nodes::Node;
+use crate::real::{Rosmaster, Wire};
+use crate::script::{Script, Step, node_api};
+use crate::stage::{CLIENTS, Failure, Stage};
+
+/// Calls that a successor has answered before the state is brought to it, if any.
+const FOUND: usize = 15;
+
+/// A sequence, with one or two successors.
+pub(crate) fn script(seed: u64, calls: usize, nodes: usize) -> Script {
+    let mut dice = Dice(seed);
+    let mut cast = Cast {
+        apis: (0..nodes).map(node_api).collect(),
+        poison: dice.once_in(3),
+        errors: !dice.once_in(4),
+        process: true,
+    };
+    cast.apis.push("rosrpc://h:1".to_owned());
+    let poison = cast.poison;
+    // What a master cannot return is not brought along, which ends the comparison of values.
+    let between = (!poison && dice.once_in(2)).then(|| dice.below(calls.max(1)));
+    let mut steps = Vec::with_capacity(calls + 2);
+    for nth in 0..calls {
+        if between == Some(nth) {
+            steps.push(successor(&mut dice, &cast));
+        }
+        let (by, call) = (dice.below(CLIENTS), dice.call(&cast, 2));
+        steps.push(Step::Call { by, call });
+    }
+    cast.poison = false;
+    steps.push(successor(&mut dice, &cast));
+    Script { poison, steps }
+}
+
+fn successor(dice: &mut Dice, cast: &Cast) -> Step {
+    let count = if dice.once_in(3) { FOUND } else { 0 };
+    Step::Successor((0..count).map(|_| dice.call(cast, 2)).collect())
+}
+
+/// Plays a sequence. `spare` is started in time for the next master that is needed.
+pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Result<(), Failure> {
+    let mut fresh = || {
+        let mut real = std::mem::replace(spare, Rosmaster::start());
+        let mut wires = vec![real.ready()];
+        wires.extend((1..CLIENTS).map(|_| Wire::connect(real.port).unwrap()));
+        let mut model = Master::default();
+        let (pid, uri) = wires[0].identity();
+        model.set_identity(pid, uri);
+        (real, wires, model)
+    };
+    let (mut real, wires, model) = fresh();
+    let mut stage = Stage::new(nodes, wires, model);
+    stage.callbacks = !script.poison;
+    for (nth, step) in script.steps.iter().enumerate() {
+        let done = match step {
+            Step::Call { by, call } => {
+                let call = stage.real(call);
+                stage.call(by % CLIENTS, &call)
+            }
+            Step::Successor(found) => finish(&mut stage).and_then(|()| {
+                let (next, wires, model) = fresh();
+                real = next;
+                succeed(&mut stage, wires, model, found)
+            }),
+            Step::Crash { .. } => Ok(()),
+        };
+        done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
+    }
+    finish(&mut stage).map_err(|why| format!("at the end: {why}"))?;
+    drop(real);
+    Ok(())
+}
+
+/// Compares all that can be heard, read and seen.
+fn finish(stage: &mut Stage<'_>) -> Result<(), Failure> {
+    stage.settle()?;
+    let mut wire = stage.wires.remove(0);
+    let same = stage
+        .same_reads(&mut wire)
+        .and_then(|()| look(&mut wire, &stage.model));
+    stage.wires.insert(0, wire);
+    same
+}
+
+/// Brings the state to a master that has answered the calls `found`, and goes on with that one.
+fn succeed(
+    stage: &mut Stage<'_>,
+    wires: Vec<Wire>,
+    model: Master,
+    found: &[Call],
+) -> Result<(), Failure> {
+    let target = std::mem::replace(&mut stage.model, model);
+    stage.wires = wires;
+    stage.callbacks = true;
+    for call in found {
+        let call = stage.real(call);
+        stage
+            .call(0, &call)
+            .map_err(|why| format!("{call:?} {why}"))?;
+    }
+    let plan = Plan::new(&target, &stage.model, &Mark::new("test"));
+    let reply = stage.wires[0].call(plan.call())?;
+    plan.verify(&reply)
+        .map_err(|mismatches| format!("the injection: {mismatches:?}"))?;
+    let notices = stage.model.clone().apply(plan.call()).notices;
+    let is_complete = |notice: &Notice| match notice {
+        Notice::PublisherUpdate {
+            topic, publishers, ..
+        } => *publishers == plan.expected().publishers_of(topic),
+        Notice::ParamUpdate { .. } => true,
+        Notice::Shutdown { .. } => false,
+    };
+    let is_fine = match found.is_empty() {
+        true => notices.is_empty(),
+        false => notices.iter().all(is_complete),
+    };
+    if !is_fine {
+        return Err(format!("the injection causes {notices:?}"));
+    }
+    let cannot_be = |it: &Skipped| matches!(it, Skipped::Param { .. } | Skipped::Unnameable { .. });
+    if found.is_empty() && !plan.skipped().iter().all(cannot_be) {
+        return Err(format!("the injection skips {:?}", plan.skipped()));
+    }
+    if found.is_empty() && plan.skipped().is_empty() {
+        let words = difference(&target, plan.expected());
+        if !words.is_empty() {
+            return Err(format!("the injection makes something else: {words:?}"));
+        }
+    }
+    stage.note(&notices, false);
+    let (pid, uri) = stage.wires[0].identity();
+    stage.model = plan.expected().clone();
+    stage.model.set_identity(pid, uri);
+    Ok(())
+}
+
+/// A look at the real master, with the model as the state known before, must show the model.
+fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
+    let mark = Mark::new("none");
+    let look = match FirstLook::decode(&wire.call(&FirstLook::call(&mark))?) {
+        Err(NotAMaster::ParamsUnreadable { .. }) => {
+            FirstLook::decode(&wire.call(&FirstLook::call_without_params(&mark))?)
+        }
+        look => look,
+    };
+    let look = look.map_err(|error| error.to_string())?;
+    if look.marked() {
+        return Err("a mark that nobody left".to_owned());
+    }
+    let second = match look.second_call(model) {
+        Some(call) => Some(wire.call(&call)?),
+        None => None,
+    };
+    let found = look
+        .into_master(second.as_ref(), model)
+        .map_err(|error| error.to_string())?;
+    let words = difference(model, &found);
+    match words.is_empty() {
+        true => Ok(()),
+        false => Err(format!("a look shows something else: {words:?}")),
+    }
+}

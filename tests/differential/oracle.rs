@@ -1,0 +1,235 @@
+//! What a node may hear.
+//!
+//! Without a crash it is exactly what the model says, in order. A crash of the master may do this,
+//! and nothing else:
+//!
+//! * The callbacks of the one call that was under way may be lost, or come once more: the master
+//!   may have run it before it died, its successor runs it again, and it was never answered twice.
+//! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
+//!   crash before the last one (the letter may cross a change). Never a partial one, never a
+//!   `paramUpdate` or a `shutdown`, never a list to a node that does not subscribe.
+
+use std::collections::HashSet;
+
+use rosrescue::master::Master;
+use rosrescue::xmlrpc::{Call, Value};
+
+/// A callback that the model sends.
+#[derive(Clone, Debug)]
+pub(crate) struct Expected {
+    pub(crate) call: Call,
+    /// A crash may have lost or doubled it.
+    pub(crate) risky: bool,
+}
+
+type List = (String, String, Vec<String>);
+
+/// Full lists of publishers, by subscriber and topic, as they have been true lately.
+#[derive(Debug, Default)]
+pub(crate) struct TrueLists {
+    before: HashSet<List>,
+    since: HashSet<List>,
+    /// Since the call that was under way was answered.
+    after: HashSet<List>,
+    /// Those who have subscribed all the time since then.
+    faithful: Option<HashSet<(String, String)>>,
+}
+
+impl TrueLists {
+    /// The master crashes in that state.
+    pub(crate) fn crash(&mut self, model: &Master) {
+        self.before = std::mem::take(&mut self.since);
+        self.after.clear();
+        self.faithful = None;
+        self.add(model);
+    }
+
+    /// The call that was under way led to that state.
+    pub(crate) fn answered(&mut self, model: &Master) {
+        self.after.clear();
+        self.faithful = None;
+        self.add(model);
+    }
+
+    /// What is true in that state.
+    pub(crate) fn add(&mut self, model: &Master) {
+        let mut subscribers = HashSet::new();
+        for topic in model.subscribed_topics() {
+            let publishers = model.publishers_of(topic);
+            for api in model.subscribers_of(topic) {
+                subscribers.insert((api.clone(), topic.to_owned()));
+                let list = (api, topic.to_owned(), publishers.clone());
+                self.after.insert(list.clone());
+                self.since.insert(list);
+            }
+        }
+        match &mut self.faithful {
+            Some(faithful) => faithful.retain(|it| subscribers.contains(it)),
+            None => self.faithful = Some(subscribers),
+        }
+    }
+
+    /// Whether the call is a list that may be sent to the node at `api` because of a crash.
+    pub(crate) fn has(&self, api: &str, call: &Call) -> bool {
+        let list = as_list(api, call);
+        list.is_some_and(|list| self.before.contains(&list) || self.since.contains(&list))
+    }
+
+    /// Whether the node at `api` still has to be told of what the crash has swallowed: it subscribes,
+    /// and has not heard a list that was true after the call that was under way.
+    pub(crate) fn owes(&self, api: &str, swallowed: &Call, heard: &[Call]) -> bool {
+        let Some((api, topic, _)) = as_list(api, swallowed) else {
+            return false;
+        };
+        let pair = (api, topic);
+        let subscribes = self.faithful.as_ref().is_some_and(|it| it.contains(&pair));
+        let (api, topic) = pair;
+        let is_news = |call: &Call| {
+            as_list(&api, call).is_some_and(|list| list.1 == topic && self.after.contains(&list))
+        };
+        subscribes && !heard.iter().any(is_news)
+    }
+}
+
+/// The subscriber, topic and publishers of a `publisherUpdate`.
+fn as_list(api: &str, call: &Call) -> Option<List> {
+    let [
+        Value::String(master),
+        Value::String(topic),
+        Value::Array(list),
+    ] = call.params.as_slice()
+    else {
+        return None;
+    };
+    if call.method != "publisherUpdate" || master != "/master" {
+        return None;
+    }
+    let list: Option<_> = list
+        .iter()
+        .map(|uri| uri.as_str().map(str::to_owned))
+        .collect();
+    Some((api.to_owned(), topic.clone(), list?))
+}
+
+/// Whether what was heard is what had to be; gives what a crash has swallowed.
+pub(crate) fn judge(
+    expected: &[Expected],
+    heard: &[Call],
+    is_repeat: impl Fn(&Call) -> bool,
+) -> Result<Vec<Call>, String> {
+    let mut next = 0;
+    let mut swallowed = Vec::new();
+    for (nth, call) in heard.iter().enumerate() {
+        let ahead = expected[next..].iter();
+        let lost = ahead.take_while(|it| it.risky && it.call != *call).count();
+        if expected.get(next + lost).is_some_and(|it| it.call == *call) {
+            swallowed.extend(expected[next..next + lost].iter().map(|it| it.call.clone()));
+            next += lost + 1;
+            continue;
+        }
+        let doubled = expected.iter().any(|it| it.risky && it.call == *call);
+        if !doubled && !is_repeat(call) {
+            let wanted = expected.get(next).map(|it| &it.call);
+            return Err(format!(
+                "number {nth} is\n  {call:?}\ninstead of\n  {wanted:?}"
+            ));
+        }
+    }
+    let rest = &expected[next..];
+    if let Some(missing) = rest.iter().find(|it| !it.risky) {
+        return Err(format!("missing is\n  {:?}", missing.call));
+    }
+    swallowed.extend(rest.iter().map(|it| it.call.clone()));
+    Ok(swallowed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(name: &str) -> Call {
+        Call::new(name, Vec::new())
+    }
+
+    fn verdict(expected: &[(&str, bool)], heard: &[&str]) -> bool {
+        let expected: Vec<_> = expected
+            .iter()
+            .map(|(name, risky)| Expected {
+                call: call(name),
+                risky: *risky,
+            })
+            .collect();
+        let heard: Vec<_> = heard.iter().map(|name| call(name)).collect();
+        judge(&expected, &heard, |call| call.method == "repeat").is_ok()
+    }
+
+    #[test]
+    fn without_a_crash_all_is_heard_once_and_in_order() {
+        let expected = [("a", false), ("b", false), ("a", false)];
+        assert!(verdict(&expected, &["a", "b", "a"]));
+        for heard in [
+            &["a", "b"][..],
+            &["a", "a", "b"],
+            &["a", "b", "a", "a"],
+            &["b", "a"],
+            &[],
+        ] {
+            assert!(!verdict(&expected, heard), "{heard:?}");
+        }
+    }
+
+    #[test]
+    fn a_crash_loses_or_doubles_what_was_under_way_and_repeats_true_lists() {
+        let expected = [("a", false), ("x", true), ("y", true), ("b", false)];
+        for heard in [
+            &["a", "x", "y", "b"][..],
+            &["a", "b"],
+            &["a", "y", "b"],
+            &["a", "x", "y", "x", "y", "b"],
+            &["repeat", "a", "b", "repeat"],
+        ] {
+            assert!(verdict(&expected, heard), "{heard:?}");
+        }
+        for heard in [
+            &["x", "y", "b"][..],
+            &["a", "x", "y"],
+            &["a", "a", "b"],
+            &["a", "b", "z"],
+        ] {
+            assert!(!verdict(&expected, heard), "{heard:?}");
+        }
+    }
+
+    #[test]
+    fn a_list_is_true_for_those_who_subscribe_and_in_full() {
+        let mut model = Master::default();
+        let mut register = |method: &str, node: &str, api: &str| {
+            let params = vec![node.into(), "/t".into(), "a/B".into(), api.into()];
+            model.apply(&Call::new(method, params));
+        };
+        register("registerPublisher", "/p1", "http://p1");
+        register("registerPublisher", "/p2", "http://p2");
+        register("registerSubscriber", "/s", "http://s");
+        let mut lists = TrueLists::default();
+        lists.crash(&model);
+        let update = |list: &[&str]| {
+            let list: Vec<Value> = list.iter().map(|uri| (*uri).into()).collect();
+            let params = vec!["/master".into(), "/t".into(), Value::Array(list)];
+            Call::new("publisherUpdate", params)
+        };
+        assert!(lists.has("http://s", &update(&["http://p1", "http://p2"])));
+        assert!(!lists.has("http://s", &update(&["http://p1"])));
+        assert!(!lists.has("http://p1", &update(&["http://p1", "http://p2"])));
+        // What is swallowed is owed to it until it hears what is true now.
+        let late = update(&["http://p1"]);
+        lists.answered(&model);
+        assert!(lists.owes("http://s", &late, std::slice::from_ref(&late)));
+        let truth = update(&["http://p1", "http://p2"]);
+        assert!(!lists.owes("http://s", &late, &[truth]));
+        lists.crash(&Master::default());
+        assert!(!lists.owes("http://s", &late, &[]));
+        assert!(lists.has("http://s", &update(&["http://p1", "http://p2"])));
+        lists.crash(&Master::default());
+        assert!(!lists.has("http://s", &update(&["http://p1", "http://p2"])));
+    }
+}

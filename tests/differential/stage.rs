@@ -1,0 +1,211 @@
+//! What a run consists of: the model beside the real thing, clients, nodes, and what they must hear.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use rosrescue::master::{Master, Notice, accepted, difference};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+
+use crate::dice::{CALLERS, KEYS, NAMES};
+use crate::nodes::{self, Node};
+use crate::oracle::{Expected, TrueLists, judge};
+use crate::real::Wire;
+use crate::script::with_real_apis;
+
+/// Clients of a run, each with a connection of its own. Their calls take turns.
+pub(crate) const CLIENTS: usize = 3;
+
+/// Why a run failed.
+pub(crate) type Failure = String;
+
+/// One run.
+pub(crate) struct Stage<'n> {
+    pub(crate) nodes: &'n [Node],
+    pub(crate) apis: Vec<String>,
+    pub(crate) model: Master,
+    pub(crate) wires: Vec<Wire>,
+    /// Whether callbacks can be foretold.
+    pub(crate) callbacks: bool,
+    /// What each node must hear since the last settling.
+    told: Vec<Vec<Expected>>,
+    /// What may be repeated because of a crash.
+    pub(crate) repeats: Option<TrueLists>,
+}
+
+impl<'n> Stage<'n> {
+    pub(crate) fn new(nodes: &'n [Node], wires: Vec<Wire>, model: Master) -> Self {
+        for node in nodes {
+            node.take_now();
+        }
+        Self {
+            apis: nodes.iter().map(|node| node.api.clone()).collect(),
+            told: nodes.iter().map(|_| Vec::new()).collect(),
+            nodes,
+            model,
+            wires,
+            callbacks: true,
+            repeats: None,
+        }
+    }
+
+    pub(crate) fn real(&self, call: &Call) -> Call {
+        with_real_apis(call, &self.apis)
+    }
+
+    /// Makes a call, which both must answer alike.
+    pub(crate) fn call(&mut self, by: usize, call: &Call) -> Result<(), Failure> {
+        let reply = self.wires[by].call(call)?;
+        self.answered(call, &reply, false)
+    }
+
+    /// Compares the reply to `call` with the model's. `risky`: a crash may have lost or doubled the
+    /// callbacks.
+    pub(crate) fn answered(
+        &mut self,
+        call: &Call,
+        reply: &Reply,
+        risky: bool,
+    ) -> Result<(), Failure> {
+        let before = self.model.clone();
+        let outcome = self.model.apply(call);
+        if outcome.reply != *reply {
+            return Err(format!(
+                "answered\n  {reply:?}\ninstead of\n  {:?}",
+                outcome.reply
+            ));
+        }
+        self.note(&outcome.notices, risky);
+        let accepted = accepted(&before, call, reply);
+        let mut mirror = before;
+        for (call, _) in &accepted.calls {
+            mirror.apply(call);
+        }
+        let words = difference(&mirror, &self.model);
+        match words.is_empty() {
+            true => Ok(()),
+            false => Err(format!(
+                "the mirror that took what the reply {reply:?} says differs: {words:?}"
+            )),
+        }
+    }
+
+    /// The callbacks that the nodes must hear.
+    pub(crate) fn note(&mut self, notices: &[Notice], risky: bool) {
+        for (to, call) in notices.iter().map(nodes::as_call) {
+            if let Some(index) = self.apis.iter().position(|api| api == to) {
+                self.told[index].push(Expected { call, risky });
+            }
+        }
+        match &mut self.repeats {
+            Some(repeats) if risky => repeats.answered(&self.model),
+            Some(repeats) => repeats.add(&self.model),
+            None => {}
+        }
+    }
+
+    /// Makes every node hear one last thing, and compares what they heard before it.
+    pub(crate) fn settle(&mut self) -> Result<(), Failure> {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let topic = format!("/last{}", COUNT.fetch_add(1, Ordering::Relaxed));
+        let call = |method: &str, params: &[&str]| {
+            Call::new(method, params.iter().map(|text| (*text).into()).collect())
+        };
+        let of_listeners = |method: &str, with_type: bool| -> Vec<Call> {
+            let listeners = self.apis.iter().enumerate().map(|(index, api)| {
+                let name = format!("/listener{index}");
+                match with_type {
+                    true => call(method, &[&name, &topic, "a/B", api]),
+                    false => call(method, &[&name, &topic, api]),
+                }
+            });
+            listeners.collect()
+        };
+        let last = [&*topic, "http://last"];
+        let mut calls = of_listeners("registerSubscriber", true);
+        calls.push(call(
+            "registerPublisher",
+            &["/last", last[0], "a/B", last[1]],
+        ));
+        calls.extend(of_listeners("unregisterSubscriber", false));
+        calls.push(call("unregisterPublisher", &["/last", last[0], last[1]]));
+        for call in calls {
+            self.call(0, &call)
+                .map_err(|why| format!("settling: {call:?} {why}"))?;
+        }
+        let is_last = |call: &Call| call.params.get(1) == Some(&Value::from(topic.as_str()));
+        for (index, node) in self.nodes.iter().enumerate() {
+            let expected = std::mem::take(&mut self.told[index]);
+            let heard = node.take(is_last)?;
+            if self.callbacks {
+                self.judge(node, &expected, heard)
+                    .map_err(|why| format!("callbacks to node{index}: {why}"))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Compares what a node heard, and waits until what a crash has swallowed is made good.
+    fn judge(&self, node: &Node, expected: &[Expected], heard: Vec<Call>) -> Result<(), Failure> {
+        let heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
+        let nothing = TrueLists::default();
+        let lists = self.repeats.as_ref().unwrap_or(&nothing);
+        let swallowed = judge(expected, &heard, |call| lists.has(&node.api, call))?;
+        let deadline = Instant::now() + nodes::patience();
+        let mut news = heard;
+        while let Some(owed) = swallowed.iter().find(|it| lists.owes(&node.api, it, &news)) {
+            if Instant::now() > deadline {
+                return Err(format!(
+                    "lost in the crash and never made good is\n  {owed:?}"
+                ));
+            }
+            std::thread::sleep(Duration::from_millis(5));
+            let late = node.take_now();
+            judge(&[], &late, |call| lists.has(&node.api, call))?;
+            news.extend(late);
+        }
+        Ok(())
+    }
+
+    /// Every read that a client may send, of everything that was ever named.
+    pub(crate) fn same_reads(&self, wire: &mut Wire) -> Result<(), Failure> {
+        let mut model = self.model.clone();
+        let own = |method: &str| Call::new(method, vec!["/test".into()]);
+        let one = |caller: &str, method: &str, name: &str| {
+            Call::new(method, vec![caller.into(), name.into()])
+        };
+        let mut calls: Vec<Call> = ["getSystemState", "getTopicTypes", "getParamNames"]
+            .map(own)
+            .into();
+        for subgraph in ["", "/ns"] {
+            calls.push(one("/test", "getPublishedTopics", subgraph));
+        }
+        calls.push(one("/test", "getParam", "/"));
+        let keys = model.params().keys().filter(|key| !key.is_empty());
+        calls.extend(keys.map(|key| one("/test", "getParam", key)));
+        calls.extend(KEYS.iter().map(|key| one("/n0", "getParam", key)));
+        let callers = CALLERS.iter().map(|caller| (*caller).to_owned());
+        let known = model.nodes().map(|(caller_id, _)| caller_id.to_owned());
+        let nodes: BTreeSet<String> = callers.chain(known).collect();
+        calls.extend(nodes.iter().map(|node| one(node, "lookupNode", "~")));
+        calls.extend(nodes.iter().map(|node| one("/a//x", "lookupNode", node)));
+        let services = model.snapshot().services.into_keys();
+        let services: BTreeSet<String> = services
+            .chain(NAMES.iter().map(|name| (*name).to_owned()))
+            .collect();
+        calls.extend(
+            services
+                .iter()
+                .map(|service| one("/test", "lookupService", service)),
+        );
+        for call in calls {
+            let (expected, found) = (model.apply(&call).reply, wire.call(&call)?);
+            if expected != found {
+                return Err(format!(
+                    "{call:?} answered\n  {found:?}\ninstead of\n  {expected:?}"
+                ));
+            }
+        }
+        Ok(())
+    }
+}
