@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{FirstLook, Mark, Master, Plan};
+use rosrescue::master::{FirstLook, Mark, Master, Plan, Skipped};
 use rosrescue::xmlrpc::Call;
 use rustix::process::Signal;
 
@@ -142,8 +142,8 @@ fn is_complete(model: &Master) -> bool {
 #[derive(Default)]
 pub(crate) struct Tally {
     pub(crate) crashes: u32,
-    /// Crashes left out, since not everything could have been brought back.
-    pub(crate) spared: u32,
+    /// Crashes left out, since something could not have been brought back: what.
+    pub(crate) spared: Vec<Skipped>,
 }
 
 /// Plays a sequence through rosrescue.
@@ -168,11 +168,12 @@ pub(crate) fn run(
                     true => crash_under(&mut rig, &mut stage, by, &call, nth),
                 }
             }
-            Step::Crash { .. } if !is_restorable(&stage.model) => {
-                tally.spared += 1;
-                Ok(())
-            }
             Step::Crash { in_flight: during } => {
+                let skipped = skipped(&stage.model);
+                if !skipped.is_empty() {
+                    tally.spared.extend(skipped.into_iter().take(1));
+                    continue;
+                }
                 tally.crashes += 1;
                 in_flight = *during;
                 // What was queued is heard before; a crash loses it, which is nobody's fault.
@@ -213,8 +214,8 @@ fn crash_under(
     stage.answered(call, &reply, true)
 }
 
-/// Whether a master can be brought to that state whole.
-fn is_restorable(model: &Master) -> bool {
+/// What of that state cannot be brought to an empty master.
+fn skipped(model: &Master) -> Vec<Skipped> {
     let plan = Plan::new(model, &Master::default(), &Mark::new("test"));
-    plan.skipped().is_empty()
+    plan.skipped().to_vec()
 }

@@ -33,6 +33,7 @@ mod stage;
 #[path = "../support/mod.rs"]
 mod support;
 
+use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
@@ -60,10 +61,19 @@ fn number(name: &str, default: u64) -> u64 {
     }
 }
 
-/// The sequence that is to be played alone, if there is one.
-fn given() -> Option<Script> {
-    let path = std::env::var("ROSRESCUE_SCRIPT").ok()?;
-    Some(Script::parse(&std::fs::read_to_string(path).unwrap()))
+/// What is played before any random sequence: all that ever failed, or the one file that is given
+/// instead of everything else.
+fn scripts() -> (Vec<(String, Script)>, bool) {
+    let read = |path: &Path| {
+        let script = Script::parse(&std::fs::read_to_string(path).unwrap());
+        (path.display().to_string(), script)
+    };
+    if let Ok(path) = std::env::var("ROSRESCUE_SCRIPT") {
+        return (vec![read(Path::new(&path))], true);
+    }
+    let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/differential/found");
+    let found = std::fs::read_dir(found).unwrap();
+    (found.map(|it| read(&it.unwrap().path())).collect(), false)
 }
 
 fn nodes() -> Vec<Node> {
@@ -92,14 +102,12 @@ fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), 
 fn a_bare_rosmaster_answers_as_the_model_does() {
     let nodes = nodes();
     let mut spare = Rosmaster::start();
-    if let Some(script) = given() {
-        if !script
-            .steps
-            .iter()
-            .any(|it| matches!(it, Step::Crash { .. }))
-        {
-            direct::run(&script, &nodes, &mut spare).unwrap();
-        }
+    let (scripts, alone) = scripts();
+    for (path, script) in &scripts {
+        println!("{path}");
+        direct::run(script, &nodes, &mut spare).unwrap();
+    }
+    if alone {
         return;
     }
     let calls = usize::try_from(number("ROSRESCUE_CALLS", CALLS)).unwrap();
@@ -123,16 +131,14 @@ fn a_bare_rosmaster_answers_as_the_model_does() {
 fn through_rosrescue_no_crash_of_the_master_can_be_told() {
     let nodes = nodes();
     let mut tally = Tally::default();
-    if let Some(script) = given() {
+    let (scripts, alone) = scripts();
+    for (path, script) in scripts.iter().filter(|(_, script)| !script.poison) {
         for core in [false, true] {
-            if script
-                .steps
-                .iter()
-                .any(|it| matches!(it, Step::Crash { .. }))
-            {
-                crashes::run(&script, &nodes, core, &mut tally).unwrap();
-            }
+            println!("{path}, core: {core}");
+            crashes::run(script, &nodes, core, &mut tally).unwrap();
         }
+    }
+    if alone {
         return;
     }
     let calls = usize::try_from(number("ROSRESCUE_CALLS", CALLS)).unwrap();
@@ -153,8 +159,9 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
         played += script.calls();
     }
     let Tally { crashes, spared } = tally;
+    let spared: Vec<_> = spared.iter().map(ToString::to_string).collect();
     println!(
-        "{count} sequences, {played} calls, {crashes} crashes, {spared} left out, seeds from {first}, {:?}",
+        "{count} sequences, {played} calls, {crashes} crashes, left out {spared:?}, seeds from {first}, {:?}",
         start.elapsed()
     );
 }
