@@ -1,29 +1,38 @@
-//! Topics that are told again, because older news of them may still come from the master.
+//! News that we tell beside the master, which may be late.
 //!
 //! rosmaster makes each list of publishers when something changes, and sends it when one of its
-//! threads gets to it: after minutes, where nodes that cannot be reached hold them up. A list that
-//! overtakes ours from behind makes roscpp nodes drop links, until they are told anew.
+//! threads gets to it: after minutes, where nodes that cannot be reached hold them up. So we tell the
+//! news ourselves, but not before the master would have done so if nothing held it up: a list of its
+//! that comes after a newer one of ours makes roscpp nodes drop links, until they are told anew. And
+//! we tell them again and again, because such a list may still be on its way.
 
 use std::{
     collections::BTreeMap,
     time::{Duration, Instant},
 };
 
-/// Pause before the first repetition.
+/// How long nothing must have changed before we tell it: idle threads of rosmaster look for work
+/// every 100 ms.
+const QUIET: Duration = Duration::from_millis(300);
+/// What changes all the time is told so long after the first change.
+const LATEST: Duration = Duration::from_millis(600);
+/// Pause before it is told again.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after its last change a topic is told again: two connects that get no answer.
+/// How long after the last change it is told again: two connects of rosmaster that get no answer.
 const LIFE: Duration = Duration::from_secs(300);
 
-/// The topics, and when each is to be told again.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Repeats {
-    of: BTreeMap<String, Wait>,
+/// What has changed, and when it is to be told.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Repeats<K: Ord> {
+    of: BTreeMap<K, Wait>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
+    /// The first change that has not been told, if there is one.
+    untold: Option<Instant>,
     pause: Duration,
     next: Instant,
     end: Instant,
@@ -31,31 +40,43 @@ struct Wait {
     held_up: bool,
 }
 
-impl Repeats {
-    /// The publishers of `topic` have changed.
-    pub fn changed(&mut self, topic: &str, now: Instant) {
-        let held_up = self.of.get(topic).is_some_and(|wait| wait.held_up);
+impl<K: Ord> Default for Repeats<K> {
+    fn default() -> Self {
+        Self {
+            of: BTreeMap::new(),
+        }
+    }
+}
+
+impl<K: Ord + Clone> Repeats<K> {
+    /// `key` has changed.
+    pub fn changed(&mut self, key: K, now: Instant) {
+        let before = self.of.get(&key);
+        let untold = before.and_then(|wait| wait.untold).unwrap_or(now);
         let wait = Wait {
+            untold: Some(untold),
             pause: FIRST_PAUSE,
-            next: now + FIRST_PAUSE,
+            next: (now + QUIET).min(untold + LATEST),
             end: now + LIFE,
-            held_up,
+            held_up: before.is_some_and(|wait| wait.held_up),
         };
-        self.of.insert(topic.to_owned(), wait);
+        self.of.insert(key, wait);
     }
 
-    /// Those to be told now. `holding_up`: there are nodes that do not answer.
-    pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<String> {
+    /// What is to be told now. `holding_up`: there are nodes that do not answer. While all do, the
+    /// master tells the news itself.
+    pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
-        self.of.retain(|topic, wait| {
+        self.of.retain(|key, wait| {
             if wait.next > now {
                 return true;
             }
             wait.held_up |= holding_up;
-            wait.pause = (wait.pause * 2).min(LONGEST_PAUSE);
+            wait.untold = None;
             wait.next = now + wait.pause;
+            wait.pause = (wait.pause * 2).min(LONGEST_PAUSE);
             if wait.held_up {
-                due.push(topic.clone());
+                due.push(key.clone());
             }
             wait.held_up && now < wait.end
         });
@@ -73,17 +94,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_is_repeated_while_everybody_answers() {
+    fn nothing_is_told_while_everybody_answers() {
         let start = Instant::now();
         let mut repeats = Repeats::default();
         repeats.changed("/t", start);
         let next = repeats.next().unwrap();
-        assert_eq!(repeats.due(next, false), Vec::<String>::new());
+        assert_eq!(repeats.due(next, false), Vec::<&str>::new());
         assert_eq!(repeats.next(), None);
     }
 
     #[test]
-    fn a_topic_is_repeated_for_as_long_as_the_master_may_be_late() {
+    fn it_is_told_again_for_as_long_as_the_master_may_be_late() {
         let start = Instant::now();
         let mut repeats = Repeats::default();
         repeats.changed("/t", start);
@@ -92,10 +113,23 @@ mod tests {
             // Also when they answer again: a thread may still hang.
             told.extend(repeats.due(next, told.is_empty()).iter().map(|_| next));
         }
-        let seconds: Vec<_> = told.iter().map(|at| (*at - start).as_secs()).collect();
-        assert_eq!(seconds.get(..6).unwrap(), [1, 3, 7, 15, 25, 35]);
-        assert_eq!(seconds.last(), Some(&305));
-        repeats.changed("/t", start);
-        assert_eq!(repeats.due(start, true), Vec::<String>::new());
+        let times: Vec<_> = told.iter().map(|at| (*at - start).as_millis()).collect();
+        let first = [300, 1300, 3300, 7300, 15_300, 25_300, 35_300];
+        assert_eq!(times.get(..7).unwrap(), first);
+        assert_eq!(times.last(), Some(&305_300));
+    }
+
+    #[test]
+    fn what_changes_all_the_time_is_told_nevertheless() {
+        let start = Instant::now();
+        let step = Duration::from_millis(100);
+        let mut repeats = Repeats::default();
+        let mut told = Vec::new();
+        for i in 0..20 {
+            let now = start + step * i;
+            told.extend(repeats.due(now, true).iter().map(|_| i));
+            repeats.changed("/t", now);
+        }
+        assert_eq!(told, [6, 12, 18]);
     }
 }

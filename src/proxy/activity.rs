@@ -23,13 +23,16 @@ const NODES: usize = 1024;
 const LEVELS: usize = 8;
 
 /// Something that a node may be told.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Letter {
     /// The full list of a topic's publishers.
     Topic(String),
     /// The value of a parameter. The key ends in a slash.
     Param(String),
 }
+
+/// An address and what is to be told there; to all subscribers of a topic if there is no address.
+pub type News = (Option<String>, Letter);
 
 /// When a node's registrations last changed, as numbers that grow with every call: equal numbers
 /// mean that nothing came between.
@@ -67,8 +70,7 @@ pub struct Activity {
     displaced_seen: usize,
     /// Whether news are collected.
     telling: bool,
-    /// Address and letter; all subscribers of a topic if there is no address.
-    news: IndexSet<(Option<String>, Letter)>,
+    news: IndexSet<News>,
 }
 
 impl Activity {
@@ -166,9 +168,18 @@ impl Activity {
         std::mem::replace(&mut self.telling, telling) != telling
     }
 
-    /// The news since the last time: to whom, all subscribers if that is left open, and what.
-    pub fn take_news(&mut self) -> IndexSet<(Option<String>, Letter)> {
+    /// The news since the last time.
+    pub fn take_news(&mut self) -> IndexSet<News> {
         std::mem::take(&mut self.news)
+    }
+
+    /// What the master may not have told by `now` is news once more.
+    pub fn repeat_news(&mut self, now: Instant) {
+        let topics = self.topics_noticed(now).into_iter();
+        let params = self.params_noticed(now).into_iter();
+        let params = params.map(|(api, key)| (Some(api), Letter::Param(key)));
+        let topics = topics.map(|topic| (None, Letter::Topic(topic)));
+        self.news.extend(topics.chain(params));
     }
 
     /// `pid` is behind `api`, at which `node` is registered, and was asked for after the deed that

@@ -6,10 +6,7 @@
 
 use std::{
     collections::BTreeSet,
-    sync::{
-        Arc,
-        atomic::{AtomicUsize, Ordering},
-    },
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
@@ -74,6 +71,8 @@ pub(super) struct Outcome {
 /// is told, and the census is taken.
 pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     let under_way = Nodes::begin_census(&proxy);
+    // As if somebody did not answer, until the questions have been put.
+    let waiting = Waiting::new(&proxy);
     let mut gate = proxy.gate.clone();
     while !matches!(gate.look(), State::Open { .. }) {
         gate.changed().await;
@@ -94,7 +93,9 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     }
     // What nodes say in parked calls is newer than what they say to us.
     barrier(&proxy).await;
-    let census = census(&proxy).await;
+    let visits = begin_visits(&proxy);
+    drop(waiting);
+    let census = collect(visits).await;
     drop(under_way);
     if proxy.shadow.incarnation() != incarnation {
         // The next recovery reports.
@@ -130,6 +131,10 @@ async fn barrier(proxy: &Proxy) {
 
 /// Asks every node, all at the same time.
 pub async fn census(proxy: &Arc<Proxy>) -> Census {
+    collect(begin_visits(proxy)).await
+}
+
+fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<Outcome> {
     let apis: BTreeSet<String> = proxy.shadow.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Mark::is_ours(name));
         let apis = nodes.map(|(_, api)| api.to_owned());
@@ -138,9 +143,12 @@ pub async fn census(proxy: &Arc<Proxy>) -> Census {
     });
     let mut visits = JoinSet::new();
     for api in apis {
-        let proxy = proxy.clone();
-        visits.spawn(async move { visit(&proxy, &api).await });
+        visits.spawn(visit(proxy, api));
     }
+    visits
+}
+
+async fn collect(mut visits: JoinSet<Outcome>) -> Census {
     let mut census = Census::default();
     while let Some(outcome) = visits.join_next().await {
         if let Ok(outcome) = outcome {
@@ -169,7 +177,16 @@ pub(super) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<N
 }
 
 /// Asks what is behind `api` until it is clear what is to be made of it.
-pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
+pub(super) fn visit(
+    proxy: &Arc<Proxy>,
+    api: String,
+) -> impl Future<Output = Outcome> + Send + 'static {
+    let (proxy, waiting) = (proxy.clone(), Waiting::new(proxy));
+    async move { converse(&proxy, &api, waiting).await }
+}
+
+async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> Outcome {
+    let mut waiting = Some(waiting);
     let mut outcome = Outcome {
         sign: Sign::Silent,
         names: Vec::new(),
@@ -187,9 +204,8 @@ pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
             break;
         }
         let permit = permit().await;
-        let waiting = Waiting::new(&proxy.nodes.unanswered);
         let interview = node::interview(api, proxy.config.census_timeout).await;
-        drop((permit, waiting));
+        drop(permit);
         outcome.sign = interview.sign;
         outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
         match interview.sign {
@@ -213,6 +229,7 @@ pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
                 }
             }
         }
+        drop(waiting.take());
         let findings = asked.findings(proxy, api, &interview);
         findings.act(proxy, api, &before, &mut outcome).await;
         if findings.is_settled() {
@@ -224,18 +241,18 @@ pub(super) async fn visit(proxy: &Arc<Proxy>, api: &str) -> Outcome {
 }
 
 /// Counts a question for as long as it has no answer.
-struct Waiting<'a>(&'a AtomicUsize);
+struct Waiting(Arc<Proxy>);
 
-impl<'a> Waiting<'a> {
-    fn new(count: &'a AtomicUsize) -> Self {
-        count.fetch_add(1, Ordering::Relaxed);
-        Self(count)
+impl Waiting {
+    fn new(proxy: &Arc<Proxy>) -> Self {
+        proxy.nodes.unanswered.fetch_add(1, Ordering::Relaxed);
+        Self(proxy.clone())
     }
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for Waiting {
     fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
+        self.0.nodes.unanswered.fetch_sub(1, Ordering::Relaxed);
     }
 }
 

@@ -20,7 +20,7 @@ use crate::{
     census::{Repeats, Suspects, Verdict},
     proxy::{
         Proxy,
-        activity::Letter,
+        activity::{Letter, News},
         gate::{StandIn, State},
         shadow::Shadow,
     },
@@ -46,7 +46,7 @@ pub struct Nodes {
     deadly: Mutex<HashSet<Vec<String>>>,
     /// Recoveries whose census is not over.
     censuses: AtomicUsize,
-    /// Nodes that are being asked and have not answered yet.
+    /// Nodes that are being asked, or are about to be, and have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
@@ -95,12 +95,10 @@ impl Nodes {
         self.changed.notify_one();
         if self.update_telling(proxy) {
             // What changed before, the master may be about to tell this very node first.
-            let noticed = proxy
+            proxy
                 .shadow
-                .with_activity(|_, activity| activity.topics_noticed(now));
-            for topic in noticed {
-                healing::tell_subscribers(proxy, &topic);
-            }
+                .with_activity(|_, activity| activity.repeat_news(now));
+            proxy.shadow.news.notify_one();
         }
     }
 
@@ -159,17 +157,17 @@ pub async fn watch(proxy: Arc<Proxy>) {
         .config
         .reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
-    let mut repeats = Repeats::default();
+    let mut repeats = Repeats::<News>::default();
     loop {
         let next = proxy.nodes.lock().next().map(Into::into);
         tokio::select! {
-            () = proxy.shadow.news.notified() => tell_news(&proxy, &mut repeats),
+            () = proxy.shadow.news.notified() => take_news(&proxy, &mut repeats),
             () = wait::until(next) => ask_suspects(&proxy),
             () = wait::until(repeats.next().map(Into::into)) => {
                 let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
                 let holding_up = unanswered || !proxy.nodes.lock().is_empty();
-                for topic in repeats.due(Instant::now(), holding_up) {
-                    healing::tell_subscribers(&proxy, &topic);
+                for news in repeats.due(Instant::now(), holding_up) {
+                    tell(&proxy, news);
                 }
             }
             // A suspect that is new may be due before the others.
@@ -184,22 +182,25 @@ pub async fn watch(proxy: Arc<Proxy>) {
     }
 }
 
-fn tell_news(proxy: &Arc<Proxy>, repeats: &mut Repeats) {
+fn take_news(proxy: &Arc<Proxy>, repeats: &mut Repeats<News>) {
     let (news, displaced) = proxy
         .shadow
         .with_activity(|_, activity| (activity.take_news(), activity.take_displaced()));
-    for (to, letter) in news {
-        match (to, letter) {
-            (Some(api), letter) => healing::send(proxy, &api, letter),
-            (None, Letter::Topic(topic)) => {
-                healing::tell_subscribers(proxy, &topic);
-                repeats.changed(&topic, Instant::now());
-            }
-            (None, Letter::Param(_)) => {}
-        }
+    for news in news {
+        repeats.changed(news, Instant::now());
     }
     for (node, api) in displaced {
         tokio::spawn(displace(proxy.clone(), node, api));
+    }
+}
+
+fn tell(proxy: &Arc<Proxy>, news: News) {
+    match news {
+        (Some(api), letter) => healing::send(proxy, &api, letter),
+        (None, Letter::Topic(topic)) => {
+            healing::tell_subscribers(proxy, &topic);
+        }
+        (None, Letter::Param(_)) => {}
     }
 }
 
@@ -217,7 +218,7 @@ fn ask_suspects(proxy: &Arc<Proxy>) {
     for api in due {
         let proxy = proxy.clone();
         tokio::spawn(async move {
-            let outcome = census::visit(&proxy, &api).await;
+            let outcome = census::visit(&proxy, api).await;
             if outcome.sign != Sign::Silent {
                 say(&outcome, "a suspect answers again");
             }
