@@ -100,6 +100,48 @@ fn case_2_with_the_three_threads_of_a_usual_master_last_callbacks() {
     the_master_dies_at_every_callback("3", 4..=6);
 }
 
+/// The master dies before it tells anybody, and rosrescue with it.
+#[test]
+fn both_die_between_the_change_and_its_news() {
+    let program = Path::new(NODES).join("fragile_master.py");
+    let mut robot = Robot::start_with(
+        Mode::Core,
+        &["--rosmaster", program.to_str().unwrap(), "-w", "3"],
+    );
+    let client = robot.client();
+    let fakes = ["/subscriber0", "/subscriber1", "/subscriber2"].map(FakeNode::start);
+    client.set_param("/gain", 1);
+    for fake in &fakes {
+        fake.subscribe(&client, "/chatter", "std_msgs/String");
+        fake.watch_param(&client, "/gain");
+    }
+    let mut all = Vec::new();
+    let mut publishers = Vec::new();
+    for point in 1..=3 {
+        let file = robot.scratch.path("die-at");
+        std::fs::write(&file, format!("publisherUpdate {point}")).unwrap();
+        let publisher = FakeNode::start(&format!("/publisher{point}"));
+        publisher.publish(&client, "/chatter", "std_msgs/String");
+        all.push(publisher.api.clone());
+        publishers.push(publisher);
+        client.set_param("/gain", point);
+        robot.rescue.kill();
+        robot.rescue.start_again();
+        robot.rescue.wait_serving();
+        robot.await_gate();
+        eventually(&format!("all know the publishers, point {point}"), || {
+            let mut lists = fakes.iter().map(|fake| fake.updates("/chatter"));
+            lists.all(|updates| updates.last() == Some(&all))
+        });
+        eventually(&format!("all know the parameter, point {point}"), || {
+            let mut told = fakes.iter().map(|fake| fake.heard("paramUpdate"));
+            told.all(|told| told.last().is_some_and(|told| told[2] == point.into()))
+        });
+        // Where rosrescue was faster, the master lives.
+        let _ = std::fs::remove_file(&file);
+    }
+}
+
 /// The same for parameters: who has cached one is told of a change that the dead master still owed.
 #[test]
 fn the_master_dies_at_every_callback_of_a_parameter() {

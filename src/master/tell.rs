@@ -40,6 +40,21 @@ impl Master {
             .map(String::as_str)
     }
 
+    /// Every subscription of a parameter that is set: the subscriber's address and the key, with a
+    /// trailing slash.
+    pub fn param_subscribers(&self) -> Vec<(String, String)> {
+        let subscribers = self.registry.shared(Shared::ParamSubscribers).keys();
+        let set = subscribers.filter(|key| self.is_set(key));
+        let all = set.flat_map(|key| {
+            let apis = self
+                .registry
+                .apis(Shared::ParamSubscribers, key)
+                .into_iter();
+            apis.map(|api| (api, key.clone()))
+        });
+        all.collect()
+    }
+
     /// Whether a node at `api` subscribes a topic.
     pub fn subscribes(&self, api: &str, topic: &str) -> bool {
         let nodes = self.registry.shared(Shared::Subscribers).get(topic);

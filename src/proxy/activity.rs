@@ -8,7 +8,7 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 
 use crate::{
-    master::{self, Notice},
+    master::{self, Master, Notice},
     xmlrpc::{Call, Value},
 };
 
@@ -171,6 +171,15 @@ impl Activity {
     /// The news since the last time.
     pub fn take_news(&mut self) -> IndexSet<News> {
         std::mem::take(&mut self.news)
+    }
+
+    /// Takes everything that a node may be told for changed just now.
+    pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
+        let topics = mirror.subscribed_topics();
+        self.topics
+            .extend(topics.map(|topic| (topic.to_owned(), now)));
+        let params = mirror.param_subscribers().into_iter();
+        self.params.extend(params.map(|param| (param, now)));
     }
 
     /// What the master may not have told by `now` is news once more.

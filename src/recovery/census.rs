@@ -19,7 +19,7 @@ use super::{
     healing,
     node::{self, Interview, Sign},
     nodes::Nodes,
-    report,
+    report::{self, Outcome as Recovered},
 };
 use crate::{
     census::{Mending, Name, Registration, Verdict, judge},
@@ -69,7 +69,7 @@ pub(super) struct Outcome {
 
 /// What follows a recovery that took place since `outage`, beside traffic: who did not hear the news
 /// is told, and the census is taken.
-pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
+pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Recovered) {
     let under_way = Nodes::begin_census(&proxy);
     // As if somebody did not answer, until the questions have been put.
     let waiting = Waiting::new(&proxy);
@@ -79,13 +79,14 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant) {
     }
     let start = Instant::now();
     let incarnation = proxy.shadow.incarnation();
-    let (topics, params) = proxy.shadow.with_activity(|_, activity| {
-        (
-            activity.topics_noticed(outage),
-            activity.params_noticed(outage),
-        )
-    });
-    let mut healed = topics;
+    let (mut healed, params) = match outcome {
+        // A master that lives on tells its news itself.
+        Recovered::Adopted => Default::default(),
+        _ => proxy.shadow.with_activity(|_, activity| {
+            let params = activity.params_noticed(outage);
+            (activity.topics_noticed(outage), params)
+        }),
+    };
     healed.retain(|topic| healing::tell_subscribers(&proxy, topic));
     healed.sort();
     for (api, key) in params {

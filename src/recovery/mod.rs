@@ -428,10 +428,16 @@ impl Guard {
             report.outcome,
             report.restored
         );
-        let resumed = report.outcome == Outcome::Resumed;
+        let outcome = report.outcome;
         self.proxy.board.set_report(report);
-        if !resumed {
-            tokio::spawn(census::after_recovery(self.proxy.clone(), since));
+        if !self.served {
+            // What happened just before we died ourselves, nobody knows any more.
+            self.proxy.shadow.with_activity(|mirror, activity| {
+                activity.notice_all(mirror, Instant::now());
+            });
+        }
+        if outcome != Outcome::Resumed {
+            tokio::spawn(census::after_recovery(self.proxy.clone(), since, outcome));
         }
     }
 
