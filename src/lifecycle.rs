@@ -23,6 +23,9 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 /// A master that has served for so long ends a crash loop. One that always lived longer could not
 /// die more than [`DEATHS_AT_ONCE`] times within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
+/// A dying master may still take connections for so long, and close them at once. That is no second
+/// death.
+const DYING: Duration = Duration::from_millis(100);
 /// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
 /// seconds; a rosmaster whose port was taken stays alive without ever listening.
 const START_LIMIT: Duration = Duration::from_secs(30);
@@ -176,6 +179,8 @@ pub struct Lifecycle {
     serving_since: Option<Instant>,
     /// A master of others has closed its connection, and it is not known yet whether it died.
     lost: bool,
+    /// When a master of others was counted as dead, until its port refuses.
+    dying: Option<Instant>,
     missed: u32,
     timer: Option<(Instant, Timer)>,
 }
@@ -194,6 +199,7 @@ impl Lifecycle {
             crash_loop: false,
             serving_since: None,
             lost: false,
+            dying: None,
             missed: 0,
             timer: None,
         }
@@ -238,8 +244,10 @@ impl Lifecycle {
             // It died while it was being examined, or it closes every connection: not in a rush.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
-                if self.supervision == Supervision::Theirs {
+                let again = self.dying.is_some_and(|at| now.duration_since(at) < DYING);
+                if self.supervision == Supervision::Theirs && !again {
                     actions.extend(self.their_death(now));
+                    self.dying = Some(now);
                 }
                 actions
             }
@@ -328,6 +336,7 @@ impl Lifecycle {
     }
 
     fn refused(&mut self, now: Instant) -> Vec<Action> {
+        self.dying = None;
         match (self.supervision, self.child) {
             (Supervision::Ours, None) => {
                 self.seek(now);

@@ -343,3 +343,29 @@ fn the_rate_of_restarts_is_bounded() {
         }
     }
 }
+
+/// A dying process takes connections until its listening socket is closed, which comes last.
+#[test]
+fn a_master_that_is_still_dying_dies_once() {
+    let mut script = Script::serving(Supervision::Theirs);
+    script
+        .feed(
+            Input::ConnectionLost,
+            &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
+        )
+        .feed(Input::Connected, &[Action::Examine]);
+    for _ in 0..3 {
+        script.feed(Input::ConnectionLost, &[]);
+        script.now += DYING / 10;
+        script
+            .feed(Input::Wake, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine]);
+    }
+    assert_eq!(script.machine.deaths(), 1);
+    script
+        .feed(Input::ConnectionLost, &[])
+        .feed(Input::Refused, &[])
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::ConnectionLost, &[]);
+    assert_eq!(script.machine.deaths(), 2, "it was gone, and came back");
+}

@@ -143,7 +143,12 @@ impl Dice {
 
     /// A call of any kind.
     pub(crate) fn call(&mut self, cast: &Cast, levels: usize) -> Call {
-        let caller = self.pick(CALLERS);
+        let caller = match self.pick(CALLERS) {
+            // Only the node itself can say its name: while it is registered, nobody can bring in the
+            // type of a topic of that name.
+            "/o d" if !cast.process => "/x/",
+            caller => caller,
+        };
         let mut params: Vec<Value> = vec![caller.into()];
         let method = match self.below(if levels == 0 { 100 } else { 112 }) {
             0..=15 => {

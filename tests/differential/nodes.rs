@@ -23,6 +23,9 @@ pub(crate) fn patience() -> Duration {
     })
 }
 
+/// What the census asks.
+const QUESTIONS: [&str; 3] = ["getPid", "getPublications", "getSubscriptions"];
+
 /// A listening node.
 pub(crate) struct Node {
     pub(crate) api: String,
@@ -71,12 +74,18 @@ fn serve(connection: TcpStream, notes: &Mutex<Vec<Call>>) {
     let mut connection = BufReader::new(connection);
     while let Some(body) = read_message(&mut connection) {
         let call = decode_call(&body).unwrap();
-        // Asking a node for a sign of life changes nothing in it.
-        if call.method != "getPid" {
+        // A question changes nothing in a node. It is alive and has no answer: what it registers is
+        // rolled with dice.
+        let reply = if QUESTIONS.contains(&call.method.as_str()) {
+            Reply::Fault {
+                code: 1,
+                text: "no such method".to_owned(),
+            }
+        } else {
             notes.lock().unwrap().push(call);
-        }
-        let answer = vec![Value::Int(1), "".into(), 0.into()];
-        let body = encode_reply(&Reply::Value(Value::Array(answer)));
+            Reply::Value(vec![Value::Int(1), "".into(), 0.into()].into())
+        };
+        let body = encode_reply(&reply);
         let head = format!(
             "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
             body.len()

@@ -6,13 +6,16 @@
 //! * The callbacks of the one call that was under way may be lost, or come once more: the master
 //!   may have run it before it died, its successor runs it again, and it was never answered twice.
 //! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
-//!   crash before the last one (the letter may cross a change). Never a partial one, never a
-//!   `paramUpdate` or a `shutdown`, never a list to a node that does not subscribe.
+//!   crash before the last one (the letter may cross a change). So may a subscriber of a parameter be
+//!   sent its value. Never a partial list, never a value that is not true, never a `shutdown`, nothing
+//!   to a node that does not subscribe.
 
 use std::collections::HashSet;
 
 use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Value};
+
+use crate::nodes::blank;
 
 /// A callback that the model sends.
 #[derive(Clone, Debug)]
@@ -29,6 +32,9 @@ type List = (String, String, Vec<String>);
 pub(crate) struct TrueLists {
     before: HashSet<List>,
     since: HashSet<List>,
+    /// The states themselves, for the values of parameters.
+    states_before: Vec<Master>,
+    states_since: Vec<Master>,
     /// Since the call that was under way was answered.
     after: HashSet<List>,
     /// Those who have subscribed all the time since then.
@@ -39,6 +45,7 @@ impl TrueLists {
     /// The master crashes in that state.
     pub(crate) fn crash(&mut self, model: &Master) {
         self.before = std::mem::take(&mut self.since);
+        self.states_before = std::mem::take(&mut self.states_since);
         self.after.clear();
         self.faithful = None;
         self.add(model);
@@ -53,6 +60,7 @@ impl TrueLists {
 
     /// What is true in that state.
     pub(crate) fn add(&mut self, model: &Master) {
+        self.states_since.push(model.clone());
         let mut subscribers = HashSet::new();
         for topic in model.subscribed_topics() {
             let publishers = model.publishers_of(topic);
@@ -71,6 +79,10 @@ impl TrueLists {
 
     /// Whether the call is a list that may be sent to the node at `api` because of a crash.
     pub(crate) fn has(&self, api: &str, call: &Call) -> bool {
+        if call.method == "paramUpdate" {
+            let mut states = self.states_before.iter().chain(&self.states_since);
+            return states.any(|state| is_true_param(state, api, call));
+        }
         let list = as_list(api, call);
         list.is_some_and(|list| self.before.contains(&list) || self.since.contains(&list))
     }
@@ -89,6 +101,15 @@ impl TrueLists {
         };
         subscribes && !heard.iter().any(is_news)
     }
+}
+
+/// Whether the node at `api` subscribes what the `paramUpdate` is about, and that is so.
+fn is_true_param(state: &Master, api: &str, call: &Call) -> bool {
+    let key = call.params.get(1).and_then(Value::as_str);
+    key.is_some_and(|key| {
+        state.subscribes_param(api, key)
+            && state.param_update(key).map(blank).as_ref() == Some(call)
+    })
 }
 
 /// The subscriber, topic and publishers of a `publisherUpdate`.
