@@ -16,7 +16,9 @@ use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
-use support::{Client, FakeNode, Library, Mode, Robot, State, eventually, eventually_some, params};
+use support::{
+    Client, FakeNode, Library, Mode, Robot, State, eventually, eventually_some, holds, params,
+};
 
 /// How often each thing is done. `ROSRESCUE_TEST_ROUNDS` says otherwise. A core restarts a master at
 /// once for the first five deaths within a minute only.
@@ -36,6 +38,39 @@ fn assert_innocent(node: &FakeNode, round: usize) {
         "{} in round {round}",
         node.name
     );
+}
+
+/// Hears of a parameter from the master, whose threads take what it has to tell in order: what was to be
+/// told before has been told, or is being told.
+struct Witness(FakeNode);
+
+impl Witness {
+    fn start(client: &Client) -> Self {
+        let node = FakeNode::start("/witness");
+        node.watch_param(client, "/round");
+        Self(node)
+    }
+
+    #[track_caller]
+    fn hear(&self, client: &Client) {
+        let before = self.0.heard("paramUpdate").len();
+        let number = i32::try_from(before).unwrap() + 1_000_000;
+        client.set_param("/round", number);
+        eventually("the master tells its news", || {
+            let heard = self.0.heard("paramUpdate");
+            heard.iter().any(|told| told[2] == Value::Int(number))
+        });
+    }
+}
+
+/// The master calls beside everything else: long enough for it to have done so.
+#[track_caller]
+fn assert_all_innocent(nodes: &[FakeNode]) {
+    let innocent = |node: &FakeNode| node.heard("shutdown").is_empty();
+    let all = holds(Duration::from_secs(2), || nodes.iter().all(innocent));
+    let guilty = nodes.iter().filter(|node| !innocent(node));
+    let names: Vec<_> = guilty.map(|node| node.name.as_str()).collect();
+    assert!(all, "told to shut down: {names:?}");
 }
 
 /// Makes the node a process of its own, and registers this and that.
@@ -85,11 +120,15 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
     for mode in [Mode::Core, Mode::Proxy] {
         let mut robot = Robot::start(mode);
         let client = robot.client();
-        let witness = FakeNode::start("/witness");
-        witness.subscribe(&client, "/phoenix/topic", "std_msgs/String");
+        let witness = Witness::start(&client);
+        witness
+            .0
+            .subscribe(&client, "/phoenix/topic", "std_msgs/String");
         let mut node = FakeNode::start("/phoenix");
         claim(&node, &client);
         for round in 0..rounds(mode, 50) {
+            // What came late of the round before.
+            assert_innocent(&node, round);
             node = outage(&mut robot, |client| {
                 // The old one is dead, or still there: then it is told to make way, as ever.
                 let old = node;
@@ -105,11 +144,12 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
                 (parked, old, api)
             })
             .finish(&robot, round);
-            assert_innocent(&witness, round);
+            witness.hear(&client);
         }
         eventually("the witness knows the last one", || {
-            witness.updates("/phoenix/topic").last() == Some(&vec![node.api.clone()])
+            witness.0.updates("/phoenix/topic").last() == Some(&vec![node.api.clone()])
         });
+        assert_all_innocent(&[node, witness.0]);
     }
 }
 
@@ -146,6 +186,8 @@ fn api_of(robot: &Robot, node: &str) -> Option<String> {
 fn who_has_the_port_of_a_node_that_moved_on_stays() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
+    let witness = Witness::start(&client);
+    let mut stay = Vec::new();
     for round in 0..rounds(Mode::Proxy, 50) {
         let old = FakeNode::start("/moving");
         claim(&old, &client);
@@ -162,6 +204,7 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
             (moved, parked(client, heir))
         });
         let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
+        witness.hear(&client);
         assert_innocent(&moved, round);
         assert_innocent(&heir, round);
         let state = robot.state();
@@ -172,7 +215,9 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
             node.unsubscribe(&client, "/shared");
             node.withdraw(&client, &format!("{}/service", node.name));
         }
+        stay.extend([moved, heir]);
     }
+    assert_all_innocent(&stay);
 }
 
 /// The old port goes to somebody else first, and then the node comes back elsewhere. Here even a
@@ -181,6 +226,8 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
 fn who_had_the_port_before_the_node_moved_on_stays_too() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
+    let witness = Witness::start(&client);
+    let mut stay = Vec::new();
     for round in 0..rounds(Mode::Proxy, 50) {
         let old = FakeNode::start("/moving");
         claim(&old, &client);
@@ -201,6 +248,7 @@ fn who_had_the_port_before_the_node_moved_on_stays_too() {
             (moved, heir)
         });
         let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
+        witness.hear(&client);
         assert_innocent(&moved, round);
         assert_innocent(&heir, round);
         for node in [&moved, &heir] {
@@ -208,7 +256,9 @@ fn who_had_the_port_before_the_node_moved_on_stays_too() {
             node.unsubscribe(&client, "/shared");
             node.withdraw(&client, &format!("{}/service", node.name));
         }
+        stay.extend([moved, heir]);
     }
+    assert_all_innocent(&stay);
 }
 
 /// A node dies and its port goes to another one; nobody comes back.
@@ -217,12 +267,14 @@ fn who_has_the_port_of_a_dead_node_stays() {
     for mode in [Mode::Core, Mode::Proxy] {
         let mut robot = Robot::start(mode);
         let client = robot.client();
+        let witness = Witness::start(&client);
         let mut node = FakeNode::start("/first");
         claim(&node, &client);
-        for round in 0..rounds(mode, 25) {
+        for round in 0..rounds(mode, 15) {
             let heir = format!("/heir{round}");
             let port = node.port();
             let name = node.name.clone();
+            assert_innocent(&node, round);
             let parked = outage(&mut robot, |client| {
                 drop(node);
                 parked(client, FakeNode::start_at(&heir, port))
@@ -232,8 +284,10 @@ fn who_has_the_port_of_a_dead_node_stays() {
                 State::try_read(&robot.bare()).is_ok_and(|state| !state.knows(&name))
             });
             assert_innocent(&node, round);
+            witness.hear(&client);
             assert!(robot.state().knows(&heir), "round {round}");
         }
+        assert_all_innocent(&[node]);
     }
 }
 
@@ -242,6 +296,7 @@ fn who_has_the_port_of_a_dead_node_stays() {
 fn what_the_new_master_knows_already_wins() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
+    let witness = Witness::start(&client);
     let mut old = FakeNode::start("/both");
     claim(&old, &client);
     for round in 0..rounds(Mode::Proxy, 15) {
@@ -253,11 +308,13 @@ fn what_the_new_master_knows_already_wins() {
         claim(&new, &robot.bare());
         robot.rescue.signal(Signal::CONT);
         robot.await_recovery(dead);
+        witness.hear(&client);
         assert_eq!(api_of(&robot, "/both"), Some(new.api.clone()));
         assert_innocent(&old, round);
         assert_innocent(&new, round);
         old = new;
     }
+    assert_all_innocent(&[old]);
 }
 
 /// Real nodes that are killed and started again under their names while there is no master.
