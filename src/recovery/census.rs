@@ -30,7 +30,7 @@ use crate::{
         gate::State,
     },
     ros_env::MasterUri,
-    xmlrpc::{Call, Reply},
+    xmlrpc::{Call, Reply, Value},
 };
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
@@ -370,16 +370,34 @@ async fn mend(
     // In a multicall it travels alone, see the lane: it must not bump anybody.
     let alone = Call::multicall([call.clone()]);
     let reply = proxy.lane.call(alone, kind).await;
-    if reply.is_none() {
-        // One master after the other took it and never answered.
-        proxy.nodes.forbid(&call);
-    }
-    if let Some(Reply::Value(_)) = reply {
+    let Some(reply) = reply else {
+        let moved = proxy
+            .shadow
+            .with_mirror(|mirror| mirror.displaced_by(&call).is_some());
+        if !moved {
+            // One master after the other took it and never answered.
+            proxy.nodes.forbid(&call);
+        }
+        return;
+    };
+    if is_done(&reply) {
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
         outcome
             .mended
             .push(format!("{sign} {}", one.describe(&name.node)));
     }
+}
+
+/// Whether the one entry of a multicall was answered with success: a node may claim a type that no
+/// master takes.
+fn is_done(reply: &Reply) -> bool {
+    let Reply::Value(results) = reply else {
+        return false;
+    };
+    let answer = results.as_array().and_then(|results| results.first());
+    let answer = answer.and_then(|result| result.as_array()?.first());
+    let code = answer.and_then(|answer| answer.as_array()?.first());
+    code.and_then(Value::as_int) == Some(1)
 }
 
 /// Unregisters a node as it would have done itself. Not if it has another address by now, or has
