@@ -349,3 +349,20 @@ fn no_helper_takes_the_name_of_a_node() {
     );
     assert!(matches!(plan.skipped(), [Skipped::Unnameable { .. }]));
 }
+
+#[test]
+fn that_there_once_was_a_service_is_brought_along() {
+    let gone = call("unregisterService", &["/s", "/add", "rosrpc://h/s"]);
+    let mut before = after([
+        provide("/s", "/add"),
+        publish("/s", "/t", "a/B"),
+        gone.clone(),
+    ]);
+    let plan = restores(&before);
+    assert_eq!(count(&plan, "registerService"), 1);
+    let (mut successor, _) = run(&plan, &Master::default());
+    assert_eq!(successor.apply(&gone), before.apply(&gone));
+    // Once more: the successor's successor.
+    let (mut successor, _) = run(&restores(&successor), &Master::default());
+    assert_eq!(successor.apply(&gone), before.apply(&gone));
+}
