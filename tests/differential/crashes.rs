@@ -180,6 +180,7 @@ pub(crate) fn run(
                 stage.settle().and_then(|()| {
                     let repeats = stage.repeats.get_or_insert_default();
                     repeats.crash(&stage.model);
+                    stage.away = true;
                     if *during { Ok(()) } else { rig.crash() }
                 })
             }

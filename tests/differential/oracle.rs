@@ -5,6 +5,9 @@
 //!
 //! * The callbacks of the one call that was under way may be lost, or come once more: the master
 //!   may have run it before it died, its successor runs it again, and it was never answered twice.
+//! * So may those of unregistrations that are answered while no master is there. Several of them
+//!   are told with the one list that is true in the end.
+//! * Whoever misses a list by that is sent one that is true after it.
 //! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
 //!   crash before the last one (the letter may cross a change). So may a subscriber of a parameter be
 //!   sent its value. Never a partial list, never a value that is not true, never a `shutdown`, nothing

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Notice, accepted, difference};
+use rosrescue::master::{Kind, Master, Notice, accepted, difference, kind};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 use crate::dice::{CALLERS, KEYS, NAMES};
@@ -31,6 +31,8 @@ pub(crate) struct Stage<'n> {
     told: Vec<Vec<Expected>>,
     /// What may be repeated because of a crash.
     pub(crate) repeats: Option<TrueLists>,
+    /// Whether the master may still be away: no call has been answered that only a master answers.
+    pub(crate) away: bool,
 }
 
 impl<'n> Stage<'n> {
@@ -46,6 +48,7 @@ impl<'n> Stage<'n> {
             wires,
             callbacks: true,
             repeats: None,
+            away: false,
         }
     }
 
@@ -75,7 +78,13 @@ impl<'n> Stage<'n> {
                 outcome.reply
             ));
         }
-        self.note(&outcome.notices, risky);
+        // An unregistration that no master has seen is told to nodes with what follows it.
+        let kind = kind(call);
+        self.note(
+            &outcome.notices,
+            risky || self.away && kind == Kind::Unregister,
+        );
+        self.away &= kind != Kind::Mutate;
         let accepted = accepted(&before, call, reply);
         let mut mirror = before;
         for (call, _) in &accepted.calls {
