@@ -13,7 +13,7 @@
 //!   sent its value. Never a partial list, never a value that is not true, never a `shutdown`, nothing
 //!   to a node that does not subscribe.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 
 use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Value};
@@ -136,35 +136,51 @@ fn as_list(api: &str, call: &Call) -> Option<List> {
 }
 
 /// Whether what was heard is what had to be; gives what a crash has swallowed.
+///
+/// Callbacks may be equal, so what was heard may be accounted for in several ways: all are followed.
 pub(crate) fn judge(
     expected: &[Expected],
     heard: &[Call],
     is_repeat: impl Fn(&Call) -> bool,
 ) -> Result<Vec<Call>, String> {
-    let mut next = 0;
-    let mut swallowed = Vec::new();
-    for (nth, call) in heard.iter().enumerate() {
-        let ahead = expected[next..].iter();
-        let lost = ahead.take_while(|it| it.risky && it.call != *call).count();
-        if expected.get(next + lost).is_some_and(|it| it.call == *call) {
-            swallowed.extend(expected[next..next + lost].iter().map(|it| it.call.clone()));
-            next += lost + 1;
-            continue;
+    // How many of the expected ones may be done with.
+    let mut done = BTreeSet::from([0]);
+    let pass_over_lost = |done: &mut BTreeSet<usize>| {
+        for (nth, it) in expected.iter().enumerate() {
+            if it.risky && done.contains(&nth) {
+                done.insert(nth + 1);
+            }
         }
+    };
+    pass_over_lost(&mut done);
+    for (nth, call) in heard.iter().enumerate() {
         let doubled = expected.iter().any(|it| it.risky && it.call == *call);
-        if !doubled && !is_repeat(call) {
-            let wanted = expected.get(next).map(|it| &it.call);
+        let additional = doubled || is_repeat(call);
+        let mut next: BTreeSet<usize> = done
+            .iter()
+            .filter(|done| expected.get(**done).is_some_and(|it| it.call == *call))
+            .map(|done| done + 1)
+            .collect();
+        if additional {
+            next.extend(&done);
+        }
+        pass_over_lost(&mut next);
+        if next.is_empty() {
+            let wanted = done.last().and_then(|done| expected.get(*done));
+            let wanted = wanted.map(|it| &it.call);
             return Err(format!(
                 "number {nth} is\n  {call:?}\ninstead of\n  {wanted:?}"
             ));
         }
+        done = next;
     }
-    let rest = &expected[next..];
-    if let Some(missing) = rest.iter().find(|it| !it.risky) {
-        return Err(format!("missing is\n  {:?}", missing.call));
+    if !done.contains(&expected.len()) {
+        let missing = done.last().and_then(|done| expected.get(*done));
+        return Err(format!("missing is\n  {:?}", missing.map(|it| &it.call)));
     }
-    swallowed.extend(rest.iter().map(|it| it.call.clone()));
-    Ok(swallowed)
+    let risky = expected.iter().filter(|it| it.risky);
+    let unheard = risky.filter(|it| !heard.contains(&it.call));
+    Ok(unheard.map(|it| it.call.clone()).collect())
 }
 
 #[cfg(test)]
@@ -209,6 +225,7 @@ mod tests {
             &["a", "x", "y", "b"][..],
             &["a", "b"],
             &["a", "y", "b"],
+            &["a", "x", "b"],
             &["a", "x", "y", "x", "y", "b"],
             &["repeat", "a", "b", "repeat"],
         ] {
