@@ -79,6 +79,8 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     }
     let start = Instant::now();
     let incarnation = proxy.shadow.incarnation();
+    // Parked calls first: they wait, and what nodes say in them is newer than what they say to us.
+    barrier(&proxy).await;
     let (mut healed, params) = match outcome {
         // A master that lives on tells its news itself.
         Recovered::Adopted => Default::default(),
@@ -92,8 +94,6 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     for (api, key) in params {
         healing::send(&proxy, &api, Letter::Param(key));
     }
-    // What nodes say in parked calls is newer than what they say to us.
-    barrier(&proxy).await;
     let visits = begin_visits(&proxy);
     drop(waiting);
     let census = collect(visits).await;
