@@ -84,7 +84,8 @@ impl<'n> Stage<'n> {
             &outcome.notices,
             risky || self.away && kind == Kind::Unregister,
         );
-        self.away &= kind != Kind::Mutate;
+        // The call that was under way may have been answered by the master that died.
+        self.away &= risky || kind != Kind::Mutate;
         let accepted = accepted(&before, call, reply);
         let mut mirror = before;
         for (call, _) in &accepted.calls {
