@@ -82,6 +82,13 @@ fn claim(node: &FakeNode, client: &Client) {
     node.offer(client, &format!("{}/service", node.name));
 }
 
+/// Takes back what [`claim`] registered.
+fn give_up(node: &FakeNode, client: &Client) {
+    node.unpublish(client, &format!("{}/topic", node.name));
+    node.unsubscribe(client, "/shared");
+    node.withdraw(client, &format!("{}/service", node.name));
+}
+
 /// The master's death, with what `meanwhile` does to the nodes until the new master is there.
 fn outage<T>(robot: &mut Robot, meanwhile: impl FnOnce(&Client) -> T) -> T {
     let dead = robot.master_pid();
@@ -211,9 +218,7 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
         assert_eq!(state.publishers_of("/moving/topic"), ["/moving"]);
         assert!(state.knows(&heir.name), "round {round}\n{state}");
         for node in [&moved, &heir] {
-            node.unpublish(&client, &format!("{}/topic", node.name));
-            node.unsubscribe(&client, "/shared");
-            node.withdraw(&client, &format!("{}/service", node.name));
+            give_up(node, &client);
         }
         stay.extend([moved, heir]);
     }
@@ -252,9 +257,7 @@ fn who_had_the_port_before_the_node_moved_on_stays_too() {
         assert_innocent(&moved, round);
         assert_innocent(&heir, round);
         for node in [&moved, &heir] {
-            node.unpublish(&client, &format!("{}/topic", node.name));
-            node.unsubscribe(&client, "/shared");
-            node.withdraw(&client, &format!("{}/service", node.name));
+            give_up(node, &client);
         }
         stay.extend([moved, heir]);
     }

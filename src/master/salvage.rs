@@ -1,6 +1,6 @@
 //! Reading the parameters of a master that cannot return them all at once.
 
-use super::CALLER_ID;
+use super::{CALLER_ID, Master};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// The parameters of a master that holds one which it cannot return, read part by part.
@@ -14,7 +14,8 @@ pub struct Salvage {
     leaves: Vec<String>,
     /// Keys still to be asked for, the next one last.
     open: Vec<String>,
-    tree: Struct,
+    /// What has been read.
+    found: Master,
     unreadable: Vec<String>,
 }
 
@@ -51,7 +52,9 @@ impl Salvage {
         match reply {
             Reply::Value(Value::Array(fields)) => {
                 if let [Value::Int(1), _, value] = fields.as_slice() {
-                    insert(&mut self.tree, &key, value.clone());
+                    let key = format!("/{key}").into();
+                    let params = vec![CALLER_ID.into(), key, value.clone()];
+                    self.found.apply(&Call::new("setParam", params));
                 }
             }
             Reply::Value(_) | Reply::Fault { .. } if self.leaves.contains(&key) => {
@@ -63,7 +66,7 @@ impl Salvage {
 
     /// What could be read, and the keys of what could not.
     pub fn finish(self) -> (Struct, Vec<String>) {
-        (self.tree, self.unreadable)
+        (self.found.params().clone(), self.unreadable)
     }
 
     /// Asks for each thing directly in the namespace `prefix`, in order.
@@ -83,27 +86,9 @@ impl Salvage {
     }
 }
 
-/// Puts `value` under `key`, in namespaces that are made as needed.
-fn insert(tree: &mut Struct, key: &str, value: Value) {
-    match key.split_once('/') {
-        None => {
-            tree.insert(key.to_owned(), value);
-        }
-        Some((namespace, rest)) => {
-            let inner = tree
-                .entry(namespace.to_owned())
-                .or_insert_with(|| Value::Struct(Struct::new()));
-            if let Value::Struct(inner) = inner {
-                insert(inner, rest, value);
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Master;
 
     fn set(master: &mut Master, key: &str, value: Value) {
         let params = vec!["/n".into(), key.into(), value];

@@ -33,6 +33,8 @@ use crate::{
 const ACQUAINTANCE: Duration = Duration::from_secs(2);
 /// How often it is looked whether a node is to be asked.
 const ROUND: Duration = Duration::from_millis(500);
+/// So many registrations that masters died of are remembered: one is rare.
+const DEADLY: usize = 1000;
 /// How long a node whose name another one is about to take may need to answer.
 const DISPLACED_TIME: Duration = Duration::from_secs(1);
 
@@ -64,7 +66,9 @@ impl Nodes {
     /// A master died of this call: it is not made again to mend what a node says.
     pub(super) fn forbid(&self, call: &Call) {
         let mut deadly = self.deadly.lock().unwrap_or_else(PoisonError::into_inner);
-        deadly.insert(essence(call));
+        if deadly.len() < DEADLY {
+            deadly.insert(essence(call));
+        }
     }
 
     /// Whether [`Nodes::forbid`] was told so.
