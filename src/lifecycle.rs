@@ -66,6 +66,8 @@ pub enum Input {
     Unreachable,
     /// The connection to the master has ended.
     ConnectionLost,
+    /// A thread of the master has ended, as all do when it is killed.
+    ThreadEnded,
     /// The master holds the whole state.
     Examined {
         /// It is not the incarnation that was served before.
@@ -255,6 +257,9 @@ impl Lifecycle {
                 self.lost = self.supervision == Supervision::Theirs;
                 self.lost(now, Cause::ConnectionLost, vec![Action::Connect])
             }
+            // The rest of it follows within milliseconds; if it does not, connecting shows that it lives.
+            Input::ThreadEnded if self.phase != Phase::Serving => Vec::new(),
+            Input::ThreadEnded => self.lost(now, Cause::Exited, vec![Action::Connect]),
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
                 self.phase = Phase::Serving;

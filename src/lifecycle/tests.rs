@@ -81,6 +81,35 @@ fn a_child_whose_end_is_seen_first_shuts_the_gate_too() {
 }
 
 #[test]
+fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
+    let mut script = Script::serving(Supervision::Ours);
+    script
+        .feed(
+            Input::ThreadEnded,
+            &[Action::ShutGate(Cause::Exited), Action::Connect],
+        )
+        // The dying process still takes connections.
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::ThreadEnded, &[])
+        .feed(Input::ConnectionLost, &[])
+        .feed(Input::Exited, &[Action::Spawn]);
+    assert_eq!(script.machine.deaths(), 1);
+}
+
+#[test]
+fn a_thread_that_ended_alone_is_no_death() {
+    let mut script = Script::serving(Supervision::Ours);
+    script
+        .feed(
+            Input::ThreadEnded,
+            &[Action::ShutGate(Cause::Exited), Action::Connect],
+        )
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::Examined { new: false }, &[Action::OpenGate]);
+    assert_eq!(script.machine.deaths(), 0);
+}
+
+#[test]
 fn an_idle_connection_that_the_master_closed_is_no_death() {
     let mut script = Script::serving(Supervision::Ours);
     script

@@ -2,6 +2,7 @@
 
 pub mod census;
 pub mod core_duties;
+mod early_end;
 pub mod examine;
 pub mod healing;
 pub mod master_process;
@@ -61,6 +62,8 @@ pub struct Guard {
     connection: Option<Connection>,
     /// Resolves when the connection to the master ends.
     ended: Option<Ended>,
+    /// Resolves when a thread of the master ends; told once of each master that is ours.
+    thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
     prepared: Option<JoinHandle<Prepared>>,
@@ -95,6 +98,7 @@ impl Guard {
             process,
             connection: None,
             ended: None,
+            thread_ended: None,
             step: None,
             probe_deadline: None,
             prepared: None,
@@ -172,6 +176,10 @@ impl Guard {
                     }
                     self.disconnect();
                     return Input::ConnectionLost;
+                }
+                () = wait::for_some(self.thread_ended.as_mut()) => {
+                    self.thread_ended = None;
+                    return Input::ThreadEnded;
                 }
                 () = exited(&mut self.process) => {
                     self.disconnect();
@@ -296,6 +304,7 @@ impl Guard {
                 let new = examination.outcome != Outcome::Resumed;
                 if new {
                     self.suspicion.survived();
+                    self.watch_threads(examination.pid);
                 }
                 // Whatever it dies of from now on, it is not the injection.
                 self.progress.take();
@@ -338,6 +347,13 @@ impl Guard {
     fn watch(&mut self, connection: Connection) {
         self.ended = Some(Box::pin(connection.ended()));
         self.connection = Some(connection);
+    }
+
+    /// Watches the threads of a master of ours, where the kernel can do that.
+    fn watch_threads(&mut self, pid: i32) {
+        let ours = self.process.as_ref().filter(|process| process.is(pid));
+        let ended = ours.and_then(|_| early_end::of(pid).ok());
+        self.thread_ended = ended.map(|ended| Box::pin(ended) as Ended);
     }
 
     fn disconnect(&mut self) {
