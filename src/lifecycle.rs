@@ -9,8 +9,10 @@ use std::{
 };
 
 mod suspicion;
+mod words;
 
 pub use suspicion::{InFlight, Suspicion, Trial};
+pub use words::{Action, Cause, Input, Probing, Supervision};
 
 /// Deaths older than this no longer count towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);
@@ -31,115 +33,6 @@ const DYING: Duration = Duration::from_millis(100);
 const START_LIMIT: Duration = Duration::from_secs(30);
 /// Pause before asking again something that is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
-
-/// Who starts masters.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Supervision {
-    /// rosrescue does.
-    Ours,
-    /// Somebody else does; rosrescue waits.
-    Theirs,
-}
-
-/// How a hung master is told from a slow one.
-#[derive(Clone, Copy, Debug)]
-pub struct Probing {
-    /// Pause between an answered probe and the next.
-    pub interval: Duration,
-    /// So many missed probes in a row mean that the master hangs.
-    pub count: u32,
-}
-
-/// What happened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Input {
-    /// rosrescue starts; `remembered`: the checkpoint names a master that may still be there.
-    Start {
-        /// Whether to try a remembered master before a new one is spawned.
-        remembered: bool,
-    },
-    /// The connection to the master is there.
-    Connected,
-    /// Nothing listens at the master's address.
-    Refused,
-    /// The master's address cannot be reached, or does not answer in time.
-    Unreachable,
-    /// The connection to the master has ended.
-    ConnectionLost,
-    /// A thread of the master has ended, as all do when it is killed.
-    ThreadEnded,
-    /// The master holds the whole state.
-    Examined {
-        /// It is not the incarnation that was served before.
-        new: bool,
-    },
-    /// What listens there does not answer as a master does.
-    NotAMaster,
-    /// The master answered a probe in time.
-    ProbeAnswered,
-    /// The master did not answer a probe in time.
-    ProbeMissed,
-    /// A master was spawned.
-    Spawned,
-    /// No master could be spawned.
-    SpawnFailed,
-    /// The spawned master has ended.
-    Exited,
-    /// The time of [`Lifecycle::deadline`] has come.
-    Wake,
-    /// rosrescue is to stop.
-    Stop,
-}
-
-/// Why the gate is shut.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Cause {
-    /// The master's connection ended: it died, or it closed an idle connection.
-    ConnectionLost,
-    /// The master's process ended.
-    Exited,
-    /// The master no longer answers.
-    Hung,
-    /// rosrescue stops.
-    Stopping,
-}
-
-impl Cause {
-    /// The cause in words, for reports.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::ConnectionLost => "the master's connection ended",
-            Self::Exited => "the master's process ended",
-            Self::Hung => "the master stopped answering",
-            Self::Stopping => "rosrescue stops",
-        }
-    }
-}
-
-/// What the shell is to do, in order. `Connect`, `Examine` and `Probe` replace one another: a new
-/// one cancels the one under way.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Action {
-    /// Connect to the master; answer `Connected`, `Refused` or `Unreachable`.
-    Connect,
-    /// Bring the connected master to the mirror's state, or the mirror to its; answer `Examined`,
-    /// `NotAMaster` or `Unreachable`.
-    Examine,
-    /// Let no call pass.
-    ShutGate(Cause),
-    /// Let calls pass.
-    OpenGate,
-    /// Ask the master for a sign of life; answer `ProbeAnswered` or `ProbeMissed`.
-    Probe,
-    /// Start a master; answer `Spawned` or `SpawnFailed`.
-    Spawn,
-    /// End the master at once.
-    Kill,
-    /// Say that the master dies again and again; so many deaths within a minute.
-    ReportCrashLoop(usize),
-    /// Say that it no longer does.
-    ReportCalm,
-}
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
@@ -253,13 +146,17 @@ impl Lifecycle {
                 }
                 actions
             }
-            Input::ConnectionLost => {
-                self.lost = self.supervision == Supervision::Theirs;
-                self.lost(now, Cause::ConnectionLost, vec![Action::Connect])
-            }
-            // The rest of it follows within milliseconds; if it does not, connecting shows that it lives.
             Input::ThreadEnded if self.phase != Phase::Serving => Vec::new(),
-            Input::ThreadEnded => self.lost(now, Cause::Exited, vec![Action::Connect]),
+            // Of a killed master the rest follows within milliseconds; if not, connecting shows that it
+            // lives.
+            Input::ConnectionLost | Input::ThreadEnded => {
+                self.lost = self.supervision == Supervision::Theirs;
+                let cause = match input {
+                    Input::ThreadEnded => Cause::Exited,
+                    _ => Cause::ConnectionLost,
+                };
+                self.lost(now, cause, vec![Action::Connect])
+            }
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
                 self.phase = Phase::Serving;

@@ -97,6 +97,27 @@ fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
 }
 
 #[test]
+fn a_master_of_others_whose_thread_ends_dies_once() {
+    let lost = [Action::ShutGate(Cause::Exited), Action::Connect];
+    let mut script = Script::serving(Supervision::Theirs);
+    script
+        .feed(Input::ThreadEnded, &lost)
+        .feed(Input::Refused, &[])
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+    assert_eq!(script.machine.deaths(), 1);
+    script
+        .feed(Input::ThreadEnded, &lost)
+        // The dying process still takes connections.
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::ConnectionLost, &[])
+        .feed(Input::Refused, &[])
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+    assert_eq!(script.machine.deaths(), 2);
+}
+
+#[test]
 fn a_thread_that_ended_alone_is_no_death() {
     let mut script = Script::serving(Supervision::Ours);
     script

@@ -175,6 +175,7 @@ impl Upstream {
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
     ended: watch::Receiver<()>,
+    local: bool,
     host: HeaderValue,
     instance: HeaderValue,
     max_reply: usize,
@@ -190,6 +191,7 @@ impl Connection {
         max_reply: usize,
     ) -> io::Result<Self> {
         stream.set_nodelay(true)?;
+        let (peer, own) = (stream.peer_addr()?.ip(), stream.local_addr()?.ip());
         let (sender, driver) = hyper::client::conn::http1::Builder::new()
             .title_case_headers(true)
             .handshake(TokioIo::new(stream))
@@ -205,6 +207,7 @@ impl Connection {
         Ok(Self {
             sender,
             ended,
+            local: peer.is_loopback() || peer == own,
             host,
             instance,
             max_reply,
@@ -214,6 +217,11 @@ impl Connection {
     /// Whether the connection is known to have ended.
     pub fn is_closed(&self) -> bool {
         self.sender.is_closed()
+    }
+
+    /// Whether the other end is on this computer, or seems to be: a tunnel's is here too.
+    pub fn is_local(&self) -> bool {
+        self.local
     }
 
     /// Returns when the connection has ended.

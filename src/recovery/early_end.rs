@@ -67,8 +67,20 @@ end.set()
 time.sleep(3600)
 ";
 
+    /// Whether this kernel can do it: Linux 6.9 or later.
+    fn is_possible() -> bool {
+        let name = rustix::system::uname();
+        let mut numbers = name.release().to_str().unwrap().split(['.', '-']);
+        let mut next = || numbers.next().unwrap().parse::<u32>().unwrap();
+        (next(), next()) >= (6, 9)
+    }
+
     #[tokio::test]
     async fn the_end_of_a_thread_is_told() {
+        if !is_possible() {
+            assert!(of(std::process::id().try_into().unwrap()).is_err());
+            return;
+        }
         for kill in [false, true] {
             let mut child = Command::new("/usr/bin/python3")
                 .args(["-c", PROGRAM])

@@ -132,12 +132,6 @@ impl MasterProcess {
         .await;
     }
 
-    /// Whether `pid` is the master that we started, or the rosmaster that an earlier rosrescue left.
-    pub fn is(&self, pid: i32) -> bool {
-        self.pid(Some(pid))
-            .is_some_and(|ours| i32::try_from(ours) == Ok(pid))
-    }
-
     fn pid(&self, said: Option<i32>) -> Option<u32> {
         let said = said.and_then(|pid| u32::try_from(pid).ok());
         self.child

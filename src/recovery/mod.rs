@@ -9,15 +9,12 @@ pub mod master_process;
 pub mod node;
 pub mod nodes;
 pub mod report;
+mod saying;
 mod set_aside;
 
 pub use nodes::Nodes;
 
-use std::{
-    pin::Pin,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{pin::Pin, sync::Arc, time::Instant};
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -25,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 use self::{
     examine::{Examination, ExamineError, Known, Prepared, Progress},
     master_process::MasterProcess,
-    report::{Outage, Outcome, Phases},
+    report::{Outage, Outcome},
 };
 use crate::{
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision, Suspicion},
@@ -35,12 +32,9 @@ use crate::{
         pool::{VerifyError, connect_verified},
         upstream::{ConnectError, Connection},
     },
-    supervisor::SupervisorError,
+    supervisor::{self, SupervisorError},
     wait,
 };
-
-/// A message about a state that lasts is repeated after this time.
-const REPEAT: Duration = Duration::from_secs(10);
 
 /// What a step under way ends in. Steps exclude one another.
 enum Done {
@@ -62,7 +56,7 @@ pub struct Guard {
     connection: Option<Connection>,
     /// Resolves when the connection to the master ends.
     ended: Option<Ended>,
-    /// Resolves when a thread of the master ends; told once of each master that is ours.
+    /// Resolves when a thread of the master ends; told once of each master.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
@@ -300,12 +294,12 @@ impl Guard {
                 })
             }
             Done::Examined(connection, Ok(examination)) => {
-                self.connection = Some(connection);
                 let new = examination.outcome != Outcome::Resumed;
                 if new {
                     self.suspicion.survived();
-                    self.watch_threads(examination.pid);
+                    self.thread_ended = thread_of(&connection, examination.pid);
                 }
+                self.connection = Some(connection);
                 // Whatever it dies of from now on, it is not the injection.
                 self.progress.take();
                 self.report(examination);
@@ -347,13 +341,6 @@ impl Guard {
     fn watch(&mut self, connection: Connection) {
         self.ended = Some(Box::pin(connection.ended()));
         self.connection = Some(connection);
-    }
-
-    /// Watches the threads of a master of ours, where the kernel can do that.
-    fn watch_threads(&mut self, pid: i32) {
-        let ours = self.process.as_ref().filter(|process| process.is(pid));
-        let ended = ours.and_then(|_| early_end::of(pid).ok());
-        self.thread_ended = ended.map(|ended| Box::pin(ended) as Ended);
     }
 
     fn disconnect(&mut self) {
@@ -414,70 +401,14 @@ impl Guard {
             }
         }
     }
+}
 
-    /// Reports what an examination came to; census and healing add to the report when they end.
-    fn report(&mut self, examination: Examination) {
-        let Outage { cause, since, .. } = self.outage;
-        let report = self.outage.report(Instant::now(), examination);
-        let uri = self.proxy.uri.clone();
-        self.proxy.shadow.set_identity(report.master_pid, uri);
-        if report.outcome == Outcome::Resumed && cause == Cause::ConnectionLost.as_str() {
-            // Such as after each idle connection that a master with `-t` closes.
-            tracing::debug!("the same master goes on");
-            return;
-        }
-        let Phases {
-            absence_ms,
-            look_ms,
-            injection_ms,
-            total_ms,
-        } = report.phases;
-        tracing::info!(
-            cause,
-            absence_ms,
-            look_ms,
-            injection_ms,
-            total_ms,
-            master_pid = report.master_pid,
-            skipped = ?report.skipped,
-            "{}: {}",
-            report.outcome,
-            report.restored
-        );
-        let outcome = report.outcome;
-        self.proxy.board.set_report(report);
-        if !self.served {
-            // What happened just before we died ourselves, nobody knows any more.
-            self.proxy.shadow.with_activity(|mirror, activity| {
-                activity.notice_all(mirror, Instant::now());
-            });
-        }
-        if outcome != Outcome::Resumed {
-            tokio::spawn(census::after_recovery(self.proxy.clone(), since, outcome));
-        }
-    }
-
-    fn say_waiting(&mut self, what: &str) {
-        // A child that is about to listen needs no message.
-        if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
-            || self.outage.since.elapsed() > REPEAT
-        {
-            self.say(format!("waiting for the master: {what}"));
-        }
-    }
-
-    /// Warns, at most once in [`REPEAT`] for the same text.
-    fn say(&mut self, text: String) {
-        let now = Instant::now();
-        let again = self
-            .said
-            .as_ref()
-            .is_none_or(|(said, at)| *said != text || now.duration_since(*at) >= REPEAT);
-        if again {
-            tracing::warn!("{text}");
-            self.said = Some((text, now));
-        }
-    }
+/// The end of a thread of the master `pid`, if it is on this computer and the kernel can tell.
+fn thread_of(connection: &Connection, pid: i32) -> Option<Ended> {
+    let is_master = |pid| connection.is_local() && supervisor::runs(pid, "rosmaster");
+    u32::try_from(pid).ok().filter(|pid| is_master(*pid))?;
+    let ended = early_end::of(pid).ok()?;
+    Some(Box::pin(ended))
 }
 
 async fn exited(process: &mut Option<MasterProcess>) {

@@ -1,0 +1,79 @@
+//! What the guard says: in the log, in reports, and to whoever sees to the nodes after a recovery.
+
+use std::time::{Duration, Instant};
+
+use super::{
+    Guard, census,
+    examine::Examination,
+    report::{Outage, Outcome, Phases},
+};
+use crate::lifecycle::Cause;
+
+/// A message about a state that lasts is repeated after this time.
+const REPEAT: Duration = Duration::from_secs(10);
+
+impl Guard {
+    /// Reports what an examination came to; census and healing add to the report when they end.
+    pub(super) fn report(&mut self, examination: Examination) {
+        let Outage { cause, since, .. } = self.outage;
+        let report = self.outage.report(Instant::now(), examination);
+        let uri = self.proxy.uri.clone();
+        self.proxy.shadow.set_identity(report.master_pid, uri);
+        if report.outcome == Outcome::Resumed && cause == Cause::ConnectionLost.as_str() {
+            // Such as after each idle connection that a master with `-t` closes.
+            tracing::debug!("the same master goes on");
+            return;
+        }
+        let Phases {
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+        } = report.phases;
+        tracing::info!(
+            cause,
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+            master_pid = report.master_pid,
+            skipped = ?report.skipped,
+            "{}: {}",
+            report.outcome,
+            report.restored
+        );
+        let outcome = report.outcome;
+        self.proxy.board.set_report(report);
+        if !self.served {
+            // What happened just before we died ourselves, nobody knows any more.
+            self.proxy.shadow.with_activity(|mirror, activity| {
+                activity.notice_all(mirror, Instant::now());
+            });
+        }
+        if outcome != Outcome::Resumed {
+            tokio::spawn(census::after_recovery(self.proxy.clone(), since, outcome));
+        }
+    }
+
+    pub(super) fn say_waiting(&mut self, what: &str) {
+        // A child that is about to listen needs no message.
+        if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
+            || self.outage.since.elapsed() > REPEAT
+        {
+            self.say(format!("waiting for the master: {what}"));
+        }
+    }
+
+    /// Warns, at most once in [`REPEAT`] for the same text.
+    pub(super) fn say(&mut self, text: String) {
+        let now = Instant::now();
+        let again = self
+            .said
+            .as_ref()
+            .is_none_or(|(said, at)| *said != text || now.duration_since(*at) >= REPEAT);
+        if again {
+            tracing::warn!("{text}");
+            self.said = Some((text, now));
+        }
+    }
+}
