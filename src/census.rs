@@ -4,6 +4,7 @@
 //! Without evidence a node is what it is registered as: a robot that loses a healthy node is worse
 //! off than one that keeps a dead one.
 
+mod backoff;
 mod repeats;
 mod suspects;
 

@@ -11,6 +11,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use super::backoff::Backoff;
+
 /// How long nothing must have changed before we tell it: idle threads of rosmaster look for work
 /// every 100 ms.
 const QUIET: Duration = Duration::from_millis(300);
@@ -33,8 +35,7 @@ pub struct Repeats<K: Ord> {
 struct Wait {
     /// The first change that has not been told, if there is one.
     untold: Option<Instant>,
-    pause: Duration,
-    next: Instant,
+    backoff: Backoff,
     end: Instant,
     /// Somebody held up the master since the change.
     held_up: bool,
@@ -55,8 +56,7 @@ impl<K: Ord + Clone> Repeats<K> {
         let untold = before.and_then(|wait| wait.untold).unwrap_or(now);
         let wait = Wait {
             untold: Some(untold),
-            pause: FIRST_PAUSE,
-            next: (now + QUIET).min(untold + LATEST),
+            backoff: Backoff::new((now + QUIET).min(untold + LATEST), FIRST_PAUSE),
             end: now + LIFE,
             held_up: before.is_some_and(|wait| wait.held_up),
         };
@@ -68,13 +68,12 @@ impl<K: Ord + Clone> Repeats<K> {
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
-            if wait.next > now {
+            if wait.backoff.next() > now {
                 return true;
             }
             wait.held_up |= holding_up;
             wait.untold = None;
-            wait.next = now + wait.pause;
-            wait.pause = (wait.pause * 2).min(LONGEST_PAUSE);
+            wait.backoff.done(now, LONGEST_PAUSE);
             if wait.held_up {
                 due.push(key.clone());
             }
@@ -85,7 +84,7 @@ impl<K: Ord + Clone> Repeats<K> {
 
     /// When something is to be told next.
     pub fn next(&self) -> Option<Instant> {
-        self.of.values().map(|wait| wait.next).min()
+        self.of.values().map(|wait| wait.backoff.next()).min()
     }
 }
 

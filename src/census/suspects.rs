@@ -5,6 +5,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use super::backoff::Backoff;
+
 /// Pause before a suspect is asked for the first time again.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
@@ -13,13 +15,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 /// The addresses that are suspect, and when each is to be asked again.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Suspects {
-    of: BTreeMap<String, Wait>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Wait {
-    pause: Duration,
-    next: Instant,
+    of: BTreeMap<String, Backoff>,
 }
 
 impl Suspects {
@@ -28,11 +24,8 @@ impl Suspects {
         if self.of.contains_key(api) {
             return false;
         }
-        let wait = Wait {
-            pause: FIRST_PAUSE,
-            next: now + FIRST_PAUSE,
-        };
-        self.of.insert(api.to_owned(), wait);
+        let backoff = Backoff::new(now + FIRST_PAUSE, FIRST_PAUSE * 2);
+        self.of.insert(api.to_owned(), backoff);
         true
     }
 
@@ -59,10 +52,9 @@ impl Suspects {
     /// Those to be asked now; the next time comes after a longer pause.
     pub fn due(&mut self, now: Instant) -> Vec<String> {
         let mut due = Vec::new();
-        for (api, wait) in &mut self.of {
-            if wait.next <= now {
-                wait.pause = (wait.pause * 2).min(LONGEST_PAUSE);
-                wait.next = now + wait.pause;
+        for (api, backoff) in &mut self.of {
+            if backoff.next() <= now {
+                backoff.done(now, LONGEST_PAUSE);
                 due.push(api.clone());
             }
         }
@@ -71,7 +63,7 @@ impl Suspects {
 
     /// When somebody is to be asked next.
     pub fn next(&self) -> Option<Instant> {
-        self.of.values().map(|wait| wait.next).min()
+        self.of.values().map(Backoff::next).min()
     }
 }
 

@@ -28,6 +28,18 @@ impl Script {
         self
     }
 
+    /// The connection to a master that was served ends.
+    fn lose(&mut self) -> &mut Self {
+        let shut = Action::ShutGate(Cause::ConnectionLost);
+        self.feed(Input::ConnectionLost, &[shut, Action::Connect])
+    }
+
+    /// A master that listens is found to hold the state.
+    fn serve(&mut self, new: bool) -> &mut Self {
+        self.feed(Input::Connected, &[Action::Examine])
+            .feed(Input::Examined { new }, &[Action::OpenGate])
+    }
+
     /// Jumps to the next deadline, which must lie `pause` ahead.
     fn wake(&mut self, pause: Duration, expected: &[Action]) -> &mut Self {
         let deadline = self.machine.deadline().expect("a deadline");
@@ -46,9 +58,7 @@ impl Script {
                 script.feed(Input::Start { remembered: false }, &[Action::Connect])
             }
         };
-        script
-            .feed(Input::Connected, &[Action::Examine])
-            .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        script.serve(true);
         script
     }
 }
@@ -57,17 +67,13 @@ impl Script {
 fn a_killed_child_is_replaced_at_once() {
     let mut script = Script::serving(Supervision::Ours);
     script
-        .feed(
-            Input::ConnectionLost,
-            &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-        )
+        .lose()
         .feed(Input::Refused, &[])
         .feed(Input::Exited, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect])
         .feed(Input::Refused, &[])
         .wake(Duration::from_millis(1), &[Action::Connect])
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        .serve(true);
 }
 
 #[test]
@@ -103,8 +109,7 @@ fn a_master_of_others_whose_thread_ends_dies_once() {
     script
         .feed(Input::ThreadEnded, &lost)
         .feed(Input::Refused, &[])
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        .serve(true);
     assert_eq!(script.machine.deaths(), 1);
     script
         .feed(Input::ThreadEnded, &lost)
@@ -112,8 +117,7 @@ fn a_master_of_others_whose_thread_ends_dies_once() {
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[])
         .feed(Input::Refused, &[])
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        .serve(true);
     assert_eq!(script.machine.deaths(), 2);
 }
 
@@ -125,21 +129,14 @@ fn a_thread_that_ended_alone_is_no_death() {
             Input::ThreadEnded,
             &[Action::ShutGate(Cause::Exited), Action::Connect],
         )
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: false }, &[Action::OpenGate]);
+        .serve(false);
     assert_eq!(script.machine.deaths(), 0);
 }
 
 #[test]
 fn an_idle_connection_that_the_master_closed_is_no_death() {
     let mut script = Script::serving(Supervision::Ours);
-    script
-        .feed(
-            Input::ConnectionLost,
-            &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-        )
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+    script.lose().serve(true);
     assert_eq!(script.machine.deaths(), 0);
 }
 
@@ -155,10 +152,7 @@ fn a_remembered_master_is_tried_first_and_replaced_when_it_is_gone() {
 fn an_external_master_is_waited_for_with_growing_pauses() {
     let mut script = Script::serving(Supervision::Theirs);
     script
-        .feed(
-            Input::ConnectionLost,
-            &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-        )
+        .lose()
         .feed(Input::Refused, &[])
         .wake(Duration::from_millis(1), &[Action::Connect]);
     script.now += Duration::from_secs(3);
@@ -195,8 +189,7 @@ fn a_crash_loop_is_slowed_down_and_reported_but_never_given_up() {
         .feed(Input::Exited, &[Action::ReportCrashLoop(11)])
         .wake(LONGEST_PAUSE, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect])
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        .serve(true);
     for _ in 1..CALM.as_secs() {
         script
             .wake(PROBING.interval, &[Action::Probe])
@@ -240,8 +233,7 @@ fn a_hung_external_master_is_asked_again_and_never_killed() {
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::Unreachable, &[])
         .wake(Duration::from_millis(200), &[Action::Connect])
-        .feed(Input::Connected, &[Action::Examine])
-        .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        .serve(true);
 }
 
 #[test]
@@ -290,10 +282,7 @@ fn a_master_that_serves_for_a_moment_before_each_death_does_not_end_the_crash_lo
             script.now = script.machine.deadline().expect("a pause");
             script.feed(Input::Wake, &[Action::Spawn]);
         }
-        script
-            .feed(Input::Spawned, &[Action::Connect])
-            .feed(Input::Connected, &[Action::Examine])
-            .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+        script.feed(Input::Spawned, &[Action::Connect]).serve(true);
     }
     assert_eq!(
         script.machine.deadline(),
@@ -319,19 +308,13 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
             0 => {
                 let actions = [Action::OpenGate].iter().chain(said).copied();
                 script
-                    .feed(
-                        Input::ConnectionLost,
-                        &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-                    )
+                    .lose()
                     .feed(Input::Connected, &[Action::Examine])
                     .feed(Input::Examined { new: true }, &actions.collect::<Vec<_>>());
             }
             1 => {
                 script
-                    .feed(
-                        Input::ConnectionLost,
-                        &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-                    )
+                    .lose()
                     .feed(Input::Refused, said)
                     .feed(Input::Refused, &[])
                     .feed(Input::Connected, &[Action::Examine]);
@@ -340,20 +323,13 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
                 script
                     .feed(Input::ConnectionLost, said)
                     .feed(Input::Refused, &[])
-                    .feed(Input::Connected, &[Action::Examine])
-                    .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+                    .serve(true);
             }
         }
     }
     assert_eq!(script.machine.deaths(), 9);
     for _ in 0..3 {
-        script
-            .feed(
-                Input::ConnectionLost,
-                &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-            )
-            .feed(Input::Connected, &[Action::Examine])
-            .feed(Input::Examined { new: false }, &[Action::OpenGate]);
+        script.lose().serve(false);
     }
     assert_eq!(script.machine.deaths(), 9, "idle connections are closed");
     script.now += CALM;
@@ -377,10 +353,7 @@ fn the_rate_of_restarts_is_bounded() {
                     script.feed(Input::Wake, &[Action::Spawn]);
                 }
                 starts.push(script.now);
-                script
-                    .feed(Input::Spawned, &[Action::Connect])
-                    .feed(Input::Connected, &[Action::Examine])
-                    .feed(Input::Examined { new: true }, &[Action::OpenGate]);
+                script.feed(Input::Spawned, &[Action::Connect]).serve(true);
             }
             for from in &starts {
                 let minute = *from..*from + DEATH_MEMORY;
@@ -398,12 +371,7 @@ fn the_rate_of_restarts_is_bounded() {
 #[test]
 fn a_master_that_is_still_dying_dies_once() {
     let mut script = Script::serving(Supervision::Theirs);
-    script
-        .feed(
-            Input::ConnectionLost,
-            &[Action::ShutGate(Cause::ConnectionLost), Action::Connect],
-        )
-        .feed(Input::Connected, &[Action::Examine]);
+    script.lose().feed(Input::Connected, &[Action::Examine]);
     for _ in 0..3 {
         script.feed(Input::ConnectionLost, &[]);
         script.now += DYING / 10;

@@ -4,7 +4,7 @@
 import rospy
 from roscpp.srv import GetLoggers
 
-from lines import say
+from lines import say, ticks
 
 
 def main():
@@ -14,16 +14,11 @@ def main():
     rospy.wait_for_service("who")
     say("ready", rospy.get_name())
     ask = rospy.ServiceProxy("who", GetLoggers)
-    rate = rospy.Rate(hz)
-    while not rospy.is_shutdown():
+    for _ in ticks(hz):
         try:
             say("reply", ask().loggers[0].name)
         except rospy.ServiceException as error:
             say("failed", error)
-        except rospy.ROSInterruptException:
-            break
-        try:
-            rate.sleep()
         except rospy.ROSInterruptException:
             break
 

@@ -21,6 +21,8 @@ The roscpp nodes say the same (lines.h). `tests/support/node.rs` reads it.
 import sys
 import threading
 
+import rospy
+
 _lock = threading.Lock()
 
 
@@ -30,3 +32,14 @@ def say(*words):
     with _lock:
         sys.stdout.write(line)
         sys.stdout.flush()
+
+
+def ticks(hz):
+    """Yields HZ times a second, until the node ends."""
+    rate = rospy.Rate(hz)
+    while not rospy.is_shutdown():
+        yield
+        try:
+            rate.sleep()
+        except rospy.ROSInterruptException:
+            return

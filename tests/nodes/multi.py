@@ -8,7 +8,7 @@ import rospy
 from roscpp.srv import GetLoggers, GetLoggersResponse
 from std_msgs.msg import String
 
-from lines import say
+from lines import say, ticks
 
 
 def main():
@@ -27,16 +27,9 @@ def main():
         else:
             raise SystemExit("`%s` is none of pub:, sub:, srv:, param:" % argument)
     say("ready", rospy.get_name())
-    rate = rospy.Rate(10)
-    number = 0
-    while not rospy.is_shutdown():
-        number += 1
+    for number, _ in enumerate(ticks(10), 1):
         for publisher in publishers:
             publisher.publish("%s %d" % (rospy.get_name(), number))
-        try:
-            rate.sleep()
-        except rospy.ROSInterruptException:
-            break
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import json
 
 import rospy
 
-from lines import say
+from lines import say, ticks
 
 
 def main():
@@ -17,16 +17,12 @@ def main():
     rospy.get_param_cached(key, None)
     say("ready", rospy.get_name())
     seen = object()
-    rate = rospy.Rate(50)
-    while not rospy.is_shutdown():
+    for _ in ticks(50):
         try:
             value = rospy.get_param_cached(key, None)
             if value != seen:
                 say("value", json.dumps(value))
                 seen = value
-            rate.sleep()
-        except rospy.ROSInterruptException:
-            break
         except Exception as error:  # a failed look must be seen by the test, not end the node
             say("failed", type(error).__name__, error)
             rospy.sleep(0.1)

@@ -6,7 +6,7 @@ It begins before it is a node: a held registration blocks every other call of a 
 
 import rospy
 
-from lines import say
+from lines import say, ticks
 
 DEFAULT = -1
 
@@ -29,14 +29,8 @@ def main():
         read(key, count)
     rospy.init_node("reader")
     say("ready", rospy.get_name())
-    rate = rospy.Rate(50)
-    while not rospy.is_shutdown():
-        count += 1
+    for count, _ in enumerate(ticks(50), count + 1):
         read(key, count)
-        try:
-            rate.sleep()
-        except rospy.ROSInterruptException:
-            break
 
 
 if __name__ == "__main__":

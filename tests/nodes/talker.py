@@ -7,7 +7,7 @@ A quiet one does not say what it has sent. Nothing is thrown away when a listene
 import rospy
 from std_msgs.msg import String
 
-from lines import say
+from lines import say, ticks
 
 
 class Links(rospy.SubscribeListener):
@@ -33,17 +33,10 @@ def main():
     publisher = rospy.Publisher("chatter", String, subscriber_listener=links, queue_size=0)
     links.publisher = publisher
     say("ready", rospy.get_name())
-    number = 0
-    rate = rospy.Rate(hz)
-    while not rospy.is_shutdown():
-        number += 1
+    for number, _ in enumerate(ticks(hz), 1):
         publisher.publish("%s %d" % (rospy.get_name(), number))
         if not quiet:
             say("sent", number)
-        try:
-            rate.sleep()
-        except rospy.ROSInterruptException:
-            break
 
 
 if __name__ == "__main__":
