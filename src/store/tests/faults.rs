@@ -1,0 +1,193 @@
+//! Disks that fail, and jobs that come too late.
+
+use super::*;
+
+const EIO: i32 = 5;
+const ENOSPC: i32 = 28;
+const EROFS: i32 = 30;
+
+#[test]
+fn a_failing_disk_costs_only_what_was_said_to_be_unprotected() {
+    let mut failures = 0;
+    for errno in [ENOSPC, EIO, EROFS] {
+        for fault in [Fault::Errno(errno), Fault::Once(errno), Fault::Short(errno)] {
+            for at in 0..operations() {
+                let fs = SimFs::default();
+                fs.arm(at, fault);
+                let mut model = Model::default();
+                life(&fs, &mut model);
+                let context = format!("{fault:?} at operation {at}");
+                // A kill now: whatever had been acknowledged is there.
+                let loaded = open(&fs.after_kill()).unwrap().1;
+                check(&model, loaded.as_ref(), model.acked, &context);
+                go_on(&fs.after_kill(), &context);
+                failures += 1;
+            }
+        }
+    }
+    println!("{failures} failures");
+}
+
+#[test]
+fn an_unprotected_store_says_so_and_can_be_rearmed() {
+    for fault in [Fault::Errno(ENOSPC), Fault::Short(ENOSPC)] {
+        let fs = SimFs::default();
+        let mut model = Model::default();
+        let (mut store, _) = open(&fs).unwrap();
+        model.begin(&mut store);
+        model.append(&mut store, 2);
+        fs.arm(0, fault);
+        model.append(&mut store, 3);
+        assert_eq!((model.acked, store.seq()), (2, 5));
+        assert!(store.unprotected().unwrap().contains("latest-chkpt.yaml"));
+        // Nothing is tried on that file again, and a new one does not work either.
+        model.append(&mut store, 1);
+        assert!(store.sync_job().is_none() && !store.wants_compaction());
+        assert!(store.rearm(&model.checkpoint(store.seq())).is_err());
+        assert!(store.unprotected().is_some());
+        fs.disarm();
+
+        // Beside traffic: what comes while the new file is written is in it.
+        let job = store
+            .begin_compaction(model.checkpoint(store.seq()))
+            .unwrap();
+        model.append(&mut store, 2);
+        assert_eq!(model.acked, 2);
+        store.finish_compaction(job.run()).unwrap();
+        assert_eq!(store.unprotected(), None);
+        model.append(&mut store, 1);
+        assert_eq!(model.acked, 9);
+        drop(store);
+        let loaded = open(&fs).unwrap().1.unwrap();
+        assert!(loaded.exact && loaded.damage.is_empty());
+        assert_eq!(state(&loaded), model.applied);
+    }
+}
+
+#[test]
+fn numbers_of_an_unprotected_time_are_never_used_again() {
+    // Else the previous generation's whole records of a batch that failed would pass for new ones.
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    model.append(&mut store, 1);
+    fs.arm(0, Fault::Short(ENOSPC));
+    model.append(&mut store, 10);
+    fs.disarm();
+    store.rearm(&model.checkpoint(store.seq())).unwrap();
+    model.append(&mut store, 1);
+    assert_eq!(model.acked, 12);
+    drop(store);
+    let loaded = open(&fs).unwrap().1.unwrap();
+    assert_eq!(state(&loaded), model.applied);
+    assert_eq!(loaded.records.len(), 1);
+}
+
+#[test]
+fn a_compaction_that_cannot_keep_up_is_given_up_in_bounded_memory() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    let job = store.begin_compaction(model.checkpoint(0)).unwrap();
+    let large = Entry::Call(Call::new("setParam", vec!["x".repeat(1 << 20).into()]));
+    for _ in 0..20 {
+        store.append(std::slice::from_ref(&large)).unwrap();
+        assert!(store.pending.as_ref().unwrap().meanwhile.len() <= MEANWHILE_BYTES_MAX);
+    }
+    let error = store.finish_compaction(job.run()).unwrap_err();
+    assert!(matches!(error, StoreError::Overtaken { .. }));
+    // Nothing is lost, and it is not tried again at once.
+    assert!(store.unprotected().is_none() && !store.wants_compaction());
+    drop(store);
+    assert_eq!(open(&fs).unwrap().1.unwrap().records.len(), 20);
+}
+
+#[test]
+fn a_job_that_was_overtaken_or_lost_is_in_nobodys_way() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    let lost = store.begin_compaction(model.checkpoint(0)).unwrap();
+    let busy = store.begin_compaction(model.checkpoint(0)).map(|_| ());
+    assert!(matches!(busy, Err(StoreError::Busy)));
+    drop(lost);
+    let late = store.begin_compaction(model.checkpoint(0)).unwrap();
+    model.append(&mut store, 1);
+    model.begin(&mut store);
+    let names = fs.list(Path::new("/log")).unwrap();
+    let previous = fs
+        .read(Path::new("/log/latest-chkpt.yaml.previous"), 0)
+        .unwrap();
+    let error = store.finish_compaction(late.run()).unwrap_err();
+    assert!(matches!(error, StoreError::Overtaken { .. }));
+    assert_eq!(fs.list(Path::new("/log")).unwrap(), names);
+    assert!(
+        fs.read(Path::new("/log/latest-chkpt.yaml.previous"), 0)
+            .unwrap()
+            == previous
+    );
+}
+
+#[test]
+fn a_session_is_set_aside_whole_or_not_at_all() {
+    let run = |fs: &SimFs| {
+        let Ok((mut store, loaded)) = open(fs) else {
+            return;
+        };
+        assert!(loaded.is_some());
+        if store.set_aside("session").is_err() {
+            return;
+        }
+        let mut next = Model {
+            session: "b",
+            ..Model::default()
+        };
+        next.begin(&mut store);
+        next.append(&mut store, 2);
+        next.sync(&mut store);
+        next.begin(&mut store);
+        next.append(&mut store, 1);
+        next.sync(&mut store);
+    };
+    let prepared = || {
+        let fs = SimFs::default();
+        let mut model = Model {
+            session: "a",
+            ..Model::default()
+        };
+        let (mut store, _) = open(&fs).unwrap();
+        model.begin(&mut store);
+        model.append(&mut store, 2);
+        model.begin(&mut store);
+        model.append(&mut store, 1);
+        model.sync(&mut store);
+        fs.arm(usize::MAX / 2, Fault::Kill(0));
+        fs
+    };
+    let fs = prepared();
+    let before = fs.ops();
+    run(&fs);
+    for at in 0..=fs.ops() - before {
+        let fs = prepared();
+        fs.arm(at, Fault::Kill(4));
+        run(&fs);
+        let mut images = fs.after_power_loss(400);
+        images.push(fs.after_kill());
+        for image in images {
+            let Some(loaded) = open(&image).unwrap().1 else {
+                continue;
+            };
+            assert!(loaded.exact, "at operation {at}: {loaded:?}");
+            let expected: &[u64] = match loaded.session() {
+                Some(Session { id, .. }) if id == "a" => &[1, 2, 3],
+                Some(Session { id, .. }) if id == "b" => &[4, 5, 6],
+                other => panic!("at operation {at}: {other:?}"),
+            };
+            let found = state(&loaded);
+            assert!(expected.starts_with(&found), "at operation {at}: {found:?}");
+        }
+    }
+}
