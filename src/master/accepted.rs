@@ -1,19 +1,62 @@
-//! Which of a call's mutations a master has accepted.
+//! Which of a call's mutations a master has executed, and whether a mirror agrees.
 
 use super::multicall::{self, Entry};
 use super::{Master, api};
 use crate::xmlrpc::{Call, Reply, Value};
 
-/// The mutating calls, taken out of multicalls, that a master has executed.
+/// A mutating call, taken out of multicalls, that a master has answered.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Answered {
+    /// The call.
+    pub call: Call,
+    /// The master's answer.
+    pub reply: Reply,
+    /// Whether the master has changed its state by it.
+    pub executed: bool,
+}
+
+impl Answered {
+    /// How the answer of a mirror of that master to the same call compares. `live`: parameters may
+    /// have been written later in the same request. The value that `subscribeParam` answers may then
+    /// hold them already, for rosmaster writes the dictionary itself, when all has been run.
+    pub fn compare(&self, mirror: &Reply, live: bool) -> Agreement {
+        let same = match (&self.reply, mirror) {
+            (Reply::Value(Value::Array(master)), Reply::Value(Value::Array(mirror)))
+                if live && self.call.method == "subscribeParam" =>
+            {
+                master.first() == mirror.first()
+            }
+            (master, mirror) => master == mirror,
+        };
+        match (same, executed(&self.call.method, mirror)) {
+            (true, _) => Agreement::Same,
+            (false, Some(false)) if !self.executed => Agreement::OtherWords,
+            (false, _) => Agreement::Diverged,
+        }
+    }
+}
+
+/// How two answers compare.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Agreement {
+    /// They are equal.
+    Same,
+    /// Both refuse, and say so differently: no state has changed.
+    OtherWords,
+    /// One of the two states is not what it should be.
+    Diverged,
+}
+
+/// The mutating calls, taken out of multicalls, that a master has answered.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Accepted {
-    /// The calls in the order of their execution, with the answer to each.
-    pub calls: Vec<(Call, Reply)>,
+    /// The calls in the order of their execution.
+    pub calls: Vec<Answered>,
     /// Whether that is known for certain. If not, the master's state has to be read again.
     pub certain: bool,
 }
 
-/// Which mutating calls within `call` the master has executed, given its `reply`.
+/// Which mutating calls within `call` the master has answered, given its `reply`.
 ///
 /// A call has been executed if its answer's code is 1, and in the few cases where rosmaster changes
 /// its state and answers an error: a `setParam` whose callbacks cannot be worked out, a
@@ -50,11 +93,11 @@ impl Walk<'_> {
             return;
         }
         match executed(method, reply) {
-            Some(true) => {
-                let call = Call::new(method, params.to_vec());
-                self.accepted.calls.push((call, reply.clone()));
-            }
-            Some(false) => {}
+            Some(executed) => self.accepted.calls.push(Answered {
+                call: Call::new(method, params.to_vec()),
+                reply: reply.clone(),
+                executed,
+            }),
             None => self.accepted.certain = false,
         }
     }
@@ -81,8 +124,8 @@ impl Walk<'_> {
     fn simulate(&mut self, params: &[Value], levels: usize) {
         let before = self.accepted.calls.len();
         let mut model = self.mirror.clone();
-        for (call, _) in &self.accepted.calls {
-            model.apply(call);
+        for answered in &self.accepted.calls {
+            model.apply(&answered.call);
         }
         self.run(&mut model, params, levels);
         if self.accepted.calls.len() > before {
@@ -113,7 +156,11 @@ impl Walk<'_> {
                     let call = Call::new(method, params.to_vec());
                     let reply = model.apply(&call).reply;
                     if executed(method, &reply) == Some(true) {
-                        self.accepted.calls.push((call, reply));
+                        self.accepted.calls.push(Answered {
+                            call,
+                            reply,
+                            executed: true,
+                        });
                     }
                 }
             }
@@ -170,6 +217,36 @@ mod tests {
     use super::*;
     use crate::xmlrpc::Struct;
 
+    #[test]
+    fn a_refusal_is_compared_too() {
+        let answer = |code: i32, text: &str, value: Value| {
+            Reply::Value(vec![Value::from(code), text.into(), value].into())
+        };
+        let delete = Call::new("deleteParam", vec!["/n".into(), "/a".into()]);
+        let refused = answer(-1, "parameter [/a] is not set", 0.into());
+        let done = answer(1, "parameter /a deleted", 0.into());
+        let of = accepted(&Master::default(), &delete, &refused)
+            .calls
+            .remove(0);
+        assert_eq!(of.compare(&refused, false), Agreement::Same);
+        assert_eq!(of.compare(&done, false), Agreement::Diverged);
+        let other = answer(-1, "no such parameter", 0.into());
+        assert_eq!(of.compare(&other, false), Agreement::OtherWords);
+    }
+
+    #[test]
+    fn what_is_written_behind_a_subscription_may_be_seen_by_it() {
+        let answer =
+            |value: i32| Reply::Value(vec![Value::from(1), "".into(), value.into()].into());
+        let params = vec!["/n".into(), "http://n/".into(), "/a".into()];
+        let subscribe = Call::new("subscribeParam", params);
+        let of = accepted(&Master::default(), &subscribe, &answer(2))
+            .calls
+            .remove(0);
+        assert_eq!(of.compare(&answer(1), true), Agreement::Same);
+        assert_eq!(of.compare(&answer(1), false), Agreement::Diverged);
+    }
+
     fn set(key: &str, value: impl Into<Value>) -> Call {
         Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
     }
@@ -183,6 +260,12 @@ mod tests {
         master
     }
 
+    /// The calls that have been executed.
+    fn executed(accepted: Accepted) -> Vec<Call> {
+        let executed = accepted.calls.into_iter().filter(|of| of.executed);
+        executed.map(|of| of.call).collect()
+    }
+
     /// What is accepted of `call`, by what the model itself answers.
     fn of(master: &Master, call: &Call) -> Accepted {
         let reply = master.clone().apply(call).reply;
@@ -192,9 +275,9 @@ mod tests {
     #[test]
     fn a_refused_call_is_not_accepted_and_a_read_never() {
         let master = Master::default();
-        assert_eq!(of(&master, &set("/a", 1)).calls.len(), 1);
-        assert_eq!(of(&master, &set("/", 1)).calls, []);
-        assert_eq!(of(&master, &set("/a", Value::Nil)).calls, []);
+        assert_eq!(executed(of(&master, &set("/a", 1))), [set("/a", 1)]);
+        assert_eq!(executed(of(&master, &set("/", 1))), []);
+        assert_eq!(executed(of(&master, &set("/a", Value::Nil))), []);
         let read = Call::new("getParamNames", vec!["/n".into()]);
         assert_eq!(
             of(&master, &Call::multicall([read.clone(), read])).calls,
@@ -207,9 +290,8 @@ mod tests {
         let inner = Call::multicall([set("/b", 2), set("/", 3)]);
         let call = Call::multicall([set("/a", 1), set("", 1), inner]);
         let found = of(&Master::default(), &call);
-        let calls: Vec<_> = found.calls.into_iter().map(|(call, _)| call).collect();
-        assert_eq!(calls, [set("/a", 1), set("/b", 2)]);
         assert!(found.certain);
+        assert_eq!(executed(found), [set("/a", 1), set("/b", 2)]);
     }
 
     #[test]

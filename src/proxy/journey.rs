@@ -46,12 +46,44 @@ pub struct LaneItem {
     pub answer: oneshot::Sender<Answer>,
     /// How often it has travelled in vain.
     pub attempts: u32,
+    /// What the first journey whose reply was lost must have come to, if it arrived.
+    pub foretold: Option<Reply>,
 }
 
 impl LaneItem {
+    /// A call that has not travelled yet.
+    pub fn new(
+        raw: Option<(Head, Bytes)>,
+        call: Option<Call>,
+        kind: Kind,
+        answer: oneshot::Sender<Answer>,
+    ) -> Self {
+        Self {
+            raw,
+            call,
+            kind,
+            answer,
+            attempts: 0,
+            foretold: None,
+        }
+    }
+
     /// The caller id, for messages.
     pub fn caller(&self) -> Option<&str> {
         self.call.as_ref()?.params.first()?.as_str()
+    }
+
+    /// The answer of an earlier journey whose reply was lost, if `reply` shows that it was run then:
+    /// what could be done before can not be done any more.
+    pub fn done_before(&self, reply: &Reply) -> Option<Reply> {
+        let success = |reply: &Reply| match reply {
+            Reply::Value(Value::Array(answer)) => answer.first() == Some(&Value::Int(1)),
+            _ => false,
+        };
+        let refused = matches!(reply, Reply::Value(Value::Array(_))) && !success(reply);
+        self.foretold
+            .clone()
+            .filter(|first| success(first) && refused)
     }
 
     /// The nodes whose registrations the call may change. What cannot be decoded has none that we
@@ -247,13 +279,20 @@ mod tests {
 
     fn item(call: Call) -> LaneItem {
         let body = Bytes::from(xmlrpc::encode_call(&call));
-        LaneItem {
-            raw: Some((Head::default(), body)),
-            call: Some(call),
-            kind: Kind::Mutate,
-            answer: oneshot::channel().0,
-            attempts: 0,
-        }
+        let raw = Some((Head::default(), body));
+        LaneItem::new(raw, Some(call), Kind::Mutate, oneshot::channel().0)
+    }
+
+    #[test]
+    fn what_was_done_by_a_lost_journey_is_answered_as_done() {
+        let answer = |code: i32| Reply::Value(vec![Value::from(code), "".into(), 0.into()].into());
+        let mut item = item(Call::new("deleteParam", vec!["/n".into(), "/a".into()]));
+        assert_eq!(item.done_before(&answer(-1)), None);
+        item.foretold = Some(answer(1));
+        assert_eq!(item.done_before(&answer(-1)), Some(answer(1)));
+        assert_eq!(item.done_before(&answer(1)), None);
+        item.foretold = Some(answer(-1));
+        assert_eq!(item.done_before(&answer(-1)), None);
     }
 
     fn set(key: &str, value: impl Into<Value>) -> Call {

@@ -12,10 +12,9 @@ use tokio::sync::{Semaphore, SemaphorePermit, mpsc, oneshot};
 
 use super::{
     Proxy,
+    flight::{Cargo, Landed, travel},
     gate::{Gate, StandIn, State},
     journey::{self, Answer, LaneItem, TravelError},
-    look::{self, LookError},
-    pool::connect_verified,
     upstream::{CallError, Connection, RawReply},
 };
 use crate::{
@@ -31,6 +30,8 @@ const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// A call that gets no reply so often is given up and its connection closed: a master that breaks
 /// off each reply must not hold up the lane for ever.
 const ATTEMPTS: u32 = 3;
+/// Pause before a master that could not be looked at is looked at again.
+const LOOK_PAUSE: Duration = Duration::from_secs(1);
 /// Calls between the clients and the queue. The runner never lets them wait.
 const CHANNEL: usize = 64;
 
@@ -71,13 +72,7 @@ impl Lane {
     /// Makes a call of rosrescue's own, recorded as any other. None if the master never answers.
     pub async fn call(&self, call: Call, kind: Kind) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
-        let item = LaneItem {
-            raw: None,
-            call: Some(call),
-            kind,
-            answer,
-            attempts: 0,
-        };
+        let item = LaneItem::new(None, Some(call), kind, answer);
         self.items.send(item).await.ok()?;
         match answered.await.ok()? {
             Answer::Made(reply) => Some(reply),
@@ -100,26 +95,19 @@ pub fn lane(max_parked: usize) -> (Lane, LaneRunner) {
         connection: None,
         flight: None,
         resync_due: false,
+        resync_at: None,
         retry_at: None,
+        opaque: None,
     };
     let places = Arc::new([max_parked, max_parked].map(Semaphore::new));
     (Lane { items: tx, places }, runner)
 }
 
-/// What a flight brings back.
-struct Landed {
-    connection: Option<(u64, Connection)>,
-    result: Result<Cargo, TravelError>,
-}
-
-enum Cargo {
-    Reply(RawReply),
-    Resynced(Box<Master>),
-}
-
 /// Calls on their way to the master, or a resync if there are none.
 struct Flight {
     incarnation: u64,
+    /// Of the mirror, when it took off.
+    version: u64,
     items: Vec<LaneItem>,
     landing: Pin<Box<dyn Future<Output = Landed> + Send>>,
 }
@@ -132,7 +120,18 @@ pub struct LaneRunner {
     connection: Option<(u64, Connection)>,
     flight: Option<Flight>,
     resync_due: bool,
+    /// When a resync is due that could not be made before.
+    resync_at: Option<tokio::time::Instant>,
     retry_at: Option<tokio::time::Instant>,
+    /// A call that we do not understand, answered with success: the answer waits until the mirror
+    /// has been made anew, and knows what the call did.
+    opaque: Option<Opaque>,
+}
+
+struct Opaque {
+    incarnation: u64,
+    item: LaneItem,
+    raw: RawReply,
 }
 
 impl LaneRunner {
@@ -150,6 +149,10 @@ impl LaneRunner {
                 landed = wait::for_some(self.flight.as_mut().map(|flight| &mut flight.landing)) => self.landed(&proxy, landed),
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = wait::tick(&mut resync) => self.resync_due = true,
+                () = wait::until(self.resync_at) => {
+                    self.resync_at = None;
+                    self.resync_due = true;
+                }
             }
             while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
@@ -180,6 +183,10 @@ impl LaneRunner {
             // Its master has been succeeded, and the new one never saw these calls.
             self.take_back(flight.items);
         }
+        if let Some(opaque) = self.opaque.take_if(|of| of.incarnation != incarnation) {
+            self.queue.push_front(opaque.item);
+        }
+        self.resync_due |= proxy.shadow.take_doubt();
         if self.flight.is_some() || self.retry_at.is_some() {
             return;
         }
@@ -201,6 +208,7 @@ impl LaneRunner {
             return;
         }
         self.resync_due = false;
+        self.resync_at = None;
         let connection = self
             .connection
             .take()
@@ -209,6 +217,7 @@ impl LaneRunner {
         let landing = Box::pin(travel(proxy.clone(), incarnation, connection, &items));
         self.flight = Some(Flight {
             incarnation,
+            version: proxy.shadow.version(),
             items,
             landing,
         });
@@ -216,44 +225,85 @@ impl LaneRunner {
 
     fn landed(&mut self, proxy: &Arc<Proxy>, landed: Landed) {
         let Some(Flight {
-            incarnation, items, ..
+            incarnation,
+            version,
+            items,
+            ..
         }) = self.flight.take()
         else {
             return;
         };
         self.connection = landed.connection;
         match landed.result {
-            Ok(Cargo::Resynced(state)) => {
-                if proxy.shadow.incarnation() == incarnation {
-                    let difference = proxy.shadow.adopt(*state);
-                    if !difference.is_empty() {
-                        tracing::warn!(
-                            ?difference,
-                            "the master differed from the mirror, which was made anew from it"
-                        );
-                    }
-                }
-            }
+            Ok(Cargo::Resynced(state)) => self.resync(proxy, incarnation, version, *state),
             Ok(Cargo::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
-            Err(error) => {
-                tracing::debug!(%error, calls = items.len(), "journey");
-                let sent = matches!(&error, TravelError::Call(error) if !matches!(error, CallError::NotSent(_)));
-                // A master that cannot be looked at will be looked at after the next doubt.
-                self.resync_due |= items.is_empty() && matches!(error, TravelError::Connect(_));
-                self.retry_at = Some(tokio::time::Instant::now() + RETRY_PAUSE);
-                let mut again = Vec::with_capacity(items.len());
-                for mut item in items {
-                    item.attempts += u32::from(sent);
-                    if item.attempts < ATTEMPTS {
-                        again.push(item);
-                    } else {
-                        tracing::warn!(%error, caller_id = item.caller(), "gave up a call");
-                        let _ = item.answer.send(Answer::Close);
-                    }
-                }
-                self.take_back(again);
+            Err(error) => self.failed(proxy, items, &error),
+        }
+    }
+
+    fn resync(&mut self, proxy: &Proxy, incarnation: u64, version: u64, state: Master) {
+        if proxy.shadow.incarnation() != incarnation {
+            return;
+        }
+        if proxy.shadow.version() != version {
+            // The gate was shut meanwhile, and the mirror has taken what this look does not show.
+            self.resync_due = true;
+            return;
+        }
+        let difference = proxy.shadow.adopt(state);
+        if !difference.is_empty() {
+            tracing::warn!(
+                ?difference,
+                "the master differed from the mirror, which was made anew from it"
+            );
+        }
+        self.answer_opaque();
+    }
+
+    fn answer_opaque(&mut self) {
+        if let Some(Opaque { item, raw, .. }) = self.opaque.take() {
+            let _ = item.answer.send(Answer::Raw(raw));
+        }
+    }
+
+    fn failed(&mut self, proxy: &Proxy, items: Vec<LaneItem>, error: &TravelError) {
+        tracing::debug!(%error, calls = items.len(), "journey");
+        let now = tokio::time::Instant::now();
+        self.retry_at = Some(now + RETRY_PAUSE);
+        if items.is_empty() {
+            if matches!(error, TravelError::Connect(_)) {
+                self.resync_due = true;
+            } else {
+                self.resync_at = Some(now + LOOK_PAUSE);
+                self.answer_opaque();
+            }
+            return;
+        }
+        let sent =
+            matches!(error, TravelError::Call(error) if !matches!(error, CallError::NotSent(_)));
+        let mut foretold = Vec::new();
+        if sent {
+            // The master may live, and have done all of it.
+            proxy.shadow.doubt();
+            foretold = proxy
+                .shadow
+                .foretell(items.iter().filter_map(|item| item.call.as_ref()));
+        }
+        let mut foretold = foretold.into_iter();
+        let mut again = Vec::with_capacity(items.len());
+        for mut item in items {
+            item.attempts += u32::from(sent);
+            if item.call.is_some() && item.foretold.is_none() {
+                item.foretold = foretold.next();
+            }
+            if item.attempts < ATTEMPTS {
+                again.push(item);
+            } else {
+                tracing::warn!(%error, caller_id = item.caller(), "gave up a call");
+                let _ = item.answer.send(Answer::Close);
             }
         }
+        self.take_back(again);
     }
 
     fn take_back(&mut self, items: Vec<LaneItem>) {
@@ -273,8 +323,18 @@ impl LaneRunner {
         let reply = xmlrpc::decode_reply(&raw.body)
             .ok()
             .filter(|_| raw.status.is_success());
+        let mut opaque = false;
         let replies = match (items.as_slice(), reply) {
-            ([_], Some(reply)) => vec![reply],
+            ([item], Some(reply)) => {
+                opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
+                vec![reply]
+            }
+            // What we cannot read may have changed anything. What we know of the call is recorded as
+            // if it had gone as foretold.
+            ([item], None) if raw.status.is_success() => {
+                opaque = true;
+                proxy.shadow.foretell(item.call.iter())
+            }
             ([_], None) => Vec::new(),
             (_, Some(reply)) => match journey::unpack(&reply, items.len()) {
                 Some(replies) => replies,
@@ -290,23 +350,29 @@ impl LaneRunner {
         let Ok(recorded) = proxy.shadow.record(Instant::now(), incarnation, &travelled) else {
             return self.take_back(items);
         };
-        // What we did not understand, call or reply, may have changed anything.
-        let opaque = match (items.as_slice(), replies.as_slice()) {
-            ([LaneItem { call: None, .. }], [Reply::Value(_)]) => true,
-            ([LaneItem { call: Some(_), .. }], []) => raw.status.is_success(),
-            _ => false,
-        };
         self.resync_due |= recorded.doubtful || opaque;
-        let answers: Vec<_> = match items.len() {
-            1 => items
-                .into_iter()
-                .map(|item| (item, Answer::Raw(raw.clone())))
-                .collect(),
-            _ => items
-                .into_iter()
-                .zip(replies.into_iter().map(Answer::Made))
-                .collect(),
-        };
+        if opaque {
+            self.opaque = items.into_iter().next().map(|item| Opaque {
+                incarnation,
+                item,
+                raw,
+            });
+            return;
+        }
+        let alone = items.len() == 1;
+        let replies = replies.into_iter().map(Some).chain(std::iter::repeat(None));
+        let answers: Vec<_> = items
+            .into_iter()
+            .zip(replies)
+            .map(|(item, reply)| {
+                let first = reply.as_ref().and_then(|reply| item.done_before(reply));
+                let answer = match first.or_else(|| reply.filter(|_| !alone)) {
+                    Some(reply) => Answer::Made(reply),
+                    None => Answer::Raw(raw.clone()),
+                };
+                (item, answer)
+            })
+            .collect();
         let send = move || {
             for (item, answer) in answers {
                 let _ = item.answer.send(answer);
@@ -351,8 +417,11 @@ impl LaneRunner {
         for item in self.queue.drain(..) {
             let registrants = item.registrants();
             match &item.call {
-                Some(call) if item.kind == Kind::Unregister && busy.is_disjoint(&registrants) => {
-                    let reply = proxy.shadow.unregister(Instant::now(), call);
+                Some(call)
+                    if item.kind == Kind::Unregister
+                        && busy.is_disjoint(&registrants)
+                        && let Some(reply) = proxy.shadow.unregister(Instant::now(), call) =>
+                {
                     proxy.stats.stood_in.count();
                     let _ = item.answer.send(Answer::Made(reply));
                 }
@@ -373,55 +442,4 @@ fn bumps(proxy: &Proxy, call: &Call) -> bool {
         let mut calls = entries.iter().chain([call]);
         calls.any(|call| mirror.displaced_by(call).is_some())
     })
-}
-
-/// One journey. The future owns what it needs, so that dropping it ends it.
-fn travel(
-    proxy: Arc<Proxy>,
-    incarnation: u64,
-    connection: Option<(u64, Connection)>,
-    items: &[LaneItem],
-) -> impl Future<Output = Landed> + Send + 'static {
-    let outbound = (!items.is_empty()).then(|| journey::outbound(items));
-    async move {
-        let connected = match connection {
-            Some((_, connection)) => Ok(connection),
-            None => connect_verified(&proxy.upstream, &proxy.mark).await,
-        };
-        let mut connection = match connected {
-            Ok(connection) => connection,
-            Err(error) => {
-                return Landed {
-                    connection: None,
-                    result: Err(error.into()),
-                };
-            }
-        };
-        let result = match outbound {
-            Some((head, body)) => connection
-                .forward(&head, body)
-                .await
-                .map(Cargo::Reply)
-                .map_err(Into::into),
-            None => {
-                let held = hold_of(&proxy, &mut connection).await;
-                held.map(|held| Cargo::Resynced(held.into()))
-                    .map_err(Into::into)
-            }
-        };
-        let usable = match &result {
-            Ok(Cargo::Reply(reply)) => reply.leaves_connection_usable(),
-            Ok(Cargo::Resynced(_)) => true,
-            Err(_) => false,
-        };
-        let connection = usable.then_some((incarnation, connection));
-        Landed { connection, result }
-    }
-}
-
-/// What the master behind `connection` holds.
-async fn hold_of(proxy: &Proxy, connection: &mut Connection) -> Result<Master, LookError> {
-    let previous = proxy.shadow.with_mirror(Clone::clone);
-    let first = look::first(connection, &proxy.mark).await?;
-    look::second(first, connection, &previous).await
 }

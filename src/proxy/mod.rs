@@ -3,6 +3,7 @@
 pub mod activity;
 pub mod clients;
 pub mod door;
+mod flight;
 pub mod gate;
 pub mod journey;
 pub mod keeper;

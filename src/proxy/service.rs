@@ -186,13 +186,7 @@ async fn answer(
                 .as_ref()
                 .filter(|call| journey::asks_uri(call))
                 .cloned();
-            let item = LaneItem {
-                raw: Some((head, body)),
-                call,
-                kind,
-                answer: tx,
-                attempts: 0,
-            };
+            let item = LaneItem::new(Some((head, body)), call, kind, tx);
             proxy.lane.submit(item).await;
             await_lane(proxy, pace, hold, rx, names_uri.as_ref()).await
         }

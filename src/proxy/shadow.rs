@@ -14,10 +14,10 @@ use tokio::sync::{Notify, watch};
 
 use super::{activity::Activity, stats::Stats};
 use crate::{
-    master::{self, Master},
+    master::{self, Agreement, Answered, Master},
     record::{Checkpoint, Entry, Session},
     store::Store,
-    xmlrpc::{Call, Reply},
+    xmlrpc::{Call, Reply, Value},
 };
 
 /// Unregistrations that take nothing away are remembered beside so many others.
@@ -66,6 +66,8 @@ struct Inner {
     owed: Vec<Call>,
     activity: Activity,
     diverged: HashSet<String>,
+    frozen: bool,
+    doubted: bool,
 }
 
 impl Shadow {
@@ -87,6 +89,8 @@ impl Shadow {
             owed: Vec::new(),
             activity: Activity::default(),
             diverged: HashSet::new(),
+            frozen: true,
+            doubted: false,
         };
         Self {
             inner: Mutex::new(inner),
@@ -145,19 +149,30 @@ impl Shadow {
         if inner.incarnation != incarnation {
             return Err(Superseded);
         }
-        let mut entries = Vec::with_capacity(travelled.len());
         let mut recorded = Recorded::default();
+        let mut answered = Vec::with_capacity(travelled.len());
         for (call, reply) in travelled {
             let accepted = master::accepted(&inner.mirror, call, reply);
             recorded.doubtful |= !accepted.certain;
-            for (call, reply) in accepted.calls {
-                let outcome = inner.apply(now, &call, &self.news);
-                if outcome != reply {
-                    recorded.doubtful = true;
-                    self.stats.divergences.count();
-                    inner.report_divergence(&call.method, &outcome, &reply);
-                }
-                entries.push(Entry::Call(call));
+            answered.extend(accepted.calls);
+        }
+        let writes = |of: &Answered| matches!(of.call.method.as_str(), "setParam" | "deleteParam");
+        let last_write = answered.iter().rposition(writes).unwrap_or_default();
+        let mut entries = Vec::with_capacity(answered.len());
+        for (index, answered) in answered.into_iter().enumerate() {
+            let outcome = inner.apply(now, &answered.call, &self.news);
+            let agreement = answered.compare(&outcome, index < last_write);
+            if agreement != Agreement::Same {
+                self.stats.divergences.count();
+                inner.report_divergence(&answered, &outcome);
+            }
+            if agreement == Agreement::Diverged {
+                recorded.doubtful = true;
+                // What the master refused is in no journal.
+                inner.checkpoint_due |= !answered.executed;
+            }
+            if answered.executed {
+                entries.push(Entry::Call(answered.call));
             }
         }
         if !entries.is_empty() {
@@ -167,6 +182,12 @@ impl Shadow {
             self.work.notify_one();
         }
         Ok(recorded)
+    }
+
+    /// What the master would answer to these calls, one after the other.
+    pub fn foretell<'a>(&self, calls: impl Iterator<Item = &'a Call>) -> Vec<Reply> {
+        let mut model = self.with_mirror(Clone::clone);
+        calls.map(|call| model.apply(call).reply).collect()
     }
 
     /// Records and applies a call of our own before there is any master.
@@ -180,26 +201,46 @@ impl Shadow {
     /// master would. One that takes nothing away is not recorded, and is remembered within limits: it
     /// may be said without end. It may mean a registration whose reply was lost with an earlier
     /// rosrescue, and which the master that comes back has run.
-    pub fn unregister(&self, now: Instant, call: &Call) -> Reply {
+    ///
+    /// None while the mirror is frozen: the call has to wait for the master.
+    pub fn unregister(&self, now: Instant, call: &Call) -> Option<Reply> {
         let mut inner = self.lock();
+        if inner.frozen {
+            return None;
+        }
         let before = inner.mirror.counts();
         let reply = inner.apply(now, call, &self.news);
         let idle = inner.mirror.counts() == before;
         if idle && (inner.owed.len() >= OWED_IDLY || inner.owed.contains(call)) {
-            return reply;
+            return Some(reply);
         }
         let accepted = master::accepted(&inner.mirror, call, &reply).calls;
+        let accepted = accepted.into_iter().filter(|of| of.executed);
+        let accepted: Vec<_> = accepted.map(|of| of.call).collect();
         if !idle {
-            let entries = accepted.iter().map(|(call, _)| Entry::Call(call.clone()));
-            let entries: Vec<_> = entries.collect();
+            let entries: Vec<_> = accepted.iter().cloned().map(Entry::Call).collect();
             inner.append(&entries);
         }
-        inner
-            .owed
-            .extend(accepted.into_iter().map(|(call, _)| call));
+        inner.owed.extend(accepted);
         drop(inner);
         self.work.notify_one();
-        reply
+        Some(reply)
+    }
+
+    /// From now on, or no longer, the mirror takes no unregistration by itself. Frozen at first: it
+    /// is thawed while the gate is shut, until the master that is examined is compared with it.
+    pub fn set_frozen(&self, frozen: bool) {
+        self.lock().frozen = frozen;
+    }
+
+    /// The master may not be what the mirror is: it is to be read again.
+    pub fn doubt(&self) {
+        self.lock().doubted = true;
+    }
+
+    /// Whether there was such a doubt, once.
+    pub fn take_doubt(&self) -> bool {
+        std::mem::take(&mut self.lock().doubted)
     }
 
     /// A new incarnation takes over, to be brought to the mirror's state: replies of the old one no
@@ -378,17 +419,31 @@ impl Inner {
         }
     }
 
-    fn report_divergence(&mut self, method: &str, mirror: &Reply, master: &Reply) {
+    fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
+        let method = answered.call.method.as_str();
         if self.diverged.insert(method.to_owned()) {
+            let [master, mirror] = [&answered.reply, mirror].map(|reply| in_short(method, reply));
             tracing::warn!(
                 method,
-                mirror = cut(&format!("{mirror:?}")),
-                master = cut(&format!("{master:?}")),
-                "the mirror's reply differs from the master's; the mirror will be made anew from \
-                 the master (said once for each method)"
+                mirror,
+                master,
+                "the mirror's reply differs from the master's; the mirror is made anew from the \
+                 master if their states can differ (said once for each method)"
             );
         }
     }
+}
+
+/// A reply for the log. Values of parameters are nobody's business there.
+fn in_short(method: &str, reply: &Reply) -> String {
+    let text = match reply {
+        Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
+            let said = answer.get(..2).unwrap_or_default();
+            format!("{said:?} and a value")
+        }
+        reply => format!("{reply:?}"),
+    };
+    cut(&text).to_owned()
 }
 
 fn cut(text: &str) -> &str {

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::{report::Outcome, set_aside};
+use super::{beside, report::Outcome, set_aside};
 use crate::{
     lifecycle::{InFlight, Input, Trial},
     master::{CALLER_ID, Careful, Counts, FirstLook, Master, Plan},
@@ -152,6 +152,8 @@ pub enum Known {
     Nothing,
     /// If it bears the mark, this process has served it before.
     ServedIfMarked,
+    /// If it bears the mark, it has been injected, and nobody has seen it answer.
+    InjectedIfMarked,
     /// This process has just started it, as the successor of one that it served, on a loopback port
     /// that was free: it is empty. That saves a look, and reading back would show if it were not.
     New {
@@ -170,9 +172,12 @@ pub async fn examine(
     let start = Instant::now();
     let mut first = match manner.known {
         Known::New { pid } => FirstLook::at_new(pid),
-        Known::Nothing | Known::ServedIfMarked => first_look(proxy, connection).await?,
+        Known::Nothing | Known::ServedIfMarked | Known::InjectedIfMarked => {
+            first_look(proxy, connection).await?
+        }
     };
     // From here to the open gate the mirror must not change: the master is compared with it.
+    proxy.shadow.set_frozen(true);
     if keeper.state() == State::Shut(StandIn::Unregistrations) {
         keeper.set(State::Shut(StandIn::Reads));
     }
@@ -191,7 +196,7 @@ pub async fn examine(
     };
     if !first.marked() {
         inject(proxy, connection, first, manner, start, &mut examination).await?;
-    } else if matches!(manner.known, Known::Nothing) {
+    } else if !matches!(manner.known, Known::ServedIfMarked) {
         let previous = proxy.shadow.with_mirror(Clone::clone);
         let held = second_look(first, connection, &previous).await?;
         proxy.shadow.succeed();
@@ -202,7 +207,10 @@ pub async fn examine(
                 "the master went on without us; the mirror follows it"
             );
         }
-        examination.outcome = Outcome::Adopted;
+        examination.outcome = match manner.known {
+            Known::Nothing => Outcome::Adopted,
+            _ => Outcome::Injected,
+        };
         examination.look = start.elapsed();
     }
     examination.injection = start.elapsed().saturating_sub(examination.look);
@@ -278,7 +286,12 @@ async fn inject(
             ..
         } = next;
         manner.progress.set(InFlight::Whole);
-        let raw = within(INJECTION_LIMIT, connection.forward(&Head::default(), body)).await?;
+        let head = Head::default();
+        let injected = within(INJECTION_LIMIT, connection.forward(&head, body));
+        let raw = tokio::select! {
+            raw = injected => raw?,
+            limit = beside::silence(proxy) => return Err(ExamineError::Silent { limit }),
+        };
         manner.progress.take();
         examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
         // The reply is long, and everybody waits: it is decoded only if it differs from the
@@ -289,10 +302,7 @@ async fn inject(
         };
         let Err(mismatches) = verdict else {
             examination.mismatches.clear();
-            if complete {
-                // Unregistrations that slipped in while the mirror was being shut.
-                pay_owed(proxy, connection).await?;
-            } else {
+            if !complete {
                 proxy.shadow.adopt(plan.expected().clone());
             }
             proxy.stats.injections.count();
@@ -360,9 +370,7 @@ async fn inject_carefully(
             progress.take();
             // Only now is it known that the rest is harmless.
             examination.set_aside = set_aside::set_aside(proxy, plan.left_out());
-            if plan.expected() == &target {
-                pay_owed(proxy, connection).await?;
-            } else {
+            if plan.expected() != &target {
                 proxy.shadow.adopt(plan.expected().clone());
             }
             proxy.stats.injections.count();

@@ -1,5 +1,6 @@
 //! Watches the master and brings it back: the shell around [`crate::lifecycle`].
 
+mod beside;
 pub mod census;
 pub mod core_duties;
 mod early_end;
@@ -65,8 +66,8 @@ pub struct Guard {
     /// What the master is at while it is examined.
     progress: Progress,
     outage: Outage,
-    /// This process has served a master.
-    served: bool,
+    /// The incarnation that was served last.
+    served: Option<u64>,
     /// The mirror is known to be a master's state, so that it may stand in.
     known: bool,
     said: Option<(String, Instant)>,
@@ -99,7 +100,7 @@ impl Guard {
             suspicion: Suspicion::default(),
             progress: Progress::default(),
             outage: Outage::begin(Instant::now(), "start"),
-            served: false,
+            served: None,
             known: restored,
             said: None,
         }
@@ -111,7 +112,7 @@ impl Guard {
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, SupervisorError> {
         if self.known {
-            self.keeper.set(State::Shut(StandIn::Unregistrations));
+            self.keep_shut();
         }
         let remembered = self
             .process
@@ -217,11 +218,13 @@ impl Guard {
                 };
                 let (proxy, keeper) = (self.proxy.clone(), self.keeper.clone());
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
+                let incarnation = self.proxy.shadow.incarnation();
                 let manner = examine::Manner {
                     known: match (self.served, new) {
-                        (true, Some(pid)) => Known::New { pid },
-                        (true, None) => Known::ServedIfMarked,
-                        (false, _) => Known::Nothing,
+                        (None, _) => Known::Nothing,
+                        (_, Some(pid)) => Known::New { pid },
+                        (served, None) if served == Some(incarnation) => Known::ServedIfMarked,
+                        _ => Known::InjectedIfMarked,
                     },
                     prepared: self.prepared.take(),
                     trial: self.suspicion.trial(),
@@ -295,7 +298,10 @@ impl Guard {
             }
             Done::Examined(connection, Ok(examination)) => {
                 let new = examination.outcome != Outcome::Resumed;
-                if new {
+                if !new {
+                    // Somebody may have written past us.
+                    self.proxy.shadow.doubt();
+                } else {
                     self.suspicion.survived();
                     self.thread_ended = thread_of(&connection, examination.pid);
                 }
@@ -346,7 +352,7 @@ impl Guard {
     fn disconnect(&mut self) {
         // An injection that was under way froze the mirror.
         if matches!(self.keeper.state(), State::Shut(_)) {
-            self.keeper.set(State::Shut(self.stand_in()));
+            self.keep_shut();
         }
         self.connection = None;
         self.ended = None;
@@ -354,16 +360,18 @@ impl Guard {
         self.probe_deadline = None;
     }
 
-    fn stand_in(&self) -> StandIn {
-        if self.known {
-            StandIn::Unregistrations
-        } else {
-            StandIn::Nobody
-        }
+    /// Lets nothing pass; the mirror stands in as far as it may.
+    fn keep_shut(&self) {
+        let stand_in = match self.known {
+            true => StandIn::Unregistrations,
+            false => StandIn::Nobody,
+        };
+        self.proxy.shadow.set_frozen(!self.known);
+        self.keeper.set(State::Shut(stand_in));
     }
 
     fn shut_gate(&mut self, cause: Cause) {
-        self.keeper.set(State::Shut(self.stand_in()));
+        self.keep_shut();
         self.outage = Outage::begin(Instant::now(), cause.as_str());
         if cause == Cause::Stopping {
             return;
@@ -379,9 +387,9 @@ impl Guard {
 
     fn open_gate(&mut self) {
         self.known = true;
-        self.served = true;
         self.said = None;
         let incarnation = self.proxy.shadow.incarnation();
+        self.served = Some(incarnation);
         self.keeper.set(State::Open { incarnation });
         self.proxy.board.set_open(true);
     }
@@ -393,7 +401,7 @@ impl Guard {
         match process.spawn(&self.proxy) {
             Ok(()) => Ok(()),
             // At the start there is nothing to protect yet: better to say so than to try for ever.
-            Err(error) if !self.served && !self.known => Err(error),
+            Err(error) if self.served.is_none() && !self.known => Err(error),
             Err(error) => {
                 tracing::error!(%error, "cannot start a master");
                 process.report_failure();

@@ -44,7 +44,7 @@ impl Guard {
         );
         let outcome = report.outcome;
         self.proxy.board.set_report(report);
-        if !self.served {
+        if self.served.is_none() {
             // What happened just before we died ourselves, nobody knows any more.
             self.proxy.shadow.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());

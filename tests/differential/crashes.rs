@@ -11,7 +11,7 @@ use crate::nodes::{Node, patience};
 use crate::real::{Rosmaster, Wire};
 use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
-use crate::support::{Rescue, Scratch, Setup, free_port, signal};
+use crate::support::{Rescue, Scratch, Setup, free_port, signal, status};
 
 /// A sequence with so many crashes.
 pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> Script {
@@ -169,7 +169,13 @@ pub(crate) fn run(
                 }
             }
             Step::Crash { in_flight: during } => {
-                let skipped = skipped(&stage.model);
+                let mut skipped = skipped(&stage.model);
+                // The call that is under way may be part of the state.
+                if let (true, Some(Step::Call { call, .. })) = (during, script.steps.get(nth + 1)) {
+                    let mut after = stage.model.clone();
+                    after.apply(&stage.real(call));
+                    skipped.extend(self::skipped(&after));
+                }
                 if !skipped.is_empty() {
                     tally.spared.extend(skipped.into_iter().take(1));
                     continue;
@@ -189,6 +195,10 @@ pub(crate) fn run(
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
     let end = stage.settle().and_then(|()| {
+        let divergences = &status(&rig.rescue.client())["counters"]["divergences"];
+        if *divergences != 0 {
+            return Err(format!("{divergences} replies were taken for divergences"));
+        }
         let mut wire = rig.wire();
         stage.same_reads(&mut wire)?;
         let mut behind = Wire::connect(rig.master_port).map_err(|error| error.to_string())?;

@@ -88,8 +88,8 @@ impl<'n> Stage<'n> {
         self.away &= risky || kind != Kind::Mutate;
         let accepted = accepted(&before, call, reply);
         let mut mirror = before;
-        for (call, _) in &accepted.calls {
-            mirror.apply(call);
+        for answered in accepted.calls.iter().filter(|of| of.executed) {
+            mirror.apply(&answered.call);
         }
         let words = difference(&mirror, &self.model);
         match words.is_empty() {

@@ -4,7 +4,9 @@ use crate::xmlrpc::Value;
 
 fn shadow() -> Shadow {
     let stats = Box::leak(Box::default());
-    Shadow::new(Master::default(), Session::default(), None, stats)
+    let shadow = Shadow::new(Master::default(), Session::default(), None, stats);
+    shadow.set_frozen(false);
+    shadow
 }
 
 fn call(method: &str, params: &[&str]) -> Call {
@@ -71,7 +73,7 @@ fn an_unregistration_in_an_outage_is_owed_until_paid_or_succeeded() {
     }
     let bye = |topic| call("unregisterPublisher", &["/n", topic, "http://n:1/"]);
     let reply = shadow.unregister(now, &bye("/a"));
-    let Reply::Value(reply) = reply else {
+    let Some(Reply::Value(reply)) = reply else {
         panic!("{reply:?}")
     };
     assert_eq!(
@@ -85,6 +87,44 @@ fn an_unregistration_in_an_outage_is_owed_until_paid_or_succeeded() {
     assert_eq!(shadow.with_mirror(|mirror| mirror.counts().publishers), 0);
     shadow.succeed();
     assert_eq!(shadow.owed(), []);
+}
+
+#[test]
+fn a_frozen_mirror_takes_no_unregistration() {
+    let shadow = shadow();
+    shadow.set_frozen(true);
+    let bye = call("unregisterPublisher", &["/n", "/a", "http://n:1/"]);
+    assert_eq!(shadow.unregister(Instant::now(), &bye), None);
+    assert_eq!(shadow.owed(), []);
+}
+
+#[test]
+fn what_the_master_refuses_and_the_mirror_would_do_casts_doubt() {
+    let shadow = shadow();
+    let now = Instant::now();
+    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), 1.into()]);
+    let reply = answered(&set, &mut Master::default());
+    shadow.record(now, 0, &[(&set, &reply)]).unwrap();
+    let delete = call("deleteParam", &["/n", "/a"]);
+    let refusal = answered(&delete, &mut Master::default());
+    let recorded = shadow.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    assert!(recorded.doubtful && shadow.checkpoint_due());
+    assert_eq!(shadow.stats.divergences.value(), 1);
+    let recorded = shadow.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    assert!(!recorded.doubtful, "it is gone from both");
+}
+
+#[test]
+fn a_write_behind_a_subscription_is_no_divergence() {
+    let shadow = shadow();
+    let set = |key: &str| Call::new("setParam", vec!["/n".into(), key.into(), 1.into()]);
+    let subscribe = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    let call = Call::multicall([set("/a/x"), subscribe, set("/a/y")]);
+    let reply = answered(&call, &mut Master::default());
+    let recorded = shadow
+        .record(Instant::now(), 0, &[(&call, &reply)])
+        .unwrap();
+    assert!(!recorded.doubtful);
 }
 
 /// Also what the mirror knows nothing of, for the master that comes back may know it.
