@@ -257,6 +257,22 @@ fn five_deaths_in_a_row_during_recovery() {
 }
 
 #[test]
+fn a_master_that_hangs_while_it_is_given_the_state() {
+    let probes = ["--probe-interval", "100", "--probe-timeout", "500"];
+    let patient = Patient::new(&probes);
+    patient.fall_ill("hang 9\ntimes 1");
+    let begin = Instant::now();
+    // It is not replaced only when a whole injection takes too long.
+    let soon = Duration::from_secs(20);
+    eventually("a master hangs", || patient.sickness.deaths().len() == 1);
+    eventually("another one serves", || {
+        status(&patient.client())["open"] == true
+    });
+    assert!(begin.elapsed() < soon, "{:?}", begin.elapsed());
+    patient.await_state(&patient.before, "after a hang");
+}
+
+#[test]
 fn a_parameter_that_kills() {
     let mut patient = Patient::new(&[]);
     let client = patient.client();
