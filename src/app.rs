@@ -118,11 +118,13 @@ pub async fn run(
     let uri = config.advertised.to_string();
     say(&format!("ROS_MASTER_URI={uri}"));
     say(&format!("checkpoint: {}", config.checkpoint.display()));
-    let remembered = beginning.session.master_uri.as_deref();
-    let remembered = remembered.and_then(|uri| MasterUri::parse(uri).ok());
-    let address = match (&config.master, &remembered) {
+    let last = beginning.session.master_uri.as_deref();
+    let last = last.and_then(|uri| MasterUri::parse(uri).ok());
+    // Where we listen ourselves now, no master can be.
+    let last = last.filter(|uri| uri.port != config.advertised.port);
+    let address = match (&config.master, &last) {
         (MasterConfig::External(address), _) => address.clone(),
-        (_, Some(remembered)) => remembered.clone(),
+        (_, Some(last)) => last.clone(),
         // Until there is one.
         (_, None) => MasterUri {
             host: "127.0.0.1".to_owned(),
@@ -130,8 +132,9 @@ pub async fn run(
         },
     };
     let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
-    let port = remembered.map(|uri| uri.port);
+    let port = last.map(|uri| uri.port);
     let process = supervised.map(|(_, rosmaster)| MasterProcess::new(rosmaster, port));
+    let left = process.as_ref().is_some_and(MasterProcess::is_left);
     let (gate_keeper, gate) = gate::gate();
     let (lane, lane_runner) = lane::lane(config.max_parked);
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
@@ -167,7 +170,7 @@ pub async fn run(
     proxy.shadow.set_identity(pid, proxy.uri.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
-        if port.is_none() {
+        if !left {
             core_duties::seed_run_id(&proxy);
         }
         tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()))
@@ -192,7 +195,7 @@ pub async fn run(
     .await?;
     close(&proxy).await;
     if let Some(process) = process {
-        process.stop(proxy.board.master_pid()).await;
+        process.stop().await;
     }
     Ok(())
 }

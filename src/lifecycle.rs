@@ -59,7 +59,7 @@ pub struct Lifecycle {
     supervision: Supervision,
     probing: Probing,
     phase: Phase,
-    /// When our child was spawned; none while it is known to be gone or was never ours.
+    /// When our child was spawned, or we were, if it was left to us; none while it is gone.
     child: Option<Instant>,
     /// Since when no master has been connected.
     seeking_since: Option<Instant>,
@@ -123,7 +123,7 @@ impl Lifecycle {
             return Vec::new();
         }
         match input {
-            Input::Start { remembered } => self.start(now, remembered),
+            Input::Start { left } => self.start(now, left),
             Input::Connected => {
                 self.phase = Phase::Examining;
                 self.timer = None;
@@ -131,6 +131,11 @@ impl Lifecycle {
             }
             Input::Refused => self.refused(now),
             Input::Unreachable => self.unreachable(now),
+            Input::NotAMaster | Input::ConnectionLost
+                if self.phase == Phase::Examining && self.is_hopeless(now) =>
+            {
+                self.give_up(now)
+            }
             Input::NotAMaster => {
                 self.seek(now);
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
@@ -209,12 +214,13 @@ impl Lifecycle {
         }
     }
 
-    fn start(&mut self, now: Instant, remembered: bool) -> Vec<Action> {
+    fn start(&mut self, now: Instant, left: bool) -> Vec<Action> {
         self.seek(now);
-        match self.supervision {
-            Supervision::Ours if !remembered => vec![Action::Spawn],
-            _ => vec![Action::Connect],
+        if self.supervision == Supervision::Ours && !left {
+            return vec![Action::Spawn];
         }
+        self.child = left.then_some(now);
+        vec![Action::Connect]
     }
 
     fn seek(&mut self, now: Instant) {
@@ -239,16 +245,8 @@ impl Lifecycle {
 
     fn refused(&mut self, now: Instant) -> Vec<Action> {
         self.dying = None;
-        match (self.supervision, self.child) {
-            (Supervision::Ours, None) => {
-                self.seek(now);
-                // Not our child: a master of an earlier rosrescue, and it is dead.
-                self.spawn(now)
-            }
-            (Supervision::Ours, Some(since)) if now.duration_since(since) > START_LIMIT => {
-                // Its end is reported as `Exited`, which spawns the next one.
-                vec![Action::Kill]
-            }
+        match self.child {
+            Some(since) if now.duration_since(since) > START_LIMIT => self.give_up(now),
             _ => {
                 let mut actions = self.connect_later(now, false);
                 if std::mem::take(&mut self.lost) {
@@ -258,6 +256,18 @@ impl Lifecycle {
                 actions
             }
         }
+    }
+
+    /// Whether our child has been given its time, and still nobody at its port is a master.
+    fn is_hopeless(&self, now: Instant) -> bool {
+        let since = self.seeking_since.filter(|_| self.child.is_some());
+        since.is_some_and(|since| now.duration_since(since) > START_LIMIT)
+    }
+
+    /// Our child is no use. Its end is reported as `Exited`, which spawns the next one.
+    fn give_up(&mut self, now: Instant) -> Vec<Action> {
+        self.seek(now);
+        vec![Action::Kill]
     }
 
     fn unreachable(&mut self, now: Instant) -> Vec<Action> {
@@ -291,7 +301,7 @@ impl Lifecycle {
             Supervision::Theirs => Vec::new(),
         };
         let actions = self.lost(now, Cause::Hung, then);
-        // The killed one's end comes as `Exited` or, if it was not our child, as `Refused`.
+        // The killed one's end comes as `Exited`.
         self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
         actions
     }

@@ -17,6 +17,8 @@ use tokio::process::{Child, Command};
 
 use crate::config::SupervisedConfig;
 
+mod left;
+
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
 /// Where ROS installs programs that are not on the PATH.
@@ -85,6 +87,7 @@ pub struct Rosmaster {
     output: PathBuf,
     /// The logging configuration that it is given.
     log_config: PathBuf,
+    checkpoint: PathBuf,
 }
 
 impl Rosmaster {
@@ -105,6 +108,7 @@ impl Rosmaster {
             config: config.clone(),
             output: beside(".rosmaster-output.log"),
             log_config: beside(".rosmaster-logging.conf"),
+            checkpoint: checkpoint.to_owned(),
         })
     }
 
@@ -127,6 +131,24 @@ impl Rosmaster {
         free_port().map_err(spawn_error)
     }
 
+    /// The rosmaster that an earlier rosrescue with this checkpoint left behind at `port`. Any that
+    /// does not listen there has never served, or never will: it is ended.
+    pub fn left_behind(&self, port: Option<u16>) -> Option<u32> {
+        let all = left::find(&left::owner(&self.checkpoint));
+        let serves = |pid: &u32| port.is_some_and(|port| left::listens(*pid, port));
+        let found = all.iter().copied().find(serves);
+        if found.is_none() {
+            for pid in all.into_iter().filter(|pid| runs(*pid, "rosmaster")) {
+                tracing::info!(
+                    pid,
+                    "ending a rosmaster that was left behind and does not serve"
+                );
+                signal_process(pid, Signal::KILL);
+            }
+        }
+        found
+    }
+
     /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
     pub fn spawn(&self, port: u16) -> Result<Child, SupervisorError> {
         let mut command = Command::new(&self.program);
@@ -136,6 +158,7 @@ impl Rosmaster {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
         add_ros_paths(&mut command, &self.program, 2);
+        command.env(left::OWNER, left::owner(&self.checkpoint));
         // Loopback only: nodes come through us.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
@@ -271,6 +294,15 @@ pub fn runs(pid: u32, name: &str) -> bool {
             .file_name()
             .is_some_and(|file| file == name)
     })
+}
+
+/// Returns when the process `pid`, which is no child of ours, has ended.
+pub async fn ended(pid: u32) {
+    if left::ended(pid).await.is_err() {
+        while is_alive(pid) {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
 }
 
 /// How a process ended, in words.

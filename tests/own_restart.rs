@@ -11,14 +11,16 @@
 mod support;
 
 use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpListener;
 use std::thread;
 use std::time::Duration;
 
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 use support::{
-    FakeNode, Library, Mode, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
-    free_port, holds,
+    Client, FakeNode, Library, Mode, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State, alive,
+    eventually, eventually_some, free_port, holds, signal,
 };
 
 #[test]
@@ -90,7 +92,7 @@ fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() 
         leaving
     });
     holds(Duration::from_secs(1), || !unregistering.is_finished());
-    support::signal(master, Signal::CONT);
+    signal(master, Signal::CONT);
     let _leaving = unregistering.join().unwrap();
     robot.rescue.wait_serving();
     robot.await_gate();
@@ -253,4 +255,138 @@ fn a_system_with_a_parameter_that_spoils_the_others_is_taken_over() {
         client.param("/gain") == Some(3.into()) && client.param("/arm/speed") == Some(1.5.into())
     });
     assert!(client.param("/arm").is_some(), "nothing spoils it any more");
+}
+
+/// `rosrescue core` whose rosmaster chooses its own port.
+fn core(scratch: &Scratch) -> Rescue {
+    let port = free_port();
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    Setup::bare(scratch, arguments).at_port(port).start()
+}
+
+/// Process id and port of the rosmaster behind it.
+fn master_of(rescue: &Rescue) -> (u32, u16) {
+    let client = rescue.client();
+    let pid = eventually_some("the master's process id", || client.master_pid());
+    let words = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap();
+    let mut words = words.split('\0');
+    assert!(words.any(|word| word == "-p"), "its port is in its command");
+    (pid, words.next().unwrap().parse().unwrap())
+}
+
+/// What somebody else does with each connection to the port where our master was.
+fn squat(port: u16, what: &'static str) {
+    let listener = eventually_some("the port is free", || {
+        TcpListener::bind(("127.0.0.1", port)).ok()
+    });
+    thread::spawn(move || {
+        let mut kept = Vec::new();
+        for mut stream in listener.incoming().flatten() {
+            match what {
+                "closes" => {}
+                "is silent" => kept.push(stream),
+                _ => {
+                    let _ = stream.read(&mut [0; 4096]);
+                    let _ = stream.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nno\n");
+                }
+            }
+        }
+    });
+}
+
+#[test]
+fn a_core_starts_although_somebody_else_has_its_masters_port() {
+    for what in ["closes", "is silent", "answers nonsense"] {
+        let scratch = Scratch::new();
+        let mut rescue = core(&scratch);
+        rescue.client().set_param("/kept", what);
+        let (master, port) = master_of(&rescue);
+        rescue.kill();
+        signal(master, Signal::KILL);
+        eventually("the master is dead", || !alive(master));
+        squat(port, what);
+        rescue.start_again();
+        rescue.wait_serving();
+        assert_eq!(rescue.client().param("/kept"), Some(what.into()));
+        assert_ne!(master_of(&rescue).1, port, "{what}");
+    }
+}
+
+#[test]
+fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.client().set_param("/ours", 1);
+    let (master, port) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
+    let stranger = Rosmaster::start_at(&scratch, port);
+    stranger.client().set_param("/theirs", 1);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/ours"), Some(1.into()));
+    assert_eq!(rescue.client().param("/theirs"), None);
+    assert_eq!(stranger.client().param("/ours"), None);
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert!(alive(stranger.pid()), "it is not ours to end");
+}
+
+#[test]
+fn the_old_port_of_the_master_may_become_our_own() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.client().set_param("/kept", 1);
+    let (master, port) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+}
+
+#[test]
+fn a_master_that_was_left_hanging_is_replaced() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    let probing = ["--probe-timeout", "300"];
+    let setup = Setup::bare(&scratch, arguments).args(probing);
+    let mut rescue = setup.at_port(port).start();
+    rescue.client().set_param("/kept", 1);
+    let (master, _) = master_of(&rescue);
+    rescue.kill();
+    support::stop(master);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    assert_ne!(master_of(&rescue).0, master);
+    eventually("the one that hung is gone", || !alive(master));
+}
+
+/// Killed right after it has started its rosmaster, which nobody has spoken to yet.
+#[test]
+fn a_master_that_was_left_empty_serves_or_is_ended() {
+    for millis in [0, 60, 120, 180, 240] {
+        let scratch = Scratch::new();
+        let port = free_port();
+        let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+        let mut rescue = Setup::bare(&scratch, arguments).at_port(port).spawn();
+        rescue.wait_line("that it has one", |line| line.contains("started rosmaster"));
+        thread::sleep(Duration::from_millis(millis));
+        rescue.kill();
+        rescue.start_again();
+        rescue.wait_serving();
+        let (master, at) = master_of(&rescue);
+        assert_eq!(Client::new(at).master_pid(), Some(master));
+        let masters = || {
+            let all = scratch.survivors().into_iter();
+            all.filter(|(pid, words)| words.contains("rosmaster") && alive(*pid))
+                .count()
+        };
+        eventually("there is one rosmaster", || masters() == 1);
+        assert_eq!(rescue.terminate().code(), Some(0));
+        assert_eq!(scratch.survivors(), vec![]);
+    }
 }

@@ -52,11 +52,9 @@ impl Script {
         let mut script = Self::new(supervision);
         match supervision {
             Supervision::Ours => script
-                .feed(Input::Start { remembered: false }, &[Action::Spawn])
+                .feed(Input::Start { left: false }, &[Action::Spawn])
                 .feed(Input::Spawned, &[Action::Connect]),
-            Supervision::Theirs => {
-                script.feed(Input::Start { remembered: false }, &[Action::Connect])
-            }
+            Supervision::Theirs => script.feed(Input::Start { left: false }, &[Action::Connect]),
         };
         script.serve(true);
         script
@@ -141,11 +139,52 @@ fn an_idle_connection_that_the_master_closed_is_no_death() {
 }
 
 #[test]
-fn a_remembered_master_is_tried_first_and_replaced_when_it_is_gone() {
+fn a_master_that_was_left_is_taken_over_and_replaced_when_it_ends() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { remembered: true }, &[Action::Connect])
-        .feed(Input::Refused, &[Action::Spawn]);
+        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(Input::Refused, &[])
+        .wake(Duration::from_millis(1), &[Action::Connect])
+        .serve(false)
+        .lose()
+        .feed(Input::Refused, &[])
+        .feed(Input::Exited, &[Action::Spawn]);
+}
+
+#[test]
+fn a_master_that_was_left_hanging_is_killed() {
+    let mut script = Script::new(Supervision::Ours);
+    script
+        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(Input::Connected, &[Action::Examine])
+        .feed(Input::Unreachable, &[Action::Kill])
+        .feed(Input::Exited, &[Action::Spawn]);
+}
+
+/// Whatever answers at the port of our child instead of it.
+#[test]
+fn a_child_at_whose_port_there_is_no_master_is_replaced() {
+    for answer in [Input::NotAMaster, Input::ConnectionLost] {
+        let mut script = Script::new(Supervision::Ours);
+        script
+            .feed(Input::Start { left: false }, &[Action::Spawn])
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(answer, &[]);
+        script.now += START_LIMIT + Duration::from_secs(1);
+        script
+            .feed(Input::Wake, &[Action::Connect])
+            .feed(Input::Connected, &[Action::Examine])
+            .feed(answer, &[Action::Kill])
+            .feed(Input::Exited, &[Action::Spawn]);
+        // Those of others are never given up.
+        let mut script = Script::new(Supervision::Theirs);
+        script.feed(Input::Start { left: false }, &[Action::Connect]);
+        script.now += START_LIMIT * 2;
+        script.feed(Input::Connected, &[Action::Examine]);
+        let actions = script.machine.on(script.now, answer);
+        assert!(!actions.contains(&Action::Kill), "{actions:?}");
+    }
 }
 
 #[test]
@@ -240,7 +279,7 @@ fn a_hung_external_master_is_asked_again_and_never_killed() {
 fn a_child_that_never_listens_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { remembered: false }, &[Action::Spawn])
+        .feed(Input::Start { left: false }, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect]);
     script.now += START_LIMIT + Duration::from_secs(1);
     script
@@ -252,7 +291,7 @@ fn a_child_that_never_listens_is_killed() {
 fn a_master_that_dies_while_it_is_examined_is_replaced_without_a_rush() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { remembered: false }, &[Action::Spawn])
+        .feed(Input::Start { left: false }, &[Action::Spawn])
         .feed(Input::Spawned, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[])

@@ -23,10 +23,11 @@ pub struct Probing {
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Input {
-    /// rosrescue starts; `remembered`: the checkpoint names a master that may still be there.
+    /// rosrescue starts.
     Start {
-        /// Whether to try a remembered master before a new one is spawned.
-        remembered: bool,
+        /// Whether a master that an earlier rosrescue spawned still runs. Its end is told as that of
+        /// a child.
+        left: bool,
     },
     /// The connection to the master is there.
     Connected,

@@ -18,32 +18,50 @@ pub struct MasterProcess {
     rosmaster: Rosmaster,
     /// Port of the last master; tried first, so that whoever looks finds it where it was.
     port: Option<u16>,
-    /// Our child, while it has not been reported gone.
-    child: Option<u32>,
+    /// Our child, or what was left to us, while it has not been reported gone.
+    current: Option<u32>,
     /// Our child, while nobody has spoken to it.
     new: Option<i32>,
-    /// Ends of children.
+    /// Ends of processes.
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     /// What a command to spawn came to; to be fed to the lifecycle next.
     news: Option<Input>,
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`; one may run at `remembered` already.
-    pub fn new(rosmaster: Rosmaster, remembered: Option<u16>) -> Self {
-        Self {
+    /// Starts masters with `rosmaster`; the last one was at `port`, and may be there still.
+    pub fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
+        let left = rosmaster.left_behind(port);
+        let this = Self {
             rosmaster,
-            port: remembered,
-            child: None,
+            port,
+            current: left,
             new: None,
             ends: mpsc::channel(4),
             news: None,
+        };
+        if let (Some(pid), Some(port)) = (left, port) {
+            tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
+            this.watch(pid, async move {
+                supervisor::ended(pid).await;
+                "it was no child of this rosrescue".to_owned()
+            });
         }
+        this
     }
 
-    /// Whether a master of an earlier rosrescue may be there.
-    pub fn is_remembered(&self) -> bool {
-        self.port.is_some()
+    /// Whether a master of an earlier rosrescue is there.
+    pub fn is_left(&self) -> bool {
+        self.current.is_some()
+    }
+
+    /// Tells of the end of `pid`, which `end` waits for.
+    fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
+        let ends = self.ends.0.clone();
+        tokio::spawn(async move {
+            // The receiver is gone only when nobody cares any more.
+            let _ = ends.send((pid, end.await)).await;
+        });
     }
 
     /// Starts a master and tells `proxy` where it is.
@@ -64,17 +82,14 @@ impl MasterProcess {
         let mut child = self.rosmaster.spawn(port)?;
         let pid = child.id().unwrap_or_default();
         tracing::info!(pid, port, "started rosmaster");
-        let ends = self.ends.0.clone();
-        tokio::spawn(async move {
-            let how = match child.wait().await {
+        self.watch(pid, async move {
+            match child.wait().await {
                 Ok(status) => supervisor::describe(status),
                 Err(error) => error.to_string(),
-            };
-            // The receiver is gone only when nobody cares any more.
-            let _ = ends.send((pid, how)).await;
+            }
         });
         self.port = Some(port);
-        self.child = Some(pid);
+        self.current = Some(pid);
         self.new = i32::try_from(pid).ok();
         self.news = Some(Input::Spawned);
         Ok(())
@@ -95,13 +110,13 @@ impl MasterProcess {
         self.news.take()
     }
 
-    /// Returns when the child has ended. Cancel safe.
+    /// Returns when the master has ended. Cancel safe.
     pub async fn exited(&mut self) {
         loop {
             match self.ends.1.recv().await {
-                Some((pid, how)) if Some(pid) == self.child => {
+                Some((pid, how)) if Some(pid) == self.current => {
                     tracing::warn!(pid, how, "rosmaster has ended");
-                    self.child = None;
+                    self.current = None;
                     self.new = None;
                     return;
                 }
@@ -112,31 +127,21 @@ impl MasterProcess {
         }
     }
 
-    /// Kills the master: our child, else the process that called itself `pid`, if it is a rosmaster.
-    pub fn kill(&mut self, pid: Option<i32>) {
-        if let Some(pid) = self.pid(pid) {
+    /// Kills the master.
+    pub fn kill(&self) {
+        // Until its end is told nobody else can have its process id; of one that was left to us that
+        // holds but for the moment between the two.
+        if let Some(pid) = self.current {
             tracing::warn!(pid, "killing the master");
             supervisor::signal_process(pid, rustix::process::Signal::KILL);
         }
     }
 
     /// Ends the master in order.
-    pub async fn stop(mut self, pid: Option<i32>) {
-        let Some(pid) = self.pid(pid) else { return };
-        let child = self.child == Some(pid);
-        supervisor::stop(pid, || match child {
-            // It is reaped by the task that waits for it.
-            true => self.ends.1.try_recv().is_ok_and(|(ended, _)| ended == pid),
-            false => !supervisor::is_alive(pid),
-        })
-        .await;
-    }
-
-    fn pid(&self, said: Option<i32>) -> Option<u32> {
-        let said = said.and_then(|pid| u32::try_from(pid).ok());
-        self.child
-            .or(said)
-            .filter(|pid| supervisor::runs(*pid, "rosmaster") || self.child == Some(*pid))
+    pub async fn stop(mut self) {
+        let Some(pid) = self.current else { return };
+        let ends = &mut self.ends.1;
+        supervisor::stop(pid, || ends.try_recv().is_ok_and(|(ended, _)| ended == pid)).await;
     }
 
     /// The end of what the last master wrote.

@@ -114,11 +114,8 @@ impl Guard {
         if self.known {
             self.keep_shut();
         }
-        let remembered = self
-            .process
-            .as_ref()
-            .is_some_and(MasterProcess::is_remembered);
-        let mut input = Input::Start { remembered };
+        let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
+        let mut input = Input::Start { left };
         loop {
             self.suspect(input);
             let actions = self.lifecycle.on(Instant::now(), input);
@@ -253,9 +250,8 @@ impl Guard {
             Action::Spawn => self.spawn()?,
             Action::Kill => {
                 self.disconnect();
-                let pid = self.proxy.board.master_pid();
-                if let Some(process) = &mut self.process {
-                    process.kill(pid);
+                if let Some(process) = &self.process {
+                    process.kill();
                 }
             }
             Action::ReportCrashLoop(deaths) => {

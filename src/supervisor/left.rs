@@ -1,0 +1,157 @@
+//! A rosmaster that an earlier rosrescue left behind when it was killed.
+//!
+//! It is known by its process and not by its port: since rosrescue died, anybody may have taken the
+//! port, another rosmaster too. Each rosmaster that is started bears the checkpoint's path in its
+//! environment, which nobody else writes and which the kernel shows for as long as the process lives.
+
+use std::{
+    ffi::{OsStr, OsString},
+    fs, io,
+    os::unix::ffi::OsStrExt,
+    path::Path,
+};
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use tokio::net::unix::pipe::Receiver;
+
+/// The environment variable that says whose master a process is.
+pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
+
+/// What the masters of `checkpoint` bear in [`OWNER`].
+pub(super) fn owner(checkpoint: &Path) -> OsString {
+    let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
+    // The file itself may not be there yet.
+    let folder = absolute.parent().and_then(|path| path.canonicalize().ok());
+    match (folder, absolute.file_name()) {
+        (Some(folder), Some(name)) => folder.join(name).into(),
+        _ => absolute.into(),
+    }
+}
+
+/// Living processes that bear `owner` and whose rosrescue is gone.
+pub(super) fn find(owner: &OsStr) -> Vec<u32> {
+    let mut wanted = format!("{OWNER}=").into_bytes();
+    wanted.extend(owner.as_bytes());
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let ids = processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    ids.filter(|pid| {
+        let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
+        let is_ours = environment.split(|byte| *byte == 0).any(|of| of == wanted);
+        is_ours && !has_rosrescue(*pid)
+    })
+    .collect()
+}
+
+/// Whether the parent of `pid` is a rosrescue, so that nobody has left it behind.
+fn has_rosrescue(pid: u32) -> bool {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    // The command's name comes before, in parentheses, with whatever it likes in it.
+    let after = stat.rsplit(')').next().unwrap_or_default();
+    let parent = after.split_whitespace().nth(1).unwrap_or_default();
+    let program = fs::read_link(format!("/proc/{parent}/exe")).unwrap_or_default();
+    let name = program.file_name().unwrap_or_default();
+    name.as_bytes().starts_with(b"rosrescue")
+}
+
+/// Whether the process `pid` listens at `port`, on IPv4 as rosmaster does.
+pub(super) fn listens(pid: u32, port: u16) -> bool {
+    const LISTENING: &str = "0A";
+    let table = fs::read_to_string("/proc/self/net/tcp").unwrap_or_default();
+    let local = format!(":{port:04X}");
+    let sockets: Vec<_> = table
+        .lines()
+        .filter_map(|line| {
+            let columns: Vec<_> = line.split_whitespace().collect();
+            let is_it = columns.get(1)?.ends_with(&local) && *columns.get(3)? == LISTENING;
+            is_it.then(|| columns.get(9).map(|inode| format!("socket:[{inode}]")))?
+        })
+        .collect();
+    let open = fs::read_dir(format!("/proc/{pid}/fd"));
+    let mut open = open.into_iter().flatten().flatten();
+    open.any(|entry| {
+        let target = fs::read_link(entry.path()).unwrap_or_default();
+        sockets.iter().any(|socket| target == Path::new(socket))
+    })
+}
+
+/// Returns when the process `pid`, which is no child of ours, has ended.
+///
+/// # Errors
+///
+/// What the system says: the process is gone, or the kernel is older than 5.3 and cannot watch it.
+pub(super) async fn ended(pid: u32) -> io::Result<()> {
+    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
+    let pid = pid.ok_or(io::ErrorKind::InvalidInput)?;
+    // Never read: only whether it could be is of interest, which tokio tells safely of pipes alone.
+    let process = Receiver::from_owned_fd_unchecked(pidfd_open(pid, PidfdFlags::empty())?)?;
+    process.readable().await
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        net::TcpListener,
+        process::{Command, Stdio},
+        time::Duration,
+    };
+
+    use super::*;
+
+    /// Runs `program` and gives the id of the process that it prints.
+    fn pid_of(program: &str, owner: &OsStr) -> u32 {
+        let output = Command::new("sh")
+            .args(["-c", program])
+            .env(OWNER, owner)
+            .stderr(Stdio::null())
+            .output()
+            .unwrap();
+        String::from_utf8(output.stdout)
+            .unwrap()
+            .trim()
+            .parse()
+            .unwrap()
+    }
+
+    #[tokio::test]
+    async fn only_an_orphan_that_bears_the_name_was_left_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let owner = owner(&folder.path().join("checkpoint"));
+        let mut kept = Command::new("sleep")
+            .arg("60")
+            .env(OWNER, &owner)
+            .spawn()
+            .unwrap();
+        // This test's program is called after rosrescue, too.
+        assert_eq!(find(&owner), Vec::<u32>::new(), "its rosrescue lives");
+        let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
+        assert_eq!(find(&owner), [orphan]);
+        assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
+        let end = tokio::spawn(ended(orphan));
+        crate::supervisor::signal_process(orphan, rustix::process::Signal::KILL);
+        let end = tokio::time::timeout(Duration::from_secs(60), end).await;
+        end.expect("the end is told").unwrap().unwrap();
+        assert_eq!(find(&owner), Vec::<u32>::new());
+        kept.kill().unwrap();
+        kept.wait().unwrap();
+    }
+
+    #[test]
+    fn who_listens_is_known() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        assert!(listens(std::process::id(), port));
+        assert!(!listens(1, port) || std::process::id() == 1);
+        drop(listener);
+        assert!(!listens(std::process::id(), port));
+    }
+
+    #[test]
+    fn a_checkpoint_has_one_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+        fs::create_dir(&real).unwrap();
+        std::os::unix::fs::symlink(&real, &link).unwrap();
+        assert_eq!(owner(&real.join("c")), owner(&link.join("c")));
+        assert_ne!(owner(&real.join("c")), owner(&real.join("d")));
+    }
+}
