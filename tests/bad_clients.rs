@@ -170,22 +170,45 @@ fn a_web_page_cannot_change_anything() {
     let body = encode_call("setParam", params!["/c", "/evil", 1]);
     let length = body.len();
     let text = String::from_utf8(body.clone()).unwrap();
+    let post =
+        |head: &str| format!("POST / HTTP/1.1\r\n{head}Content-Length: {length}\r\n\r\n{text}");
     let request_of = |kind: &str, more: &str| {
-        format!(
-            "POST / HTTP/1.1\r\nHost: evil.example\r\nContent-Type: {kind}\r\n{more}Content-Length: {length}\r\n\r\n{text}"
-        )
+        post(&format!(
+            "Host: evil.example\r\nContent-Type: {kind}\r\n{more}"
+        ))
     };
+    // As `fetch(url, {method: 'POST', mode: 'no-cors', body: new Uint8Array(...)})` sends it.
+    let address = format!("Host: 127.0.0.1:{}\r\n", robot.port());
+    let untyped = |origin: &str| post(&format!("{address}Origin: {origin}\r\n"));
     for bytes in [
         request_of("text/plain", "Origin: http://evil.example\r\n"),
         request_of("text/plain;charset=UTF-8", ""),
         request_of("application/x-www-form-urlencoded", ""),
         request_of("multipart/form-data; boundary=x", ""),
         request_of("text/xml", "Origin: http://evil.example\r\n"),
+        untyped("http://evil.example"),
+        untyped("http://127.0.0.1:8000"),
+        untyped("null"),
+        post(&format!(
+            "{address}Content-Type: text/xml\r\nOrigin: http://evil.example\r\n"
+        )),
     ] {
         let response = client.exchange(bytes.as_bytes()).unwrap();
         assert!(response.code >= 400, "{}: {bytes}", response.status);
     }
     assert_eq!(robot.bare().param("/evil"), None);
-    let fine = request("POST / HTTP/1.1", &[], &body);
-    assert_eq!(client.exchange(&fine).unwrap().code, 200);
+    let fine = [
+        request("POST / HTTP/1.1", &[], &body),
+        // Clients that are no browser: without a type, and under a name that we do not know.
+        post(&address).into_bytes(),
+        post("Host: robot.example:11311\r\nContent-Type: text/xml\r\n").into_bytes(),
+        post("").into_bytes(),
+        // A page of our own.
+        untyped(&format!("http://127.0.0.1:{}", robot.port())).into_bytes(),
+    ];
+    for bytes in &fine {
+        assert_eq!(client.exchange(bytes).unwrap().code, 200);
+        assert_eq!(robot.bare().param("/evil"), Some(1.into()));
+        robot.bare().ok("deleteParam", params!["/c", "/evil"]);
+    }
 }

@@ -27,9 +27,24 @@ const BROWSER_TYPES: [&str; 3] = [
 ];
 
 /// Whether a POST with these headers may call the master. `names` are those of this computer.
+///
+/// A browser says with every POST of a page where the page is from (`null` if it keeps that to
+/// itself); no ROS client does. It may lack a content type, as that of a typed array does.
 pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
-    if headers.contains_key(ORIGIN) {
+    for origin in headers.get_all(ORIGIN) {
         check_host(headers, names)?;
+        let origin = String::from_utf8_lossy(origin.as_bytes());
+        let site = origin.strip_prefix("http://").map(str::as_bytes);
+        let own = headers.get(HOST).map(|host| host.as_bytes());
+        if !site
+            .zip(own)
+            .is_some_and(|(a, b)| a.eq_ignore_ascii_case(b))
+        {
+            return Err(Refusal {
+                status: StatusCode::FORBIDDEN,
+                reason: format!("a page of `{origin}` may not call the master"),
+            });
+        }
     }
     let Some(content_type) = headers.get(CONTENT_TYPE) else {
         return Ok(());
@@ -125,12 +140,30 @@ mod tests {
                 ],
                 403,
             ),
+            (
+                &[
+                    ("origin", "http://evil.example"),
+                    ("host", "10.0.0.5:11311"),
+                ],
+                403,
+            ),
+            (
+                &[("origin", "http://robot:8000"), ("host", "robot:11311")],
+                403,
+            ),
+            (&[("origin", "null"), ("host", "robot:11311")], 403),
+            (&[("origin", "http://robot:11311")], 403),
         ] {
             let refusal = check_post(&headers(pairs), &own).unwrap_err();
-            assert_eq!(refusal.status.as_u16(), status);
+            assert_eq!(refusal.status.as_u16(), status, "{pairs:?}");
         }
-        let same_site = headers(&[("origin", "http://robot:8000"), ("host", "Robot:11311")]);
-        assert_eq!(check_post(&same_site, &own), Ok(()));
+        for host in ["Robot:11311", "10.0.0.5:11311", "[::1]:11311"] {
+            let mut same_site = headers(&[("origin", "http://robot:11311")]);
+            let origin = format!("http://{}", host.to_lowercase());
+            same_site.insert(ORIGIN, origin.parse().unwrap());
+            same_site.insert(HOST, host.parse().unwrap());
+            assert_eq!(check_post(&same_site, &own), Ok(()));
+        }
         assert!(check_host(&headers(&[("host", "[::1]:11311")]), &own).is_ok());
     }
 
