@@ -10,7 +10,14 @@
 
 mod support;
 
-use support::{Mode, PATIENCE, Robot, encode_call, http_request, params, request};
+use std::io::Write;
+
+use flate2::{Compression, write::GzEncoder};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+use support::{
+    Client, Mode, Netns, PATIENCE, Robot, Scratch, Setup, encode_call, eventually, free_port,
+    http_request, params, request,
+};
 
 #[test]
 fn garbage_from_clients() {
@@ -211,4 +218,98 @@ fn a_web_page_cannot_change_anything() {
         assert_eq!(robot.bare().param("/evil"), Some(1.into()));
         robot.bare().ok("deleteParam", params!["/c", "/evil"]);
     }
+}
+
+/// Every form in which rosmaster understands a `shutdown`: whatever rosrescue cannot read is not taken
+/// from another computer.
+#[test]
+fn no_other_computer_shuts_the_master_down() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
+    let rescue = setup.start();
+    let here = rescue.client();
+    // A connection to an address of ours comes from that address, which is not loopback.
+    let elsewhere = Client::at(&net.near(), rescue.port());
+    let plain = encode_call("shutdown", params!["/evil", "because"]);
+    let text = String::from_utf8(plain.clone()).unwrap();
+    let document = &text[text.find("<methodCall").unwrap()..];
+    let utf16 = |text: &str, mark: bool| {
+        let text = format!("{}{text}", if mark { "\u{feff}" } else { "" });
+        let units = text.encode_utf16();
+        units.flat_map(u16::to_le_bytes).collect::<Vec<u8>>()
+    };
+    let zip = |body: &[u8]| {
+        let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
+        encoder.write_all(body).unwrap();
+        encoder.finish().unwrap()
+    };
+    let within = |more: Value| {
+        let several = [
+            Call::new("hasParam", vec!["/evil".into(), more]),
+            Call::new("shutdown", params!["/evil", "because"]),
+        ];
+        encode_call("system.multicall", Call::multicall(several).params)
+    };
+    let odd = String::from_utf8(within("odd".into())).unwrap();
+    let (first, second) = plain.split_at(30);
+    let with = |header: &str, body: &[u8]| request("POST /RPC2 HTTP/1.1", &[header], body);
+    let requests = [
+        http_request(&plain),
+        http_request(&within(1.into())),
+        http_request(odd.replace("odd", "<bigdecimal>1</bigdecimal>").as_bytes()),
+        with("Content-Encoding: identity", &plain),
+        with("Content-Encoding: Identity", &plain),
+        with("Content-Encoding: gzip", &zip(&plain)),
+        with("content-encoding: GZip", &zip(&plain)),
+        with(
+            "Content-Encoding: gzip",
+            &[zip(first), zip(second)].concat(),
+        ),
+        http_request(format!("<!DOCTYPE methodCall>{document}").as_bytes()),
+        http_request(
+            format!("<!DOCTYPE a [<!ENTITY b 'shutdown'>]>{document}")
+                .replace(">shutdown<", ">&b;<")
+                .as_bytes(),
+        ),
+        http_request(format!("<?xml version='1.0' encoding='cp1252'?>{document}").as_bytes()),
+        http_request(&utf16(document, true)),
+        http_request(&utf16(
+            &format!("<?xml version='1.0' encoding='utf-16'?>{document}"),
+            false,
+        )),
+        with("Content-Encoding: gzip", &zip(&utf16(document, true))),
+        http_request(b"garbage"),
+    ];
+    let master = here.master_pid().expect("a master");
+    for (number, bytes) in requests.iter().enumerate() {
+        let response = elsewhere.exchange(bytes).unwrap();
+        match response.reply() {
+            Reply::Fault { text, .. } => assert!(text.contains("own computer"), "{text}"),
+            Reply::Value(value) => {
+                let refusal = value.as_array().and_then(<[_]>::first);
+                assert_eq!(refusal, Some(&(-1).into()), "request {number}: {value:?}");
+            }
+        }
+    }
+    // What the master refuses itself is left to it.
+    let packed = with("Content-Encoding: br", &plain);
+    assert_eq!(elsewhere.exchange(&packed).unwrap().code, 501);
+    // And everything else passes.
+    let body = encode_call("setParam", params!["/far", "/far", 1]);
+    for header in [
+        "Content-Encoding: IDENTITY",
+        "Content-Type: text/xml; charset=utf-8",
+    ] {
+        assert_eq!(elsewhere.exchange(&with(header, &body)).unwrap().code, 200);
+    }
+    assert_eq!(elsewhere.param("/far"), Some(1.into()));
+    assert_eq!(here.master_pid(), Some(master));
+    // From its own computer it may come as it likes.
+    here.exchange(&requests[8]).unwrap();
+    eventually(
+        "the master has been shut down, and there is another",
+        || here.master_pid().is_some_and(|pid| pid != master),
+    );
+    assert_eq!(here.param("/far"), Some(1.into()));
 }

@@ -3,12 +3,12 @@
 use std::{io::Read, net::SocketAddr, sync::Arc, time::Duration};
 
 use bytes::Bytes;
-use flate2::read::GzDecoder;
+use flate2::read::MultiGzDecoder;
 use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
     Method, Request, Response, StatusCode,
     body::{Body, Incoming},
-    header::{CONTENT_ENCODING, CONTENT_TYPE, SERVER, USER_AGENT},
+    header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER, USER_AGENT},
 };
 use thiserror::Error;
 use tokio::sync::{SemaphorePermit, oneshot};
@@ -48,6 +48,10 @@ const IDENTITY_TIME: Duration = Duration::from_secs(1);
 const ROSCPP_SET_PARAM_HOLD: Duration = Duration::from_secs(24 * 3600);
 /// What roscpp calls itself.
 const ROSCPP: &[u8] = b"XMLRPC++";
+/// Said to another computer of a body that rosrescue cannot decode. The master may know how to, and
+/// it may be a `shutdown`.
+const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
+                         computer only; send XML-RPC in UTF-8, without a document type";
 /// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
 const BODY_TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
@@ -129,7 +133,8 @@ async fn post(
         Err(BodyError::TooSlow) => return Err(Closed("the request came too slowly")),
     };
     proxy.stats.calls.count();
-    let call = decode(&head, body.clone(), proxy.config.max_body).await;
+    let packing = Packing::of(head.encoding.as_ref());
+    let call = decode(packing, body.clone(), proxy.config.max_body).await;
     if let Some(call) = &call {
         let caller_id = call
             .params
@@ -141,6 +146,14 @@ async fn post(
     } else {
         proxy.stats.undecoded.count();
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
+        if packing != Packing::Unknown && !door::may_shut_down(peer.ip()) {
+            proxy.stats.refused.count();
+            tracing::warn!(%peer, "refused a request of another computer that cannot be decoded");
+            return Ok(xml(&Reply::Fault {
+                code: 1,
+                text: UNDECODED.to_owned(),
+            }));
+        }
     }
     let hold = match &call {
         Some(call) if roscpp && call.method == "setParam" => ROSCPP_SET_PARAM_HOLD,
@@ -307,17 +320,15 @@ fn plain(raw: RawReply) -> HttpReply {
 
 fn xml(reply: &Reply) -> HttpReply {
     let mut http = Response::new(Full::new(Bytes::from(xmlrpc::encode_reply(reply))));
-    http.headers_mut().insert(
-        CONTENT_TYPE,
-        hyper::header::HeaderValue::from_static("text/xml"),
-    );
+    http.headers_mut()
+        .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http
 }
 
 fn text(status: StatusCode, text: String) -> HttpReply {
     let mut http = Response::new(Full::new(Bytes::from(text)));
     *http.status_mut() = status;
-    let plain = hyper::header::HeaderValue::from_static("text/plain; charset=utf-8");
+    let plain = HeaderValue::from_static("text/plain; charset=utf-8");
     http.headers_mut().insert(CONTENT_TYPE, plain);
     http
 }
@@ -367,27 +378,44 @@ async fn read_body<'a>(
     }
 }
 
-async fn decode(head: &Head, body: Bytes, limit: usize) -> Option<Call> {
-    let gzip = head.encoding.as_ref().is_some_and(|of| of == "gzip");
-    if head.encoding.is_some() && !gzip {
-        return None;
+/// How a body is packed, as rosmaster reads the header.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Packing {
+    Plain,
+    Gzip,
+    /// rosmaster refuses it without a look at the body.
+    Unknown,
+}
+
+impl Packing {
+    fn of(encoding: Option<&HeaderValue>) -> Self {
+        match encoding.map(HeaderValue::as_bytes) {
+            None => Self::Plain,
+            Some(name) if name.eq_ignore_ascii_case(b"identity") => Self::Plain,
+            Some(name) if name.eq_ignore_ascii_case(b"gzip") => Self::Gzip,
+            Some(_) => Self::Unknown,
+        }
     }
+}
+
+async fn decode(packing: Packing, body: Bytes, limit: usize) -> Option<Call> {
     let long = body.len() > SMALL_BODY;
     let work = move || {
-        if !gzip {
+        if packing == Packing::Plain {
             return xmlrpc::decode_call(&body).ok();
         }
         let mut unpacked = Vec::new();
         // What unpacks to more than the limit is not looked into; rosmaster will do as it likes.
         let most = u64::try_from(limit).unwrap_or(u64::MAX);
-        GzDecoder::new(&*body)
+        MultiGzDecoder::new(&*body)
             .take(most)
             .read_to_end(&mut unpacked)
             .ok()?;
         xmlrpc::decode_call(&unpacked).ok()
     };
-    if gzip || long {
-        return tokio::task::spawn_blocking(work).await.ok()?;
+    match packing {
+        Packing::Plain if !long => work(),
+        Packing::Plain | Packing::Gzip => tokio::task::spawn_blocking(work).await.ok()?,
+        Packing::Unknown => None,
     }
-    work()
 }
