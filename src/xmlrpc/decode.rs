@@ -8,7 +8,7 @@ use std::borrow::Cow;
 use super::error::DecodeError;
 use super::number;
 use super::prolog::text_of;
-use super::scan::{Event, Scanner};
+use super::scan::{Event, LineEnds, Scanner};
 use super::value::{Call, Reply, Struct, Value};
 
 /// How deep arrays and structs may lie inside each other.
@@ -29,7 +29,7 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 /// Where CPython raises, and in the few cases that are named at [`DecodeError`].
 pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     let wanted = "call";
-    let document = unmarshal(body, wanted)?;
+    let document = unmarshal(body, wanted, Writer::Any)?;
     if document.is_fault {
         let what = "it is a fault";
         return Err(DecodeError::Shape { wanted, what });
@@ -41,7 +41,9 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     Ok(Call::new(method, document.values))
 }
 
-/// Reads an answer.
+/// Reads an answer, as CPython's server meant it: it escapes neither a carriage return, which a reader
+/// of XML takes for a line feed, nor a date's text, in which it would find references. So this does
+/// neither, and what a master holds is read as it is.
 ///
 /// # Errors
 ///
@@ -49,7 +51,7 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
 /// at [`DecodeError`].
 pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     let wanted = "reply";
-    let document = unmarshal(body, wanted)?;
+    let document = unmarshal(body, wanted, Writer::Python)?;
     let mut values = document.values.into_iter();
     let (Some(value), None) = (values.next(), values.next()) else {
         let what = "it does not hold one value";
@@ -86,16 +88,39 @@ struct Document {
     is_fault: bool,
 }
 
-fn unmarshal(body: &[u8], wanted: &'static str) -> Result<Document, DecodeError> {
+/// Who wrote a document.
+#[derive(Clone, Copy, Default, PartialEq, Eq)]
+enum Writer {
+    /// Anybody who knows XML.
+    #[default]
+    Any,
+    /// CPython's server, which leaves two things unescaped.
+    Python,
+}
+
+fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Document, DecodeError> {
     let text = text_of(body)?;
-    let mut scanner = Scanner::new(&text, MAX_OPEN);
-    let mut machine = Unmarshaller::default();
+    let line_ends = match writer {
+        Writer::Any => LineEnds::Normal,
+        Writer::Python => LineEnds::Kept,
+    };
+    let mut scanner = Scanner::new(&text, MAX_OPEN, line_ends);
+    let mut machine = Unmarshaller {
+        writer,
+        ..Unmarshaller::default()
+    };
     while let Some(event) = scanner.next()? {
         match event {
             Event::Start(tag) => machine.start(tag.name().0, scanner.at())?,
             Event::End(tag) => machine.end(tag.name().0, scanner.at())?,
             // Adding to no text borrows the piece; mostly there is but one.
             Event::Text(piece) => machine.text += piece,
+            Event::Reference(reference, _) if machine.is_unescaped => {
+                machine.text += "&";
+                machine.text += reference.into_inner();
+                machine.text += ";";
+            }
+            Event::Reference(_, character) => machine.text += character,
         }
     }
     let Some(kind) = machine.kind else {
@@ -174,6 +199,9 @@ struct Unmarshaller<'a> {
     text: Cow<'a, str>,
     /// A `<value>` has begun and no element in it: so far it is an untyped string.
     is_bare: bool,
+    writer: Writer,
+    /// What looks like a reference is text, because the writer does not escape this element's.
+    is_unescaped: bool,
 }
 
 impl Unmarshaller<'_> {
@@ -188,6 +216,7 @@ impl Unmarshaller<'_> {
             self.marks.push(self.stack.len());
         }
         self.text = Cow::Borrowed("");
+        self.is_unescaped = self.writer == Writer::Python && tag == Some(Tag::DateTime);
         if self.is_bare && tag.is_none() {
             let tag = name.to_owned();
             return Err(DecodeError::UnknownType { at, tag });

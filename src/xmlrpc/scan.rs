@@ -21,8 +21,19 @@ pub(super) enum Event<'a> {
     Start(BytesStart<'a>),
     /// An end tag.
     End(BytesEnd<'a>),
-    /// A piece of text, line ends already made `\n`, or the character of a reference.
+    /// A piece of text; its line ends are already made `\n` where XML's rule counts.
     Text(Cow<'a, str>),
+    /// A reference, and the character that it stands for.
+    Reference(BytesRef<'a>, Cow<'static, str>),
+}
+
+/// What becomes of line ends in text.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum LineEnds {
+    /// Each becomes `\n`, as XML has it.
+    Normal,
+    /// They stay.
+    Kept,
 }
 
 /// Walks over a document and checks it on the way.
@@ -31,13 +42,14 @@ pub(super) struct Scanner<'a> {
     /// How many elements are open.
     open: usize,
     max_open: usize,
+    line_ends: LineEnds,
     seen_root: bool,
 }
 
 impl<'a> Scanner<'a> {
     /// Begins at the start of `text`, which has only characters of XML; `max_open` bounds the open
     /// elements.
-    pub(super) fn new(text: &'a str, max_open: usize) -> Self {
+    pub(super) fn new(text: &'a str, max_open: usize, line_ends: LineEnds) -> Self {
         let mut reader = Reader::from_str(text);
         let config = reader.config_mut();
         config.check_comments = true;
@@ -46,6 +58,7 @@ impl<'a> Scanner<'a> {
             reader,
             open: 0,
             max_open,
+            line_ends,
             seen_root: false,
         }
     }
@@ -86,10 +99,20 @@ impl<'a> Scanner<'a> {
                 }
                 // Looking for one character alone is much faster, and encoders write `&gt;`.
                 Markup::Text(text) if text.contains('>') && text.contains("]]>") => "]]> in text",
-                Markup::Text(text) => return Ok(Some(Event::Text(text.xml10_content()))),
-                Markup::CData(text) => return Ok(Some(Event::Text(text.xml10_content()))),
+                Markup::Text(text) => {
+                    return Ok(Some(Event::Text(match self.line_ends {
+                        LineEnds::Normal => text.xml10_content(),
+                        LineEnds::Kept => text.into_inner(),
+                    })));
+                }
+                Markup::CData(text) => {
+                    return Ok(Some(Event::Text(match self.line_ends {
+                        LineEnds::Normal => text.xml10_content(),
+                        LineEnds::Kept => text.into_inner(),
+                    })));
+                }
                 Markup::GeneralRef(reference) => match character(&reference) {
-                    Some(text) => return Ok(Some(Event::Text(text))),
+                    Some(text) => return Ok(Some(Event::Reference(reference, text))),
                     None => "a reference to nothing",
                 },
                 Markup::Decl(_) if at == 0 => continue,

@@ -48,6 +48,28 @@ fn line_ends_become_line_feeds_unless_they_are_references() {
     assert_eq!(value("a&#13;&#xA;b"), text("a\r\nb"));
 }
 
+/// As a master writes them, and therefore holds them.
+#[test]
+fn a_reply_keeps_what_cpython_does_not_escape() {
+    let date = |text: &str| Value::DateTime(text.to_owned());
+    for value in [
+        text("a\r\nb\rc\r\r\n"),
+        Value::Struct(Struct::from([(
+            "\r\n".to_owned(),
+            Value::Array(vec![text("\r")]),
+        )])),
+        date("a&amp;b&#13;c\rd > e"),
+        date("&lt;a/&gt;"),
+        text("a&amp;b&#13;"),
+    ] {
+        let reply = Reply::Value(value);
+        assert_eq!(decode_reply(&encode_reply(&reply)), Ok(reply));
+    }
+    for broken in ["a<b", "a & b", "]]>", "&nbsp;"] {
+        assert!(decode_reply(&encode_reply(&Reply::Value(date(broken)))).is_err());
+    }
+}
+
 #[test]
 fn text_is_joined_over_references_sections_and_comments() {
     assert_eq!(

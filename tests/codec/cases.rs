@@ -75,27 +75,6 @@ pub(crate) fn values(more: BoxedStrategy<Value>) -> impl Strategy<Value = Value>
     })
 }
 
-/// The value with every carriage return and the pair of it and a line feed as one line feed: what
-/// is left after XML when they are not references, and CPython writes none.
-pub(crate) fn with_line_feeds(value: &Value) -> Value {
-    let text = |text: &str| text.replace("\r\n", "\n").replace('\r', "\n");
-    match value {
-        Value::String(string) => Value::String(text(string)),
-        Value::Array(elements) => elements
-            .iter()
-            .map(with_line_feeds)
-            .collect::<Vec<_>>()
-            .into(),
-        Value::Struct(members) => Value::Struct(
-            members
-                .iter()
-                .map(|(name, member)| (text(name), with_line_feeds(member)))
-                .collect(),
-        ),
-        other => other.clone(),
-    }
-}
-
 /// A piece of a document, mostly well-formed, seldom sensible.
 pub(crate) fn mess() -> impl Strategy<Value = String> {
     let text = proptest::sample::select(vec![

@@ -18,7 +18,7 @@ use rosrescue::xmlrpc::{
     Call, DecodeError, Reply, Struct, Value, decode_call, decode_reply, encode_call, encode_reply,
 };
 
-use cases::{any_value, double, mess, returnable, text, with_line_feeds};
+use cases::{any_value, double, mess, returnable, text};
 use documents::{odd_documents, params, refused_documents};
 use master::Master;
 use peer::{Peer, hex};
@@ -69,6 +69,14 @@ fn verdict(verb: &str, document: &[u8]) -> Result<String, DecodeError> {
             notation(&Value::from(text))
         ),
     })
+}
+
+/// The document without what is read otherwise in a reply: carriage returns and dates, which CPython
+/// does not escape.
+fn plain(document: &[u8]) -> Vec<u8> {
+    let text = String::from_utf8_lossy(document);
+    let text = text.replace('\r', "").replace("dateTime.iso8601", "date");
+    text.into_bytes()
 }
 
 /// The same verdict on both sides, or a refusal of the kinds that we allow ourselves.
@@ -171,7 +179,7 @@ proptest! {
     #[test]
     fn a_reply_comes_back(value in returnable()) {
         let reply = decode_reply(&encode_reply(&Reply::Value(value.clone()))).unwrap();
-        prop_assert_eq!(reply, Reply::Value(with_line_feeds(&value)));
+        prop_assert_eq!(reply, Reply::Value(value));
     }
 
     #[test]
@@ -226,6 +234,11 @@ fn senseless_documents_are_taken_as_cpython_takes_them() {
     with_peer(&proptest::collection::vec(mess(), 1..4), |peer, inside| {
         let document = params(&inside.concat());
         for verb in ["call", "reply"] {
+            let document = if verb == "reply" {
+                plain(&document)
+            } else {
+                document.clone()
+            };
             compare(peer, verb, &document).map_err(TestCaseError::fail)?;
         }
         Ok(())
