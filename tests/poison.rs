@@ -10,7 +10,8 @@
 
 mod support;
 
-use support::{Rosmaster, Scratch, Setup, eventually, params};
+use rosrescue::xmlrpc::Value;
+use support::{Rosmaster, Scratch, Setup, eventually, params, tree};
 
 /// CPython writes a carriage return as it is, and whoever reads that as XML gets a line feed.
 #[test]
@@ -37,5 +38,57 @@ fn carriage_returns_outlive_master_and_rosrescue() {
     eventually("the parameters are back", || {
         master.client().param("/before") == Some("a\r\nb\rc".into())
             && master.client().param("/through") == Some("d\r\ne\rf".into())
+    });
+}
+
+/// CPython does not escape a date's text, so that whatever holds this one is answered with no XML.
+fn poison() -> Value {
+    Value::DateTime("a<b & ]]>".to_owned())
+}
+
+/// Somebody's master that holds a date with markup, and a rosrescue that has never seen it.
+#[test]
+fn a_master_with_a_date_that_breaks_its_answers_is_taken_over() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let before = master.client();
+    before.set_param("/good", 1);
+    before.set_param("/ns/good", 2);
+    before.set_param("/ns/bad", poison());
+    before.set_param("/ns/fine", Value::DateTime("a&amp;b >".to_owned()));
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    rescue.client().set_param("/later", 3);
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let after = master.client();
+    eventually("the state is back", || after.param("/later").is_some());
+    let names = params!["/good", "/ns/good", "/ns/fine", "/later"];
+    assert_eq!(
+        after.ok("getParamNames", params!["/n"]),
+        Value::Array(names)
+    );
+    let date = Value::DateTime("a&amp;b >".to_owned());
+    assert_eq!(
+        after.param("/ns"),
+        Some(tree! { "good" => 2, "fine" => date })
+    );
+}
+
+/// What came through rosrescue itself is kept, and left out where it would spoil a new master.
+#[test]
+fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    let client = rescue.client();
+    client.set_param("/bad", poison());
+    client.set_param("/good", 1);
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let after = master.client();
+    eventually("the state is back", || after.param("/good").is_some());
+    assert_eq!(after.param("/"), Some(tree! { "good" => 1 }));
+    rescue.wait_line("what was left out", |line| {
+        line.contains("the parameter `/bad`")
     });
 }

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use crate::xmlrpc::{Struct, Value};
+use crate::xmlrpc::{Reply, Struct, Value, decode_reply, encode_reply};
 
 /// Deepest nesting of arrays and structs in a reply, the reply's own array counted, that rosmaster
 /// can write before Python's recursion limit ends it. Measured with Python 3.11.
@@ -171,6 +171,25 @@ fn error_within(value: &Value, levels: usize) -> Option<&'static str> {
     }
 }
 
+/// Whether a reply that holds this value, inside so many `levels` less than the deepest, is a document
+/// with that value in it.
+fn is_returnable(value: &Value, levels: usize) -> bool {
+    error_within(value, levels).is_none() && !holds_markup(value)
+}
+
+/// Whether a date's text is taken for markup by whoever reads the reply: CPython does not escape it.
+fn holds_markup(value: &Value) -> bool {
+    match value {
+        Value::DateTime(text) if text.contains(['<', '>', '&']) => {
+            let reply = Reply::Value(value.clone());
+            decode_reply(&encode_reply(&reply)).as_ref() != Ok(&reply)
+        }
+        Value::Array(elements) => elements.iter().any(holds_markup),
+        Value::Struct(members) => members.values().any(holds_markup),
+        _ => false,
+    }
+}
+
 /// Levels of a namespace within the tree that can be written in a multicall's result, where the tree
 /// lies in the result's list, the entry's, and the answer's.
 const DEEPEST_NAMESPACE: usize = DEEPEST_REPLY - 4;
@@ -178,7 +197,7 @@ const DEEPEST_NAMESPACE: usize = DEEPEST_REPLY - 4;
 /// Whether a multicall can return the whole tree.
 pub(super) fn is_writable(tree: &Struct) -> bool {
     let mut values = tree.values();
-    values.all(|value| error_within(value, DEEPEST_NAMESPACE).is_none())
+    values.all(|value| is_returnable(value, DEEPEST_NAMESPACE))
 }
 
 /// The tree without what a master could take but never return, and the keys of what was left out.
@@ -193,7 +212,7 @@ fn keep_writable(tree: &Struct, path: &str, levels: usize, left_out: &mut Vec<St
     for (key, value) in tree {
         let path = format!("{path}/{key}");
         let kept_value = match value {
-            _ if error_within(value, levels).is_none() => Some(value.clone()),
+            _ if is_returnable(value, levels) => Some(value.clone()),
             Value::Struct(members) if levels > 1 => Some(Value::Struct(keep_writable(
                 members,
                 &path,
@@ -266,6 +285,7 @@ mod tests {
             ),
             ("nil".into(), Value::Array(vec![Value::Nil])),
         ]);
+        assert!(!is_writable(&poisoned));
         let (kept, left_out) = writable(&poisoned);
         assert_eq!(left_out, ["/a/big", "/nil"]);
         let good = Struct::from([("good".into(), Value::Int(1))]);
@@ -273,5 +293,38 @@ mod tests {
             Value::Struct(kept),
             Value::Struct(Struct::from([("a".into(), Value::Struct(good))]))
         );
+    }
+
+    #[test]
+    fn a_date_is_left_out_if_its_text_breaks_the_reply() {
+        let tree = |text: &str| {
+            let date = Value::Array(vec![Value::DateTime(text.to_owned())]);
+            Struct::from([("d".to_owned(), date)])
+        };
+        for fine in [
+            "",
+            "20240101T00:00:00",
+            "a > b",
+            "a&amp;b",
+            "&lt;",
+            "a\rb",
+            "]]",
+        ] {
+            assert!(is_writable(&tree(fine)), "{fine}");
+        }
+        for broken in [
+            "a<b",
+            "a & b",
+            "&nbsp;",
+            "]]>",
+            "a<!-- -->",
+            "</dateTime.iso8601></value><value>",
+        ] {
+            assert_eq!(
+                writable(&tree(broken)),
+                (Struct::new(), vec!["/d".to_owned()])
+            );
+            assert!(!is_writable(&tree(broken)), "{broken}");
+        }
     }
 }

@@ -46,21 +46,22 @@ impl Salvage {
         Some(Call::new("getParam", vec![CALLER_ID.into(), key.into()]))
     }
 
-    /// Takes in the reply to [`Salvage::next`]. A key that vanished meanwhile is left out.
-    pub fn take(&mut self, reply: &Reply) {
+    /// Takes in the reply to [`Salvage::next`], none if it was no XML-RPC. A key that vanished
+    /// meanwhile is left out.
+    pub fn take(&mut self, reply: Option<&Reply>) {
         let Some(key) = self.open.pop() else { return };
         match reply {
-            Reply::Value(Value::Array(fields)) => {
+            Some(Reply::Value(Value::Array(fields))) => {
                 if let [Value::Int(1), _, value] = fields.as_slice() {
                     let key = format!("/{key}").into();
                     let params = vec![CALLER_ID.into(), key, value.clone()];
                     self.found.apply(&Call::new("setParam", params));
                 }
             }
-            Reply::Value(_) | Reply::Fault { .. } if self.leaves.contains(&key) => {
+            _ if self.leaves.contains(&key) => {
                 self.unreadable.push(format!("/{key}"));
             }
-            Reply::Value(_) | Reply::Fault { .. } => self.enter(&format!("{key}/")),
+            _ => self.enter(&format!("{key}/")),
         }
     }
 
@@ -117,7 +118,7 @@ mod tests {
             asked += 1;
             // As rosmaster: a value that cannot be written is a fault.
             let reply = ask(&mut master, &call);
-            salvage.take(&reply);
+            salvage.take(Some(&reply));
         }
         let (tree, unreadable) = salvage.finish();
         assert_eq!(tree, whole);
@@ -130,6 +131,6 @@ mod tests {
         assert!(Salvage::new(&Reply::Value(Value::Int(1))).is_none());
         let mut salvage = Salvage::default();
         assert_eq!(salvage.next(), None);
-        salvage.take(&Reply::Value(Value::Nil));
+        salvage.take(Some(&Reply::Value(Value::Nil)));
     }
 }

@@ -4,6 +4,7 @@ use thiserror::Error;
 
 use super::upstream::{CallError, Connection};
 use crate::master::{FirstLook, Mark, Master, NotAMaster, Salvage};
+use crate::xmlrpc::Call;
 
 /// A look that showed nothing.
 #[derive(Debug, Error)]
@@ -19,13 +20,27 @@ pub enum LookError {
 
 /// The first look; without the parameters if the master cannot return one of them.
 pub async fn first(connection: &mut Connection, mark: &Mark) -> Result<FirstLook, LookError> {
-    match FirstLook::decode(&connection.call(&FirstLook::call(mark)).await?) {
-        Err(NotAMaster::ParamsUnreadable { .. }) => {
-            let call = FirstLook::call_without_params(mark);
-            Ok(FirstLook::decode(&connection.call(&call).await?)?)
+    let whole = look(connection, &FirstLook::call(mark)).await;
+    match whole {
+        Err(LookError::NotAMaster(
+            NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
+        )) => look(connection, &FirstLook::call_without_params(mark)).await,
+        Err(error) if is_broken_document(&error) => {
+            let rest = look(connection, &FirstLook::call_without_params(mark)).await;
+            // Whoever speaks no XML-RPC at all may have closed the connection.
+            rest.map_err(|_| error)
         }
-        look => Ok(look?),
+        whole => whole,
     }
+}
+
+async fn look(connection: &mut Connection, call: &Call) -> Result<FirstLook, LookError> {
+    Ok(FirstLook::decode(&connection.call(call).await?)?)
+}
+
+/// Whether a parameter may have broken the document: a master does not escape a date's text.
+fn is_broken_document(error: &LookError) -> bool {
+    matches!(error, LookError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
 
 /// The second look, and with it the state that the master holds.
@@ -51,14 +66,18 @@ async fn salvage(first: FirstLook, connection: &mut Connection) -> Result<FirstL
         return Ok(first);
     };
     while let Some(call) = salvage.next() {
-        salvage.take(&connection.call(&call).await?);
+        match connection.call(&call).await.map_err(LookError::from) {
+            Ok(reply) => salvage.take(Some(&reply)),
+            Err(error) if is_broken_document(&error) => salvage.take(None),
+            Err(error) => return Err(error),
+        }
     }
     let (params, unreadable) = salvage.finish();
     tracing::warn!(
         ?unreadable,
         "the master holds parameters that it can never return; they are not protected, and neither \
          they nor the namespaces around them can be read by anybody. Delete them, or set them to \
-         what fits 32 bits"
+         numbers of 32 bits and dates without markup"
     );
     Ok(first.with_params(params))
 }
