@@ -25,9 +25,6 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 /// A master that has served for so long ends a crash loop. One that always lived longer could not
 /// die more than [`DEATHS_AT_ONCE`] times within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// A dying master may still take connections for so long, and close them at once. That is no second
-/// death.
-const DYING: Duration = Duration::from_millis(100);
 /// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
 /// seconds; a rosmaster whose port was taken stays alive without ever listening.
 const START_LIMIT: Duration = Duration::from_secs(30);
@@ -74,8 +71,9 @@ pub struct Lifecycle {
     serving_since: Option<Instant>,
     /// A master of others has closed its connection, and it is not known yet whether it died.
     lost: bool,
-    /// When a master of others was counted as dead, until its port refuses.
-    dying: Option<Instant>,
+    /// A master of others was counted as dead, and neither has its port refused nor anybody answered
+    /// there since.
+    dying: bool,
     missed: u32,
     timer: Option<(Instant, Timer)>,
 }
@@ -94,7 +92,7 @@ impl Lifecycle {
             crash_loop: false,
             serving_since: None,
             lost: false,
-            dying: None,
+            dying: false,
             missed: 0,
             timer: None,
         }
@@ -115,6 +113,11 @@ impl Lifecycle {
     /// Deaths of masters that were noticed since the start.
     pub fn deaths(&self) -> u64 {
         self.total_deaths
+    }
+
+    /// The master that is examined has answered: if it ends now, that is a death of its own.
+    pub fn answered(&mut self) {
+        self.dying = false;
     }
 
     /// Takes in what happened at `now`; answers what is to be done, in order.
@@ -144,10 +147,9 @@ impl Lifecycle {
             // It died while it was being examined, or it closes every connection: not in a rush.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
-                let again = self.dying.is_some_and(|at| now.duration_since(at) < DYING);
+                let again = std::mem::replace(&mut self.dying, true);
                 if self.supervision == Supervision::Theirs && !again {
                     actions.extend(self.their_death(now));
-                    self.dying = Some(now);
                 }
                 actions
             }
@@ -157,13 +159,14 @@ impl Lifecycle {
             Input::ConnectionLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
-                    Input::ThreadEnded => Cause::Exited,
+                    Input::ThreadEnded => Cause::ThreadEnded,
                     _ => Cause::ConnectionLost,
                 };
                 self.lost(now, cause, vec![Action::Connect])
             }
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
+                self.dying = false;
                 self.phase = Phase::Serving;
                 self.seeking_since = None;
                 self.serving_since = Some(now);
@@ -244,7 +247,7 @@ impl Lifecycle {
     }
 
     fn refused(&mut self, now: Instant) -> Vec<Action> {
-        self.dying = None;
+        self.dying = false;
         match self.child {
             Some(since) if now.duration_since(since) > START_LIMIT => self.give_up(now),
             _ => {

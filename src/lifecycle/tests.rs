@@ -90,7 +90,7 @@ fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
     script
         .feed(
             Input::ThreadEnded,
-            &[Action::ShutGate(Cause::Exited), Action::Connect],
+            &[Action::ShutGate(Cause::ThreadEnded), Action::Connect],
         )
         // The dying process still takes connections.
         .feed(Input::Connected, &[Action::Examine])
@@ -102,7 +102,7 @@ fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
 
 #[test]
 fn a_master_of_others_whose_thread_ends_dies_once() {
-    let lost = [Action::ShutGate(Cause::Exited), Action::Connect];
+    let lost = [Action::ShutGate(Cause::ThreadEnded), Action::Connect];
     let mut script = Script::serving(Supervision::Theirs);
     script
         .feed(Input::ThreadEnded, &lost)
@@ -125,7 +125,7 @@ fn a_thread_that_ended_alone_is_no_death() {
     script
         .feed(
             Input::ThreadEnded,
-            &[Action::ShutGate(Cause::Exited), Action::Connect],
+            &[Action::ShutGate(Cause::ThreadEnded), Action::Connect],
         )
         .serve(false);
     assert_eq!(script.machine.deaths(), 0);
@@ -406,14 +406,15 @@ fn the_rate_of_restarts_is_bounded() {
     }
 }
 
-/// A dying process takes connections until its listening socket is closed, which comes last.
+/// A dying process takes connections until its listening socket is closed, which comes last; and a
+/// relay before a dead master takes and closes them for ever.
 #[test]
 fn a_master_that_is_still_dying_dies_once() {
     let mut script = Script::serving(Supervision::Theirs);
     script.lose().feed(Input::Connected, &[Action::Examine]);
-    for _ in 0..3 {
+    for _ in 0..10 {
         script.feed(Input::ConnectionLost, &[]);
-        script.now += DYING / 10;
+        script.now += Duration::from_millis(100);
         script
             .feed(Input::Wake, &[Action::Connect])
             .feed(Input::Connected, &[Action::Examine]);
@@ -425,4 +426,10 @@ fn a_master_that_is_still_dying_dies_once() {
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[]);
     assert_eq!(script.machine.deaths(), 2, "it was gone, and came back");
+    script
+        .feed(Input::Wake, &[])
+        .feed(Input::Connected, &[Action::Examine]);
+    script.machine.answered();
+    script.feed(Input::ConnectionLost, &[]);
+    assert_eq!(script.machine.deaths(), 3, "another one had answered");
 }

@@ -67,6 +67,8 @@ pub enum Input {
 pub enum Cause {
     /// The master's connection ended: it died, or it closed an idle connection.
     ConnectionLost,
+    /// A thread of the master ended: it dies, or it is being stopped in order.
+    ThreadEnded,
     /// The master's process ended.
     Exited,
     /// The master no longer answers.
@@ -80,6 +82,7 @@ impl Cause {
     pub fn as_str(self) -> &'static str {
         match self {
             Self::ConnectionLost => "the master's connection ended",
+            Self::ThreadEnded => "a thread of the master ended",
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
             Self::Stopping => "rosrescue stops",

@@ -12,14 +12,15 @@ use rustix::{
 };
 use tokio::net::unix::pipe::Receiver;
 
-/// So many threads are watched: one of them may be the last.
-const WATCHED: usize = 3;
+/// So many threads are watched: one of them may be the last. A rosmaster with `-w 1` has no more that
+/// live as long as it does, one that calls nodes and one that serves.
+const WATCHED: usize = 2;
 /// The descriptor is to tell of the end of a thread, not of a process. Linux 6.9 or later.
 const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits());
 
 /// Resolves when one of the oldest threads of the process `pid` has ended, other than the first:
 /// Linux tells of that one's end only with that of the whole process. In rosmaster the oldest ones
-/// are those of the pool that calls nodes, which live as long as the master does.
+/// live as long as the master does.
 ///
 /// # Errors
 ///

@@ -26,7 +26,7 @@ use self::{
     report::{Outage, Outcome},
 };
 use crate::{
-    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, Suspicion},
+    lifecycle::{Action, Cause, InFlight, Input, Lifecycle, Supervision, Suspicion},
     proxy::{
         Proxy,
         gate::{Keeper, StandIn, State},
@@ -139,7 +139,11 @@ impl Guard {
         match input {
             Input::ConnectionLost | Input::Exited | Input::Unreachable => {
                 let careful = self.suspicion.trial().is_some();
-                self.suspicion.died(self.progress.take());
+                let at = self.progress.take();
+                if at != InFlight::Nothing {
+                    self.lifecycle.answered();
+                }
+                self.suspicion.died(at);
                 if !careful && self.suspicion.trial().is_some() {
                     tracing::warn!(
                         "masters die while they are given the state: it is given entry by entry, \

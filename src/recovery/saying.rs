@@ -19,8 +19,10 @@ impl Guard {
         let report = self.outage.report(Instant::now(), examination);
         let uri = self.proxy.uri.clone();
         self.proxy.shadow.set_identity(report.master_pid, uri);
-        if report.outcome == Outcome::Resumed && cause == Cause::ConnectionLost.as_str() {
-            // Such as after each idle connection that a master with `-t` closes.
+        let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
+        if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
+            // Such as after each idle connection that a master with `-t` closes; or it is being
+            // stopped, and its threads end before it does.
             tracing::debug!("the same master goes on");
             return;
         }
