@@ -75,6 +75,8 @@ pub struct Lifecycle {
     /// there since.
     dying: bool,
     missed: u32,
+    /// Spawns that failed since the last that did not.
+    failed_spawns: usize,
     timer: Option<(Instant, Timer)>,
 }
 
@@ -94,6 +96,7 @@ impl Lifecycle {
             lost: false,
             dying: false,
             missed: 0,
+            failed_spawns: 0,
             timer: None,
         }
     }
@@ -183,11 +186,14 @@ impl Lifecycle {
             Input::ProbeMissed => self.probe_missed(now),
             Input::Spawned => {
                 self.child = Some(now);
+                self.failed_spawns = 0;
                 self.seeking_since = Some(now);
                 vec![Action::Connect]
             }
             Input::SpawnFailed => {
-                self.timer = Some((now + self.pause_before_spawn(), Timer::Spawn));
+                let pause = pause_after(self.failed_spawns).max(self.pause_before_spawn());
+                self.failed_spawns += 1;
+                self.timer = Some((now + pause, Timer::Spawn));
                 Vec::new()
             }
             Input::Exited => {
@@ -344,14 +350,15 @@ impl Lifecycle {
     }
 
     fn pause_before_spawn(&self) -> Duration {
-        match self.deaths.len().checked_sub(DEATHS_AT_ONCE + 1) {
-            None => Duration::ZERO,
-            Some(further) => {
-                let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
-                (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
-            }
-        }
+        let further = self.deaths.len().checked_sub(DEATHS_AT_ONCE + 1);
+        further.map_or(Duration::ZERO, pause_after)
     }
+}
+
+/// The pause after the first failure and `further` ones.
+fn pause_after(further: usize) -> Duration {
+    let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
+    (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
 }
 
 /// Eager at first, when a restart is a matter of milliseconds, and cheap later. A refused connect

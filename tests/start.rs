@@ -17,7 +17,9 @@ use std::thread;
 use std::time::Duration;
 
 use rustix::process::Signal;
-use support::{Rescue, Rosmaster, Scratch, Setup, eventually, free_port, holds, params};
+use support::{
+    Rescue, Rosmaster, Scratch, Setup, eventually, find_program, free_port, holds, params,
+};
 
 /// Runs rosrescue to its end, which must come by itself, with `code`, one clear sentence on standard
 /// error, and nothing left behind. Gives the sentence.
@@ -303,6 +305,42 @@ fn no_rosmaster_installed() {
     if rescue.exited().is_none() {
         assert_eq!(rescue.terminate().code(), Some(0));
     }
+}
+
+/// Such as while its package is being upgraded.
+#[test]
+fn a_rosmaster_that_is_gone_for_a_while_is_started_when_it_is_back() {
+    let scratch = Scratch::new();
+    let program = scratch.path("rosmaster");
+    let away = scratch.path("away");
+    fs::copy(find_program("rosmaster"), &program).unwrap();
+    let port = free_port();
+    let arguments = [
+        "core",
+        "--no-rosout",
+        "-p",
+        &port.to_string(),
+        "--rosmaster",
+    ];
+    let setup = Setup::bare(&scratch, arguments).arg(&program);
+    let mut rescue = setup.at_port(port).start();
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    let dead = client.master_pid().expect("the master's process id");
+    fs::rename(&program, &away).unwrap();
+    support::signal(dead, Signal::KILL);
+    let program_text = program.to_str().unwrap();
+    rescue.wait_line("which program cannot be started", |line| {
+        line.contains("cannot start a master") && line.contains(program_text)
+    });
+    assert!(holds(Duration::from_secs(3), || rescue.exited().is_none()));
+    let lines = rescue.stderr().len();
+    assert!(lines < 30, "{lines} lines:\n{}", rescue.stderr().join("\n"));
+    fs::rename(&away, &program).unwrap();
+    eventually("another master is there", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    assert_eq!(client.param("/kept"), Some(1.into()));
 }
 
 #[test]

@@ -244,6 +244,29 @@ fn a_crash_loop_is_slowed_down_and_reported_but_never_given_up() {
 }
 
 #[test]
+fn a_master_that_cannot_be_spawned_is_tried_again_with_growing_pauses() {
+    let mut script = Script::serving(Supervision::Ours);
+    script
+        .lose()
+        .feed(Input::Refused, &[])
+        .feed(Input::Exited, &[Action::Spawn]);
+    for _ in 0..2 {
+        for pause_ms in [500, 1_000, 2_000, 4_000, 8_000, 10_000, 10_000] {
+            script
+                .feed(Input::SpawnFailed, &[])
+                .wake(Duration::from_millis(pause_ms), &[Action::Spawn]);
+        }
+        // One that can be spawned ends the row.
+        script
+            .feed(Input::Spawned, &[Action::Connect])
+            .serve(true)
+            .lose()
+            .feed(Input::Exited, &[Action::Spawn]);
+    }
+    assert_eq!(script.machine.deaths(), 3, "what never lived has not died");
+}
+
+#[test]
 fn a_hung_child_is_killed_after_so_many_missed_probes() {
     let mut script = Script::serving(Supervision::Ours);
     script

@@ -403,8 +403,8 @@ impl Guard {
             // At the start there is nothing to protect yet: better to say so than to try for ever.
             Err(error) if self.served.is_none() && !self.known => Err(error),
             Err(error) => {
-                tracing::error!(%error, "cannot start a master");
                 process.report_failure();
+                self.say(format!("cannot start a master: {error}"));
                 Ok(())
             }
         }
