@@ -18,6 +18,9 @@ use tokio::process::{Child, Command};
 use crate::config::SupervisedConfig;
 
 mod left;
+mod rosout;
+
+pub use rosout::Rosout;
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
@@ -98,16 +101,11 @@ impl Rosmaster {
             Some(path) => return Err(SupervisorError::NotAProgram { path: path.clone() }),
             None => find_program("rosmaster", &["bin"]).ok_or(SupervisorError::NoRosmaster)?,
         };
-        let beside = |suffix: &str| {
-            let mut name = checkpoint.as_os_str().to_owned();
-            name.push(suffix);
-            PathBuf::from(name)
-        };
         Ok(Self {
             program,
             config: config.clone(),
-            output: beside(".rosmaster-output.log"),
-            log_config: beside(".rosmaster-logging.conf"),
+            output: beside(checkpoint, ".rosmaster-output.log"),
+            log_config: beside(checkpoint, ".rosmaster-logging.conf"),
             checkpoint: checkpoint.to_owned(),
         })
     }
@@ -195,12 +193,24 @@ impl Rosmaster {
 
     /// The end of what the last rosmaster wrote, for the message that it died early.
     pub fn last_words(&self) -> String {
-        let text = std::fs::read(&self.output).unwrap_or_default();
-        let tail = text
-            .get(text.len().saturating_sub(400)..)
-            .unwrap_or_default();
-        String::from_utf8_lossy(tail).trim().to_owned()
+        tail_of(&self.output)
     }
+}
+
+/// A file that belongs to `checkpoint`.
+fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
+    let mut name = checkpoint.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
+}
+
+/// The end of a file, for people; nothing if it cannot be read.
+fn tail_of(path: &Path) -> String {
+    let text = std::fs::read(path).unwrap_or_default();
+    let tail = text
+        .get(text.len().saturating_sub(400)..)
+        .unwrap_or_default();
+    String::from_utf8_lossy(tail).trim().to_owned()
 }
 
 fn create(path: &Path) -> io::Result<File> {
@@ -210,21 +220,6 @@ fn create(path: &Path) -> io::Result<File> {
         .truncate(true)
         .mode(0o600)
         .open(path)
-}
-
-/// The command that runs rosout as a node of the master at `uri`.
-pub fn rosout(uri: &str) -> Option<Command> {
-    let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
-        Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
-    })?;
-    let mut command = Command::new(program);
-    command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
-    command
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .process_group(0);
-    Some(command)
 }
 
 /// A program of a ROS in `/opt/ros` finds its modules and libraries only with that ROS's paths, which
@@ -411,9 +406,6 @@ mod tests {
             python.unwrap(),
             Path::new("/opt/ros/noetic/lib/python3/dist-packages")
         );
-        let set = paths("/opt/ros/noetic/lib/rosout/rosout", 3);
-        let library = std::env::split_paths(&set[OsStr::new("LD_LIBRARY_PATH")]).next();
-        assert_eq!(library.unwrap(), Path::new("/opt/ros/noetic/lib"));
         assert!(paths("/usr/bin/rosmaster", 2).is_empty());
     }
 

@@ -11,11 +11,12 @@
 mod support;
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use support::{Mode, Robot, alive, eventually, holds, params};
+use support::{Mode, Robot, Scratch, Setup, alive, eventually, free_port, holds, params};
 
 #[test]
 fn an_orderly_stop_leaves_nothing_behind() {
@@ -121,4 +122,31 @@ fn a_core_keeps_rosout_alive() {
             && now.subscribers == before.subscribers
             && now.nodes != before.nodes
     });
+}
+
+/// One that ends at once, such as without its libraries, is started ever more seldom, and says why.
+#[test]
+fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
+    let scratch = Scratch::new();
+    let folder = scratch.path("bin");
+    fs::create_dir(&folder).unwrap();
+    let program = folder.join("rosout");
+    fs::write(&program, "#!/bin/sh\necho no library here >&2\nexit 127\n").unwrap();
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let port = free_port();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port.to_string()]);
+    let mut rescue = setup.env("PATH", path).at_port(port).start();
+    let line = rescue.wait_line("that it has ended", |line| {
+        line.contains("rosout has ended")
+    });
+    assert!(line.contains("no library here"), "{line}");
+    assert!(line.contains("127"), "{line}");
+    thread::sleep(Duration::from_secs(8));
+    let lines = rescue.stderr();
+    let starts = lines.iter().filter(|line| line.contains("started rosout"));
+    // At 0, 1, 3 and 7 seconds.
+    let starts = starts.count();
+    assert!((2..=4).contains(&starts), "{starts}: {lines:?}");
+    assert_eq!(rescue.terminate().code(), Some(0));
 }

@@ -2,7 +2,7 @@
 
 use std::{
     sync::{Arc, atomic::Ordering},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use tokio_util::sync::CancellationToken;
@@ -11,7 +11,7 @@ use super::node::{self, Sign};
 use crate::{
     master::Kind,
     proxy::Proxy,
-    supervisor,
+    supervisor::{self, Rosout},
     xmlrpc::{Call, Reply, Value},
 };
 
@@ -19,8 +19,11 @@ use crate::{
 const CALLER_ID: &str = "/rosrescue";
 /// How long `rosversion` may take: it is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
-/// Pause before a rosout that has ended is started again, as roslaunch's respawn has it.
+/// Pause before a rosout that has ended is started again, as roslaunch's respawn has it. It doubles
+/// with each one that did not live for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
+/// The longest of these pauses.
+const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 /// The node that rosout is.
 const ROSOUT: &str = "/rosout";
 
@@ -93,7 +96,13 @@ async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
 
 /// Keeps a rosout running: ours, or one that is there already.
 async fn keep_rosout(proxy: &Proxy) {
+    let Some(rosout) = Rosout::find(&proxy.config.checkpoint) else {
+        tracing::warn!("no rosout is installed (apt-get install rosout): /rosout is not collected");
+        return;
+    };
+    let mut pause = RESPAWN;
     loop {
+        let start = Instant::now();
         match living_rosout(proxy).await {
             Some(pid) => {
                 proxy.rosout.store(pid, Ordering::Relaxed);
@@ -101,27 +110,24 @@ async fn keep_rosout(proxy: &Proxy) {
                     tokio::time::sleep(RESPAWN).await;
                 }
             }
-            None => {
-                let Some(mut command) = supervisor::rosout(&proxy.uri) else {
-                    tracing::warn!(
-                        "no rosout is installed (apt-get install rosout): /rosout is not collected"
-                    );
-                    return;
-                };
-                match command.spawn() {
-                    Ok(mut child) => {
-                        let pid = child.id().unwrap_or_default();
-                        proxy.rosout.store(pid, Ordering::Relaxed);
-                        tracing::info!(pid, "started rosout");
-                        let ended = child.wait().await.map(supervisor::describe);
-                        tracing::warn!(pid, how = ended.unwrap_or_default(), "rosout has ended");
-                    }
-                    Err(error) => tracing::warn!(%error, "cannot start rosout"),
+            None => match rosout.spawn(&proxy.uri) {
+                Ok(mut child) => {
+                    let pid = child.id().unwrap_or_default();
+                    proxy.rosout.store(pid, Ordering::Relaxed);
+                    tracing::info!(pid, "started rosout");
+                    let how = child.wait().await.map(supervisor::describe);
+                    let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
+                    tracing::warn!(pid, how, last_words, "rosout has ended");
                 }
-            }
+                Err(error) => tracing::warn!(%error, "cannot start rosout"),
+            },
         }
         proxy.rosout.store(0, Ordering::Relaxed);
-        tokio::time::sleep(RESPAWN).await;
+        if start.elapsed() >= LONGEST_RESPAWN {
+            pause = RESPAWN;
+        }
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(LONGEST_RESPAWN);
     }
 }
 

@@ -1,0 +1,77 @@
+//! rosout, the node that collects the log.
+
+use std::{
+    io,
+    path::{Path, PathBuf},
+    process::Stdio,
+};
+
+use tokio::process::{Child, Command};
+
+use super::{add_ros_paths, beside, create, find_program, is_program, tail_of};
+
+/// Starts rosouts.
+#[derive(Debug)]
+pub struct Rosout {
+    program: PathBuf,
+    /// What the last one wrote to stderr.
+    output: PathBuf,
+}
+
+impl Rosout {
+    /// Finds the program, if there is one. A file for its last words will lie beside `checkpoint`.
+    pub fn find(checkpoint: &Path) -> Option<Self> {
+        let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
+            Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
+        })?;
+        Some(Self {
+            program,
+            output: beside(checkpoint, ".rosout-output.log"),
+        })
+    }
+
+    /// Starts one as a node of the master at `uri`. It outlives us: dropping the child does not end
+    /// it.
+    pub fn spawn(&self, uri: &str) -> io::Result<Child> {
+        let stderr = create(&self.output).map_or_else(|_| Stdio::null(), Stdio::from);
+        self.command(uri).stderr(stderr).spawn()
+    }
+
+    fn command(&self, uri: &str) -> Command {
+        let mut command = Command::new(&self.program);
+        command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
+        add_ros_paths(&mut command, &self.program, 3);
+        command
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .process_group(0);
+        command
+    }
+
+    /// The end of what the last one wrote.
+    pub fn last_words(&self) -> String {
+        tail_of(&self.output)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ffi::OsStr;
+
+    use super::*;
+
+    #[test]
+    fn a_rosout_in_opt_finds_its_libraries() {
+        let rosout = Rosout {
+            program: PathBuf::from("/opt/ros/noetic/lib/rosout/rosout"),
+            output: PathBuf::new(),
+        };
+        let command = rosout.command("http://localhost:1/");
+        let mut set = command.as_std().get_envs();
+        let (_, paths) = set
+            .find(|(name, _)| *name == OsStr::new("LD_LIBRARY_PATH"))
+            .unwrap();
+        let first = std::env::split_paths(paths.unwrap()).next();
+        assert_eq!(first.unwrap(), Path::new("/opt/ros/noetic/lib"));
+    }
+}
