@@ -142,7 +142,7 @@ impl Config {
             None => ros_env::bind_addresses(env),
             Some(text) => vec![parse_address(text, "an IP address such as 10.0.0.7 or ::")?],
         };
-        let listen = addresses
+        let listen: Vec<_> = addresses
             .into_iter()
             .map(|address| SocketAddr::new(address, port))
             .collect();
@@ -154,7 +154,7 @@ impl Config {
             rosout: !args.no_rosout,
             log_dir: ros_env::log_dir(env),
         });
-        let host = ros_env::advertised_host(env, hostname, local_address);
+        let host = advertised_host(&listen, env, hostname, local_address);
         Self::common(&args.common, env, listen, MasterUri { host, port }, master)
     }
 
@@ -170,7 +170,7 @@ impl Config {
         let port = listen
             .first()
             .map_or(ros_env::DEFAULT_MASTER_PORT, SocketAddr::port);
-        let host = ros_env::advertised_host(env, hostname, local_address);
+        let host = advertised_host(&listen, env, hostname, local_address);
         let advertised = MasterUri { host, port };
         Self::common(
             &args.common,
@@ -247,6 +247,22 @@ fn seconds(option: &'static str, given: f64, most: f64) -> Result<Duration, Usag
         return Err(error);
     }
     Duration::try_from_secs_f64(given).map_err(|_| error)
+}
+
+/// The host by which others reach us. Without a word of the environment it is the address that is
+/// served, if that is a single one: nothing listens at the others.
+fn advertised_host(
+    listen: &[SocketAddr],
+    env: Lookup<'_>,
+    hostname: &str,
+    local_address: Option<IpAddr>,
+) -> String {
+    match listen.first().map(SocketAddr::ip) {
+        Some(served) if !served.is_unspecified() && ros_env::address_override(env).is_none() => {
+            served.to_string()
+        }
+        _ => ros_env::advertised_host(env, hostname, local_address),
+    }
 }
 
 fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, UsageError> {
@@ -329,6 +345,25 @@ mod tests {
             let config = config(&["proxy", "--master", "http://m:1", "--listen", given]).unwrap();
             assert_eq!(config.listen.first().unwrap().to_string(), first, "{given}");
         }
+    }
+
+    #[test]
+    fn the_address_that_is_served_is_the_one_that_is_said() {
+        let core = |given| config(&["core", "--listen", given]).unwrap().advertised;
+        assert_eq!(core("192.0.2.2").to_string(), "http://192.0.2.2:12345/");
+        assert_eq!(core("::1").to_string(), "http://[::1]:12345/");
+        for all in ["0.0.0.0", "::"] {
+            assert_eq!(core(all).to_string(), "http://robot:12345/");
+        }
+        let given = ["--listen", "127.0.0.3:4000"];
+        let proxy = ["proxy", "--master", "http://m:1"];
+        let proxy = config(&[&proxy[..], &given].concat()).unwrap().advertised;
+        assert_eq!(proxy.to_string(), "http://127.0.0.3:4000/");
+        // A word of the environment comes first: there may be a NAT before us.
+        let cli = Cli::parse_from(["rosrescue", "--listen", "192.0.2.2", "-p", "1"]);
+        let env = |name: &str| (name == "ROS_IP").then(|| "10.0.0.7".to_owned());
+        let config = Config::core(&cli.core, &env, "robot", None).unwrap();
+        assert_eq!(config.advertised.to_string(), "http://10.0.0.7:1/");
     }
 
     #[test]

@@ -11,14 +11,14 @@
 mod support;
 
 use std::fs;
-use std::net::TcpListener;
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
 use rustix::process::Signal;
 use support::{
-    Rescue, Rosmaster, Scratch, Setup, eventually, find_program, free_port, holds, params,
+    Client, Rescue, Rosmaster, Scratch, Setup, eventually, find_program, free_port, holds, params,
 };
 
 /// Runs rosrescue to its end, which must come by itself, with `code`, one clear sentence on standard
@@ -305,6 +305,37 @@ fn no_rosmaster_installed() {
     if rescue.exited().is_none() {
         assert_eq!(rescue.terminate().code(), Some(0));
     }
+}
+
+/// rosout is a client as any: it must find the master by what is said.
+#[test]
+fn an_address_to_serve_is_the_one_that_is_said() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let said = format!("http://127.0.0.7:{port}/");
+    let arguments = ["core", "--listen", "127.0.0.7", "-p", &port.to_string()];
+    // An empty variable is none.
+    let mut rescue = Setup::bare(&scratch, arguments).env("ROS_IP", "").spawn();
+    rescue.wait_line("that address", |line| {
+        line == format!("ROS_MASTER_URI={said}")
+    });
+    let client = Client::at("127.0.0.7", port);
+    eventually("rosout has registered", || {
+        let name = params!["/test", "/rosout"];
+        client.ask("lookupNode", name).is_some()
+    });
+    assert_eq!(client.ok("getUri", params!["/test"]), said.as_str().into());
+    assert!(TcpStream::connect(("127.0.0.1", port)).is_err());
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    let master = Rosmaster::start(&scratch);
+    let address = format!("127.0.0.7:{port}");
+    let uri = format!("http://127.0.0.1:{}", master.port);
+    let arguments = ["proxy", "--master", &uri, "--listen", &address];
+    let mut rescue = Setup::bare(&scratch, arguments).env("ROS_IP", "").spawn();
+    rescue.wait_line("that address", |line| {
+        line == format!("ROS_MASTER_URI={said}")
+    });
 }
 
 /// Such as while its package is being upgraded.
