@@ -73,12 +73,18 @@ async fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error:
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
+    // The terminal was closed. Whoever started us with nohup does not want to know.
+    let mut hangup = match is_hangup_ignored() {
+        true => None,
+        false => Some(signal(SignalKind::hangup())?),
+    };
     let stopper = stop.clone();
     tokio::spawn(async move {
         for first in [true, false] {
             let status = tokio::select! {
                 _ = interrupt.recv() => 130,
                 _ = terminate.recv() => 143,
+                _ = async { hangup.as_mut()?.recv().await }, if hangup.is_some() => 129,
             };
             if first {
                 stopper.cancel();
@@ -91,6 +97,15 @@ async fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error:
     names.extend(std::env::var("ROS_HOSTNAME").ok());
     app::run(config, names, stop, say).await?;
     Ok(())
+}
+
+/// Whether we were started with SIGHUP ignored, as the kernel tells.
+fn is_hangup_ignored() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    // The lowest bit is that of signal 1.
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .is_some_and(|mask| mask & 1 == 1)
 }
 
 /// Prints a line; a reader that has gone away is no reason to stop.
@@ -123,6 +138,8 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_target(false)
+        // It would be told on stderr, and panic where the terminal is gone.
+        .log_internal_errors(false)
         .with_ansi(ansi);
     match args.log_format {
         LogFormat::Text => log.init(),

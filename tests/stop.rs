@@ -12,6 +12,7 @@ mod support;
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -20,7 +21,7 @@ use support::{Mode, Robot, Scratch, Setup, alive, eventually, free_port, holds, 
 
 #[test]
 fn an_orderly_stop_leaves_nothing_behind() {
-    for signal in [Signal::TERM, Signal::INT] {
+    for signal in [Signal::TERM, Signal::INT, Signal::HUP] {
         let mut robot = Robot::start(Mode::Core);
         robot.client().set_param("/x", 1);
         let master = robot.master_pid();
@@ -83,20 +84,71 @@ fn a_core_stops_even_if_its_master_hangs() {
 
 #[test]
 fn a_second_signal_ends_at_once() {
-    let mut robot = Robot::start(Mode::Core);
-    let master = robot.master_pid();
-    // An orderly stop has to wait for this one.
-    support::stop(master);
-    robot.rescue.signal(Signal::TERM);
-    thread::sleep(Duration::from_millis(50));
-    let start = Instant::now();
-    robot.rescue.signal(Signal::INT);
-    robot.rescue.wait();
-    assert!(
-        start.elapsed() < Duration::from_secs(3),
-        "{:?}",
-        start.elapsed()
-    );
+    for (second, code) in [(Signal::INT, 130), (Signal::TERM, 143), (Signal::HUP, 129)] {
+        let mut robot = Robot::start(Mode::Core);
+        let master = robot.master_pid();
+        // An orderly stop has to wait for this one.
+        support::stop(master);
+        robot.rescue.signal(Signal::TERM);
+        thread::sleep(Duration::from_millis(50));
+        let start = Instant::now();
+        robot.rescue.signal(second);
+        assert_eq!(robot.rescue.wait().code(), Some(code));
+        assert!(
+            start.elapsed() < Duration::from_secs(3),
+            "{:?}",
+            start.elapsed()
+        );
+    }
+}
+
+/// Runs its arguments in a terminal of its own, closes that once calls pass, and ends as they do.
+const IN_A_TERMINAL: &str = r#"
+import os, pty, sys
+pid, terminal = pty.fork()
+if pid == 0:
+    os.execv(sys.argv[1], sys.argv[1:])
+said = b""
+while b"fault tolerant" not in said:
+    said += os.read(terminal, 4096)
+os.close(terminal)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) % 256)
+"#;
+
+#[test]
+fn a_terminal_that_is_closed_ends_it_in_good_order() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(&scratch, ["core", "-v", "-p", &port]).wrapped(|command| {
+        let mut python = Command::new("/usr/bin/python3");
+        scratch.prepare(&mut python);
+        python.args(["-c", IN_A_TERMINAL]);
+        python.arg(command.get_program()).args(command.get_args());
+        python
+    });
+    let mut rescue = setup.spawn();
+    assert_eq!(rescue.wait().code(), Some(0), "{:?}", rescue.output());
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_core_under_nohup_outlives_its_terminal() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port.to_string()]);
+    let setup = setup.wrapped(|command| {
+        let mut nohup = Command::new("nohup");
+        scratch.prepare(&mut nohup);
+        nohup.arg(command.get_program()).args(command.get_args());
+        nohup
+    });
+    let mut rescue = setup.at_port(port).start();
+    rescue.signal(Signal::HUP);
+    assert!(holds(Duration::from_millis(500), || rescue
+        .exited()
+        .is_none()));
+    rescue.client().set_param("/alive", true);
+    assert_eq!(rescue.terminate().code(), Some(0));
 }
 
 /// rosout is kept alive; what it says for itself in the master is there again.
