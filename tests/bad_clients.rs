@@ -11,6 +11,7 @@
 mod support;
 
 use std::io::Write;
+use std::time::{Duration, Instant};
 
 use flate2::{Compression, write::GzEncoder};
 use rosrescue::xmlrpc::{Call, Reply, Value};
@@ -143,6 +144,74 @@ fn a_request_that_stops_half_way_is_ended() {
         }
     }
     assert_eq!(robot.bare().param("/half"), None);
+}
+
+/// Whoever announces much and sends little, or nothing, takes nobody's room, and is not waited for.
+#[test]
+fn announced_bodies_take_no_room() {
+    let robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let head = "POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 67108864\r\n\r\n";
+    let chunked = "POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n";
+    let wires: Vec<_> = (0..40)
+        .map(|number| {
+            let mut wire = client.connect().unwrap();
+            let more = " ".repeat([0, 1, 100_000][number % 3]);
+            match number % 2 {
+                0 => wire.send(format!("{head}{more}").as_bytes()).unwrap(),
+                _ => wire
+                    .send(format!("{chunked}{:x}\r\n{more}", 64 << 20).as_bytes())
+                    .unwrap(),
+            }
+            wire
+        })
+        .collect();
+    let start = Instant::now();
+    for key in ["/large", "/large_too"] {
+        client.set_param(key, "z".repeat(1 << 20));
+    }
+    let took = start.elapsed();
+    assert_eq!(
+        robot.bare().param("/large"),
+        Some("z".repeat(1 << 20).into())
+    );
+    // They are given up after 10 s.
+    assert!(took < Duration::from_secs(8), "{took:?}");
+    for mut wire in wires {
+        assert!(wire.closes(PATIENCE), "it is still waited for");
+    }
+}
+
+/// There is room for four bodies of the largest size. More than that, each half sent, do not wait for
+/// each other for ever.
+#[test]
+fn more_large_bodies_than_there_is_room_for_are_taken_in_turn() {
+    let robot = Robot::start_with(Mode::Proxy, &["--max-body", "1"]);
+    let client = robot.client();
+    let requests: Vec<_> = (0..24)
+        .map(|number| {
+            let key = format!("/large/of{number}");
+            http_request(&encode_call(
+                "setParam",
+                params!["/c", key, "z".repeat(1_000_000)],
+            ))
+        })
+        .collect();
+    std::thread::scope(|scope| {
+        for request in &requests {
+            let client = client.clone();
+            scope.spawn(move || {
+                let mut wire = client.connect().unwrap();
+                let (first, second) = request.split_at(request.len() / 2);
+                wire.send(first).unwrap();
+                std::thread::sleep(Duration::from_millis(200));
+                wire.send(second).unwrap();
+                assert_eq!(wire.response().unwrap().code, 200);
+            });
+        }
+    });
+    let tree = robot.bare().param("/large").unwrap();
+    assert_eq!(tree.as_struct().unwrap().len(), requests.len());
 }
 
 /// rosmaster does not read the body behind a head that it refuses; what is left in that connection must

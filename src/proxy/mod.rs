@@ -1,6 +1,7 @@
 //! Between the nodes and the master: listener, door, gate, lane, pool, mirror.
 
 pub mod activity;
+pub mod body;
 pub mod clients;
 pub mod door;
 mod flight;

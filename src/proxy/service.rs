@@ -4,17 +4,18 @@ use std::{io::Read, net::SocketAddr, sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use flate2::read::MultiGzDecoder;
-use http_body_util::{BodyExt, Full, Limited};
+use http_body_util::Full;
 use hyper::{
     Method, Request, Response, StatusCode,
-    body::{Body, Incoming},
+    body::Incoming,
     header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER, USER_AGENT},
 };
 use thiserror::Error;
-use tokio::sync::{SemaphorePermit, oneshot};
+use tokio::sync::oneshot;
 
 use super::{
     Proxy,
+    body::{self, BodyError, Room},
     door::{self, Refusal},
     gate::{StandIn, State},
     journey::{self, Answer, LaneItem},
@@ -36,9 +37,6 @@ pub type HttpReply = Response<Full<Bytes>>;
 #[error("closed without an answer: {0}")]
 pub struct Closed(&'static str);
 
-/// Larger bodies, in bytes, wait for room in memory and are decoded outside the runtime's threads:
-/// so much takes some 0.3 ms.
-const SMALL_BODY: usize = 64 << 10;
 /// A master that takes longer to say its process id is answered for: roslaunch waits 5 s for that,
 /// and then starts a master of its own on our port.
 const IDENTITY_TIME: Duration = Duration::from_secs(1);
@@ -52,10 +50,6 @@ const ROSCPP: &[u8] = b"XMLRPC++";
 /// it may be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
                          computer only; send XML-RPC in UTF-8, without a document type";
-/// Every body is given this time, and a second more for each [`BODY_RATE`] bytes.
-const BODY_TIME: Duration = Duration::from_secs(10);
-/// The slowest link that a body is taken from, in bytes a second.
-const BODY_RATE: u64 = 64 << 10;
 
 /// Answers one request.
 pub async fn serve(
@@ -120,8 +114,8 @@ async fn post(
         encoding: request.headers().get(CONTENT_ENCODING).cloned(),
     };
     // Held until the call is answered.
-    let mut room = None;
-    let body = match read_body(&proxy, request.into_body(), &mut room).await {
+    let mut room = Room::of(&proxy.bodies);
+    let body = match body::read(request.into_body(), proxy.config.max_body, &mut room).await {
         Ok(body) => body,
         Err(BodyError::TooLarge { limit }) => {
             proxy.stats.refused.count();
@@ -131,6 +125,7 @@ async fn post(
         }
         Err(BodyError::Broken) => return Err(Closed("the request broke off")),
         Err(BodyError::TooSlow) => return Err(Closed("the request came too slowly")),
+        Err(BodyError::NoRoom) => return Err(Closed("too many large requests at the same time")),
     };
     proxy.stats.calls.count();
     let packing = Packing::of(head.encoding.as_ref());
@@ -339,45 +334,6 @@ fn refuse(proxy: &Proxy, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-enum BodyError {
-    TooLarge { limit: usize },
-    Broken,
-    TooSlow,
-}
-
-/// Reads a body. A large one first waits for room, so that many at once do not fill the memory.
-async fn read_body<'a>(
-    proxy: &'a Proxy,
-    body: Incoming,
-    room: &mut Option<SemaphorePermit<'a>>,
-) -> Result<Bytes, BodyError> {
-    let limit = proxy.config.max_body;
-    let hint = body.size_hint();
-    if hint.lower() > limit as u64 {
-        return Err(BodyError::TooLarge { limit });
-    }
-    let most = hint
-        .upper()
-        .map_or(limit, |upper| usize::try_from(upper).unwrap_or(limit));
-    let time = BODY_TIME + Duration::from_secs(most as u64 / BODY_RATE);
-    let read = async {
-        if most > SMALL_BODY {
-            let kib = u32::try_from(most.min(limit) >> 10).unwrap_or(u32::MAX);
-            // Never closed.
-            *room = proxy.bodies.acquire_many(kib).await.ok();
-        }
-        Limited::new(body, limit).collect().await
-    };
-    match tokio::time::timeout(time, read).await {
-        Err(_) => Err(BodyError::TooSlow),
-        Ok(Ok(body)) => Ok(body.to_bytes()),
-        Ok(Err(error)) if error.is::<http_body_util::LengthLimitError>() => {
-            Err(BodyError::TooLarge { limit })
-        }
-        Ok(Err(_)) => Err(BodyError::Broken),
-    }
-}
-
 /// How a body is packed, as rosmaster reads the header.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Packing {
@@ -399,7 +355,7 @@ impl Packing {
 }
 
 async fn decode(packing: Packing, body: Bytes, limit: usize) -> Option<Call> {
-    let long = body.len() > SMALL_BODY;
+    let long = body.len() > body::SMALL;
     let work = move || {
         if packing == Packing::Plain {
             return xmlrpc::decode_call(&body).ok();

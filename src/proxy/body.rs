@@ -1,0 +1,160 @@
+//! Request bodies: so large, so slow, and so many at once.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::BodyExt;
+use hyper::body::{Body, Incoming};
+use tokio::{
+    sync::{Semaphore, SemaphorePermit},
+    time::{Instant, timeout, timeout_at},
+};
+
+/// Larger bodies, in bytes, need room in memory and are decoded outside the runtime's threads: so much
+/// takes some 0.3 ms.
+pub const SMALL: usize = 64 << 10;
+/// Every body is given this time, and a second more for each [`RATE`] bytes that have arrived. No pause
+/// in it may be longer.
+const TIME: Duration = Duration::from_secs(10);
+/// The slowest link that a body is taken from, in bytes a second.
+const RATE: u64 = 64 << 10;
+/// Whoever holds this needs no room: one body can always be read to its end, so that bodies that each
+/// have a part of the room do not wait for each other.
+static LAST: Semaphore = Semaphore::const_new(1);
+
+/// Why there is no body.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BodyError {
+    /// It is larger than so many bytes.
+    TooLarge {
+        /// The limit.
+        limit: usize,
+    },
+    /// It broke off, or is no HTTP.
+    Broken,
+    /// Its bytes came too slowly.
+    TooSlow,
+    /// Others took all the room for too long.
+    NoRoom,
+}
+
+/// Room in memory for one body; given back on drop. What is announced costs nothing: a body takes
+/// twice what has arrived of it.
+#[derive(Debug)]
+pub struct Room<'a> {
+    /// In KiB.
+    pool: &'a Semaphore,
+    held: Option<SemaphorePermit<'a>>,
+    last: Option<SemaphorePermit<'static>>,
+}
+
+impl<'a> Room<'a> {
+    /// No room yet, of `pool`'s, which counts KiB.
+    pub fn of(pool: &'a Semaphore) -> Self {
+        Self {
+            pool,
+            held: None,
+            last: None,
+        }
+    }
+
+    /// Waits until there is room for `bytes` in all.
+    async fn grow(&mut self, bytes: usize) {
+        let held = self.held.as_ref().map_or(0, SemaphorePermit::num_permits);
+        let missing = bytes.div_ceil(1 << 10).saturating_sub(held);
+        if self.last.is_some() || missing == 0 {
+            return;
+        }
+        let missing = u32::try_from(missing).unwrap_or(u32::MAX);
+        // Neither is ever closed.
+        tokio::select! {
+            biased;
+            more = self.pool.acquire_many(missing) => match (&mut self.held, more) {
+                (Some(held), Ok(more)) => held.merge(more),
+                (held, more) => *held = more.ok(),
+            },
+            last = LAST.acquire() => self.last = last.ok(),
+        }
+    }
+}
+
+/// Reads a body of at most `limit` bytes, and takes `room` for it as it arrives.
+pub async fn read(
+    mut body: Incoming,
+    limit: usize,
+    room: &mut Room<'_>,
+) -> Result<Bytes, BodyError> {
+    let hint = body.size_hint();
+    if hint.lower() > limit as u64 {
+        return Err(BodyError::TooLarge { limit });
+    }
+    let most = hint
+        .upper()
+        .map_or(limit, |upper| usize::try_from(upper).unwrap_or(limit));
+    let longest = |bytes: usize| TIME + Duration::from_secs(bytes as u64 / RATE);
+    let mut whole = Vec::new();
+    let mut start = Instant::now();
+    loop {
+        let deadline = (start + longest(whole.len())).min(Instant::now() + TIME);
+        let data = match timeout_at(deadline, body.frame()).await {
+            Err(_) => return Err(BodyError::TooSlow),
+            Ok(None) => return Ok(whole.into()),
+            Ok(Some(Err(_))) => return Err(BodyError::Broken),
+            Ok(Some(Ok(frame))) => frame.into_data().unwrap_or_default(),
+        };
+        if whole.is_empty() && body.is_end_stream() && data.len() <= SMALL.min(limit) {
+            return Ok(data);
+        }
+        let length = whole.len() + data.len();
+        if length > limit {
+            return Err(BodyError::TooLarge { limit });
+        }
+        if length > whole.capacity().max(SMALL) {
+            let size = (2 * length).min(most);
+            let waits = Instant::now();
+            timeout(longest(most), room.grow(size))
+                .await
+                .map_err(|_| BodyError::NoRoom)?;
+            // The client is not to blame for that time.
+            start += waits.elapsed();
+            whole.reserve_exact(size.saturating_sub(whole.len()));
+        }
+        whole.extend_from_slice(&data);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Each has a part of the room and needs more than is left.
+    #[tokio::test]
+    async fn bodies_with_a_part_of_the_room_do_not_wait_for_each_other() {
+        let pool = Semaphore::new(256);
+        let body = || async {
+            let mut room = Room::of(&pool);
+            for kib in [32, 64, 128, 256] {
+                room.grow(kib << 10).await;
+                tokio::task::yield_now().await;
+            }
+        };
+        let all = at_once((0..20).map(|_| body()));
+        timeout(Duration::from_secs(20), all).await.unwrap();
+        assert_eq!(pool.available_permits(), 256);
+        assert_eq!(LAST.available_permits(), 1);
+    }
+
+    /// Runs all of them at the same time.
+    async fn at_once(bodies: impl Iterator<Item = impl Future<Output = ()>>) {
+        let mut bodies: Vec<_> = bodies.map(Box::pin).collect();
+        std::future::poll_fn(|cx| {
+            bodies.retain_mut(|body| body.as_mut().poll(cx).is_pending());
+            if bodies.is_empty() {
+                std::task::Poll::Ready(())
+            } else {
+                std::task::Poll::Pending
+            }
+        })
+        .await;
+    }
+}
