@@ -289,6 +289,35 @@ fn a_web_page_cannot_change_anything() {
     }
 }
 
+/// `curl $ROS_MASTER_URI`, whatever of its computer's names stands there; but no page that gave its own
+/// name our address.
+#[test]
+fn the_status_page_is_shown_under_every_name_of_its_computer() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).env("ROS_HOSTNAME", "unit7.robots.example");
+    let rescue = setup.start();
+    let code = |host: &str| {
+        let page = format!("GET / HTTP/1.1\r\nHost: {host}:{}\r\n\r\n", rescue.port());
+        rescue.client().exchange(page.as_bytes()).unwrap().code
+    };
+    let system = rustix::system::uname();
+    let hostname = system.nodename().to_str().unwrap();
+    for host in [
+        "127.0.0.1",
+        "localhost",
+        hostname,
+        "unit7.robots.example",
+        "Unit7.local",
+        "unit7.lab.example",
+        "unit7",
+    ] {
+        assert_eq!(code(host), 200, "{host}");
+    }
+    for host in ["evil.example", "evil.unit7", "unit71.local"] {
+        assert_eq!(code(host), 403, "{host}");
+    }
+}
+
 /// Every form in which rosmaster understands a `shutdown`: whatever rosrescue cannot read is not taken
 /// from another computer.
 #[test]

@@ -32,7 +32,7 @@ const BROWSER_TYPES: [&str; 3] = [
 /// itself); no ROS client does. It may lack a content type, as that of a typed array does.
 pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     for origin in headers.get_all(ORIGIN) {
-        check_host(headers, names)?;
+        check_name(headers, |name| is_own(name, names))?;
         let origin = String::from_utf8_lossy(origin.as_bytes());
         let site = origin.strip_prefix("http://").map(str::as_bytes);
         let own = headers.get(HOST).map(|host| host.as_bytes());
@@ -42,7 +42,7 @@ pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> 
         {
             return Err(Refusal {
                 status: StatusCode::FORBIDDEN,
-                reason: format!("a page of `{origin}` may not call the master"),
+                reason: format!("a page of `{origin:.100}` may not call the master"),
             });
         }
     }
@@ -59,7 +59,7 @@ pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> 
     if BROWSER_TYPES.contains(&essence.as_str()) {
         return Err(Refusal {
             status: StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            reason: format!("content type `{essence}` is not taken; XML-RPC is text/xml"),
+            reason: format!("content type `{essence:.100}` is not taken; XML-RPC is text/xml"),
         });
     }
     Ok(())
@@ -67,7 +67,29 @@ pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> 
 
 /// Whether `Host` is an address or a name of this computer: a page whose own name was pointed at
 /// us (DNS rebinding) names itself there.
+///
+/// The domains that this computer is in (`robot.local`, `robot.example.com`) are not known here, so
+/// any may stand behind its host name: the status page changes nothing.
 pub fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+    check_name(headers, |name| {
+        let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
+        let has_domain = |own: &&String| {
+            let has_name = !own.is_empty() && !own.eq_ignore_ascii_case("localhost");
+            has_name && own.parse::<IpAddr>().is_err()
+        };
+        let mut own = names.iter().filter(has_domain);
+        is_own(name, names) || own.any(|own| short(own) == short(name))
+    })
+}
+
+/// Whether `name` is an address, or one of `names` exactly.
+fn is_own(name: &str, names: &[String]) -> bool {
+    name.parse::<IpAddr>().is_ok()
+        || name.eq_ignore_ascii_case("localhost")
+        || names.iter().any(|own| own.eq_ignore_ascii_case(name))
+}
+
+fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<(), Refusal> {
     let Some(host) = headers.get(HOST) else {
         return Ok(());
     };
@@ -76,15 +98,12 @@ pub fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> 
         Some(rest) => rest.split(']').next().unwrap_or_default(),
         None => host.split(':').next().unwrap_or_default(),
     };
-    let known = name.parse::<IpAddr>().is_ok()
-        || name.eq_ignore_ascii_case("localhost")
-        || names.iter().any(|own| own.eq_ignore_ascii_case(name));
-    if known {
+    if is_known(name) {
         return Ok(());
     }
     Err(Refusal {
         status: StatusCode::FORBIDDEN,
-        reason: format!("`{name}` is not a name of this computer; use its address"),
+        reason: format!("`{name:.100}` is not a name of this computer; use its address"),
     })
 }
 
@@ -164,7 +183,43 @@ mod tests {
             same_site.insert(HOST, host.parse().unwrap());
             assert_eq!(check_post(&same_site, &own), Ok(()));
         }
-        assert!(check_host(&headers(&[("host", "[::1]:11311")]), &own).is_ok());
+        // Its own domains are not known: what may be looked at may not be changed there.
+        let rebound = [
+            ("origin", "http://robot.evil.example"),
+            ("host", "robot.evil.example"),
+        ];
+        assert!(check_post(&headers(&rebound), &own).is_err());
+    }
+
+    #[test]
+    fn the_status_page_is_shown_under_the_names_of_this_computer() {
+        let check = |host: &'static str, own: &[&str]| {
+            let own: Vec<_> = own.iter().map(|name| (*name).to_owned()).collect();
+            check_host(&headers(&[("host", host)]), &own).is_ok()
+        };
+        for (host, own) in [
+            ("[::1]:11311", &[][..]),
+            ("10.0.0.5", &[]),
+            ("localhost:11311", &[]),
+            ("ROBOT:11311", &["robot"]),
+            ("robot.local:11311", &["robot"]),
+            ("robot.example.com.:11311", &["Robot"]),
+            ("robot", &["x", "robot.example.com"]),
+            ("robot.local", &["robot.example.com"]),
+        ] {
+            assert!(check(host, own), "{host} {own:?}");
+        }
+        for (host, own) in [
+            ("evil.example", &["robot"][..]),
+            ("robot2.local", &["robot"]),
+            ("evil.robot", &["robot"]),
+            ("localhost.evil.example", &["localhost"]),
+            ("10.evil.example", &["10.0.0.5"]),
+            (".evil.example", &["", "robot"]),
+            ("", &["robot"]),
+        ] {
+            assert!(!check(host, own), "{host} {own:?}");
+        }
     }
 
     #[test]
