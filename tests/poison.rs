@@ -56,8 +56,12 @@ fn a_master_with_a_date_that_breaks_its_answers_is_taken_over() {
     before.set_param("/ns/good", 2);
     before.set_param("/ns/bad", poison());
     before.set_param("/ns/fine", Value::DateTime("a&amp;b >".to_owned()));
-    let rescue = Setup::proxy(&scratch, master.port).start();
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
     rescue.client().set_param("/later", 3);
+    // Once more, with the same master.
+    rescue.kill();
+    rescue.start_again();
+    rescue.wait_serving();
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
     let after = master.client();
@@ -90,5 +94,34 @@ fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
     assert_eq!(after.param("/"), Some(tree! { "good" => 1 }));
     rescue.wait_line("what was left out", |line| {
         line.contains("the parameter `/bad`")
+    });
+}
+
+/// What somebody changes past rosrescue is seen, even while the master holds what it cannot return.
+#[test]
+fn a_resync_sees_what_can_be_read_beside_what_cannot() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.port).args(["--resync-interval", "0.1"]);
+    let mut rescue = setup.start();
+    let client = rescue.client();
+    let huge = || Value::BigInt("1099511627776".to_owned());
+    client.set_param("/ns/huge", huge());
+    client.set_param("/ns/old", 1);
+    client.set_param("/ns/deleted", 2);
+    let past = master.client();
+    past.set_param("/ns/old", "another");
+    past.set_param("/new", 3);
+    past.ok("deleteParam", params!["/n", "/ns/deleted"]);
+    rescue.wait_line("the new parameter", |line| line.contains("`/new`"));
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let after = master.client();
+    eventually("the state is back", || after.param("/new").is_some());
+    let expected = tree! { "ns" => tree! { "old" => "another" }, "new" => 3 };
+    assert_eq!(after.param("/"), Some(expected));
+    // It has not been forgotten: this is said each time.
+    rescue.wait_line("what was left out", |line| {
+        line.contains("the parameter `/ns/huge`")
     });
 }

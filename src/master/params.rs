@@ -106,13 +106,20 @@ impl Params {
         }
         let updates = updates(subscribers, key, &value, Some(caller_id));
         let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE).collect();
+        self.detach(&path);
+        self.put(&path, value)?;
+        updates
+    }
+
+    /// Puts a value there; namespaces are made. Of what lies too deep only a nil is left.
+    pub(super) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
+        let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
         let value = match value {
             _ if levels == 0 => Value::Nil,
             value if is_deeper(&value, levels) => cut(value, levels),
             value => value,
         };
-        self.detach(&path);
         match (path.split_last(), value) {
             (None, Value::Struct(tree)) => self.tree = tree,
             (None, _) => return Err(Failure::Internal("list index out of range".to_owned())),
@@ -126,7 +133,11 @@ impl Params {
                 }
             }
         }
-        updates
+        Ok(())
+    }
+
+    pub(super) fn into_tree(self) -> Struct {
+        self.tree
     }
 
     /// `delete_param`; none if the parameter is not set.

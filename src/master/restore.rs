@@ -52,11 +52,13 @@ impl<'a> Restore<'a> {
 
     fn params(&mut self) {
         let found = self.found.params();
-        let (tree, left_out) = if found.is_empty() {
-            python::writable(self.target.params())
-        } else {
-            python::writable(&merged(self.target.params(), found))
-        };
+        let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
+        let whole = both.as_ref().unwrap_or(self.target.params());
+        if whole.iter().eq(found) {
+            // Even if it holds what a master cannot return: that stays where it is.
+            return;
+        }
+        let (tree, left_out) = python::writable(whole);
         let keys = left_out.into_iter();
         self.skipped.extend(keys.map(|key| Skipped::Param { key }));
         if !tree.iter().eq(found) {

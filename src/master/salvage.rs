@@ -1,32 +1,43 @@
 //! Reading the parameters of a master that cannot return them all at once.
 
-use super::{CALLER_ID, Master};
+use indexmap::IndexSet;
+
+use super::CALLER_ID;
+use super::params::Params;
 use crate::xmlrpc::{Call, Reply, Struct, Value};
+
+/// What rosmaster says of a parameter that is a nil itself.
+const NONE_RETURNED: &str = "Internal error (None value returned)";
 
 /// The parameters of a master that holds one which it cannot return, read part by part.
 ///
 /// Such a parameter spoils every namespace around it, so a namespace that cannot be read is entered,
-/// and what else is in it is read alone. An empty namespace beside the culprit stays unknown:
-/// `getParamNames` does not name it.
-#[derive(Clone, Debug, Default)]
-pub struct Salvage {
+/// and what else is in it is read alone. What cannot be read is taken from what was known before, and
+/// if nothing was known, a nil stands for it, which can be returned as little.
+///
+/// An empty namespace beside the culprit that was not known before stays unknown: `getParamNames`
+/// does not name it.
+#[derive(Clone)]
+pub struct Salvage<'a> {
     /// Keys of all leaves, without the leading slash.
-    leaves: Vec<String>,
-    /// Keys still to be asked for, the next one last.
-    open: Vec<String>,
+    leaves: IndexSet<String>,
+    /// What was known before.
+    previous: &'a Struct,
+    /// Paths still to be asked for, the next one last.
+    open: Vec<Vec<String>>,
     /// What has been read.
-    found: Master,
-    unreadable: Vec<String>,
+    found: Params,
+    unknown: Vec<String>,
 }
 
-impl Salvage {
+impl<'a> Salvage<'a> {
     /// The question for the names of all parameters. They can always be returned.
     pub fn names() -> Call {
         Call::new("getParamNames", vec![CALLER_ID.into()])
     }
 
     /// Begins with the reply to [`Salvage::names`]; none if it is not that of a master.
-    pub fn new(names: &Reply) -> Option<Self> {
+    pub fn new(names: &Reply, previous: &'a Struct) -> Option<Self> {
         let Reply::Value(Value::Array(fields)) = names else {
             return None;
         };
@@ -34,103 +45,206 @@ impl Salvage {
         let leaf = |name: &Value| Some(name.as_str()?.trim_start_matches('/').to_owned());
         let mut salvage = Self {
             leaves: names.iter().map(leaf).collect::<Option<_>>()?,
-            ..Self::default()
+            previous,
+            open: Vec::new(),
+            found: Params::new(Struct::new()),
+            unknown: Vec::new(),
         };
-        salvage.enter("");
+        salvage.enter(&[]);
         Some(salvage)
     }
 
     /// What to ask next.
-    pub fn next(&self) -> Option<Call> {
-        let key = format!("/{}", self.open.last()?);
+    pub fn next(&mut self) -> Option<Call> {
+        // A name with a slash, as a member of a struct may have it, leads elsewhere.
+        let unspeakable = |name: &String| name.is_empty() || name.contains('/');
+        while let Some(path) = self
+            .open
+            .pop_if(|path| path.last().is_some_and(unspeakable))
+        {
+            self.keep(&path);
+        }
+        let key = key(self.open.last()?);
         Some(Call::new("getParam", vec![CALLER_ID.into(), key.into()]))
     }
 
     /// Takes in the reply to [`Salvage::next`], none if it was no XML-RPC. A key that vanished
     /// meanwhile is left out.
     pub fn take(&mut self, reply: Option<&Reply>) {
-        let Some(key) = self.open.pop() else { return };
-        match reply {
-            Some(Reply::Value(Value::Array(fields))) => {
-                if let [Value::Int(1), _, value] = fields.as_slice() {
-                    let key = format!("/{key}").into();
-                    let params = vec![CALLER_ID.into(), key, value.clone()];
-                    self.found.apply(&Call::new("setParam", params));
+        let Some(path) = self.open.pop() else { return };
+        if let Some(Reply::Value(Value::Array(fields))) = reply {
+            match fields.as_slice() {
+                [Value::Int(1), _, value] => self.put(&path, value.clone()),
+                [_, Value::String(message), _] if message == NONE_RETURNED => {
+                    self.put(&path, Value::Nil);
                 }
+                _ => {}
             }
-            _ if self.leaves.contains(&key) => {
-                self.unreadable.push(format!("/{key}"));
-            }
-            _ => self.enter(&format!("{key}/")),
+        } else if self.leaves.contains(&path.join("/")) || !self.enter(&path) {
+            self.keep(&path);
         }
     }
 
-    /// What could be read, and the keys of what could not.
+    /// What the master holds as far as that is known, and the keys of what was neither read nor known.
     pub fn finish(self) -> (Struct, Vec<String>) {
-        (self.found.params().clone(), self.unreadable)
+        (self.found.into_tree(), self.unknown)
     }
 
-    /// Asks for each thing directly in the namespace `prefix`, in order.
-    fn enter(&mut self, prefix: &str) {
-        let mut inside: Vec<String> = Vec::new();
-        for leaf in &self.leaves {
-            if let Some(rest) = leaf.strip_prefix(prefix)
-                && let Some(name) = rest.split('/').next().filter(|name| !name.is_empty())
-            {
-                let key = format!("{prefix}{name}");
-                if !inside.contains(&key) {
-                    inside.push(key);
+    fn put(&mut self, path: &[String], value: Value) {
+        let path: Vec<&str> = path.iter().map(String::as_str).collect();
+        // It fails only for the whole tree, which is never asked for.
+        let _ = self.found.put(&path, value);
+    }
+
+    /// What was known of something that cannot be read.
+    fn keep(&mut self, path: &[String]) {
+        let value = match self.known(path) {
+            Some(value) => value.clone(),
+            None => {
+                self.unknown.push(key(path));
+                Value::Nil
+            }
+        };
+        self.put(path, value);
+    }
+
+    fn known(&self, path: &[String]) -> Option<&'a Value> {
+        let (last, namespaces) = path.split_last()?;
+        self.known_members(namespaces)?.get(last)
+    }
+
+    fn known_members(&self, path: &[String]) -> Option<&'a Struct> {
+        let mut names = path.iter();
+        names.try_fold(self.previous, |members, name| {
+            members.get(name)?.as_struct()
+        })
+    }
+
+    /// Asks for each thing directly in the namespace, in order; false if there is nothing in it.
+    ///
+    /// The order is that of the master's names. What only we know is asked for as well, behind what
+    /// is before it with us.
+    fn enter(&mut self, path: &[String]) -> bool {
+        let mut prefix = path.join("/");
+        if !prefix.is_empty() {
+            prefix.push('/');
+        }
+        let below = self
+            .leaves
+            .iter()
+            .filter_map(|leaf| leaf.strip_prefix(prefix.as_str()));
+        let first = below.filter_map(|rest| rest.split('/').next());
+        let mut inside: IndexSet<&str> = first.filter(|name| !name.is_empty()).collect();
+        let mut behind = 0;
+        for name in self.known_members(path).into_iter().flat_map(Struct::keys) {
+            match inside.get_index_of(name.as_str()) {
+                Some(at) => behind = at + 1,
+                None => {
+                    inside.shift_insert(behind, name);
+                    behind += 1;
                 }
             }
+        }
+        let inside: Vec<Vec<String>> = inside
+            .into_iter()
+            .map(|name| [path, &[name.to_owned()]].concat())
+            .collect();
+        if inside.is_empty() {
+            return false;
+        }
+        if !path.is_empty() {
+            self.put(path, Value::Struct(Struct::new()));
         }
         self.open.extend(inside.into_iter().rev());
+        true
     }
+}
+
+fn key(path: &[String]) -> String {
+    format!("/{}", path.join("/"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::master::Master;
 
     fn set(master: &mut Master, key: &str, value: Value) {
         let params = vec!["/n".into(), key.into(), value];
         master.apply(&Call::new("setParam", params));
     }
 
-    #[test]
-    fn everything_but_the_culprits_is_read() {
-        let mut master = Master::default();
-        for key in ["/a", "/b/c", "/b/d/e", "/b/d/f", "/z"] {
-            set(&mut master, key, key.into());
-        }
-        let whole = master.params().clone();
-        for key in ["/b/d/huge", "/nil"] {
-            set(
-                &mut master,
-                key,
-                Value::Array(vec![Value::BigInt("9999999999".into())]),
-            );
-        }
-        let ask = |master: &mut Master, call: &Call| master.apply(call).reply;
-        let names = ask(&mut master, &Salvage::names());
-        let mut salvage = Salvage::new(&names).unwrap();
+    /// What is found out about `master` by somebody who knew `previous`, and in how many questions.
+    fn salvaged(master: &mut Master, previous: &Struct) -> (Struct, Vec<String>, usize) {
+        let names = master.apply(&Salvage::names()).reply;
+        let mut salvage = Salvage::new(&names, previous).unwrap();
         let mut asked = 0;
         while let Some(call) = salvage.next() {
             asked += 1;
             // As rosmaster: a value that cannot be written is a fault.
-            let reply = ask(&mut master, &call);
+            let reply = master.apply(&call).reply;
             salvage.take(Some(&reply));
         }
-        let (tree, unreadable) = salvage.finish();
-        assert_eq!(tree, whole);
-        assert_eq!(unreadable, ["/b/d/huge", "/nil"]);
-        assert_eq!(asked, 4 + 2 + 3, "each namespace at most once");
+        let (tree, unknown) = salvage.finish();
+        (tree, unknown, asked)
+    }
+
+    fn poison() -> Value {
+        Value::Array(vec![Value::BigInt("9999999999".into())])
+    }
+
+    #[test]
+    fn everything_but_the_culprits_is_read() {
+        let mut master = Master::default();
+        for key in ["/a", "/b/c", "/b/d/e"] {
+            set(&mut master, key, key.into());
+        }
+        // A nil cannot be set alone, only inside a struct.
+        let nils = Struct::from([("huge".to_owned(), Value::Nil), ("f".to_owned(), 1.into())]);
+        set(&mut master, "/b/d/in", Value::Struct(nils));
+        set(&mut master, "/z", 2.into());
+        let with_nils = master.params().clone();
+        set(&mut master, "/b/d/in/huge", poison());
+        let (tree, unknown, asked) = salvaged(&mut master, &Struct::new());
+        assert_eq!(Value::Struct(tree), Value::Struct(with_nils));
+        assert_eq!(unknown, ["/b/d/in/huge"]);
+        assert_eq!(asked, 3 + 2 + 2 + 2, "each namespace at most once");
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_taken_from_what_was_known() {
+        let mut master = Master::default();
+        set(&mut master, "/old", 1.into());
+        set(&mut master, "/ns/empty", Value::Struct(Struct::new()));
+        set(&mut master, "/ns/huge", poison());
+        set(&mut master, "/ns/gone", 2.into());
+        set(&mut master, "/ns/~private", 3.into());
+        let odd = Struct::from([("a/b".to_owned(), 4.into()), ("nil".to_owned(), Value::Nil)]);
+        set(&mut master, "/odd", Value::Struct(odd));
+        let previous = master.params().clone();
+        let same = salvaged(&mut master, &previous);
+        assert_eq!(Value::Struct(same.0), Value::Struct(previous.clone()));
+        assert_eq!(same.1, Vec::<String>::new());
+
+        // Past us.
+        set(&mut master, "/old", "new".into());
+        set(&mut master, "/ns/more", 5.into());
+        let delete = vec!["/n".into(), "/ns/gone".into()];
+        master.apply(&Call::new("deleteParam", delete));
+        let now = master.params().clone();
+        let (tree, unknown, _) = salvaged(&mut master, &previous);
+        assert_eq!(Value::Struct(tree), Value::Struct(now));
+        assert_eq!(unknown, Vec::<String>::new());
     }
 
     #[test]
     fn what_is_no_reply_of_a_master_is_refused() {
-        assert!(Salvage::new(&Reply::Value(Value::Int(1))).is_none());
-        let mut salvage = Salvage::default();
+        let nothing = Struct::new();
+        assert!(Salvage::new(&Reply::Value(Value::Int(1)), &nothing).is_none());
+        let names = Master::default().apply(&Salvage::names()).reply;
+        let mut salvage = Salvage::new(&names, &nothing).unwrap();
         assert_eq!(salvage.next(), None);
         salvage.take(Some(&Reply::Value(Value::Nil)));
+        assert_eq!(salvage.finish(), (Struct::new(), Vec::new()));
     }
 }

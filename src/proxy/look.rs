@@ -49,9 +49,8 @@ pub async fn second(
     connection: &mut Connection,
     previous: &Master,
 ) -> Result<Master, LookError> {
-    // What we know of the parameters is better than what can be read; if we know nothing, not.
-    if !first.has_params() && previous.params().is_empty() {
-        first = salvage(first, connection).await?;
+    if !first.has_params() {
+        first = salvage(first, connection, previous).await?;
     }
     let second = match first.second_call(previous) {
         Some(call) => Some(connection.call(&call).await?),
@@ -60,9 +59,15 @@ pub async fn second(
     Ok(first.into_master(second.as_ref(), previous)?)
 }
 
-/// The look with what can be read of the parameters of a master that holds one that it cannot return.
-async fn salvage(first: FirstLook, connection: &mut Connection) -> Result<FirstLook, LookError> {
-    let Some(mut salvage) = Salvage::new(&connection.call(&Salvage::names()).await?) else {
+/// The look with the parameters of a master that holds one that it cannot return: each that can be
+/// read, and the others as they were.
+async fn salvage(
+    first: FirstLook,
+    connection: &mut Connection,
+    previous: &Master,
+) -> Result<FirstLook, LookError> {
+    let names = connection.call(&Salvage::names()).await?;
+    let Some(mut salvage) = Salvage::new(&names, previous.params()) else {
         return Ok(first);
     };
     while let Some(call) = salvage.next() {
@@ -73,11 +78,13 @@ async fn salvage(first: FirstLook, connection: &mut Connection) -> Result<FirstL
         }
     }
     let (params, unreadable) = salvage.finish();
-    tracing::warn!(
-        ?unreadable,
-        "the master holds parameters that it can never return; they are not protected, and neither \
+    if !unreadable.is_empty() {
+        tracing::warn!(
+            ?unreadable,
+            "the master holds parameters that it can never return; they are not protected, and neither \
          they nor the namespaces around them can be read by anybody. Delete them, or set them to \
          numbers of 32 bits and dates without markup"
-    );
+        );
+    }
     Ok(first.with_params(params))
 }
