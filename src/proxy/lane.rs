@@ -329,11 +329,12 @@ impl LaneRunner {
                 opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
                 vec![reply]
             }
-            // What we cannot read may have changed anything. What we know of the call is recorded as
-            // if it had gone as foretold.
+            // What we cannot read may have changed anything, and only a look shows what. A subscription
+            // of parameters no look shows: it is recorded as if it had gone as foretold.
             ([item], None) if raw.status.is_success() => {
                 opaque = true;
-                proxy.shadow.foretell(item.call.iter())
+                let call = item.call.iter().filter(|call| subscribes_params(call));
+                proxy.shadow.foretell(call)
             }
             ([_], None) => Vec::new(),
             (_, Some(reply)) => match journey::unpack(&reply, items.len()) {
@@ -433,6 +434,13 @@ impl LaneRunner {
         }
         self.queue = waiting;
     }
+}
+
+/// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.
+fn subscribes_params(call: &Call) -> bool {
+    let entries = call.entries();
+    let mut calls = entries.iter().chain([call]);
+    calls.any(|call| call.method == "subscribeParam")
 }
 
 /// Whether the master would shut a node down because of `call`, or of an entry of it.
