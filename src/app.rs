@@ -19,7 +19,7 @@ use crate::{
     cli::Restore,
     clock,
     config::{Config, MasterConfig},
-    master::{CALLER_ID, Mark, Master},
+    master::{Mark, Master},
     proxy::{
         Proxy,
         clients::Clients,
@@ -32,21 +32,15 @@ use crate::{
         upstream::Upstream,
     },
     record::Session,
-    recovery::{
-        Guard, Nodes, core_duties,
-        master_process::MasterProcess,
-        node::{self, Sign},
-        nodes,
-    },
+    recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
     ros_env::MasterUri,
     session::{self, Decision, Evidence},
     store::{self, OpenError, Store},
     supervisor::{Rosmaster, SupervisorError},
-    xmlrpc::Call,
 };
 
-/// How long nodes have to show that a session goes on.
-const LIFE_SIGN: Duration = Duration::from_secs(1);
+mod life;
+
 /// So many bodies of the largest size may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
 /// How long connections have to end at the stop.
@@ -303,10 +297,12 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
             tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
         }
         let session = session.unwrap_or_default();
+        let same_boot = session.boot_id == boot_id;
         let evidence = Evidence {
-            same_boot: session.boot_id == boot_id,
+            same_boot,
             closed: session.closed,
-            node_alive: config.restore == Restore::Auto && any_alive(&mirror).await,
+            node_alive: config.restore == Restore::Auto
+                && life::any_alive(&mirror, same_boot).await,
         };
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
@@ -362,22 +358,6 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         restored,
         story,
     })
-}
-
-/// Whether any node of `state` answers.
-async fn any_alive(state: &Master) -> bool {
-    let call = Call::new("getPid", vec![CALLER_ID.into()]);
-    let mut questions = JoinSet::new();
-    for (_, api) in state.nodes() {
-        let (api, call) = (api.to_owned(), call.clone());
-        questions.spawn(async move { node::ask(&api, &call, LIFE_SIGN).await == Sign::Alive });
-    }
-    while let Some(alive) = questions.join_next().await {
-        if alive.unwrap_or(false) {
-            return true;
-        }
-    }
-    false
 }
 
 /// An id from the kernel, or a constant where there is none: it is compared, not trusted.

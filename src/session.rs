@@ -15,7 +15,7 @@ pub struct Evidence {
     pub same_boot: bool,
     /// rosrescue was stopped in order.
     pub closed: bool,
-    /// A node that was registered answers.
+    /// A node that was registered answers; one on another computer, unless it is the same boot.
     pub node_alive: bool,
 }
 

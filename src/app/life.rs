@@ -1,0 +1,83 @@
+//! Whether nodes of a recorded session are alive.
+
+use std::{
+    io,
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket},
+    time::Duration,
+};
+
+use tokio::{net::lookup_host, task::JoinSet, time::timeout};
+
+use crate::{
+    master::{CALLER_ID, Master},
+    recovery::node::{self, Sign},
+    ros_env::MasterUri,
+    xmlrpc::Call,
+};
+
+/// How long nodes have to show that a session goes on, and name servers to name their addresses.
+const LIFE_SIGN: Duration = Duration::from_secs(1);
+
+/// Whether any node of `state` answers. After a boot of this computer (`same_boot` is false) only
+/// nodes elsewhere count: none of its own processes has survived, and whoever answers at the port of
+/// one is a stranger.
+pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
+    let call = Call::new("getPid", vec![CALLER_ID.into()]);
+    let mut questions = JoinSet::new();
+    for (_, api) in state.nodes() {
+        let (api, call) = (api.to_owned(), call.clone());
+        questions.spawn(async move {
+            (same_boot || is_elsewhere(&api).await)
+                && node::ask(&api, &call, LIFE_SIGN).await == Sign::Alive
+        });
+    }
+    while let Some(alive) = questions.join_next().await {
+        if alive.unwrap_or(false) {
+            return true;
+        }
+    }
+    false
+}
+
+/// Whether `api` is on another computer. If its host has no address, there is nobody to ask.
+async fn is_elsewhere(api: &str) -> bool {
+    let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
+        return false;
+    };
+    match timeout(LIFE_SIGN, lookup_host((host, port))).await {
+        Ok(Ok(mut addresses)) => !addresses.any(|address| is_own(address.ip())),
+        _ => false,
+    }
+}
+
+/// Whether an address is this computer's own: the kernel talks to itself from the same one. Nothing is
+/// sent.
+fn is_own(address: IpAddr) -> bool {
+    let any = match address {
+        IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
+        IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+    };
+    let source = || {
+        let socket = UdpSocket::bind((any, 0))?;
+        socket.connect((address, 9))?;
+        Ok::<_, io::Error>(socket.local_addr()?.ip())
+    };
+    address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn own_addresses_are_told_from_others() {
+        for own in ["127.0.0.1", "127.9.9.9", "[::1]", "0.0.0.0", "localhost"] {
+            assert!(!is_elsewhere(&format!("http://{own}:4711/")).await, "{own}");
+        }
+        // Set apart for documentation.
+        assert!(is_elsewhere("http://192.0.2.7:4711/").await);
+        for nobody in ["http://nobody.invalid:4711/", "nonsense"] {
+            assert!(!is_elsewhere(nobody).await, "{nobody}");
+        }
+    }
+}
