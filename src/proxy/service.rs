@@ -139,7 +139,6 @@ async fn post(
         proxy.clients.called(peer, caller_id);
         tracing::debug!(%peer, method = call.method, caller_id, "call");
     } else {
-        proxy.stats.undecoded.count();
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if packing != Packing::Unknown && !door::may_shut_down(peer.ip()) {
             proxy.stats.refused.count();
@@ -149,6 +148,7 @@ async fn post(
                 text: UNDECODED.to_owned(),
             }));
         }
+        proxy.stats.undecoded.count();
     }
     let hold = match &call {
         Some(call) if roscpp && call.method == "setParam" => ROSCPP_SET_PARAM_HOLD,
