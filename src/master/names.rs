@@ -53,11 +53,11 @@ pub(super) fn resolve(name: &str, caller_id: &str) -> String {
     }
 }
 
-/// `ns_join`, which leaves alone a name that starts with `/` or `~`.
+/// `ns_join`, which leaves alone a name that starts with `/` or `~`, and needs no slash behind `~`.
 pub(super) fn join(namespace: &str, name: &str) -> String {
     if name.starts_with(['/', '~']) || namespace.is_empty() {
         name.to_owned()
-    } else if namespace.ends_with('/') {
+    } else if namespace == "~" || namespace.ends_with('/') {
         format!("{namespace}{name}")
     } else {
         format!("{namespace}/{name}")
@@ -156,6 +156,22 @@ mod tests {
             ("~a//b/", "~a/b"),
         ] {
             assert_eq!(canonicalize(name), canonical, "{name}");
+        }
+    }
+
+    #[test]
+    fn names_are_joined_as_rosgraph_joins_them() {
+        for (namespace, name, joined) in [
+            ("/", "a", "/a"),
+            ("/a", "b", "/a/b"),
+            ("/a/", "b", "/a/b"),
+            ("", "a", "a"),
+            ("~", "a", "~a"),
+            ("~a", "b", "~a/b"),
+            ("/a", "~b", "~b"),
+            ("/a", "/b", "/b"),
+        ] {
+            assert_eq!(join(namespace, name), joined, "{namespace} {name}");
         }
     }
 
