@@ -10,6 +10,7 @@ mod cases;
 mod documents;
 mod master;
 mod peer;
+mod shown;
 
 use std::fmt::Write;
 

@@ -49,11 +49,7 @@ impl Peer {
             "echo",
             &encode_call(&Call::new("echo", vec![value.clone()])),
         );
-        answer
-            .as_bytes()
-            .chunks(2)
-            .map(|pair| u8::from_str_radix(std::str::from_utf8(pair).unwrap(), 16).unwrap())
-            .collect()
+        unhex(&answer)
     }
 }
 
@@ -70,4 +66,11 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
         write!(out, "{byte:02x}").unwrap();
         out
     })
+}
+
+pub(crate) fn unhex(text: &str) -> Vec<u8> {
+    let pairs = text.as_bytes().chunks(2);
+    pairs
+        .map(|pair| u8::from_str_radix(std::str::from_utf8(pair).unwrap(), 16).unwrap())
+        .collect()
 }
