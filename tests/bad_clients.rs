@@ -390,6 +390,16 @@ fn no_other_computer_shuts_the_master_down() {
             }
         }
     }
+    // A master tells a node whose name is taken to shut down: here, rosrescue.
+    for api in [rescue.client().uri().as_str(), "http://127.0.0.1:1/"] {
+        let node = params!["/evil", "/t", "std_msgs/String", api];
+        elsewhere.ok("registerPublisher", node);
+    }
+    eventually("the master has tried", || {
+        let log = rescue.output();
+        log.iter()
+            .any(|line| line.contains("registered at our address"))
+    });
     // What the master refuses itself is left to it.
     let packed = with("Content-Encoding: br", &plain);
     assert_eq!(elsewhere.exchange(&packed).unwrap().code, 501);

@@ -10,6 +10,8 @@ use hyper::{
     header::{CONTENT_TYPE, HOST, ORIGIN},
 };
 
+use crate::xmlrpc::{Call, Value};
+
 /// A request that is turned away.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
@@ -110,6 +112,12 @@ fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<()
 /// Whether a call from `peer` may shut the master down.
 pub fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
+}
+
+/// Whether a `shutdown` is what a master sends to a node when another one takes its name. Here it
+/// arrives if somebody registered our address as a node's, from whatever computer.
+pub fn is_for_a_node(call: &Call) -> bool {
+    call.params.first().and_then(Value::as_str) == Some("/master")
 }
 
 #[cfg(test)]

@@ -175,9 +175,13 @@ async fn answer(
         }
         (_, Kind::Shutdown) if !door::may_shut_down(peer.ip()) => {
             tracing::warn!(%peer, "refused to shut the master down for another computer");
-            let refusal = "shutdown is taken from the master's own computer only";
-            let reply: [Value; 3] = [(-1).into(), refusal.into(), 0.into()];
-            Ok(xml(&Reply::Value(reply.to_vec().into())))
+            Ok(no_shutdown(
+                "shutdown is taken from the master's own computer only",
+            ))
+        }
+        (Some(call), Kind::Shutdown) if door::is_for_a_node(call) => {
+            tracing::warn!(%peer, "refused to shut down for a node that is registered at our address");
+            Ok(no_shutdown("this is the master, and no node"))
         }
         (_, Kind::Read | Kind::Identity | Kind::Unknown) => {
             read(proxy, head, body, call.as_ref(), kind).await
@@ -318,6 +322,11 @@ fn xml(reply: &Reply) -> HttpReply {
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http
+}
+
+fn no_shutdown(why: &str) -> HttpReply {
+    let reply: [Value; 3] = [(-1).into(), why.into(), 0.into()];
+    xml(&Reply::Value(reply.to_vec().into()))
 }
 
 fn text(status: StatusCode, text: String) -> HttpReply {
