@@ -125,3 +125,17 @@ fn a_resync_sees_what_can_be_read_beside_what_cannot() {
         line.contains("the parameter `/ns/huge`")
     });
 }
+
+/// rosmaster takes a date for a type if it reads `*`, and gives it back as a date.
+#[test]
+fn a_type_that_is_a_date_does_not_hide_the_master() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let star = Value::DateTime("*".to_owned());
+    let api = "http://127.0.0.1:1/";
+    let params = vec!["/p".into(), "/t".into(), star, api.into()];
+    master.client().ok("registerPublisher", params);
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    let found = rescue.client().ok("lookupNode", params!["/n", "/p"]);
+    assert_eq!(found, api.into());
+}

@@ -370,12 +370,13 @@ fn lists(value: &Value) -> Option<IndexMap<String, Vec<String>>> {
     lists.collect()
 }
 
-/// `[[topic, type], …]`.
+/// `[[topic, type], …]`. A date that reads `*` is taken for a type, and comes back as one.
 fn pairs(value: &Value) -> Option<IndexMap<String, String>> {
     let pairs = value.as_array()?.iter().map(|pair| match pair.as_array()? {
-        [Value::String(topic), Value::String(topic_type)] => {
-            Some((topic.clone(), topic_type.clone()))
-        }
+        [
+            Value::String(topic),
+            Value::String(topic_type) | Value::DateTime(topic_type),
+        ] => Some((topic.clone(), topic_type.clone())),
         _ => None,
     });
     pairs.collect()
