@@ -95,13 +95,7 @@ fn what_was_written_past_the_proxy_is_found_when_the_same_master_goes_on() {
 /// A rosmaster behind a relay, and rosrescue before it.
 fn relayed(scratch: &Scratch) -> (Rosmaster, Relay, support::Rescue) {
     let master = Rosmaster::start(scratch);
-    let relay = Relay::to(
-        master
-            .client()
-            .uri()
-            .rsplit_once(':')
-            .map_or(0, |(_, port)| port.trim_end_matches('/').parse().unwrap()),
-    );
+    let relay = Relay::to(master.client().port());
     let rescue = Setup::proxy(scratch, relay.port()).start();
     (master, relay, rescue)
 }
@@ -143,18 +137,10 @@ fn an_injection_whose_reply_was_lost_is_a_recovery() {
     let client = rescue.client();
     client.set_param("/swallowed", 1);
     FakeNode::start("/dead").publish(&client, "/topic", "std_msgs/String");
-    let port = master.client();
+    let port = master.client().port();
     master.kill();
     eventually("the gate is shut", || status(&client)["open"] == false);
     relay.swallow("swallowed", 1);
-    let port = port
-        .uri()
-        .rsplit_once(':')
-        .unwrap()
-        .1
-        .trim_end_matches('/')
-        .parse()
-        .unwrap();
     let master = Rosmaster::start_at(&scratch, port);
     eventually("the dead node is taken out", || {
         let known = master.client().ok("getSystemState", params!["/x"]);

@@ -51,6 +51,10 @@ impl Client {
         }
     }
 
+    pub(crate) fn port(&self) -> u16 {
+        self.port
+    }
+
     pub(crate) fn uri(&self) -> String {
         format!("http://{}:{}/", self.host, self.port)
     }
