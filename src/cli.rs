@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum, builder::FalseyValueParser};
+use clap::{
+    Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, builder::FalseyValueParser,
+};
 
 /// Keeps a ROS 1 robot running when its master dies.
 ///
@@ -19,6 +21,20 @@ pub struct Cli {
     /// The options of `core`, for the bare `rosrescue`.
     #[command(flatten)]
     pub core: CoreArgs,
+}
+
+impl Cli {
+    /// Reads the command line and the environment; ends the process with what is wrong with them.
+    pub fn read() -> Self {
+        let mut command = Self::command();
+        let first = std::env::args_os().nth(1);
+        if first.is_some_and(|first| command.find_subcommand(first).is_some()) {
+            // The options of the bare `rosrescue` are not meant, so neither are their variables.
+            command = command.mut_args(|option| option.env(None::<&str>));
+        }
+        let matches = command.get_matches();
+        Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+    }
 }
 
 /// What to run.
@@ -46,7 +62,8 @@ pub struct CoreArgs {
     #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT")]
     #[arg(default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,
-    /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none
+    /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none. It is
+    /// probed at least twice in this time, since it closes connections that are idle for longer
     #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS")]
     #[arg(default_value_t = 5.0)]
     pub timeout: f64,

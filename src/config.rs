@@ -20,6 +20,9 @@ pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 /// File descriptors that clients do not get: census and letters open up to 192 at a time.
 const RESERVED_FILES: u64 = 192;
 
+/// The least pause between two probes.
+const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
+
 /// A command line that is well formed and still cannot be meant. Exit status 2.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
@@ -30,6 +33,16 @@ pub enum UsageError {
     /// `ROS_MASTER_URI` is not a URI.
     #[error("ROS_MASTER_URI: {0}")]
     MasterUri(UriError),
+    /// `ROS_HOSTNAME` or `ROS_IP` is nothing by which a computer could be reached.
+    #[error(
+        "{variable}: `{given}` is not a host name or an address; write one, as in robot or 10.0.0.7"
+    )]
+    Host {
+        /// The variable.
+        variable: &'static str,
+        /// What it holds.
+        given: String,
+    },
     /// `--listen` is not an address.
     #[error("--listen: `{given}` is not an address; write {form}")]
     Listen {
@@ -104,6 +117,18 @@ pub enum MasterConfig {
     External(MasterUri),
     /// rosrescue runs it.
     Supervised(SupervisedConfig),
+}
+
+impl MasterConfig {
+    /// How long a connection to it may be idle, if that is known: the sentinel is renewed with each
+    /// probe.
+    fn idle_limit(&self) -> Option<Duration> {
+        let Self::Supervised(supervised) = self else {
+            return None;
+        };
+        let limit = Duration::try_from_secs_f64(supervised.timeout).ok();
+        limit.filter(|limit| !limit.is_zero())
+    }
 }
 
 /// How to run a rosmaster and rosout.
@@ -197,7 +222,14 @@ impl Config {
         advertised: MasterUri,
         master: MasterConfig,
     ) -> Result<Self, UsageError> {
+        if let Some((variable, given)) = ros_env::bad_override(env) {
+            return Err(UsageError::Host { variable, given });
+        }
         let checkpoint = args.checkpoint.clone();
+        let interval = Duration::from_millis(args.probe_interval);
+        let interval = master.idle_limit().map_or(interval, |limit| {
+            interval.min((limit / 2).max(SHORTEST_INTERVAL))
+        });
         Ok(Self {
             listen,
             advertised,
@@ -209,7 +241,7 @@ impl Config {
             hold: seconds("--hold", args.hold, 3600.0)?,
             max_parked: usize_of(args.max_parked),
             probing: Probing {
-                interval: Duration::from_millis(args.probe_interval),
+                interval,
                 count: args.probe_count,
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
@@ -364,6 +396,30 @@ mod tests {
         let env = |name: &str| (name == "ROS_IP").then(|| "10.0.0.7".to_owned());
         let config = Config::core(&cli.core, &env, "robot", None).unwrap();
         assert_eq!(config.advertised.to_string(), "http://10.0.0.7:1/");
+    }
+
+    #[test]
+    fn the_sentinel_is_renewed_before_the_master_closes_it() {
+        for (timeout, interval, expected) in [
+            ("5", "1000", 1_000),
+            ("5", "5000", 2_500),
+            ("1", "1000", 500),
+            ("0.001", "1000", 10),
+            ("0", "9000", 9_000),
+        ] {
+            let config = config(&["-t", timeout, "--probe-interval", interval]).unwrap();
+            let expected = Duration::from_millis(expected);
+            assert_eq!(config.probing.interval, expected, "{timeout} {interval}");
+        }
+        let proxy = [
+            "proxy",
+            "--master",
+            "http://m:1",
+            "--probe-interval",
+            "9000",
+        ];
+        let interval = config(&proxy).unwrap().probing.interval;
+        assert_eq!(interval, Duration::from_secs(9));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::{
     process::ExitCode,
 };
 
-use clap::{CommandFactory, Parser, error::ErrorKind};
+use clap::{CommandFactory, error::ErrorKind};
 use rosrescue::{
     app,
     cli::{Cli, Command, CommonArgs, LogFormat},
@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = Cli::read();
     let env = |name: &str| std::env::var(name).ok();
     let hostname = rustix::system::uname()
         .nodename()

@@ -107,6 +107,22 @@ pub fn address_override(env: Lookup<'_>) -> Option<String> {
         .filter(|address| !address.is_empty())
 }
 
+/// The variable and the value of an [`address_override`] with which no address can be made.
+pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
+    let host = address_override(env)?;
+    // A scope as in fe80::1%eth0 is none of ours to check.
+    let bare = host.split('%').next().unwrap_or_default();
+    let is_name = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    if host.chars().all(is_name) || bare.parse::<IpAddr>().is_ok() && !host.contains(['/', ' ']) {
+        return None;
+    }
+    let variable = match env("ROS_HOSTNAME") {
+        Some(_) => "ROS_HOSTNAME",
+        None => "ROS_IP",
+    };
+    Some((variable, host))
+}
+
 /// The addresses a master listens on: all, or only loopback when its own address is a loopback one.
 /// The first is tried first; an address family that the computer lacks may be left out.
 pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
@@ -219,6 +235,37 @@ mod tests {
             Ok(1234)
         );
         assert!(master_port(&env(&[("ROS_MASTER_URI", "nonsense")])).is_err());
+    }
+
+    #[test]
+    fn an_override_is_a_name_or_an_address() {
+        for good in [
+            "robot",
+            "robot-7.local",
+            "my_robot",
+            "10.0.0.7",
+            "::1",
+            "fe80::1%eth0",
+            "",
+        ] {
+            assert_eq!(
+                bad_override(&env(&[("ROS_HOSTNAME", good)])),
+                None,
+                "{good}"
+            );
+        }
+        for bad in [
+            "bad host",
+            "a/b",
+            "http://robot",
+            "robot:11311",
+            "[::1]",
+            "a@b",
+            "::1% /",
+        ] {
+            let found = bad_override(&env(&[("ROS_IP", bad)]));
+            assert_eq!(found, Some(("ROS_IP", bad.to_owned())));
+        }
     }
 
     #[test]

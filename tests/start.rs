@@ -87,6 +87,68 @@ fn usage_errors_end_with_2_and_say_which() {
         2,
     );
     assert!(said.contains('x'), "{said}");
+    for bad in ["bad host", "a/b"] {
+        let setup = Setup::bare(&scratch, ["core"]).env("ROS_HOSTNAME", bad);
+        let said = refused(&scratch, setup, 2);
+        assert!(
+            said.contains("ROS_HOSTNAME") && said.contains(bad),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn variables_of_core_are_no_matter_of_proxy() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = || {
+        Setup::proxy(&scratch, master.port)
+            .env("ROSRESCUE_NUMWORKERS", "bad")
+            .env("ROSRESCUE_PORT", "bad")
+    };
+    setup().start();
+    // Its own still are.
+    let said = refused(&scratch, setup().env("ROSRESCUE_HOLD", "bad"), 2);
+    assert!(said.contains("--hold"), "{said}");
+    for arguments in [&[][..], &["core"], &["--no-rosout"]] {
+        let setup = Setup::bare(&scratch, arguments).env("ROSRESCUE_NUMWORKERS", "bad");
+        let said = refused(&scratch, setup, 2);
+        assert!(said.contains("--numworkers"), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
+fn an_address_that_this_computer_does_not_have() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port, "--listen", "198.51.100.7"]);
+    let said = refused(&scratch, setup, 1);
+    assert!(
+        said.contains("198.51.100.7") && said.contains("--listen"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_new_session_is_said_to_be_one() {
+    let scratch = Scratch::new();
+    let mut rescue = Setup::core(&scratch, free_port()).start();
+    rescue.wait_line("what it did", |line| line.contains("is served"));
+    let said = rescue.output().join("\n");
+    assert!(!said.contains("restored"), "{said}");
+}
+
+/// The gate stays open although rosmaster closes what is idle for a second.
+#[test]
+fn probes_keep_the_sentinel_from_being_idle() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port());
+    let rescue = setup.args(["-t", "1", "--probe-interval", "3000"]).start();
+    let shut = || {
+        let lines = rescue.stderr();
+        lines.iter().any(|line| line.contains("the gate is shut"))
+    };
+    assert!(holds(Duration::from_secs(5), || !shut()));
 }
 
 #[test]

@@ -75,7 +75,7 @@ mod tests {
             assert!(!is_elsewhere(&format!("http://{own}:4711/")).await, "{own}");
         }
         // Set apart for documentation.
-        assert!(is_elsewhere("http://192.0.2.7:4711/").await);
+        assert!(is_elsewhere("http://198.51.100.7:4711/").await);
         for nobody in ["http://nobody.invalid:4711/", "nonsense"] {
             assert!(!is_elsewhere(nobody).await, "{nobody}");
         }
