@@ -53,7 +53,7 @@ impl<'a> Restore<'a> {
     fn params(&mut self) {
         let found = self.found.params();
         let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
-        let whole = both.as_ref().unwrap_or(self.target.params());
+        let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
             // Even if it holds what a master cannot return: that stays where it is.
             return;

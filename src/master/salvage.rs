@@ -55,7 +55,7 @@ impl<'a> Salvage<'a> {
     }
 
     /// What to ask next.
-    pub fn next(&mut self) -> Option<Call> {
+    pub fn question(&mut self) -> Option<Call> {
         // A name with a slash, as a member of a struct may have it, leads elsewhere.
         let unspeakable = |name: &String| name.is_empty() || name.contains('/');
         while let Some(path) = self
@@ -68,7 +68,7 @@ impl<'a> Salvage<'a> {
         Some(Call::new("getParam", vec![CALLER_ID.into(), key.into()]))
     }
 
-    /// Takes in the reply to [`Salvage::next`], none if it was no XML-RPC. A key that vanished
+    /// Takes in the reply to [`Salvage::question`], none if it was no XML-RPC. A key that vanished
     /// meanwhile is left out.
     pub fn take(&mut self, reply: Option<&Reply>) {
         let Some(path) = self.open.pop() else { return };
@@ -179,7 +179,7 @@ mod tests {
         let names = master.apply(&Salvage::names()).reply;
         let mut salvage = Salvage::new(&names, previous).unwrap();
         let mut asked = 0;
-        while let Some(call) = salvage.next() {
+        while let Some(call) = salvage.question() {
             asked += 1;
             // As rosmaster: a value that cannot be written is a fault.
             let reply = master.apply(&call).reply;
@@ -243,7 +243,7 @@ mod tests {
         assert!(Salvage::new(&Reply::Value(Value::Int(1)), &nothing).is_none());
         let names = Master::default().apply(&Salvage::names()).reply;
         let mut salvage = Salvage::new(&names, &nothing).unwrap();
-        assert_eq!(salvage.next(), None);
+        assert_eq!(salvage.question(), None);
         salvage.take(Some(&Reply::Value(Value::Nil)));
         assert_eq!(salvage.finish(), (Struct::new(), Vec::new()));
     }

@@ -70,7 +70,7 @@ async fn salvage(
     let Some(mut salvage) = Salvage::new(&names, previous.params()) else {
         return Ok(first);
     };
-    while let Some(call) = salvage.next() {
+    while let Some(call) = salvage.question() {
         match connection.call(&call).await.map_err(LookError::from) {
             Ok(reply) => salvage.take(Some(&reply)),
             Err(error) if is_broken_document(&error) => salvage.take(None),
