@@ -9,8 +9,9 @@ use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
 /// Levels of the tree that are kept. rosmaster takes any depth, by a long key as well as by a deep
-/// value, and cannot return more than 491 levels. What lies deeper is kept as a nil, which can be
-/// returned as little: it bounds recursion over the tree, its drop included.
+/// value, and cannot return more than 491 levels at once. What lies deeper is kept as a nil: it bounds
+/// recursion over the tree, its drop included. rosmaster returns what lies there by a key that leads
+/// close enough; it could not be brought into a successor anyway.
 const DEEPEST_TREE: usize = 512;
 
 /// The parameter tree.

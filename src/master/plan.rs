@@ -79,7 +79,8 @@ pub enum Skipped {
         /// The topic.
         topic: String,
     },
-    /// A parameter that the master would take and could never return, alone or with its parents.
+    /// A parameter that the master would take and could not return, alone or in one reply with the
+    /// whole tree.
     Param {
         /// The parameter.
         key: String,
@@ -123,7 +124,7 @@ impl fmt::Display for Skipped {
             ),
             Self::Param { key } => write!(
                 f,
-                "the parameter `{key}`: rosmaster could never return it, nor any namespace around it"
+                "the parameter `{key}`: rosmaster could not return it, or not in one reply with all others"
             ),
             Self::Unnameable { key, caller_id } => {
                 write!(f, "`{key}` of `{caller_id}`: no name leads to it")
