@@ -80,7 +80,7 @@ fn colour_on_a_terminal_only_and_not_with_no_color() {
     let master = Rosmaster::start(&scratch);
     let is_coloured = |no_color: &str, terminal: bool| {
         let setup = Setup::proxy(&scratch, master.client().port());
-        let folder = scratch.path(&format!("{no_color}{terminal}"));
+        let folder = scratch.path(format!("{no_color}{terminal}"));
         std::fs::create_dir(&folder).unwrap();
         let setup = setup.at_checkpoint(folder.join("checkpoint"));
         let setup = setup.env("NO_COLOR", no_color);
