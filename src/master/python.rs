@@ -198,8 +198,12 @@ const DEEPEST_NAMESPACE: usize = DEEPEST_REPLY - 4;
 
 /// Whether a multicall can return the whole tree.
 pub(super) fn is_writable(tree: &Struct) -> bool {
-    let mut values = tree.values();
-    values.all(|value| is_returnable(value, DEEPEST_NAMESPACE))
+    tree.values().all(is_readable)
+}
+
+/// Whether a multicall can return a value of the tree.
+pub(super) fn is_readable(value: &Value) -> bool {
+    is_returnable(value, DEEPEST_NAMESPACE)
 }
 
 /// The tree without what a master could take but never return, and the keys of what was left out.

@@ -4,7 +4,11 @@ use indexmap::IndexSet;
 
 use super::CALLER_ID;
 use super::params::Params;
+use super::{multicall, python};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
+
+/// The names that lead to a parameter.
+type Path = Vec<String>;
 
 /// What rosmaster says of a parameter that is a nil itself.
 const NONE_RETURNED: &str = "Internal error (None value returned)";
@@ -12,7 +16,7 @@ const NONE_RETURNED: &str = "Internal error (None value returned)";
 /// The parameters of a master that holds one which it cannot return, read part by part.
 ///
 /// Such a parameter spoils every namespace around it, so a namespace that cannot be read is entered,
-/// and what else is in it is read alone. What cannot be read is taken from what was known before, and
+/// and what else is in it is read without it: all at once first, then each half, and so on. What cannot be read is taken from what was known before, and
 /// if nothing was known, a nil stands for it, which can be returned as little.
 ///
 /// An empty namespace beside the culprit that was not known before stays unknown: `getParamNames`
@@ -23,8 +27,8 @@ pub struct Salvage<'a> {
     leaves: IndexSet<String>,
     /// What was known before.
     previous: &'a Struct,
-    /// Paths still to be asked for, the next one last.
-    open: Vec<Vec<String>>,
+    /// Paths still to be asked for, those that are asked for together in one list, the next list last.
+    open: Vec<Vec<Path>>,
     /// What has been read.
     found: Params,
     unknown: Vec<String>,
@@ -56,32 +60,50 @@ impl<'a> Salvage<'a> {
 
     /// What to ask next.
     pub fn question(&mut self) -> Option<Call> {
-        // A name with a slash, as a member of a struct may have it, leads elsewhere.
-        let unspeakable = |name: &String| name.is_empty() || name.contains('/');
-        while let Some(path) = self
-            .open
-            .pop_if(|path| path.last().is_some_and(unspeakable))
-        {
-            self.keep(&path);
+        while let Some(paths) = self.open.pop_if(|paths| !paths.iter().all(is_speakable)) {
+            for path in &paths {
+                self.keep(path);
+            }
         }
-        let key = key(self.open.last()?);
-        Some(Call::new("getParam", vec![CALLER_ID.into(), key.into()]))
+        let get = |path: &Path| Call::new("getParam", vec![CALLER_ID.into(), key(path).into()]);
+        match self.open.last()?.as_slice() {
+            [path] => Some(get(path)),
+            paths => Some(Call::multicall(paths.iter().map(get))),
+        }
     }
 
     /// Takes in the reply to [`Salvage::question`], none if it was no XML-RPC. A key that vanished
     /// meanwhile is left out.
     pub fn take(&mut self, reply: Option<&Reply>) {
-        let Some(path) = self.open.pop() else { return };
+        let Some(mut paths) = self.open.pop() else {
+            return;
+        };
+        match (paths.as_slice(), reply) {
+            ([path], reply) => self.take_one(path, reply),
+            (_, Some(Reply::Value(Value::Array(results)))) if results.len() == paths.len() => {
+                for (path, result) in paths.iter().zip(results) {
+                    self.take_one(path, multicall::entry_reply(result).as_ref());
+                }
+            }
+            // One of them spoils the reply.
+            _ => {
+                let second_half = paths.split_off(paths.len() / 2);
+                self.open.extend([second_half, paths]);
+            }
+        }
+    }
+
+    fn take_one(&mut self, path: &[String], reply: Option<&Reply>) {
         if let Some(Reply::Value(Value::Array(fields))) = reply {
             match fields.as_slice() {
-                [Value::Int(1), _, value] => self.put(&path, value.clone()),
+                [Value::Int(1), _, value] => self.put(path, value.clone()),
                 [_, Value::String(message), _] if message == NONE_RETURNED => {
-                    self.put(&path, Value::Nil);
+                    self.put(path, Value::Nil);
                 }
                 _ => {}
             }
-        } else if self.leaves.contains(&path.join("/")) || !self.enter(&path) {
-            self.keep(&path);
+        } else if self.leaves.contains(&path.join("/")) || !self.enter(path) {
+            self.keep(path);
         }
     }
 
@@ -145,7 +167,7 @@ impl<'a> Salvage<'a> {
                 }
             }
         }
-        let inside: Vec<Vec<String>> = inside
+        let inside: Vec<Path> = inside
             .into_iter()
             .map(|name| [path, &[name.to_owned()]].concat())
             .collect();
@@ -155,9 +177,23 @@ impl<'a> Salvage<'a> {
         if !path.is_empty() {
             self.put(path, Value::Struct(Struct::new()));
         }
-        self.open.extend(inside.into_iter().rev());
+        // What was known to spoil a reply spoils no other's.
+        let is_alone = |path: &Path| {
+            let known = self.known(path);
+            !is_speakable(path) || known.is_some_and(|value| !python::is_readable(value))
+        };
+        let together = inside.chunk_by(|a, b| !is_alone(a) && !is_alone(b));
+        let together: Vec<Vec<Path>> = together.map(<[Path]>::to_vec).collect();
+        self.open.extend(together.into_iter().rev());
         true
     }
+}
+
+/// Whether a key can lead there: a name with a slash, as a member of a struct may have it, leads
+/// elsewhere.
+fn is_speakable(path: &Path) -> bool {
+    let last = path.last();
+    last.is_some_and(|name| !name.is_empty() && !name.contains('/'))
 }
 
 fn key(path: &[String]) -> String {
@@ -208,7 +244,30 @@ mod tests {
         let (tree, unknown, asked) = salvaged(&mut master, &Struct::new());
         assert_eq!(Value::Struct(tree), Value::Struct(with_nils));
         assert_eq!(unknown, ["/b/d/in/huge"]);
-        assert_eq!(asked, 3 + 2 + 2 + 2, "each namespace at most once");
+        // Three at the top, two in each of three namespaces, asked for together and then alone.
+        assert_eq!(asked, 4 + 1 + 3 * 3);
+    }
+
+    #[test]
+    fn a_few_culprits_among_many_are_found_with_a_few_questions() {
+        let mut master = Master::default();
+        for index in 0..1000 {
+            set(&mut master, &format!("/k{index}"), index.into());
+        }
+        let mut known = master.params().clone();
+        for key in ["k3", "k500", "k999"] {
+            known.insert(key.to_owned(), Value::Nil);
+            set(&mut master, key, poison());
+        }
+        let (tree, unknown, asked) = salvaged(&mut master, &Struct::new());
+        assert_eq!(Value::Struct(tree), Value::Struct(known));
+        assert_eq!(unknown, ["/k3", "/k500", "/k999"]);
+        assert!(asked < 3 * 2 * 10, "{asked}");
+        // Who knows them asks for them apart.
+        let previous = master.params().clone();
+        let (tree, _, asked) = salvaged(&mut master, &previous);
+        assert_eq!(Value::Struct(tree), Value::Struct(previous));
+        assert_eq!(asked, 6);
     }
 
     #[test]
