@@ -8,7 +8,7 @@ use std::{
     ffi::{OsStr, OsString},
     fs, io,
     os::unix::ffi::OsStrExt,
-    path::Path,
+    path::{Path, PathBuf},
 };
 
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
@@ -28,7 +28,8 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
     }
 }
 
-/// Living processes that bear `owner` and whose rosrescue is gone.
+/// Living processes on this network that bear `owner` and whose rosrescue is gone. Another container
+/// may show us its processes, and have a checkpoint of the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     let mut wanted = format!("{OWNER}=").into_bytes();
     wanted.extend(owner.as_bytes());
@@ -37,9 +38,14 @@ pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     ids.filter(|pid| {
         let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
         let is_ours = environment.split(|byte| *byte == 0).any(|of| of == wanted);
-        is_ours && !has_rosrescue(*pid)
+        is_ours && network(pid) == network(&"self") && !has_rosrescue(*pid)
     })
     .collect()
+}
+
+/// The network that a process is in.
+fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
+    fs::read_link(format!("/proc/{process}/ns/net")).ok()
 }
 
 /// Whether the parent of `pid` is a rosrescue, so that nobody has left it behind.
