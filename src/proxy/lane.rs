@@ -146,9 +146,17 @@ impl LaneRunner {
                     None => return,
                 },
                 () = gate.changed() => self.retry_at = None,
-                landed = wait::for_some(self.flight.as_mut().map(|flight| &mut flight.landing)) => self.landed(&proxy, landed),
+                landed = wait::for_some(self.flight.as_mut().map(|flight| &mut flight.landing)) => {
+                    // A look that takes longer than the interval must leave time for calls.
+                    if matches!(landed.result, Ok(Cargo::Resynced(_))) && let Some(resync) = &mut resync {
+                        resync.reset();
+                    }
+                    self.landed(&proxy, landed);
+                }
                 () = wait::until(self.retry_at) => self.retry_at = None,
-                () = wait::tick(&mut resync) => self.resync_due = true,
+                () = wait::tick(&mut resync) => {
+                    self.resync_due |= self.flight.as_ref().is_none_or(|flight| !flight.items.is_empty());
+                }
                 () = wait::until(self.resync_at) => {
                     self.resync_at = None;
                     self.resync_due = true;
