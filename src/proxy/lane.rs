@@ -94,6 +94,7 @@ pub fn lane(max_parked: usize) -> (Lane, LaneRunner) {
         queue: VecDeque::new(),
         connection: None,
         flight: None,
+        incarnation: 0,
         resync_due: false,
         resync_at: None,
         retry_at: None,
@@ -119,6 +120,8 @@ pub struct LaneRunner {
     queue: VecDeque<LaneItem>,
     connection: Option<(u64, Connection)>,
     flight: Option<Flight>,
+    /// The one that was open last.
+    incarnation: u64,
     resync_due: bool,
     /// When a resync is due that could not be made before.
     resync_at: Option<tokio::time::Instant>,
@@ -194,6 +197,10 @@ impl LaneRunner {
         if let Some(opaque) = self.opaque.take_if(|of| of.incarnation != incarnation) {
             self.queue.push_front(opaque.item);
         }
+        if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
+            // What was doubted is gone.
+            self.resync_due = false;
+        }
         self.resync_due |= proxy.shadow.take_doubt();
         if self.flight.is_some() || self.retry_at.is_some() {
             return;
@@ -245,7 +252,7 @@ impl LaneRunner {
         match landed.result {
             Ok(Cargo::Resynced(state)) => self.resync(proxy, incarnation, version, *state),
             Ok(Cargo::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
-            Err(error) => self.failed(proxy, items, &error),
+            Err(error) => self.failed(proxy, incarnation, items, &error),
         }
     }
 
@@ -274,7 +281,13 @@ impl LaneRunner {
         }
     }
 
-    fn failed(&mut self, proxy: &Proxy, items: Vec<LaneItem>, error: &TravelError) {
+    fn failed(
+        &mut self,
+        proxy: &Proxy,
+        incarnation: u64,
+        items: Vec<LaneItem>,
+        error: &TravelError,
+    ) {
         tracing::debug!(%error, calls = items.len(), "journey");
         let now = tokio::time::Instant::now();
         self.retry_at = Some(now + RETRY_PAUSE);
@@ -290,7 +303,7 @@ impl LaneRunner {
         let sent =
             matches!(error, TravelError::Call(error) if !matches!(error, CallError::NotSent(_)));
         let mut foretold = Vec::new();
-        if sent {
+        if sent && proxy.shadow.incarnation() == incarnation {
             // The master may live, and have done all of it.
             proxy.shadow.doubt();
             foretold = proxy

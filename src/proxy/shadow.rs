@@ -233,7 +233,7 @@ impl Shadow {
         self.lock().frozen = frozen;
     }
 
-    /// The master may not be what the mirror is: it is to be read again.
+    /// The present master may not be what the mirror is: it is to be read again.
     pub fn doubt(&self) {
         self.lock().doubted = true;
     }
@@ -249,6 +249,8 @@ impl Shadow {
         let mut inner = self.lock();
         inner.incarnation += 1;
         inner.owed.clear();
+        // The new one is brought to the mirror's state, or the mirror to its.
+        inner.doubted = false;
         inner.activity.forget_displaced();
     }
 
