@@ -143,10 +143,23 @@ async fn living_rosout(proxy: &Proxy) -> Option<u32> {
     }
 }
 
+/// By then a process that was started shows its command line.
+const STARTED: Duration = Duration::from_millis(500);
+
 /// Ends rosout in order.
 async fn end_rosout(proxy: &Proxy) {
     let pid = proxy.rosout.load(Ordering::Relaxed);
-    if pid != 0 && supervisor::runs(pid, "rosout") {
+    if pid == 0 {
+        return;
+    }
+    // A process that has just been started has no command line for a moment.
+    let named = async {
+        while supervisor::is_alive(pid) && !supervisor::runs(pid, "rosout") {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    let _ = tokio::time::timeout(STARTED, named).await;
+    if supervisor::runs(pid, "rosout") {
         supervisor::stop(pid, || !supervisor::runs(pid, "rosout")).await;
     }
 }
