@@ -94,17 +94,7 @@ pub async fn run(
         MasterConfig::Supervised(_) => "-p",
         MasterConfig::External(_) => "--listen",
     };
-    let listeners = listener::bind(&config.listen, option).map_err(|error| match error {
-        // It is the address that is wrong, not the port.
-        ListenError::Other {
-            address, source, ..
-        } if source.kind() != std::io::ErrorKind::PermissionDenied => ListenError::Other {
-            address,
-            option: "--listen",
-            source,
-        },
-        error => error,
-    })?;
+    let listeners = listener::bind(&config.listen, option)?;
     if let Some(bound) = listeners
         .first()
         .and_then(|listener| listener.local_addr().ok())

@@ -18,6 +18,7 @@ use tokio::process::{Child, Command};
 use crate::config::SupervisedConfig;
 
 mod left;
+pub mod pidfd;
 mod rosout;
 
 pub use rosout::Rosout;

@@ -197,14 +197,16 @@ fn more_large_bodies_than_there_is_room_for_are_taken_in_turn() {
             ))
         })
         .collect();
+    let halves = std::sync::Barrier::new(requests.len());
     std::thread::scope(|scope| {
         for request in &requests {
-            let client = client.clone();
+            let (client, halves) = (client.clone(), &halves);
             scope.spawn(move || {
                 let mut wire = client.connect().unwrap();
                 let (first, second) = request.split_at(request.len() / 2);
                 wire.send(first).unwrap();
-                std::thread::sleep(Duration::from_millis(200));
+                // By then each has sent a half.
+                halves.wait();
                 wire.send(second).unwrap();
                 assert_eq!(wire.response().unwrap().code, 200);
             });

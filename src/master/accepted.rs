@@ -197,6 +197,11 @@ fn executed(method: &str, reply: &Reply) -> Option<bool> {
     })
 }
 
+/// Whether a method was answered with code 1.
+pub fn is_success(reply: &Reply) -> bool {
+    matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
+}
+
 /// Whether a fault is about writing the reply and not about reading the call.
 pub(super) fn is_write_error(text: &str) -> bool {
     [

@@ -1,6 +1,6 @@
 //! A mark left in a master, by which this very process is known again.
 
-use crate::xmlrpc::{Call, Reply, Value};
+use crate::xmlrpc::{Call, Reply};
 
 /// The namespace of marks. Without a leading slash no node's name and no parameter that
 /// `getParam('/')` shows can be in it.
@@ -57,7 +57,7 @@ impl Mark {
 
     /// Whether the reply to [`Mark::lookup`] says that the mark is there.
     pub fn is_found(reply: &Reply) -> bool {
-        matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
+        super::is_success(reply)
     }
 
     /// Whether a caller id is that of a mark.
@@ -69,7 +69,7 @@ impl Mark {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::master::Master;
+    use crate::{master::Master, xmlrpc::Value};
 
     fn reads() -> Vec<Call> {
         let none = ["getSystemState", "getTopicTypes", "getParamNames"];

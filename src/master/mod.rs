@@ -34,7 +34,7 @@ mod tell;
 #[cfg(test)]
 mod tests;
 
-pub use accepted::{Accepted, Agreement, Answered, accepted};
+pub use accepted::{Accepted, Agreement, Answered, accepted, is_success};
 pub use api::Outcome;
 pub use careful::{Careful, Step, Told};
 pub use difference::difference;

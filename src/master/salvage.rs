@@ -16,8 +16,9 @@ const NONE_RETURNED: &str = "Internal error (None value returned)";
 /// The parameters of a master that holds one which it cannot return, read part by part.
 ///
 /// Such a parameter spoils every namespace around it, so a namespace that cannot be read is entered,
-/// and what else is in it is read without it: all at once first, then each half, and so on. What cannot be read is taken from what was known before, and
-/// if nothing was known, a nil stands for it, which can be returned as little.
+/// and what else is in it is read without it: all at once first, then each half, and so on. What
+/// cannot be read is taken from what was known before, and if nothing was known, a nil stands for it,
+/// which can be returned as little.
 ///
 /// An empty namespace beside the culprit that was not known before stays unknown: `getParamNames`
 /// does not name it.

@@ -76,14 +76,9 @@ impl LaneItem {
     /// The answer of an earlier journey whose reply was lost, if `reply` shows that it was run then:
     /// what could be done before can not be done any more.
     pub fn done_before(&self, reply: &Reply) -> Option<Reply> {
-        let success = |reply: &Reply| match reply {
-            Reply::Value(Value::Array(answer)) => answer.first() == Some(&Value::Int(1)),
-            _ => false,
-        };
-        let refused = matches!(reply, Reply::Value(Value::Array(_))) && !success(reply);
-        self.foretold
-            .clone()
-            .filter(|first| success(first) && refused)
+        let refused = matches!(reply, Reply::Value(Value::Array(_))) && !master::is_success(reply);
+        let first = self.foretold.as_ref().filter(|_| refused)?;
+        master::is_success(first).then(|| first.clone())
     }
 
     /// The nodes whose registrations the call may change. What cannot be decoded has none that we

@@ -50,11 +50,11 @@ pub enum ListenError {
         option: &'static str,
     },
     /// Any other reason.
-    #[error("cannot listen at {address}: {source}; choose another address with {option}")]
+    #[error("cannot listen at {address}: {source}; choose another one with {option}")]
     Other {
         /// The address.
         address: SocketAddr,
-        /// The option that chooses it.
+        /// The option that chooses what is wrong with it.
         option: &'static str,
         /// What the system said.
         source: io::Error,
@@ -62,7 +62,8 @@ pub enum ListenError {
 }
 
 /// Listens at all of `addresses`. All but the first are left out if the computer lacks their address
-/// family. With port 0 they share one free port. `option` is named in errors.
+/// family. With port 0 they share one free port. `option`, which
+/// chooses the port, is named in errors.
 pub fn bind(
     addresses: &[SocketAddr],
     option: &'static str,
@@ -83,6 +84,11 @@ pub fn bind(
                 tracing::debug!(%address, %error, "not served");
             }
             Err(source) => {
+                // Some ports are for root only; all else is about the address.
+                let option = match source.kind() {
+                    io::ErrorKind::PermissionDenied => option,
+                    _ => "--listen",
+                };
                 return Err(ListenError::Other {
                     address,
                     option,

@@ -4,6 +4,8 @@
 //! new incarnation takes over: a reply of the old master that arrives after its state was taken for
 //! the injection is not acknowledged, and the call travels again.
 
+mod words;
+
 use std::{
     collections::HashSet,
     sync::{Mutex, MutexGuard, PoisonError},
@@ -17,13 +19,11 @@ use crate::{
     master::{self, Agreement, Answered, Master},
     record::{Checkpoint, Entry, Session},
     store::Store,
-    xmlrpc::{Call, Reply, Value},
+    xmlrpc::{Call, Reply},
 };
 
 /// Unregistrations that take nothing away are remembered beside so many others.
 const OWED_IDLY: usize = 1000;
-/// Replies in a log line are cut to so many bytes.
-const LOGGED_REPLY: usize = 300;
 
 /// The call's incarnation has been succeeded by another one: the call must travel again.
 #[derive(Debug)]
@@ -424,7 +424,8 @@ impl Inner {
     fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
         let method = answered.call.method.as_str();
         if self.diverged.insert(method.to_owned()) {
-            let [master, mirror] = [&answered.reply, mirror].map(|reply| in_short(method, reply));
+            let [master, mirror] =
+                [&answered.reply, mirror].map(|reply| words::in_short(method, reply));
             tracing::warn!(
                 method,
                 mirror,
@@ -434,26 +435,6 @@ impl Inner {
             );
         }
     }
-}
-
-/// A reply for the log. Values of parameters are nobody's business there.
-fn in_short(method: &str, reply: &Reply) -> String {
-    let text = match reply {
-        Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
-            let said = answer.get(..2).unwrap_or_default();
-            format!("{said:?} and a value")
-        }
-        reply => format!("{reply:?}"),
-    };
-    cut(&text).to_owned()
-}
-
-fn cut(text: &str) -> &str {
-    let end = (0..=LOGGED_REPLY)
-        .rev()
-        .find(|end| text.is_char_boundary(*end))
-        .unwrap_or(0);
-    text.get(..end.min(text.len())).unwrap_or(text)
 }
 
 #[cfg(test)]

@@ -23,14 +23,15 @@ use super::{
 };
 use crate::{
     census::{Mending, Name, Registration, Verdict, judge},
-    master::{CALLER_ID, Kind, Mark, Master},
+    master::{self, CALLER_ID, Kind, Mark, Master},
     proxy::{
         Proxy,
         activity::{Activity, Letter},
         gate::State,
+        journey,
     },
     ros_env::MasterUri,
-    xmlrpc::{Call, Reply, Value},
+    xmlrpc::{Call, Reply},
 };
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
@@ -391,13 +392,8 @@ async fn mend(
 /// Whether the one entry of a multicall was answered with success: a node may claim a type that no
 /// master takes.
 fn is_done(reply: &Reply) -> bool {
-    let Reply::Value(results) = reply else {
-        return false;
-    };
-    let answer = results.as_array().and_then(|results| results.first());
-    let answer = answer.and_then(|result| result.as_array()?.first());
-    let code = answer.and_then(|answer| answer.as_array()?.first());
-    code.and_then(Value::as_int) == Some(1)
+    let replies = journey::unpack(reply, 1).unwrap_or_default();
+    replies.iter().any(master::is_success)
 }
 
 /// Unregisters a node as it would have done itself. Not if it has another address by now, or has

@@ -6,11 +6,10 @@
 
 use std::{fs, future::poll_fn, io, task::Poll};
 
-use rustix::{
-    fs::OFlags,
-    process::{Pid, PidfdFlags, pidfd_open},
-};
+use rustix::{fs::OFlags, process::PidfdFlags};
 use tokio::net::unix::pipe::Receiver;
+
+use crate::supervisor::pidfd;
 
 /// So many threads are watched: one of them may be the last. A rosmaster with `-w 1` has no more that
 /// live as long as it does, one that calls nodes and one that serves.
@@ -31,11 +30,7 @@ pub(super) fn of(pid: i32) -> io::Result<impl Future<Output = ()> + Send + use<>
     let others = threads.skip(1).take(WATCHED).map(|entry| {
         let name = entry?.file_name();
         let thread = name.to_str().and_then(|name| name.parse().ok());
-        let thread = thread
-            .and_then(Pid::from_raw)
-            .ok_or(io::ErrorKind::InvalidData)?;
-        // Never read: only whether it could be is of interest, which tokio tells safely of pipes alone.
-        Receiver::from_owned_fd_unchecked(pidfd_open(thread, PIDFD_THREAD)?)
+        pidfd::open(thread.ok_or(io::ErrorKind::InvalidData)?, PIDFD_THREAD)
     });
     let watched = others.collect::<io::Result<Vec<Receiver>>>()?;
     Ok(poll_fn(move |context| {

@@ -198,7 +198,7 @@ pub async fn examine(
         inject(proxy, connection, first, manner, start, &mut examination).await?;
     } else if !matches!(manner.known, Known::ServedIfMarked) {
         let previous = proxy.shadow.with_mirror(Clone::clone);
-        let held = second_look(first, connection, &previous).await?;
+        let held = second_look(proxy, first, connection, &previous).await?;
         proxy.shadow.succeed();
         let difference = proxy.shadow.adopt(held);
         if !difference.is_empty() {
@@ -226,7 +226,7 @@ async fn pay_owed(proxy: &Proxy, connection: &mut Connection) -> Result<bool, Ex
         return Ok(false);
     }
     let count = owed.len();
-    within(INJECTION_LIMIT, connection.call(&Call::multicall(owed))).await?;
+    while_alive(proxy, connection.call(&Call::multicall(owed))).await?;
     proxy.shadow.paid(count);
     Ok(true)
 }
@@ -248,7 +248,7 @@ async fn inject(
     };
     let found = match empty {
         true => Master::default(),
-        false => second_look(first, connection, &Master::default()).await?,
+        false => second_look(proxy, first, connection, &Master::default()).await?,
     };
     examination.look = start.elapsed();
     // Nothing of ours to bring: a running system is taken over.
@@ -287,11 +287,7 @@ async fn inject(
         } = next;
         manner.progress.set(InFlight::Whole);
         let head = Head::default();
-        let injected = within(INJECTION_LIMIT, connection.forward(&head, body));
-        let raw = tokio::select! {
-            raw = injected => raw?,
-            limit = beside::silence(proxy) => return Err(ExamineError::Silent { limit }),
-        };
+        let raw = while_alive(proxy, connection.forward(&head, body)).await?;
         manner.progress.take();
         examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
         // The reply is long, and everybody waits: it is decoded only if it differs from the
@@ -318,7 +314,7 @@ async fn inject(
         );
         // The truth of the master wins over what we expected of it; the rest is tried again.
         let first = first_look(proxy, connection).await?;
-        let found = second_look(first, connection, plan.expected()).await?;
+        let found = second_look(proxy, first, connection, plan.expected()).await?;
         next = Prepared::new(proxy, version, &target(), &found);
         if round == ROUNDS {
             proxy.shadow.adopt(found);
@@ -349,7 +345,7 @@ async fn inject_carefully(
             if step.tested
                 && let Some((_, age)) = trial.tested
             {
-                outlive(connection, start, age).await?;
+                outlive(proxy, connection, start, age).await?;
             }
             if step.record {
                 progress.set(InFlight::Record {
@@ -359,7 +355,7 @@ async fn inject_carefully(
                 });
                 index += 1;
             }
-            let reply = within(INJECTION_LIMIT, connection.call(&step.call)).await?;
+            let reply = while_alive(proxy, connection.call(&step.call)).await?;
             progress.set(InFlight::NoRecord);
             if reply != step.predicted {
                 let text = format!("{} was answered otherwise than predicted", step.call.method);
@@ -382,7 +378,7 @@ async fn inject_carefully(
             "the master differs from what was injected"
         );
         let first = first_look(proxy, connection).await?;
-        found = second_look(first, connection, plan.expected()).await?;
+        found = second_look(proxy, first, connection, plan.expected()).await?;
     }
     progress.take();
     proxy.shadow.adopt(found);
@@ -391,6 +387,7 @@ async fn inject_carefully(
 
 /// Waits until the master is of this `age`, and keeps it from closing an idle connection.
 async fn outlive(
+    proxy: &Proxy,
     connection: &mut Connection,
     start: Instant,
     age: Duration,
@@ -401,7 +398,7 @@ async fn outlive(
         .filter(|rest| !rest.is_zero())
     {
         tokio::time::sleep(rest.min(Duration::from_millis(500))).await;
-        within(INJECTION_LIMIT, connection.call(&sign_of_life)).await?;
+        while_alive(proxy, connection.call(&sign_of_life)).await?;
     }
     Ok(())
 }
@@ -412,11 +409,23 @@ async fn first_look(proxy: &Proxy, connection: &mut Connection) -> Result<FirstL
 }
 
 async fn second_look(
+    proxy: &Proxy,
     first: FirstLook,
     connection: &mut Connection,
     previous: &Master,
 ) -> Result<Master, ExamineError> {
-    within(INJECTION_LIMIT, look::second(first, connection, previous)).await
+    while_alive(proxy, look::second(first, connection, previous)).await
+}
+
+/// Waits for what may take long, as long as the master shows signs of life.
+async fn while_alive<T, E: Into<ExamineError>>(
+    proxy: &Proxy,
+    work: impl Future<Output = Result<T, E>>,
+) -> Result<T, ExamineError> {
+    tokio::select! {
+        done = within(INJECTION_LIMIT, work) => done,
+        limit = beside::silence(proxy) => Err(ExamineError::Silent { limit }),
+    }
 }
 
 async fn within<T, E: Into<ExamineError>>(

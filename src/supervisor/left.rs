@@ -11,8 +11,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
-use tokio::net::unix::pipe::Receiver;
+use rustix::process::PidfdFlags;
+
+use super::pidfd;
 
 /// The environment variable that says whose master a process is.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
@@ -86,10 +87,8 @@ pub(super) fn listens(pid: u32, port: u16) -> bool {
 ///
 /// What the system says: the process is gone, or the kernel is older than 5.3 and cannot watch it.
 pub(super) async fn ended(pid: u32) -> io::Result<()> {
-    let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
-    let pid = pid.ok_or(io::ErrorKind::InvalidInput)?;
-    // Never read: only whether it could be is of interest, which tokio tells safely of pipes alone.
-    let process = Receiver::from_owned_fd_unchecked(pidfd_open(pid, PidfdFlags::empty())?)?;
+    let pid = i32::try_from(pid).map_err(io::Error::other)?;
+    let process = pidfd::open(pid, PidfdFlags::empty())?;
     process.readable().await
 }
 

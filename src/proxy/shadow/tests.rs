@@ -182,10 +182,3 @@ fn topics_are_remembered_while_a_dead_master_may_owe_the_news() {
     assert_eq!(noticed(start + NOTICE_MEMORY / 2), ["/t"]);
     assert_eq!(noticed(start + NOTICE_MEMORY), Vec::<String>::new());
 }
-
-#[test]
-fn long_replies_are_cut_at_a_character() {
-    let text = "ä".repeat(LOGGED_REPLY);
-    assert_eq!(cut(&text).len(), LOGGED_REPLY);
-    assert_eq!(cut("short"), "short");
-}

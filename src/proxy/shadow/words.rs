@@ -1,0 +1,38 @@
+//! Replies in the log.
+
+use crate::xmlrpc::{Reply, Value};
+
+/// Replies in a log line are cut to so many bytes.
+const LOGGED_REPLY: usize = 300;
+
+/// A reply for the log. Values of parameters are nobody's business there.
+pub(super) fn in_short(method: &str, reply: &Reply) -> String {
+    let text = match reply {
+        Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
+            let said = answer.get(..2).unwrap_or_default();
+            format!("{said:?} and a value")
+        }
+        reply => format!("{reply:?}"),
+    };
+    cut(&text).to_owned()
+}
+
+fn cut(text: &str) -> &str {
+    let end = (0..=LOGGED_REPLY)
+        .rev()
+        .find(|end| text.is_char_boundary(*end))
+        .unwrap_or(0);
+    text.get(..end.min(text.len())).unwrap_or(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_replies_are_cut_at_a_character() {
+        let text = "ä".repeat(LOGGED_REPLY);
+        assert_eq!(cut(&text).len(), LOGGED_REPLY);
+        assert_eq!(cut("short"), "short");
+    }
+}
