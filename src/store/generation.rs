@@ -1,10 +1,11 @@
 //! Writing a new generation of the file while calls go on being recorded.
 
 use std::io;
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use super::journal::Active;
-use super::{Names, Storage, Store, StoreError, SyncJob};
+use super::{Names, Storage, Store, StoreError, SyncJob, Synced};
 use crate::record::{self, Checkpoint, Stamp};
 
 /// A journal that is smaller than this is not worth a new generation.
@@ -49,6 +50,9 @@ struct Plan<S: Storage> {
     generation: u64,
     /// Whether the present file becomes the previous generation.
     keep_present: bool,
+    /// What comes first then: the generation before may be the only one to have some of the present
+    /// file's records on the medium.
+    settle: Option<SyncJob<S>>,
     ticket: Arc<Ticket>,
 }
 
@@ -56,6 +60,7 @@ struct Plan<S: Storage> {
 #[must_use = "give it to `Store::finish_compaction`"]
 pub struct Compacted<S: Storage> {
     generation: u64,
+    settled: Option<Synced>,
     result: Result<Written<S>, StoreError>,
     _ticket: Arc<Ticket>,
 }
@@ -77,9 +82,11 @@ impl<S: Storage> CompactionJob<S> {
 }
 
 impl<S: Storage> Plan<S> {
-    fn run(self, checkpoint: &Checkpoint) -> Compacted<S> {
+    fn run(mut self, checkpoint: &Checkpoint) -> Compacted<S> {
+        let settled = self.settle.take().map(SyncJob::run);
         Compacted {
             generation: self.generation,
+            settled,
             result: self.write(checkpoint),
             _ticket: self.ticket,
         }
@@ -95,9 +102,14 @@ impl<S: Storage> Plan<S> {
         let generation = *generation;
         let encoded = record::encode_checkpoint(checkpoint, generation)?;
         let path = names.fresh(generation);
-        let file = storage.create(&path).map_err(failed("create", &path))?;
-        let written = append_all(storage, &file, &encoded.bytes).and_then(|()| storage.sync(&file));
-        written.map_err(failed("write", &path))?;
+        let file = match self.write_at(&path, &encoded.bytes) {
+            Err(StoreError::Io { source, .. })
+                if source.kind() == io::ErrorKind::StorageFull && self.make_room() =>
+            {
+                self.write_at(&path, &encoded.bytes)
+            }
+            other => other,
+        }?;
         let wanted = self.ticket.lock();
         if !*wanted {
             return Err(names.overtaken());
@@ -123,6 +135,23 @@ impl<S: Storage> Plan<S> {
             snapshot_bytes,
             linked,
         })
+    }
+
+    /// A file at `path` that holds `bytes`, on the medium.
+    fn write_at(&self, path: &Path, bytes: &[u8]) -> Result<S::File, StoreError> {
+        let storage = &self.storage;
+        let file = storage.create(path).map_err(failed("create", path))?;
+        append_all(storage, &file, bytes)
+            .and_then(|()| storage.sync(&file))
+            .map_err(failed("write", path))?;
+        Ok(file)
+    }
+
+    /// Removes the previous generation, which the present file is about to replace anyway. The present
+    /// file itself never gives way: it is the only copy until there is a new one.
+    fn make_room(&self) -> bool {
+        let wanted = self.ticket.lock();
+        *wanted && self.keep_present && self.storage.remove(&self.names.previous()).is_ok()
     }
 }
 
@@ -190,11 +219,13 @@ impl<S: Storage> Store<S> {
             overtaken: false,
             ticket: Arc::downgrade(&ticket),
         });
+        let unsettled = self.active.as_ref().is_some_and(|active| !active.named);
         Ok(Plan {
             storage: self.storage.clone(),
             names: self.names.clone(),
             generation,
             keep_present: self.usable,
+            settle: if unsettled { self.sync_job() } else { None },
             ticket,
         })
     }
@@ -223,12 +254,13 @@ impl<S: Storage> Store<S> {
     ///
     /// If there is no new generation. The present file goes on as it was, and the next compaction
     /// is wanted when it has doubled.
-    pub fn finish_compaction(&mut self, done: Compacted<S>) -> Result<(), StoreError> {
+    pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
             .pending
             .take_if(|pending| pending.generation == done.generation);
-        let finished = self.switch(pending, done);
+        let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
+        let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
             // It may not be there at all; if it stays, the next start removes it.
             let _ = self.storage.remove(&fresh);
@@ -330,10 +362,7 @@ pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) 
 }
 
 /// Says what was done to which file when it failed.
-pub(super) fn failed(
-    doing: &'static str,
-    path: &std::path::Path,
-) -> impl FnOnce(io::Error) -> StoreError {
+pub(super) fn failed(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> StoreError {
     move |source| StoreError::Io {
         doing,
         path: path.to_owned(),

@@ -64,7 +64,13 @@ impl<S: Storage> Store<S> {
             }
         };
         active.clean &= self.buffer.is_empty();
-        let written = match self.storage.append(&active.file, &self.buffer) {
+        let length = active.snapshot_bytes + active.journal_bytes + self.buffer.len() as u64;
+        let appended = match length > self.file_bytes_max {
+            // It would never be read again.
+            true => Err(io::ErrorKind::FileTooLarge.into()),
+            false => self.storage.append(&active.file, &self.buffer),
+        };
+        let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
             // The rest would fail too; the next write would only say why.
             Ok(taken) => Err(io::Error::new(
@@ -86,7 +92,10 @@ impl<S: Storage> Store<S> {
     /// Stops recording, for good as far as the present file is concerned.
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());
-        self.active = None;
+        if self.active.take().is_some_and(|active| !active.named) {
+            // Nobody knows what of it is on the medium, and the generation before has all of it that was.
+            self.usable = false;
+        }
         error
     }
 

@@ -8,7 +8,7 @@ use super::{OpenError, Storage};
 use crate::record::{self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session};
 
 /// No checkpoint is larger; what is, is not read.
-const FILE_BYTES_MAX: u64 = 1 << 30;
+pub(super) const FILE_BYTES_MAX: u64 = 1 << 30;
 
 /// What was found on disk.
 #[derive(Debug, Default)]
@@ -102,7 +102,7 @@ fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, byte
     let mut damage = Vec::new();
     let mut damaged = present.damaged.clone();
     let snapshot = present.checkpoint();
-    let usable = snapshot.is_ok();
+    let whole = snapshot.is_ok();
     let checkpoint = match snapshot {
         Ok(checkpoint) => Some(checkpoint),
         Err(why) => {
@@ -118,6 +118,7 @@ fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, byte
     // The previous generation may hold records that the present one lost or, after a loss of power
     // just behind a compaction, has not got yet.
     let mut records = present.records(base, &mut damaged);
+    let own = records.len();
     // A file that somebody put back from a copy is no successor of the previous generation.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {
@@ -163,7 +164,8 @@ fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, byte
             .and_then(generation)
             .max(generation(present))
             .unwrap_or(0),
-        usable,
+        // Not while the previous generation has what it lacks.
+        usable: whole && records.len() == own,
         torn: torn
             .clone()
             .and_then(|range| bytes.get(range).map(<[u8]>::to_vec)),

@@ -53,6 +53,7 @@ pub struct Store<S: Storage = Disk> {
     /// Whether the file at the path is whole enough to be kept as the previous generation.
     usable: bool,
     compact_above: u64,
+    file_bytes_max: u64,
     buffer: Vec<u8>,
     _lock: S::Lock,
 }
@@ -147,6 +148,7 @@ impl<S: Storage> Store<S> {
             generation,
             usable,
             compact_above: COMPACTION_BYTES_MIN,
+            file_bytes_max: load::FILE_BYTES_MAX,
             buffer: Vec::new(),
             _lock: lock,
         };

@@ -191,3 +191,65 @@ fn a_session_is_set_aside_whole_or_not_at_all() {
         }
     }
 }
+
+/// A larger file would never be read again.
+#[test]
+fn a_file_that_would_become_too_large_is_begun_anew() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    model.append(&mut store, 1);
+    store.file_bytes_max = store.snapshot_bytes() + store.journal_bytes() + 10;
+    model.append(&mut store, 1);
+    assert_eq!(model.acked, 1);
+    assert!(store.unprotected().unwrap().contains("too large"));
+    store.rearm(&model.checkpoint(store.seq())).unwrap();
+    drop(store);
+    assert_eq!(state(&open(&fs).unwrap().1.unwrap()), [1, 2]);
+}
+
+/// The previous generation gives way, the present one does not.
+#[test]
+fn a_full_disk_has_room_for_what_replaces_the_previous_generation() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    for _ in 0..3 {
+        assert!(model.begin(&mut store));
+    }
+    let names = store.names.clone();
+    assert!(fs.read(&names.previous(), 1 << 20).is_ok());
+    fs.arm(0, Fault::Once(ENOSPC));
+    assert!(model.begin(&mut store));
+    fs.arm(0, Fault::Errno(ENOSPC));
+    model.append(&mut store, 1);
+    assert!(!model.begin(&mut store));
+    fs.disarm();
+    assert!(fs.read(&names.path, 1 << 20).is_ok());
+}
+
+/// A loss of power behind a compaction leaves some records in the previous generation alone; a start that
+/// is killed must not replace that before the next generation is there.
+#[test]
+fn what_the_previous_generation_alone_has_outlives_starts_that_are_killed() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let (mut store, _) = open(&fs).unwrap();
+    model.begin(&mut store);
+    model.append(&mut store, 1);
+    let job = store
+        .begin_compaction(model.checkpoint(store.seq()))
+        .unwrap();
+    model.append(&mut store, 2);
+    model.sync(&mut store);
+    store.finish_compaction(job.run()).unwrap();
+    assert_eq!(model.synced, 3);
+    drop(store);
+    for (nth, image) in fs.after_power_loss(4_096).iter().enumerate() {
+        let context = format!("image {nth}");
+        let loaded = open(&image.after_kill()).unwrap().1;
+        check(&model, loaded.as_ref(), 3, &context);
+        starts_killed(image, 3, &context);
+    }
+}
