@@ -28,7 +28,7 @@ impl Counter {
 pub struct Stats {
     /// Calls that clients made.
     pub calls: Counter,
-    /// Calls that were answered by the mirror because the gate was shut.
+    /// Calls that were answered by the mirror, because the gate was shut or the master's answer broke off.
     pub stood_in: Counter,
     /// Calls that waited at the shut gate.
     pub parked: Counter,
@@ -55,7 +55,7 @@ impl Stats {
             ("calls", "calls that clients made", self.calls.value()),
             (
                 "stood_in",
-                "calls answered by the mirror while the gate was shut",
+                "calls answered by the mirror: the gate was shut, or the master's answer broke off",
                 self.stood_in.value(),
             ),
             (

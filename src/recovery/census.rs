@@ -109,18 +109,7 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
         .board
         .add_to_report(census, census_ms, healed, suspects)
     {
-        tracing::info!(
-            cause = report.cause,
-            total_ms = report.phases.total_ms,
-            census_ms,
-            skipped = ?report.skipped,
-            removed = ?report.removed,
-            mended = ?report.mended,
-            healed = ?report.healed,
-            suspects = ?report.suspects,
-            "recovery is complete: {}",
-            report.restored
-        );
+        report.log("recovery is complete");
     }
 }
 

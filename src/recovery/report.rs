@@ -6,6 +6,7 @@ use std::{
 };
 
 use serde::Serialize;
+use tracing::field::debug;
 
 use super::examine::Examination;
 use crate::{clock, master::Counts};
@@ -79,6 +80,37 @@ pub struct Report {
     pub suspects: Vec<String>,
     /// Topics whose subscribers were sent the full list of publishers.
     pub healed: Vec<String>,
+}
+
+impl Report {
+    /// Logs all of it in one line, but what is empty.
+    pub(super) fn log(&self, message: &str) {
+        let some = |list: &Vec<String>| (!list.is_empty()).then(|| debug(list.clone()));
+        let Phases {
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+        } = self.phases;
+        tracing::info!(
+            cause = self.cause,
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+            census_ms = self.census_ms,
+            master_pid = self.master_pid,
+            skipped = some(&self.skipped),
+            set_aside = some(&self.set_aside),
+            mismatches = some(&self.mismatches),
+            removed = some(&self.removed),
+            mended = some(&self.mended),
+            healed = some(&self.healed),
+            suspects = some(&self.suspects),
+            "{message}: {}",
+            self.restored
+        );
+    }
 }
 
 /// A duration in milliseconds, to a hundredth.

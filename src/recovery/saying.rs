@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::{
     Guard, census,
     examine::Examination,
-    report::{Outage, Outcome, Phases},
+    report::{Outage, Outcome},
 };
 use crate::lifecycle::Cause;
 
@@ -30,24 +30,7 @@ impl Guard {
             tracing::debug!("the same master goes on");
             return;
         }
-        let Phases {
-            absence_ms,
-            look_ms,
-            injection_ms,
-            total_ms,
-        } = report.phases;
-        tracing::info!(
-            cause,
-            absence_ms,
-            look_ms,
-            injection_ms,
-            total_ms,
-            master_pid = report.master_pid,
-            skipped = ?report.skipped,
-            "{}: {}",
-            report.outcome,
-            report.restored
-        );
+        report.log(&report.outcome.to_string());
         let outcome = report.outcome;
         self.proxy.board.set_report(report);
         if self.served.is_none() {
