@@ -2,7 +2,7 @@
 
 use std::{
     fs::{File, OpenOptions},
-    io,
+    io::{self, Write},
     net::{Ipv4Addr, SocketAddrV4},
     os::unix::fs::OpenOptionsExt,
     path::{Path, PathBuf},
@@ -188,7 +188,7 @@ impl Rosmaster {
     fn write_log_config(&self) -> io::Result<()> {
         match std::fs::read(&self.log_config) {
             Ok(present) if present == LOG_CONFIG.as_bytes() => Ok(()),
-            _ => std::fs::write(&self.log_config, LOG_CONFIG),
+            _ => create(&self.log_config)?.write_all(LOG_CONFIG.as_bytes()),
         }
     }
 
@@ -311,7 +311,7 @@ pub fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// The first line that `program` prints within `limit`, as roslaunch's `command=` would take it.
+/// What `program` prints within `limit`, as roslaunch's `command=` would take it.
 pub async fn output_of(program: &str, arguments: &[&str], limit: Duration) -> Option<String> {
     let mut command = Command::new(find_program(program, &["bin"])?);
     command

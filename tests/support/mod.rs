@@ -38,7 +38,7 @@ pub(crate) use kinds::{kinds, sorted};
 pub(crate) use netns::Netns;
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
-pub(crate) use process::{Process, alive, signal, stop};
+pub(crate) use process::{Process, alive, behind, signal, stop};
 pub(crate) use relay::Relay;
 pub(crate) use rescue::{Rescue, Setup};
 pub(crate) use robot::{Mode, Robot};

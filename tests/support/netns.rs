@@ -4,6 +4,8 @@
 use std::process::Command;
 use std::sync::atomic::{AtomicU8, Ordering};
 
+use super::process::behind;
+
 /// A network namespace with a veth to this one. Both go on drop.
 #[derive(Debug)]
 pub(crate) struct Netns {
@@ -86,17 +88,7 @@ impl Netns {
     pub(crate) fn inside(&self, command: &Command) -> Command {
         let mut inside = Command::new("ip");
         inside.args(["netns", "exec", &self.name]);
-        inside.arg(command.get_program()).args(command.get_args());
-        for (key, value) in command.get_envs() {
-            match value {
-                Some(value) => inside.env(key, value),
-                None => inside.env_remove(key),
-            };
-        }
-        if let Some(folder) = command.get_current_dir() {
-            inside.current_dir(folder);
-        }
-        inside
+        behind(inside, command)
     }
 }
 

@@ -236,3 +236,18 @@ fn collect(
         }
     });
 }
+
+/// `inner`, run by `outer`, which takes a command behind its own arguments.
+pub(crate) fn behind(mut outer: Command, inner: &Command) -> Command {
+    outer.arg(inner.get_program()).args(inner.get_args());
+    for (key, value) in inner.get_envs() {
+        match value {
+            Some(value) => outer.env(key, value),
+            None => outer.env_remove(key),
+        };
+    }
+    if let Some(folder) = inner.get_current_dir() {
+        outer.current_dir(folder);
+    }
+    outer
+}

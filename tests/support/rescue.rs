@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use super::patience::eventually;
-use super::process::Process;
+use super::process::{Process, behind};
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 
@@ -93,18 +93,7 @@ impl Setup {
             command.arg("--map-root-user");
         }
         command.args(["--mount", "sh", "-c", SHOW]).arg(boot_id);
-        command.arg(self.command.get_program());
-        command.args(self.command.get_args());
-        for (key, value) in self.command.get_envs() {
-            match value {
-                Some(value) => command.env(key, value),
-                None => command.env_remove(key),
-            };
-        }
-        if let Some(folder) = self.command.get_current_dir() {
-            command.current_dir(folder);
-        }
-        self.command = command;
+        self.command = behind(command, &self.command);
     }
 
     /// Starts it and waits until it serves a living master.

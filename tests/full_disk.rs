@@ -1,0 +1,154 @@
+//! A disk that cannot be written (FAULTS.md F10, F11): calls go on being forwarded, it says that it
+//! is unprotected, and it re-arms by itself.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::{
+    fs,
+    io::{ErrorKind, Write},
+    path::PathBuf,
+    process::Command,
+};
+
+use rustix::process::Signal;
+use support::{Process, Rescue, Scratch, Setup, behind, eventually, free_port, signal, status};
+
+/// A small disk that only those see who are run [on](Self::on) it.
+struct SmallDisk {
+    holder: Process,
+    folder: PathBuf,
+}
+
+impl SmallDisk {
+    fn new(scratch: &Scratch, size: &str) -> Self {
+        const MOUNT: &str =
+            r#"mount -t tmpfs -o size="$1" none "$0" && echo ready && exec tail -f /dev/null"#;
+        let folder = scratch.path("disk");
+        fs::create_dir(&folder).unwrap();
+        let mut command = Command::new("unshare");
+        command
+            .args(["--mount", "sh", "-c", MOUNT])
+            .arg(&folder)
+            .arg(size);
+        let mut holder = Process::start("a disk (mounts need root)", &mut command);
+        holder.wait_line("that it is there", |line| line == "ready");
+        Self { holder, folder }
+    }
+
+    /// `command`, run by somebody who sees the disk.
+    fn on(&self, command: &Command) -> Command {
+        let mut nsenter = Command::new("nsenter");
+        nsenter.args(["--mount", "--target", &self.holder.pid().to_string()]);
+        behind(nsenter, command)
+    }
+
+    /// The disk's folder, for us.
+    fn seen(&self) -> PathBuf {
+        let root = PathBuf::from(format!("/proc/{}/root", self.holder.pid()));
+        root.join(self.folder.strip_prefix("/").unwrap())
+    }
+
+    /// Takes what is left of the disk.
+    fn fill(&self) -> PathBuf {
+        let path = self.seen().join("somebody-elses.log");
+        let mut file = fs::File::create(&path).unwrap();
+        let error = loop {
+            if let Err(error) = file.write_all(&[b'x'; 4096]) {
+                break error;
+            }
+        };
+        assert_eq!(error.kind(), ErrorKind::StorageFull);
+        path
+    }
+
+    fn remount(&self, how: &str) {
+        let mut mount = Command::new("mount");
+        mount.args(["-o", how]).arg(&self.folder);
+        assert!(
+            self.on(&mount).status().unwrap().success(),
+            "mount -o {how}"
+        );
+    }
+
+    fn rescue(&self, scratch: &Scratch) -> Rescue {
+        Setup::core(scratch, free_port())
+            .at_checkpoint(self.folder.join("latest-chkpt.yaml"))
+            .wrapped(|command| self.on(command))
+            .start()
+    }
+}
+
+fn unprotected(rescue: &Rescue) -> bool {
+    !status(&rescue.client())["unprotected"].is_null()
+}
+
+/// Both die, and the state is that of `/last`.
+fn assert_survives(rescue: &mut Rescue, last: i32) {
+    let master = rescue.client().master_pid().unwrap();
+    rescue.kill();
+    signal(master, Signal::KILL);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/last"), Some(last.into()));
+}
+
+/// Each set is answered while the disk is unusable; the state of memory is what a dead master is
+/// restored from.
+fn goes_on_without(rescue: &mut Rescue) {
+    let client = rescue.client();
+    let mut count = 0;
+    eventually("it is said to be unprotected", || {
+        count += 1;
+        client.set_param("/last", count);
+        unprotected(rescue)
+    });
+    rescue.wait_line("why", |line| {
+        line.contains("unprotected: calls are forwarded")
+    });
+    client.set_param("/last", -1);
+    let dead = client.master_pid().unwrap();
+    signal(dead, Signal::KILL);
+    eventually("another master is there", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    assert_eq!(client.param("/last"), Some((-1).into()));
+}
+
+fn is_protected_again(rescue: &mut Rescue) {
+    eventually("it is protected again", || !unprotected(rescue));
+    rescue.wait_line("that", |line| line.contains("protected again"));
+    rescue.client().set_param("/last", 1000);
+    assert_survives(rescue, 1000);
+}
+
+#[test]
+fn a_disk_that_somebody_fills() {
+    let scratch = Scratch::new();
+    let disk = SmallDisk::new(&scratch, "1m");
+    let mut rescue = disk.rescue(&scratch);
+    let filler = disk.fill();
+    goes_on_without(&mut rescue);
+    fs::remove_file(filler).unwrap();
+    is_protected_again(&mut rescue);
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+/// While files are open for writing, a disk does not become read-only.
+#[test]
+fn a_disk_that_is_read_only_at_the_start() {
+    let scratch = Scratch::new();
+    let disk = SmallDisk::new(&scratch, "1m");
+    disk.remount("remount,ro");
+    let mut rescue = disk.rescue(&scratch);
+    goes_on_without(&mut rescue);
+    disk.remount("remount,rw");
+    is_protected_again(&mut rescue);
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
