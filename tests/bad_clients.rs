@@ -379,6 +379,10 @@ fn no_other_computer_shuts_the_master_down() {
             false,
         )),
         with("Content-Encoding: gzip", &zip(&utf16(document, true))),
+        with(
+            "Content-Encoding: gzip",
+            &zip(&[&plain[..], &[b' '; 20 << 20]].concat()),
+        ),
         http_request(b"garbage"),
     ];
     let master = here.master_pid().expect("a master");

@@ -1,8 +1,12 @@
 //! Request bodies: so large, so slow, and so many at once.
 
-use std::time::Duration;
+use std::{
+    io::{self, Read},
+    time::Duration,
+};
 
 use bytes::Bytes;
+use flate2::read::MultiGzDecoder;
 use http_body_util::BodyExt;
 use hyper::body::{Body, Incoming};
 use tokio::{
@@ -18,6 +22,9 @@ pub const SMALL: usize = 64 << 10;
 const TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
 const RATE: u64 = 64 << 10;
+/// rosmaster refuses what unpacks to more bytes: so many are the default of `gzip_decode` in Python's
+/// xmlrpc.
+const UNPACKED: usize = 20 << 20;
 /// Whoever holds this needs no room: one body can always be read to its end, so that bodies that each
 /// have a part of the room do not wait for each other.
 static LAST: Semaphore = Semaphore::const_new(1);
@@ -76,6 +83,17 @@ impl<'a> Room<'a> {
             last = LAST.acquire() => self.last = last.ok(),
         }
     }
+
+    /// As [`grow`](Self::grow), for as long as a body of `longest` bytes may take.
+    async fn grow_in_time(&mut self, bytes: usize, longest: usize) -> Result<(), BodyError> {
+        let grown = timeout(time_for(longest), self.grow(bytes)).await;
+        grown.map_err(|_| BodyError::NoRoom)
+    }
+}
+
+/// The time for a body of so many bytes.
+fn time_for(bytes: usize) -> Duration {
+    TIME + Duration::from_secs(bytes as u64 / RATE)
 }
 
 /// Reads a body of at most `limit` bytes, and takes `room` for it as it arrives.
@@ -91,11 +109,10 @@ pub async fn read(
     let most = hint
         .upper()
         .map_or(limit, |upper| usize::try_from(upper).unwrap_or(limit));
-    let longest = |bytes: usize| TIME + Duration::from_secs(bytes as u64 / RATE);
     let mut whole = Vec::new();
     let mut start = Instant::now();
     loop {
-        let deadline = (start + longest(whole.len())).min(Instant::now() + TIME);
+        let deadline = (start + time_for(whole.len())).min(Instant::now() + TIME);
         let data = match timeout_at(deadline, body.frame()).await {
             Err(_) => return Err(BodyError::TooSlow),
             Ok(None) => return Ok(whole.into()),
@@ -112,9 +129,7 @@ pub async fn read(
         if length > whole.capacity().max(SMALL) {
             let size = (2 * length).min(most);
             let waits = Instant::now();
-            timeout(longest(most), room.grow(size))
-                .await
-                .map_err(|_| BodyError::NoRoom)?;
+            room.grow_in_time(size, most).await?;
             // The client is not to blame for that time.
             start += waits.elapsed();
             whole.reserve_exact(size.saturating_sub(whole.len()));
@@ -123,9 +138,79 @@ pub async fn read(
     }
 }
 
+/// What gzip has packed into `packed`, in `room` for twice that, as for a body that comes unpacked.
+/// Nothing if it is broken, or more than `limit` bytes, or more than rosmaster takes.
+pub async fn unpack(
+    packed: Bytes,
+    limit: usize,
+    room: &mut Room<'_>,
+) -> Result<Option<Bytes>, BodyError> {
+    let most = limit.min(UNPACKED);
+    let unpacker = {
+        let packed = packed.clone();
+        move || MultiGzDecoder::new(io::Cursor::new(packed.clone())).take(most as u64 + 1)
+    };
+    // How much it is shows only now, and must be known before it takes memory.
+    let counter = unpacker.clone();
+    let counted = in_a_thread(move || io::copy(&mut counter(), &mut io::sink())).await;
+    let Some(size) = counted
+        .and_then(|size| usize::try_from(size).ok())
+        .filter(|size| *size <= most)
+    else {
+        return Ok(None);
+    };
+    if size > SMALL {
+        room.grow_in_time(2 * (packed.len() + size), most).await?;
+    }
+    let unpacked = in_a_thread(move || {
+        let mut unpacked = Vec::with_capacity(size);
+        unpacker().read_to_end(&mut unpacked)?;
+        Ok(unpacked)
+    });
+    Ok(unpacked.await.map(Bytes::from))
+}
+
+/// Does `work` beside the runtime's threads.
+async fn in_a_thread<T: Send + 'static>(
+    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+) -> Option<T> {
+    tokio::task::spawn_blocking(work).await.ok()?.ok()
+}
+
 #[cfg(test)]
 mod tests {
+    use std::io::Write;
+
+    use flate2::{Compression, write::GzEncoder};
+
     use super::*;
+
+    fn packed(bytes: &[u8]) -> Bytes {
+        let mut packer = GzEncoder::new(Vec::new(), Compression::default());
+        packer.write_all(bytes).unwrap();
+        packer.finish().unwrap().into()
+    }
+
+    #[tokio::test]
+    async fn what_unpacks_to_too_much_is_not_unpacked_and_the_rest_takes_room() {
+        let pool = Semaphore::new(80 << 10);
+        let most = vec![b'z'; UNPACKED];
+        let mut room = Room::of(&pool);
+        let whole = unpack(packed(&most), UNPACKED, &mut room).await;
+        assert_eq!(whole, Ok(Some(Bytes::from(most.clone()))));
+        assert!(pool.available_permits() <= 40 << 10);
+        drop(room);
+        let more = [packed(&most), packed(b"z")].concat();
+        for (bytes, limit) in [
+            (Bytes::from(more), usize::MAX),
+            (packed(&most), UNPACKED - 1),
+            (Bytes::from_static(b"no gzip"), UNPACKED),
+        ] {
+            let mut room = Room::of(&pool);
+            assert_eq!(unpack(bytes, limit, &mut room).await, Ok(None));
+            assert_eq!(pool.available_permits(), 80 << 10);
+        }
+    }
 
     /// Each has a part of the room and needs more than is left.
     #[tokio::test]

@@ -1,9 +1,8 @@
 //! One request from its head to its answer.
 
-use std::{io::Read, net::SocketAddr, sync::Arc, time::Duration};
+use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use bytes::Bytes;
-use flate2::read::MultiGzDecoder;
 use http_body_util::Full;
 use hyper::{
     Method, Request, Response, StatusCode,
@@ -115,8 +114,15 @@ async fn post(
     };
     // Held until the call is answered.
     let mut room = Room::of(&proxy.bodies);
-    let body = match body::read(request.into_body(), proxy.config.max_body, &mut room).await {
-        Ok(body) => body,
+    let packing = Packing::of(head.encoding.as_ref());
+    let read = async {
+        let limit = proxy.config.max_body;
+        let body = body::read(request.into_body(), limit, &mut room).await?;
+        let call = decode(packing, body.clone(), limit, &mut room).await?;
+        Ok((body, call))
+    };
+    let (body, call) = match read.await {
+        Ok(read) => read,
         Err(BodyError::TooLarge { limit }) => {
             proxy.stats.refused.count();
             tracing::warn!(%peer, limit, "refused a request body beyond the limit (--max-body)");
@@ -128,8 +134,6 @@ async fn post(
         Err(BodyError::NoRoom) => return Err(Closed("too many large requests at the same time")),
     };
     proxy.stats.calls.count();
-    let packing = Packing::of(head.encoding.as_ref());
-    let call = decode(packing, body.clone(), proxy.config.max_body).await;
     if let Some(call) = &call {
         let caller_id = call
             .params
@@ -363,24 +367,26 @@ impl Packing {
     }
 }
 
-async fn decode(packing: Packing, body: Bytes, limit: usize) -> Option<Call> {
-    let long = body.len() > body::SMALL;
-    let work = move || {
-        if packing == Packing::Plain {
-            return xmlrpc::decode_call(&body).ok();
-        }
-        let mut unpacked = Vec::new();
+/// What a body says, if it says it in a way that we know.
+async fn decode(
+    packing: Packing,
+    body: Bytes,
+    limit: usize,
+    room: &mut Room<'_>,
+) -> Result<Option<Call>, BodyError> {
+    let body = match packing {
+        Packing::Plain => Some(body),
         // What unpacks to more than the limit is not looked into; rosmaster will do as it likes.
-        let most = u64::try_from(limit).unwrap_or(u64::MAX);
-        MultiGzDecoder::new(&*body)
-            .take(most)
-            .read_to_end(&mut unpacked)
-            .ok()?;
-        xmlrpc::decode_call(&unpacked).ok()
-    };
-    match packing {
-        Packing::Plain if !long => work(),
-        Packing::Plain | Packing::Gzip => tokio::task::spawn_blocking(work).await.ok()?,
+        Packing::Gzip => body::unpack(body, limit, room).await?,
         Packing::Unknown => None,
-    }
+    };
+    let Some(body) = body else {
+        return Ok(None);
+    };
+    let small = body.len() <= body::SMALL;
+    let work = move || xmlrpc::decode_call(&body).ok();
+    Ok(match small {
+        true => work(),
+        false => tokio::task::spawn_blocking(work).await.ok().flatten(),
+    })
 }
