@@ -7,6 +7,8 @@ use serde::Serialize;
 
 /// Clients listed on the status page; there may be thousands.
 const LISTED: usize = 1000;
+/// What is kept of a caller id, in characters: a client may send any, and be idle for hours.
+const CALLER_ID: usize = 200;
 
 /// The connections of clients.
 #[derive(Debug, Default)]
@@ -23,7 +25,7 @@ struct Seen {
 pub struct Client {
     /// Where it comes from.
     pub peer: String,
-    /// The caller id of its last call.
+    /// The caller id of its last call, if it is long its beginning.
     pub caller_id: String,
     /// Calls made on it.
     pub calls: u64,
@@ -41,6 +43,8 @@ impl Clients {
 
     /// A call came from `peer`.
     pub fn called(&self, peer: SocketAddr, caller_id: &str) {
+        let end = caller_id.char_indices().nth(CALLER_ID);
+        let caller_id = end.map_or(caller_id, |(end, _)| caller_id.split_at(end).0);
         if let Some(mut seen) = self.0.get_mut(&peer) {
             seen.calls += 1;
             if seen.caller_id != caller_id {
@@ -97,6 +101,8 @@ mod tests {
             calls: 2,
         };
         assert_eq!(clients.list(), [expected]);
+        clients.called(peer, &"ü".repeat(1000));
+        assert_eq!(clients.list()[0].caller_id, "ü".repeat(CALLER_ID));
         drop(present);
         assert_eq!(clients.count(), 0);
     }
