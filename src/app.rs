@@ -23,7 +23,9 @@ use crate::{
     proxy::{
         Proxy,
         clients::Clients,
-        gate, keeper,
+        gate,
+        idle::Idle,
+        keeper,
         lane::{self, LaneRunner},
         listener::{self, ListenError},
         pool::Pool,
@@ -153,6 +155,7 @@ pub async fn run(
         instance,
         shadow: Shadow::new(mirror, session, store, stats),
         clients: Clients::default(),
+        idle: Idle::among(config.max_connections),
         bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
         stats,
         rosout: AtomicU32::new(0),

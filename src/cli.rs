@@ -209,14 +209,16 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
     pub master_connections: u32,
-    /// Connections that clients may hold at the same time; more wait
+    /// Connections that clients may hold at the same time; more wait. Half of them may be idle, but
+    /// no more than 2000: the one that has been idle for longest gives way. A low `ulimit -n` leaves
+    /// fewer, but always 16 if so many are given
     #[arg(
         long,
         env = "ROSRESCUE_MAX_CONNECTIONS",
         value_name = "COUNT",
         default_value_t = 10_000
     )]
-    #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     pub max_connections: u32,
     /// Largest request body, in MiB
     #[arg(

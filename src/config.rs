@@ -14,11 +14,10 @@ use crate::{
     ros_env::{self, Lookup, MasterUri, UriError},
 };
 
+mod files;
+
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
-
-/// File descriptors that clients do not get: census and letters open up to 192 at a time.
-const RESERVED_FILES: u64 = 192;
 
 /// The least pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
@@ -204,15 +203,6 @@ impl Config {
             advertised,
             MasterConfig::External(master),
         )
-    }
-
-    /// Leaves file descriptors for the master, the nodes and the checkpoint, out of `files` that the
-    /// process may have.
-    pub fn fit_into(&mut self, files: u64) {
-        let most = files.saturating_sub(RESERVED_FILES).max(1);
-        self.max_connections = self
-            .max_connections
-            .min(usize::try_from(most).unwrap_or(usize::MAX));
     }
 
     fn common(

@@ -13,7 +13,7 @@ use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
 use thiserror::Error;
 use tokio::{
     net::{TcpListener, TcpStream},
-    sync::Semaphore,
+    sync::{Notify, Semaphore},
 };
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
@@ -23,10 +23,11 @@ use super::{
     service,
 };
 
-/// Time in which a request's head must arrive, from its first byte.
-const HEAD_TIME: Duration = Duration::from_secs(10);
 /// Connections that the kernel holds for us while we are busy, or not there for a moment.
 const BACKLOG: i32 = 1024;
+/// What a connection buffers of what it reads, in bytes; hyper keeps so much of it in idle times. A
+/// head must fit into it.
+const BUFFER: usize = 16 << 10;
 /// Pause after a failed accept, such as one without a free file descriptor.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// After this time without a sign of life a peer is asked for one, so that connections of computers
@@ -124,18 +125,22 @@ pub async fn run(
     connections: TaskTracker,
     stop: CancellationToken,
 ) {
+    let mut failed = false;
     loop {
+        // The permit comes second: a listener that nobody connects to needs none.
         let accepted = async {
+            let accepted = listener.accept().await?;
             // Never closed.
             let permit = permits.clone().acquire_owned().await;
-            (permit, listener.accept().await)
+            io::Result::Ok((accepted, permit))
         };
-        let (permit, accepted) = tokio::select! {
+        let accepted = tokio::select! {
             accepted = accepted => accepted,
             () = stop.cancelled() => return,
         };
         match accepted {
-            Ok((stream, peer)) => {
+            Ok(((stream, peer), permit)) => {
+                failed = false;
                 let connection = serve(stream, peer, proxy.clone(), stop.clone());
                 connections.spawn(async move {
                     connection.await;
@@ -143,7 +148,9 @@ pub async fn run(
                 });
             }
             Err(error) => {
-                tracing::warn!(%error, "cannot accept a connection");
+                if !std::mem::replace(&mut failed, true) {
+                    tracing::warn!(%error, "cannot accept connections; it is tried again and again");
+                }
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
         }
@@ -161,20 +168,33 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
     let _present = clients.clients.enter(peer);
     let stream = Arc::new(stream);
     let pace = Pace::of(stream.clone());
-    let io = TokioIo::new(Paced::new(Shared(stream), pace.clone(), HEAD_TIME));
-    let service =
-        service_fn(move |request| service::serve(proxy.clone(), peer, pace.clone(), request));
+    let close = Arc::new(Notify::new());
+    let paced = Paced::new(Shared(stream), pace.clone(), &clients.idle, close.clone());
+    let service = |request| {
+        // On the heap: idle connections do not keep space for it.
+        Box::pin(service::serve(proxy.clone(), peer, pace.clone(), request))
+    };
     let connection = hyper::server::conn::http1::Builder::new()
         .title_case_headers(true)
         .half_close(true)
-        .pipeline_flush(true)
-        .serve_connection(io, service);
+        .max_buf_size(BUFFER)
+        .serve_connection(TokioIo::new(paced), service_fn(service));
     let mut connection = std::pin::pin!(connection);
-    let ended = tokio::select! {
-        ended = &mut connection => ended,
-        () = stop.cancelled() => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+    let ended = loop {
+        tokio::select! {
+            // A request that has come goes first.
+            biased;
+            ended = &mut connection => break ended,
+            () = close.notified() => {
+                if pace.is_idle() {
+                    tracing::debug!(%peer, "closed, having been idle for longest");
+                    return;
+                }
+            }
+            () = stop.cancelled() => {
+                connection.as_mut().graceful_shutdown();
+                break connection.await;
+            }
         }
     };
     if let Err(error) = ended {

@@ -6,6 +6,7 @@ pub mod clients;
 pub mod door;
 mod flight;
 pub mod gate;
+pub mod idle;
 pub mod journey;
 pub mod keeper;
 pub mod lane;
@@ -50,6 +51,8 @@ pub struct Proxy {
     pub shadow: shadow::Shadow,
     /// Who is connected.
     pub clients: clients::Clients,
+    /// Those of them without a request.
+    pub idle: idle::Idle,
     /// Memory for large bodies, in KiB.
     pub bodies: Semaphore,
     /// What was counted.

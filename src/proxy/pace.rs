@@ -1,8 +1,8 @@
-//! A connection that ends when a peer sends a request's head too slowly.
+//! A connection that ends when a peer sends a request's head too slowly, or takes nothing of an answer.
 //!
 //! hyper's own limit on the time for a head also counts the idle time before it, and would close
 //! the keep-alive connections that nodes hold for hours. Here the time begins with the head's first
-//! byte.
+//! byte. For writing hyper has no limit.
 
 use std::{
     io,
@@ -19,8 +19,16 @@ use socket2::SockRef;
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
     net::TcpStream,
+    sync::Notify,
     time::{Instant, Sleep},
 };
+
+use super::idle::{Idle, Idling};
+
+/// Time in which a request's head must arrive, from its first byte.
+const HEAD_TIME: Duration = Duration::from_secs(10);
+/// Time in which a peer must take something of an answer.
+const WRITE_TIME: Duration = Duration::from_secs(60);
 
 /// Where a connection stands between requests.
 #[derive(Clone, Debug, Default)]
@@ -32,6 +40,7 @@ pub struct Pace {
 const IDLE: u8 = 0;
 const HEAD: u8 = 1;
 const SERVING: u8 = 2;
+const REPLYING: u8 = 3;
 
 impl Pace {
     /// The pace of `stream`.
@@ -58,34 +67,68 @@ impl Pace {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
-    /// The request has been answered: the next byte begins a head.
-    pub fn idle(&self) {
-        self.place.store(IDLE, Ordering::Relaxed);
+    /// There is an answer. Once it has been sent, the next byte begins a head.
+    pub fn replying(&self) {
+        self.place.store(REPLYING, Ordering::Relaxed);
+    }
+
+    /// No request has begun since the last answer was sent.
+    pub fn is_idle(&self) -> bool {
+        self.is(IDLE)
+    }
+
+    fn is(&self, place: u8) -> bool {
+        self.place.load(Ordering::Relaxed) == place
     }
 }
 
-/// A stream that keeps `pace`.
+/// A stream that keeps `pace`, and is one of the idle ones between requests.
 #[derive(Debug)]
-pub struct Paced<S> {
+pub struct Paced<'a, S> {
     stream: S,
     pace: Pace,
-    limit: Duration,
     deadline: Pin<Box<Sleep>>,
+    /// The peer takes nothing.
+    stuck: bool,
+    idle: &'a Idle,
+    /// Told when it is to end because others are idle too.
+    close: Arc<Notify>,
+    idling: Option<Idling<'a>>,
 }
 
-impl<S> Paced<S> {
-    /// Ends `stream` when a head takes longer than `limit`.
-    pub fn new(stream: S, pace: Pace, limit: Duration) -> Self {
+impl<'a, S> Paced<'a, S> {
+    /// `stream` before its first request. `close` is told when `idle` has too many.
+    pub fn new(stream: S, pace: Pace, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
             pace,
-            limit,
-            deadline: Box::pin(tokio::time::sleep(limit)),
+            deadline: Box::pin(tokio::time::sleep(HEAD_TIME)),
+            stuck: false,
+            idling: Some(idle.enter(&close)),
+            idle,
+            close,
         }
+    }
+
+    /// Ends a write that makes no progress.
+    fn written(
+        &mut self,
+        cx: &mut Context<'_>,
+        polled: Poll<io::Result<usize>>,
+    ) -> Poll<io::Result<usize>> {
+        let was_stuck = std::mem::replace(&mut self.stuck, polled.is_pending());
+        if !self.stuck {
+            return polled;
+        }
+        if !was_stuck {
+            self.deadline.as_mut().reset(Instant::now() + WRITE_TIME);
+        }
+        let overdue = self.deadline.as_mut().poll(cx);
+        overdue.map(|()| Err(io::ErrorKind::TimedOut.into()))
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Paced<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for Paced<'_, S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -94,31 +137,39 @@ impl<S: AsyncRead + Unpin> AsyncRead for Paced<S> {
         let this = &mut *self;
         let before = buf.filled().len();
         let polled = Pin::new(&mut this.stream).poll_read(cx, buf);
-        if buf.filled().len() > before && this.pace.place.load(Ordering::Relaxed) == IDLE {
-            this.pace.place.store(HEAD, Ordering::Relaxed);
-            this.deadline.as_mut().reset(Instant::now() + this.limit);
+        if buf.filled().len() > before {
+            this.idling = None;
+            if this.pace.is(IDLE) {
+                this.pace.place.store(HEAD, Ordering::Relaxed);
+                this.deadline.as_mut().reset(Instant::now() + HEAD_TIME);
+            }
         }
-        if polled.is_pending()
-            && this.pace.place.load(Ordering::Relaxed) == HEAD
-            && this.deadline.as_mut().poll(cx).is_ready()
-        {
+        if polled.is_pending() && this.pace.is(HEAD) && this.deadline.as_mut().poll(cx).is_ready() {
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
         polled
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<'_, S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
         buf: &[u8],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(cx, buf)
+        let polled = Pin::new(&mut self.stream).poll_write(cx, buf);
+        self.written(cx, polled)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
+        let this = &mut *self;
+        let polled = Pin::new(&mut this.stream).poll_flush(cx);
+        // hyper flushes when it has written all of an answer.
+        if polled.is_ready() && this.pace.is(REPLYING) {
+            this.pace.place.store(IDLE, Ordering::Relaxed);
+            this.idling = Some(this.idle.enter(&this.close));
+        }
+        polled
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
@@ -130,7 +181,8 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<S> {
         cx: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(cx, bufs)
+        let polled = Pin::new(&mut self.stream).poll_write_vectored(cx, bufs);
+        self.written(cx, polled)
     }
 
     fn is_write_vectored(&self) -> bool {
@@ -212,23 +264,23 @@ mod tests {
 
     use super::*;
 
-    const LIMIT: Duration = Duration::from_secs(10);
-
     #[tokio::test(start_paused = true)]
     async fn idle_time_does_not_count_and_a_dribbled_head_does() {
         let (mut peer, ours) = tokio::io::duplex(64);
+        let idle = Idle::among(16);
         let pace = Pace::default();
-        let mut paced = Paced::new(ours, pace.clone(), LIMIT);
+        let mut paced = Paced::new(ours, pace.clone(), &idle, Arc::default());
         let mut byte = [0];
         for _ in 0..3 {
             let late = async {
-                tokio::time::sleep(LIMIT * 100).await;
+                tokio::time::sleep(HEAD_TIME * 100).await;
                 peer.write_all(b"P").await.unwrap();
             };
             let (read, ()) = tokio::join!(paced.read(&mut byte), late);
             assert_eq!(read.unwrap(), 1);
             pace.serving();
-            pace.idle();
+            pace.replying();
+            paced.flush().await.unwrap();
         }
         let start = Instant::now();
         let dribble = async {
@@ -245,6 +297,46 @@ mod tests {
             }
         };
         let (ended, ()) = tokio::join!(reader, dribble);
-        assert_eq!(ended, (io::ErrorKind::TimedOut, LIMIT));
+        assert_eq!(ended, (io::ErrorKind::TimedOut, HEAD_TIME));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn an_answer_may_be_taken_slowly_but_not_never() {
+        let (mut peer, ours) = tokio::io::duplex(64);
+        let idle = Idle::among(16);
+        let mut paced = Paced::new(ours, Pace::default(), &idle, Arc::default());
+        let start = Instant::now();
+        let slow = async {
+            for _ in 0..5 {
+                tokio::time::sleep(WRITE_TIME * 9 / 10).await;
+                peer.read_exact(&mut [0; 64]).await.unwrap();
+            }
+            start.elapsed()
+        };
+        let (written, last) = tokio::join!(paced.write_all(&[0; 1000]), slow);
+        assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
+        assert_eq!(start.elapsed(), last + WRITE_TIME);
+    }
+
+    #[tokio::test]
+    async fn a_connection_is_idle_from_the_end_of_its_answer_to_the_next_request() {
+        let (mut peer, ours) = tokio::io::duplex(64);
+        let idle = Idle::among(2);
+        let close = Arc::new(Notify::new());
+        let pace = Pace::default();
+        let mut paced = Paced::new(ours, pace.clone(), &idle, close.clone());
+        let mut bytes = [0; 2];
+        peer.write_all(b"PO").await.unwrap();
+        paced.read_exact(&mut bytes).await.unwrap();
+        pace.serving();
+        pace.replying();
+        paced.write_all(b"HTTP").await.unwrap();
+        assert!(!pace.is_idle());
+        // Another one is idle meanwhile.
+        drop(idle.enter(&Arc::default()));
+        paced.flush().await.unwrap();
+        assert!(pace.is_idle());
+        let _other = idle.enter(&Arc::default());
+        close.notified().await;
     }
 }

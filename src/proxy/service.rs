@@ -59,7 +59,7 @@ pub async fn serve(
 ) -> Result<HttpReply, Closed> {
     pace.serving();
     let reply = route(proxy, peer, &pace, request).await;
-    pace.idle();
+    pace.replying();
     reply
 }
 

@@ -1,0 +1,55 @@
+//! File descriptors: how many of the process's connections may take.
+
+use super::Config;
+
+/// Clients do not get these: census and letters open up to 192 at a time.
+const RESERVED: u64 = 192;
+/// Where there are few, clients get one in so many. The checkpoint, the connections to the master and
+/// its process take some 30 of the others; census and letters do with what is left, and try again.
+const SHARE: u64 = 4;
+/// Connections that clients may always hold, if they are to.
+const FEWEST: u64 = 16;
+
+impl Config {
+    /// Leaves file descriptors for the master, the nodes and the checkpoint, out of `files` that the
+    /// process may have.
+    pub fn fit_into(&mut self, files: u64) {
+        let most = files
+            .saturating_sub(RESERVED)
+            .max(files / SHARE)
+            .max(FEWEST);
+        let most = usize::try_from(most).unwrap_or(usize::MAX);
+        self.max_connections = self.max_connections.min(most);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::Cli;
+
+    #[test]
+    fn few_files_are_shared_and_clients_always_get_some() {
+        let config = Config::core(
+            &Cli::parse_from(["rosrescue"]).core,
+            &|_| None,
+            "robot",
+            None,
+        );
+        let config = config.unwrap();
+        for (files, connections) in [
+            (20, 16),
+            (64, 16),
+            (128, 32),
+            (200, 50),
+            (1024, 832),
+            (1 << 20, 10_000),
+        ] {
+            let mut config = config.clone();
+            config.fit_into(files);
+            assert_eq!(config.max_connections, connections, "{files}");
+        }
+    }
+}
