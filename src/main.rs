@@ -3,6 +3,7 @@
 use std::{
     io::{IsTerminal, Write},
     process::ExitCode,
+    time::Duration,
 };
 
 use clap::{CommandFactory, error::ErrorKind};
@@ -12,9 +13,15 @@ use rosrescue::{
     config::Config,
     proxy::listener,
 };
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::{
+    runtime::Runtime,
+    signal::unix::{SignalKind, signal},
+};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
+
+/// How long work beside the main one may go on when all is done.
+const LAST_JOBS: Duration = Duration::from_millis(500);
 
 fn main() -> ExitCode {
     let cli = Cli::read();
@@ -66,8 +73,17 @@ fn main() -> ExitCode {
     }
 }
 
-#[tokio::main]
-async fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
+fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
+    let runtime = Runtime::new()?;
+    let ended = runtime.block_on(serve(config, hostname));
+    // The closing checkpoint is on the disk, and has overtaken whatever was being written. What still
+    // runs in a thread may be a question to a name server that never answers: the end of a process
+    // does not wait for that, but the drop of a runtime would.
+    runtime.shutdown_timeout(LAST_JOBS);
+    ended
+}
+
+async fn serve(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
     let stop = CancellationToken::new();
     let (mut interrupt, mut terminate) = (
         signal(SignalKind::interrupt())?,

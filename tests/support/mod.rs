@@ -18,6 +18,7 @@
 
 mod fake;
 mod kinds;
+mod name_server;
 mod netns;
 mod node;
 mod patience;
@@ -35,6 +36,7 @@ mod twins;
 
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
 pub(crate) use kinds::{kinds, sorted};
+pub(crate) use name_server::NameServer;
 pub(crate) use netns::Netns;
 pub(crate) use node::{Library, Node};
 pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
