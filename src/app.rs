@@ -151,7 +151,11 @@ pub async fn run(
         gate,
         lane,
         pool: Pool::new(config.master_connections),
-        upstream: Upstream::new(address, HeaderValue::from_str(&instance)?),
+        upstream: Upstream::new(
+            address,
+            HeaderValue::from_str(&instance)?,
+            config.probe_timeout,
+        ),
         instance,
         shadow: Shadow::new(mirror, session, store, stats),
         clients: Clients::default(),

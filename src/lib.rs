@@ -21,6 +21,7 @@
 //! * [`recovery`]: watching the master, examining and injecting, census and healing.
 //! * [`supervisor`]: the processes of rosmaster and rosout.
 //! * [`admin`]: the status page.
+//! * [`resolver`]: the addresses of hosts, by name servers that may not answer.
 //! * [`wait`]: waiting for what may not be there.
 //! * [`app`]: puts it all together.
 
@@ -35,6 +36,7 @@ pub mod master;
 pub mod proxy;
 pub mod record;
 pub mod recovery;
+pub mod resolver;
 pub mod ros_env;
 pub mod session;
 pub mod store;

@@ -1,4 +1,4 @@
-//! A name server that does not answer holds up nobody for long.
+//! A master on another computer: its name holds up nobody for long.
 
 #![allow(
     clippy::unwrap_used,
@@ -9,10 +9,17 @@
 
 mod support;
 
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-use support::{NameServer, Rosmaster, Scratch, Setup, free_port, params};
+use rosrescue::xmlrpc::Value;
+use support::{
+    Client, NameServer, Netns, Process, Rosmaster, Scratch, Setup, eventually, find_program,
+    free_port, holds, params, status,
+};
 
+/// Where the master is, on the other side.
+const HOST: u8 = 2;
 /// Options with which a master is missed after two seconds.
 const PROBES: [&str; 6] = [
     "--probe-interval",
@@ -24,6 +31,21 @@ const PROBES: [&str; 6] = [
 ];
 const SOON: Duration = Duration::from_secs(2);
 
+/// A rosmaster on the other side of `net`, which answers.
+#[track_caller]
+fn rosmaster(scratch: &Scratch, net: &Netns, port: u16) -> (Process, Client) {
+    let mut command = Command::new(find_program("rosmaster"));
+    scratch.prepare(&mut command);
+    command.args(["--core", "-p"]).arg(port.to_string());
+    command.env("ROS_IP", net.far(HOST));
+    let process = Process::start("the far rosmaster", &mut net.inside(&command));
+    let client = Client::at(&net.far(HOST), port);
+    eventually("the far rosmaster answers", || {
+        client.master_pid() == Some(process.pid())
+    });
+    (process, client)
+}
+
 /// A rosrescue before the master at `host`.
 fn proxy(scratch: &Scratch, host: &str, master_port: u16) -> Setup {
     let port = free_port();
@@ -32,6 +54,48 @@ fn proxy(scratch: &Scratch, host: &str, master_port: u16) -> Setup {
     let arguments = ["proxy", "--master", &master, "--listen", &listen];
     let setup = Setup::bare(scratch, arguments).at_port(port);
     setup.args(["--hold", "60", "--verbose"]).args(PROBES)
+}
+
+fn is_open(client: &Client) -> bool {
+    status(client)["open"] == true
+}
+
+/// It is looked up again for each connection; what it meant before must do.
+#[test]
+fn a_name_server_that_fails_takes_no_master_away() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let names = NameServer::silent(&scratch);
+    names.say(net.far(HOST).parse().unwrap(), Duration::ZERO);
+    let port = free_port();
+    let (mut master, _) = rosmaster(&scratch, &net, port);
+    let setup = proxy(&scratch, "master.test", port);
+    let rescue = setup.wrapped(|own| names.serving(own)).start();
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    names.fall_silent();
+    let mut number = 0;
+    let all_is_well = || {
+        number += 1;
+        client.set_param("/number", number);
+        is_open(&client)
+    };
+    assert!(holds(Duration::from_secs(5), all_is_well));
+    // Nor does it prevent a recovery at the same place.
+    master.kill();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    eventually("the master is restored", || {
+        far.param("/kept") == Some(Value::Int(1)) && is_open(&client)
+    });
+    // A master that has another address is found, even if that is told too late for each probe.
+    net.cut(HOST);
+    eventually("the gate is shut", || !is_open(&client));
+    names.say(
+        net.far(HOST + 1).parse().unwrap(),
+        Duration::from_millis(600),
+    );
+    eventually("the gate is open", || is_open(&client));
+    client.set_param("/elsewhere", 1);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Connections to the master.
 
-use std::{io, time::Duration};
+use std::{io, net::SocketAddr, time::Duration};
 
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full, Limited};
@@ -12,9 +12,10 @@ use hyper::{
 };
 use hyper_util::rt::TokioIo;
 use thiserror::Error;
-use tokio::{net::TcpStream, sync::watch};
+use tokio::{net::TcpStream, sync::watch, time::timeout};
 
 use crate::{
+    resolver,
     ros_env::MasterUri,
     xmlrpc::{self, Call, Reply},
 };
@@ -125,14 +126,19 @@ impl RawReply {
 pub struct Upstream {
     address: watch::Sender<MasterUri>,
     instance: HeaderValue,
+    probe_timeout: Duration,
+    /// What the master's name was found to mean the last time.
+    found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
 }
 
 impl Upstream {
     /// Connections to `address`; `instance` tells this process from every other.
-    pub fn new(address: MasterUri, instance: HeaderValue) -> Self {
+    pub fn new(address: MasterUri, instance: HeaderValue, probe_timeout: Duration) -> Self {
         Self {
             address: watch::Sender::new(address),
             instance,
+            probe_timeout,
+            found: watch::Sender::new(None),
         }
     }
 
@@ -153,8 +159,8 @@ impl Upstream {
             master: address.to_string(),
             source,
         };
-        let target = (address.host.as_str(), address.port);
-        let stream = match tokio::time::timeout(CONNECT_LIMIT, TcpStream::connect(target)).await {
+        let connecting = async { open(self.find(&address).await?).await };
+        let stream = match timeout(CONNECT_LIMIT, connecting).await {
             Err(_) => return Err(unreachable(io::ErrorKind::TimedOut.into())),
             Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
                 return Err(ConnectError::Refused {
@@ -168,6 +174,48 @@ impl Upstream {
             .await
             .map_err(unreachable)
     }
+
+    /// The addresses of the master: what its name means now, and while nobody can tell, what it meant
+    /// before. A name server that fails must not take away a master that lives.
+    async fn find(&self, address: &MasterUri) -> io::Result<Vec<SocketAddr>> {
+        if let Ok(ip) = address.host.parse() {
+            return Ok(vec![SocketAddr::new(ip, address.port)]);
+        }
+        let (found, asked) = (self.found.clone(), address.clone());
+        // In a task: an answer that comes too late for this connection serves the next one, so that a
+        // master that has moved is found however slow the name server is.
+        let lookup = tokio::spawn(async move {
+            let addresses = resolver::addresses(&asked.host, asked.port).await?;
+            found.send_replace(Some((asked, addresses)));
+            io::Result::Ok(())
+        });
+        let known = || {
+            let found = self.found.borrow();
+            let found = found.as_ref().filter(|(of, _)| of == address);
+            found.map(|(_, addresses)| addresses.clone())
+        };
+        if known().is_some() {
+            // The rest of a probe's time is for the master.
+            let _ = timeout(self.probe_timeout / 4, lookup).await;
+        } else {
+            lookup.await.map_err(io::Error::other)??;
+        }
+        known().ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+}
+
+/// A connection to the first of `addresses` that takes it. One that refuses says more of the master
+/// than one to which there is no way.
+async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
+    let mut failure = io::Error::from(io::ErrorKind::NotFound);
+    for address in addresses {
+        match TcpStream::connect(address).await {
+            Ok(stream) => return Ok(stream),
+            Err(_) if failure.kind() == io::ErrorKind::ConnectionRefused => {}
+            Err(error) => failure = error,
+        }
+    }
+    Err(failure)
 }
 
 /// One keep-alive connection to the master, for one call at a time.

@@ -1,0 +1,103 @@
+//! Looks up the addresses of hosts. A name is looked up once for all who ask at the same time, in a
+//! thread of its own: neither the runtime nor the end of the process waits for a name server that
+//! does not answer.
+
+use std::{
+    collections::BTreeMap,
+    io,
+    net::{IpAddr, SocketAddr, ToSocketAddrs},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use tokio::sync::{Semaphore, watch};
+
+/// Names that are looked up at the same time. A name server that does not answer costs a thread for
+/// some ten seconds.
+const LOOKUPS: usize = 64;
+
+/// A name's addresses, without a port, or why there are none.
+type Found = Result<Arc<[SocketAddr]>, Arc<io::Error>>;
+
+static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
+static UNDER_WAY: Mutex<BTreeMap<String, watch::Receiver<Option<Found>>>> =
+    Mutex::new(BTreeMap::new());
+
+fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Found>>>> {
+    UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The addresses of `host`, IPv4 first, as roscpp does, with `port`.
+///
+/// # Errors
+///
+/// If it has none, or nobody can tell.
+pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return Ok(vec![SocketAddr::new(address, port)]);
+    }
+    let mut answer = {
+        let mut under_way = under_way();
+        match under_way.get(host) {
+            Some(answer) => answer.clone(),
+            None => {
+                let (tell, answer) = watch::channel(None);
+                under_way.insert(host.to_owned(), answer.clone());
+                tokio::spawn(look_up(host.to_owned(), tell));
+                answer
+            }
+        }
+    };
+    let found = answer.wait_for(Option::is_some).await;
+    let found = found.map_err(io::Error::other)?.clone();
+    match found {
+        Some(Ok(addresses)) => Ok(addresses.iter().map(|at| with_port(*at, port)).collect()),
+        Some(Err(error)) => Err(io::Error::new(error.kind(), error)),
+        None => Err(io::ErrorKind::NotFound.into()),
+    }
+}
+
+/// Of an IPv6 address the scope stays.
+fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
+    address.set_port(port);
+    address
+}
+
+async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
+    // Never closed.
+    let permit = PERMITS.acquire().await;
+    let name = host.clone();
+    let search = move || {
+        let _permit = permit;
+        let found = (name.as_str(), 0).to_socket_addrs();
+        let found = found.map_err(Arc::new).map(|addresses| {
+            let mut addresses: Vec<_> = addresses.collect();
+            addresses.sort_by_key(SocketAddr::is_ipv6);
+            addresses.dedup();
+            addresses.into()
+        });
+        // First: who asks from now on gets a fresh answer.
+        under_way().remove(&name);
+        tell.send_replace(Some(found));
+    };
+    // Without a thread the sender is dropped, which is an answer too.
+    let named = std::thread::Builder::new().name("lookup".to_owned());
+    if named.spawn(search).is_err() {
+        under_way().remove(&host);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_name_is_looked_up_and_an_address_is_not() {
+        let local = addresses("localhost", 4711).await.unwrap();
+        assert!(local.iter().all(|at| at.ip().is_loopback()), "{local:?}");
+        assert!(local.iter().all(|at| at.port() == 4711), "{local:?}");
+        assert_eq!(addresses("::1", 4711).await.unwrap().len(), 1);
+        assert!(under_way().get("::1").is_none());
+        let nobody = addresses("nobody.invalid", 4711).await;
+        assert!(nobody.is_err(), "{nobody:?}");
+    }
+}
