@@ -155,6 +155,7 @@ pub async fn run(
             address,
             HeaderValue::from_str(&instance)?,
             config.probe_timeout,
+            config.probing.count,
         ),
         instance,
         shadow: Shadow::new(mirror, session, store, stats),

@@ -1,4 +1,5 @@
-//! A master on another computer: its name holds up nobody for long.
+//! A master on another computer: connections to it that have become dead ends, and its name, hold up
+//! nobody for long.
 
 #![allow(
     clippy::unwrap_used,
@@ -10,17 +11,19 @@
 mod support;
 
 use std::process::Command;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
 use support::{
-    Client, NameServer, Netns, Process, Rosmaster, Scratch, Setup, eventually, find_program,
-    free_port, holds, params, status,
+    Client, NameServer, Netns, Process, Rescue, Rosmaster, Scratch, Setup, eventually,
+    find_program, free_port, holds, params, status,
 };
 
 /// Where the master is, on the other side.
 const HOST: u8 = 2;
-/// Options with which a master is missed after two seconds.
+/// Options with which a connection that is silent for three seconds has ended.
 const PROBES: [&str; 6] = [
     "--probe-interval",
     "100",
@@ -29,6 +32,8 @@ const PROBES: [&str; 6] = [
     "--probe-count",
     "2",
 ];
+/// That time, and as much again for two busy cores.
+const SILENCE: Duration = Duration::from_secs(6);
 const SOON: Duration = Duration::from_secs(2);
 
 /// A rosmaster on the other side of `net`, which answers.
@@ -56,8 +61,102 @@ fn proxy(scratch: &Scratch, host: &str, master_port: u16) -> Setup {
     setup.args(["--hold", "60", "--verbose"]).args(PROBES)
 }
 
+/// What the log says of a call that was on its way when its connection ended.
+fn broken_journey(rescue: &Rescue) -> Option<String> {
+    let mut log = rescue.stderr().into_iter();
+    log.find(|line| line.contains("journey error="))
+}
+
 fn is_open(client: &Client) -> bool {
     status(client)["open"] == true
+}
+
+/// The call that was on its way when the link went is not waited for until TCP tries again.
+#[test]
+fn writes_pass_as_soon_as_the_link_is_back() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    net.cut(HOST);
+    let flying = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/flying", 1)
+    });
+    // TCP sends again after 0.2, 0.6, 1.4, 3, 6.2, 12.6 and 25.4 s.
+    assert!(holds(Duration::from_secs(14), || !flying.is_finished()));
+    assert!(!is_open(&client));
+    net.mend(HOST);
+    eventually("the gate is open", || is_open(&client));
+    let start = Instant::now();
+    client.set_param("/after", 1);
+    flying.join().unwrap();
+    let took = start.elapsed();
+    println!("writes passed {took:?} after the gate was opened");
+    assert!(took < SOON, "{took:?}");
+    assert!(broken_journey(&rescue).is_some(), "it was sent again");
+    for key in ["/flying", "/after"] {
+        assert_eq!(far.param(key), Some(Value::Int(1)), "{key}");
+    }
+}
+
+/// The connections lead nowhere, and all that is connected anew is well.
+#[test]
+fn a_change_of_the_own_address_costs_one_short_wait() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    assert_eq!(client.param("/before"), Some(Value::Int(1)));
+    net.move_near();
+    let start = Instant::now();
+    let writing = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/after", 1)
+    });
+    assert_eq!(client.param("/before"), Some(Value::Int(1)));
+    let read = start.elapsed();
+    writing.join().unwrap();
+    let wrote = start.elapsed();
+    println!("after the change: read {read:?}, wrote {wrote:?}");
+    assert!(read < SILENCE && wrote < SILENCE, "{read:?} {wrote:?}");
+    let start = Instant::now();
+    client.set_param("/later", 1);
+    let later = start.elapsed();
+    assert!(later < SOON, "{later:?}");
+    for key in ["/after", "/later"] {
+        assert_eq!(far.param(key), Some(Value::Int(1)), "{key}");
+    }
+}
+
+/// A master that hangs is not the same as one that cannot be reached: its kernel answers, and the call
+/// that it has is kept.
+#[test]
+fn a_far_master_that_hangs_keeps_its_call() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    support::stop(master.pid());
+    let flying = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/flying", 1)
+    });
+    assert!(holds(SILENCE, || !flying.is_finished()));
+    assert!(!is_open(&client));
+    support::signal(master.pid(), Signal::CONT);
+    flying.join().unwrap();
+    assert_eq!(far.param("/flying"), Some(Value::Int(1)));
+    assert_eq!(broken_journey(&rescue), None, "it was sent once");
 }
 
 /// It is looked up again for each connection; what it meant before must do.

@@ -11,6 +11,7 @@ use hyper::{
     header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
 };
 use hyper_util::rt::TokioIo;
+use socket2::{SockRef, TcpKeepalive};
 use thiserror::Error;
 use tokio::{net::TcpStream, sync::watch, time::timeout};
 
@@ -127,17 +128,25 @@ pub struct Upstream {
     address: watch::Sender<MasterUri>,
     instance: HeaderValue,
     probe_timeout: Duration,
+    probe_count: u32,
     /// What the master's name was found to mean the last time.
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
 }
 
 impl Upstream {
-    /// Connections to `address`; `instance` tells this process from every other.
-    pub fn new(address: MasterUri, instance: HeaderValue, probe_timeout: Duration) -> Self {
+    /// Connections to `address`; `instance` tells this process from every other. A connection ends
+    /// when the kernel's own probes, as many with the same timeout, are not answered either.
+    pub fn new(
+        address: MasterUri,
+        instance: HeaderValue,
+        probe_timeout: Duration,
+        probe_count: u32,
+    ) -> Self {
         Self {
             address: watch::Sender::new(address),
             instance,
             probe_timeout,
+            probe_count,
             found: watch::Sender::new(None),
         }
     }
@@ -170,6 +179,8 @@ impl Upstream {
             Ok(Err(error)) => return Err(unreachable(error)),
             Ok(Ok(stream)) => stream,
         };
+        // Where the kernel cannot do that, the connection is as good as it was.
+        let _ = self.bound_silence(&stream);
         Connection::over(stream, &address, self.instance.clone(), MAX_REPLY)
             .await
             .map_err(unreachable)
@@ -202,6 +213,24 @@ impl Upstream {
         }
         known().ok_or_else(|| io::ErrorKind::NotFound.into())
     }
+
+    /// Ends a connection that has become a dead end: the other side's kernel has acknowledged nothing
+    /// for a little longer than the probes take to find that the master is gone. That of a master that
+    /// hangs does acknowledge. Where a cable is cut, or a router has forgotten the connection, nobody
+    /// does, and TCP itself would go on for a quarter of an hour. On this computer there are no dead
+    /// ends.
+    fn bound_silence(&self, stream: &TcpStream) -> io::Result<()> {
+        if is_local(stream)? {
+            return Ok(());
+        }
+        // The kernel counts in whole seconds here.
+        let pace = self.probe_timeout.max(Duration::from_secs(1));
+        let probes = TcpKeepalive::new().with_time(pace).with_interval(pace);
+        let socket = SockRef::from(stream);
+        socket.set_tcp_keepalive(&probes)?;
+        // This limit, and no count, also ends the probes.
+        socket.set_tcp_user_timeout(Some(pace * (self.probe_count + 1)))
+    }
 }
 
 /// A connection to the first of `addresses` that takes it. One that refuses says more of the master
@@ -216,6 +245,12 @@ async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
         }
     }
     Err(failure)
+}
+
+/// Whether the other end is on this computer, or seems to be: a tunnel's is here too.
+fn is_local(stream: &TcpStream) -> io::Result<bool> {
+    let peer = stream.peer_addr()?.ip();
+    Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
 }
 
 /// One keep-alive connection to the master, for one call at a time.
@@ -239,7 +274,7 @@ impl Connection {
         max_reply: usize,
     ) -> io::Result<Self> {
         stream.set_nodelay(true)?;
-        let (peer, own) = (stream.peer_addr()?.ip(), stream.local_addr()?.ip());
+        let local = is_local(&stream)?;
         let (sender, driver) = hyper::client::conn::http1::Builder::new()
             .title_case_headers(true)
             .handshake(TokioIo::new(stream))
@@ -255,7 +290,7 @@ impl Connection {
         Ok(Self {
             sender,
             ended,
-            local: peer.is_loopback() || peer == own,
+            local,
             host,
             instance,
             max_reply,

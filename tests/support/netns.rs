@@ -84,6 +84,14 @@ impl Netns {
         ip(&format!("neigh del {}.{host} dev {}", self.net, self.near));
     }
 
+    /// Our own address changes, as by DHCP: what was connected from [`near`](Self::near) is lost, and
+    /// nobody is told.
+    pub(crate) fn move_near(&self) {
+        let Self { near, net, .. } = self;
+        ip(&format!("addr del {net}.1/24 dev {near}"));
+        ip(&format!("addr add {net}.100/24 dev {near}"));
+    }
+
     /// `command`, to be run on the other side.
     pub(crate) fn inside(&self, command: &Command) -> Command {
         let mut inside = Command::new("ip");
