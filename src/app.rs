@@ -16,7 +16,6 @@ use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
     admin::Board,
-    cli::Restore,
     clock,
     config::{Config, MasterConfig},
     master::{Mark, Master},
@@ -36,7 +35,7 @@ use crate::{
     record::Session,
     recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
     ros_env::MasterUri,
-    session::{self, Decision, Evidence},
+    session::{self, Decision, Evidence, Restore},
     store::{self, OpenError, Store},
     supervisor::{Rosmaster, SupervisorError},
 };

@@ -3,8 +3,11 @@
 use std::path::PathBuf;
 
 use clap::{
-    Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, builder::FalseyValueParser,
+    Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum,
+    builder::{FalseyValueParser, PossibleValue},
 };
+
+use crate::session::Restore;
 
 /// Keeps a ROS 1 robot running when its master dies.
 ///
@@ -237,15 +240,22 @@ pub struct CommonArgs {
     pub log: Option<String>,
 }
 
-/// When a checkpoint is restored at start.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Restore {
-    /// If the session goes on: same boot and no orderly stop, or a registered node still lives
-    Auto,
-    /// Always
-    Always,
-    /// Never: the old file is kept under another name
-    Never,
+impl ValueEnum for Restore {
+    fn value_variants<'a>() -> &'a [Self] {
+        &[Self::Auto, Self::Always, Self::Never]
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        let (name, help) = match self {
+            Self::Auto => (
+                "auto",
+                "If the session goes on: same boot and no orderly stop, or a registered node still lives",
+            ),
+            Self::Always => ("always", "Always"),
+            Self::Never => ("never", "Never: the old file is kept under another name"),
+        };
+        Some(PossibleValue::new(name).help(help))
+    }
 }
 
 /// When the journal is forced to the disk.

@@ -9,9 +9,10 @@ use std::{
 use thiserror::Error;
 
 use crate::{
-    cli::{CommonArgs, CoreArgs, ProxyArgs, Restore, Sync},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Sync},
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
+    session::Restore,
 };
 
 mod files;

@@ -3,10 +3,20 @@
 //! A robot that is switched on in the morning must not wake up with yesterday's parameters.
 
 use crate::{
-    cli::Restore,
     master::Master,
     record::{Checkpoint, Entry, Record, Session},
 };
+
+/// When a checkpoint is restored at start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Restore {
+    /// If the session goes on: same boot and no orderly stop, or a registered node still lives.
+    Auto,
+    /// Always.
+    Always,
+    /// Never: the old file is kept under another name.
+    Never,
+}
 
 /// What is known about a recorded session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,69 +1,27 @@
 //! The parameters of a checkpoint can be loaded with `rosparam load`.
 
-// The lints know `#[test]` functions only, not their helpers.
-#![allow(clippy::expect_used, clippy::unwrap_used)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
 
-use std::net::{Ipv4Addr, TcpListener, TcpStream};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::thread::sleep;
-use std::time::{Duration, Instant};
+mod support;
+
+use std::process::Command;
 
 use rosrescue::record::{Checkpoint, encode_checkpoint};
 use rosrescue::xmlrpc::{Struct, Value};
-
-const PYTHON: &str = "/usr/bin/python3";
-
-/// A real rosmaster that ends with the test.
-struct Master {
-    child: Child,
-    port: u16,
-}
-
-impl Master {
-    fn start(scratch: &Path) -> Self {
-        let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-        let port = free.local_addr().unwrap().port();
-        drop(free);
-        let child = ros(scratch, port)
-            .args(["/usr/bin/rosmaster", "--core", "-p", &port.to_string()])
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        let deadline = Instant::now() + Duration::from_secs(30);
-        while TcpStream::connect((Ipv4Addr::LOCALHOST, port)).is_err() {
-            assert!(Instant::now() < deadline, "rosmaster does not listen");
-            sleep(Duration::from_millis(20));
-        }
-        Self { child, port }
-    }
-}
-
-impl Drop for Master {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn ros(scratch: &Path, port: u16) -> Command {
-    let mut command = Command::new(PYTHON);
-    command
-        .env("ROS_MASTER_URI", format!("http://127.0.0.1:{port}"))
-        .env("ROS_IP", "127.0.0.1")
-        .env("ROS_HOME", scratch)
-        .env("ROS_LOG_DIR", scratch);
-    command
-}
+use support::{Rosmaster, Scratch, find_program};
 
 /// Takes the parameters out, loads them as a user would, and says what the master returns.
 const LOAD: &str = r#"
 import subprocess, sys, yaml, xmlrpc.client, os
-checkpoint, file = sys.argv[1:]
+rosparam, checkpoint, file = sys.argv[1:]
 parameters = yaml.safe_load(open(checkpoint, 'rb'))['parameters']
 yaml.safe_dump(parameters, open(file, 'w'))
-subprocess.check_call([sys.executable, '/usr/bin/rosparam', 'load', file])
+subprocess.check_call([sys.executable, rosparam, 'load', file])
 master = xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI'])
 code, _, found = master.getParam('/test', '/')
 assert code == 1
@@ -82,7 +40,7 @@ print(len(found))
 
 #[test]
 fn parameters_are_loaded_by_rosparam() {
-    let folder = tempfile::tempdir().unwrap();
+    let scratch = Scratch::new();
     let texts = [
         "no",
         "on",
@@ -127,13 +85,17 @@ fn parameters_are_loaded_by_rosparam() {
     let count = params.len();
     let mut checkpoint = Checkpoint::default();
     checkpoint.snapshot.params = params;
-    let path = folder.path().join("latest-chkpt.yaml");
+    let path = scratch.path("latest-chkpt.yaml");
     std::fs::write(&path, encode_checkpoint(&checkpoint, 1).unwrap().bytes).unwrap();
 
-    let master = Master::start(folder.path());
-    let output = ros(folder.path(), master.port)
+    let master = Rosmaster::start(&scratch);
+    let mut python = Command::new("/usr/bin/python3");
+    scratch.prepare(&mut python);
+    let output = python
+        .env("ROS_MASTER_URI", master.client().uri())
         .args(["-c", LOAD])
-        .args([&path, &folder.path().join("parameters.yaml")])
+        .arg(find_program("rosparam"))
+        .args([&path, &scratch.path("parameters.yaml")])
         .output()
         .unwrap();
     let text = String::from_utf8_lossy(&output.stderr);

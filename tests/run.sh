@@ -1,6 +1,7 @@
 #!/bin/sh
 # Runs every check of rosrescue on a bare Debian or Ubuntu: installs what is missing of ROS 1, then
-# formatting, clippy, and unit, integration and documentation tests. Needs a Rust toolchain.
+# formatting, clippy, the documentation, the fuzz targets (whether they compile), and unit, integration
+# and documentation tests. Needs a Rust toolchain.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -16,4 +17,6 @@ fi
 
 cargo fmt --all --check
 cargo clippy --locked --all-targets -- -D warnings
+RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps
+cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 cargo test --locked

@@ -13,6 +13,7 @@ mod support;
 use std::fs;
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
+use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
@@ -212,6 +213,34 @@ fn ports_in_use() {
     assert!(said.contains(&text) && said.contains("in use"), "{said}");
 }
 
+/// `own` where nothing lies in /opt but, if one is given, a ROS with this rosmaster.
+fn with_opt(own: &Command, rosmaster: &Path) -> Command {
+    const MOUNT: &str = r#"
+        own_path=$PATH
+        PATH=/usr/sbin:/usr/bin:/sbin:/bin
+        mount -t tmpfs none /opt
+        if [ -n "$0" ]; then
+            mkdir -p /opt/ros/noetic/bin
+            ln -s "$0" /opt/ros/noetic/bin/rosmaster
+        fi
+        PATH=$own_path
+        exec "$@""#;
+    let mut command = Command::new("/usr/bin/unshare");
+    if !rustix::process::geteuid().is_root() {
+        command.arg("--map-root-user");
+    }
+    command.args(["--mount", "/bin/sh", "-ec", MOUNT]);
+    command.arg(rosmaster);
+    command.arg(own.get_program()).args(own.get_args());
+    for (key, value) in own.get_envs() {
+        match value {
+            Some(value) => command.env(key, value),
+            None => command.env_remove(key),
+        };
+    }
+    command
+}
+
 #[test]
 fn no_rosmaster_installed() {
     let scratch = Scratch::new();
@@ -223,17 +252,33 @@ fn no_rosmaster_installed() {
     let said = refused(&scratch, setup, 1);
     assert!(said.contains("/nonexistent/rosmaster"), "{said}");
 
-    // Where there is no /opt/ros an empty PATH is enough.
+    // With an empty PATH, on a computer without a ROS in /opt.
     let empty = scratch.path("empty");
     fs::create_dir(&empty).unwrap();
-    if !Path::new("/opt/ros").exists() {
-        let setup = Setup::bare(&scratch, ["core", "-p", &port]).env("PATH", &empty);
-        let said = refused(&scratch, setup, 1);
-        assert!(
-            said.contains("python3-rosmaster"),
-            "it says which package to install: {said}"
-        );
+    let bare = |more: &[&str]| {
+        Setup::bare(&scratch, ["core", "-p", &port])
+            .args(more)
+            .at_port(port.parse().unwrap())
+            .env("PATH", &empty)
+    };
+    let said = refused(
+        &scratch,
+        bare(&[]).wrapped(|own| with_opt(own, Path::new(""))),
+        1,
+    );
+    assert!(
+        said.contains("python3-rosmaster"),
+        "it says which package to install: {said}"
+    );
+    // A ROS in /opt is found without a PATH.
+    let rosmaster = find_program("rosmaster");
+    let mut setup = bare(&["--no-rosout"]);
+    if !rosmaster.starts_with("/opt/ros") {
+        setup = setup.wrapped(|own| with_opt(own, &rosmaster));
     }
+    let mut rescue = setup.start();
+    rescue.client().set_param("/x", 1);
+    assert_eq!(rescue.terminate().code(), Some(0));
 
     // One that ends at once is no master either, and is reported as such.
     let mut setup = Setup::bare(&scratch, ["core", "-p", &port, "--rosmaster", "/bin/false"]);

@@ -7,16 +7,16 @@ use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
-use crate::support::free_port;
+use crate::support::{Scratch, find_program, free_port};
 
 /// Longest wait for an answer: of a rosmaster that starts, or while another one takes its place.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A rosmaster of its own, ended when this is dropped.
 pub(crate) struct Rosmaster {
     process: Child,
     pub(crate) port: u16,
-    _scratch: tempfile::TempDir,
+    _scratch: Scratch,
 }
 
 impl Rosmaster {
@@ -27,25 +27,21 @@ impl Rosmaster {
 
     /// Starts one at `port` without waiting for it.
     pub(crate) fn start_at(port: u16) -> Self {
-        let scratch = tempfile::tempdir().unwrap();
+        let scratch = Scratch::new();
         // The default configuration's stream handler imports rospy, which doubles the start.
-        let logging = scratch.path().join("logging.conf");
+        let logging = scratch.path("logging.conf");
         std::fs::write(&logging, LOGGING).unwrap();
-        let process = Command::new("/usr/bin/python3")
-            .args(["/usr/bin/rosmaster", "--core", "-p", &port.to_string()])
-            .env_clear()
-            .env("PATH", "/usr/bin:/bin")
-            .env("LANG", "C.UTF-8")
-            .env("ROS_IP", "127.0.0.1")
+        let mut command = Command::new(find_program("rosmaster"));
+        scratch.prepare(&mut command);
+        let process = command
+            .args(["--core", "-p", &port.to_string()])
             .env("ROS_MASTER_URI", format!("http://127.0.0.1:{port}"))
-            .env("ROS_HOME", scratch.path())
-            .env("ROS_LOG_DIR", scratch.path())
             .env("ROS_PYTHON_LOG_CONFIG_FILE", &logging)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()
-            .expect("ROS Noetic's rosmaster must be installed for this test");
+            .expect("a rosmaster that can be run");
         Self {
             process,
             port,
