@@ -1,6 +1,6 @@
 //! A master, or a node that is asked by the census, that answers garbage: the client gets the master's own
-//! bytes where they are HTTP and a closed connection else, never an invented answer; nothing is recorded
-//! that was no success.
+//! bytes where they are HTTP, else a closed connection, or the mirror's answer to what only reads; never an
+//! invented one. Nothing is recorded that was no success.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,30 +12,39 @@
 mod support;
 
 use std::fs;
+use std::io::Write;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use rosrescue::xmlrpc::{Reply, Value};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
     Client, FakeMaster, FakeNode, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, encode_call,
-    eventually, holds, http_request, params,
+    eventually, holds, http_request, params, status,
 };
 
-/// A master that is real but for calls that mention `/poison`: those get `answer`.
+/// A master that is real but for calls that mention a word: those get the answer that is given.
 struct Poisoned {
     // The order is that of the drops.
     rescue: Rescue,
     _fake: FakeMaster,
     real: Rosmaster,
+    answer: Arc<Mutex<(&'static [u8], Vec<u8>)>>,
     _scratch: Scratch,
 }
 
 impl Poisoned {
+    /// Calls that mention `/poison` get `answer`.
     fn start(answer: Vec<u8>) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);
         let master = real.client();
+        let answer = Arc::new(Mutex::new((&b"/poison"[..], answer)));
+        let said = answer.clone();
         let fake = FakeMaster::start(move |body| {
-            if body.windows(7).any(|window| window == b"/poison") {
+            let (word, answer) = &*said.lock().unwrap();
+            if body.windows(word.len()).any(|window| window == *word) {
                 return answer.clone();
             }
             match master.exchange(&http_request(body)) {
@@ -44,114 +53,212 @@ impl Poisoned {
             }
         });
         let rescue = Setup::proxy(&scratch, fake.port())
-            .args(["--hold", "2"])
+            .args(["--hold", "2", "--probe-interval", "100"])
             .start();
         Self {
             rescue,
             _fake: fake,
             real,
+            answer,
             _scratch: scratch,
         }
     }
+
+    /// From now on calls that mention `word` get `answer`.
+    fn say(&self, word: &'static [u8], answer: &[u8]) {
+        *self.answer.lock().unwrap() = (word, answer.to_vec());
+    }
+
+    /// The others are served, and nothing that was no success is recorded as one.
+    fn assert_sound(&self, case: &str, round: i32) {
+        let client = self.rescue.client();
+        eventually("other calls pass", || {
+            let call = params!["/c", "/kept", round];
+            client.ask("setParam", call).is_some()
+        });
+        assert_eq!(self.real.client().param("/kept"), Some(round.into()));
+        let checkpoint = fs::read_to_string(self.rescue.checkpoint()).unwrap();
+        assert!(
+            checkpoint.contains("kept") && !checkpoint.contains("poison"),
+            "{case}: {checkpoint}"
+        );
+        self.rescue.assert_no_panic();
+    }
 }
 
-/// Status and body that the client must get, if that is certain.
-type Due<'a> = Option<(u16, &'a str)>;
+const FAULT: &str = "<methodResponse><fault><value><struct><member><name>faultCode</name><value><int>1</int>\
+                     </value></member><member><name>faultString</name><value><string>no</string></value>\
+                     </member></struct></value></fault></methodResponse>";
+
+fn with_status(status: &str, body: &[u8]) -> Vec<u8> {
+    let length = body.len();
+    let head = format!("HTTP/1.1 {status}\r\nContent-Length: {length}\r\n\r\n");
+    [head.as_bytes(), body].concat()
+}
+
+/// A gigabyte of zeros, packed, as the answer to a call.
+fn bomb() -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(&vec![0; 16 << 20]).unwrap();
+    encoder.finish().unwrap().repeat(64)
+}
+
+/// Calls that change a master's state, and calls that do not, all of them poisoned. (`subscribeParam` is
+/// not among them: if its reply is whole and cannot be read it is recorded as foretold, because no look
+/// shows what became of it.)
+fn poisoned_calls() -> [Vec<(&'static str, Vec<Value>)>; 2] {
+    let api = "http://127.0.0.1:1/";
+    let set = || Call::new("setParam", params!["/c", "/poison", "in the cup"]);
+    let get = Call::new("getParam", params!["/c", "/poison"]);
+    let changes = vec![
+        ("setParam", set().params),
+        ("deleteParam", params!["/c", "/poison"]),
+        ("registerPublisher", params!["/c", "/poison", "a/B", api]),
+        ("registerSubscriber", params!["/c", "/poison", "a/B", api]),
+        (
+            "registerService",
+            params!["/c", "/poison", "rosrpc://127.0.0.1:1", api],
+        ),
+        ("unregisterPublisher", params!["/c", "/poison", api]),
+        ("system.multicall", Call::multicall([set(), set()]).params),
+    ];
+    let reads = vec![
+        ("getParam", params!["/c", "/poison"]),
+        ("lookupNode", params!["/c", "/poison"]),
+        ("getSystemState", params!["/poison"]),
+        ("system.multicall", Call::multicall([get]).params),
+    ];
+    [changes, reads]
+}
 
 #[test]
 fn garbage_from_the_master() {
-    let http = |head: &str, body: &str| format!("{head}\r\n\r\n{body}").into_bytes();
-    let with = |status: &str, body: &str| {
-        http(
-            &format!("HTTP/1.1 {status}\r\nContent-Length: {}", body.len()),
-            body,
-        )
+    let broken = |head: &str, body: &str| (format!("{head}\r\n\r\n{body}").into_bytes(), None);
+    let whole = |status: &str, body: &[u8]| {
+        let code: u16 = status.split(' ').next().unwrap().parse().unwrap();
+        (with_status(status, body), Some((code, body.to_vec())))
     };
     let fine = "<methodResponse><params><param><value><array><data><value><int>1</int></value>\
                 <value><string>ok</string></value><value><int>0</int></value></data></array></value>\
                 </param></params></methodResponse>";
-    let cases: Vec<(Vec<u8>, Due<'_>)> = vec![
+    let number = "<methodResponse><params><param><value><int>1</int></value></param></params>\
+                  </methodResponse>";
+    let bomb = bomb();
+    let bomb_head = format!(
+        "HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: {}\r\n\r\n",
+        bomb.len()
+    );
+    // What the master says, and status and body that the client must get; none if it is no whole
+    // HTTP answer.
+    type Case = (Vec<u8>, Option<(u16, Vec<u8>)>);
+    let cases: Vec<Case> = vec![
         (b"".to_vec(), None),
         (b"SSH-2.0-OpenSSH_9.2\r\n".to_vec(), None),
         (b"\x00\x01\x02\x03".to_vec(), None),
         (b"HTTP/1.1".to_vec(), None),
         (b"HTTP/1.1 200 OK\r\nContent-".to_vec(), None),
-        (
-            http("HTTP/1.1 200 OK\r\nContent-Length: 100000", fine),
-            None,
-        ),
-        (http("HTTP/1.1 200 OK\r\nContent-Length: many", fine), None),
-        (
-            http("HTTP/1.1 200 OK\r\nContent-Length: 10000000000", fine),
-            None,
-        ),
-        (
-            http("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked", "zz\r\n"),
-            None,
-        ),
-        (with("200 OK", ""), None),
-        (with("200 OK", "not xml"), Some((200, "not xml"))),
-        (
-            with("200 OK", "<methodResponse>"),
-            Some((200, "<methodResponse>")),
-        ),
-        (with("200 OK", "<a><b/></a>"), Some((200, "<a><b/></a>"))),
-        (
-            with("500 Internal Server Error", "<html>oops</html>"),
-            Some((500, "<html>oops</html>")),
-        ),
-        (with("503 Busy", fine), Some((503, fine))),
-        (
-            with(
-                "200 OK",
-                "<methodResponse><params><param><value><int>1</int></value></param></params></methodResponse>",
-            ),
-            None,
-        ),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: 100000", fine),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: many", fine),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: 10000000000", fine),
+        broken("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked", "zz\r\n"),
+        whole("200 OK", b""),
+        whole("200 OK", b"not xml"),
+        whole("200 OK", b"<methodResponse>"),
+        whole("200 OK", b"<a><b/></a>"),
+        whole("200 OK", number.as_bytes()),
+        whole("200 OK", FAULT.as_bytes()),
+        whole("500 Internal Server Error", b"<html>oops</html>"),
+        whole("503 Busy", fine.as_bytes()),
+        ([bomb_head.as_bytes(), &bomb].concat(), Some((200, bomb))),
     ];
+    let poisoned = Poisoned::start(Vec::new());
+    let (client, real) = (poisoned.rescue.client(), poisoned.real.client());
+    let [changes, reads] = poisoned_calls();
+    let several = changes.last().unwrap().clone();
     for (number, (answer, due)) in cases.into_iter().enumerate() {
-        let poisoned = Poisoned::start(answer);
-        let client = poisoned.rescue.client();
-        client.set_param("/kept", 1);
-        let body = encode_call("setParam", params!["/c", "/poison", "in the cup"]);
-        let got = client.exchange(&http_request(&body));
-        match (&got, due) {
-            (Ok(response), Some((code, text))) => {
-                assert_eq!(
-                    (response.code, response.text().as_str()),
-                    (code, text),
-                    "case {number}"
-                );
-                assert_eq!(
-                    response.header("content-length"),
-                    Some(&*text.len().to_string())
-                );
+        poisoned.say(b"/poison", &answer);
+        for (is_read, (method, params)) in [(false, &changes), (true, &reads)]
+            .into_iter()
+            .flat_map(|(is_read, calls)| calls.iter().map(move |call| (is_read, call)))
+        {
+            if !is_read && *method == "system.multicall" && answer.ends_with(FAULT.as_bytes()) {
+                continue; // Below.
             }
-            (Ok(response), None) => {
-                let invented = response.code == 200 && response.text().contains("fault");
-                assert!(!invented, "case {number}: {}", response.text());
+            let case = format!("case {number}, {method}");
+            let request = http_request(&encode_call(method, params.clone()));
+            match (client.exchange(&request), &due) {
+                // The master's own bytes.
+                (Ok(response), Some((code, body))) => {
+                    assert!(
+                        response.code == *code && response.body == *body,
+                        "{case}: {response:.1000?}"
+                    );
+                    let length = body.len().to_string();
+                    assert_eq!(response.header("content-length"), Some(&*length), "{case}");
+                }
+                // The mirror's answer, which is what the master would have said.
+                (Ok(response), None) if is_read => {
+                    let true_one = real.exchange(&request).unwrap();
+                    assert_eq!(response.text(), true_one.text(), "{case}");
+                }
+                // A closed connection, not one that is kept waiting.
+                (Err(error), None) if !is_read => {
+                    assert_ne!(error.kind(), std::io::ErrorKind::WouldBlock, "{case}");
+                }
+                (got, _) => panic!("{case}: {got:?}"),
             }
-            (Err(error), None) => {
-                assert_ne!(
-                    error.kind(),
-                    std::io::ErrorKind::WouldBlock,
-                    "case {number}"
-                );
-            }
-            (Err(error), Some(_)) => panic!("case {number}: {error}"),
         }
-        // The others are served, and what was no success is not recorded as one.
-        eventually("other calls pass", || {
-            client.ask("setParam", params!["/c", "/kept", 2]).is_some()
-        });
-        assert_eq!(poisoned.real.client().param("/kept"), Some(2.into()));
-        let checkpoint = fs::read_to_string(poisoned.rescue.checkpoint()).unwrap();
-        assert!(
-            checkpoint.contains("kept") && !checkpoint.contains("poison"),
-            "{checkpoint}"
-        );
-        poisoned.rescue.assert_no_panic();
+        let round = i32::try_from(number).unwrap();
+        poisoned.assert_sound(&format!("case {number}"), round);
     }
+    // A multicall that rosmaster faults as a whole may have been run in part. What it has run is
+    // recorded, until the look that follows has shown that it was nothing.
+    poisoned.say(b"/poison", &with_status("200 OK", FAULT.as_bytes()));
+    let request = http_request(&encode_call("system.multicall", several.1));
+    assert_eq!(client.exchange(&request).unwrap().text(), FAULT);
+    client.set_param("/kept", 99);
+    eventually("the checkpoint is sound", || {
+        let checkpoint = fs::read_to_string(poisoned.rescue.checkpoint()).unwrap();
+        !checkpoint.contains("poison") && checkpoint.contains("99")
+    });
+    assert_eq!(status(&client)["state"]["params"], 1);
+    // Nobody has unpacked the bomb.
+    let memory = fs::read_to_string(format!("/proc/{}/status", poisoned.rescue.pid())).unwrap();
+    let most = memory.lines().find(|line| line.starts_with("VmHWM:"));
+    let most = most
+        .and_then(|line| line.split_whitespace().nth(1))
+        .unwrap();
+    assert!(most.parse::<u64>().unwrap() < 300 << 10, "{most} KiB");
+}
+
+/// Such as a master that is out of memory.
+#[test]
+fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
+    let poisoned = Poisoned::start(Vec::new());
+    let client = poisoned.rescue.client();
+    client.set_param("/kept", 1);
+    let fault = with_status("200 OK", FAULT.as_bytes());
+    poisoned.say(b"<", &fault);
+    let is_open = || status(&client)["open"] == true;
+    let set = || {
+        let call = encode_call("setParam", params!["/c", "/poison", 1]);
+        client.exchange(&http_request(&call))
+    };
+    eventually("the gate is shut", || {
+        // Until then it is the master's own answer.
+        let answer = set();
+        assert!(
+            answer.as_ref().is_ok_and(|it| it.text() == FAULT) || !is_open(),
+            "{answer:?}"
+        );
+        !is_open()
+    });
+    assert!(set().is_err(), "nobody has run it");
+    assert_eq!(client.param("/kept"), Some(1.into()));
+    poisoned.say(b"nobody says this", b"");
+    eventually("the gate is open", is_open);
+    assert_eq!(poisoned.real.client().param("/kept"), Some(1.into()));
+    poisoned.assert_sound("a fault for everything", 2);
 }
 
 /// What is HTTP and a success arrives, in whatever form the master sends it.
@@ -205,11 +312,13 @@ fn something_that_is_no_master_at_all() {
         &b"SSH-2.0-OpenSSH_9.2\r\n"[..],
         b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n",
         b"",
+        &with_status("200 OK", FAULT.as_bytes()),
     ]
     .into_iter()
     .enumerate()
     {
-        let fake = FakeMaster::start(move |_| answer.to_vec());
+        let answer = answer.to_vec();
+        let fake = FakeMaster::start(move |_| answer.clone());
         let mut rescue = Setup::proxy(&scratch, fake.port())
             .args(["--hold", "1"])
             .at_checkpoint(scratch.path(format!("{number}.yaml")))

@@ -108,7 +108,12 @@ impl Walk<'_> {
         };
         let results = match reply {
             Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
-            _ => return self.simulate(params, levels),
+            Reply::Fault { .. } => return self.simulate(params, levels),
+            // No rosmaster answers so: what has become of it only a look can show.
+            Reply::Value(_) => {
+                self.accepted.certain = false;
+                return;
+            }
         };
         for (element, result) in entries.iter().zip(results) {
             if let Entry::Call { method, params } = Entry::new(element) {
@@ -308,6 +313,15 @@ mod tests {
         let found = of(&Master::default(), &call);
         assert_eq!(found.calls.len(), 1);
         assert!(!found.certain);
+    }
+
+    #[test]
+    fn nothing_is_made_of_a_reply_that_is_none_to_a_multicall() {
+        let call = Call::multicall([set("/a", 1)]);
+        for value in [Value::Int(1), Value::Array(vec![])] {
+            let found = accepted(&Master::default(), &call, &Reply::Value(value));
+            assert_eq!((found.calls, found.certain), (vec![], false));
+        }
     }
 
     #[test]
