@@ -55,6 +55,50 @@ fn a_refusal_that_the_mirror_did_not_expect_is_believed() {
     assert_eq!(client.param("/b"), None);
 }
 
+/// Once for each method, with what both said, but no parameter's value.
+#[test]
+fn a_divergence_is_logged_once_for_each_method_with_both_replies() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let api = "http://127.0.0.1:1/";
+    for (round, topic) in (0..).zip(["/t1", "/t2"]) {
+        client.ok("registerPublisher", params!["/p", topic, "a/B", api]);
+        let own = params!["/p", topic, api];
+        robot.bare().ok("unregisterPublisher", own.clone());
+        client.ok("unregisterPublisher", own);
+        client.set_param("/key", "hush");
+        robot.bare().set_param("/key", "psst");
+        let value = client.ok("subscribeParam", params!["/p", api, "/key"]);
+        assert_eq!(value, "psst".into());
+        assert_eq!(divergences(&client), 2 * (round + 1));
+    }
+    let mut said = |method: &str| {
+        let wanted = |line: &str| line.contains(&format!("method=\"{method}\""));
+        let line = robot.rescue.wait_line("what differs", wanted);
+        // Both rounds are over: what had been said twice would be there.
+        let lines = robot.rescue.output();
+        assert_eq!(lines.iter().filter(|line| wanted(line)).count(), 1);
+        line
+    };
+    let line = said("unregisterPublisher");
+    let (mirror, master) = line.split_once(" master=").unwrap();
+    assert!(
+        mirror.contains("Unregistered [/p] as provider of [/t1]"),
+        "{line}"
+    );
+    assert!(master.contains("[/p] is not a registered node"), "{line}");
+    let line = said("subscribeParam");
+    let (mirror, master) = line.split_once(" master=").unwrap();
+    for reply in [mirror, master] {
+        assert!(reply.contains("Subscribed to parameter [/key]"), "{line}");
+    }
+    let lines = robot.rescue.output().join("\n");
+    assert!(
+        !lines.contains("hush") && !lines.contains("psst"),
+        "{lines}"
+    );
+}
+
 #[test]
 fn what_was_written_past_the_proxy_is_found_at_the_interval() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--resync-interval", "0.2"]);

@@ -10,7 +10,7 @@
 
 mod support;
 
-use rosrescue::xmlrpc::Value;
+use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{Rosmaster, Scratch, Setup, eventually, params, tree};
 
 /// CPython writes a carriage return as it is, and whoever reads that as XML gets a line feed.
@@ -76,6 +76,51 @@ fn a_master_with_a_date_that_breaks_its_answers_is_taken_over() {
         after.param("/ns"),
         Some(tree! { "good" => 2, "fine" => date })
     );
+}
+
+/// As deep as rosmaster returns a value with the whole tree in a multicall, which is how it is brought
+/// back and compared, it outlives the master; what is deeper is left out, by name.
+#[test]
+fn a_value_nested_as_deep_as_the_master_bears_outlives_it() {
+    let in_array = |value| Value::Array(vec![value]);
+    let in_struct = |value| tree! { "k" => value };
+    let wraps: [fn(Value) -> Value; 2] = [in_array, in_struct];
+    let nested = |depth: usize, wrap: fn(Value) -> Value| {
+        (0..depth).fold(Value::from("leaf"), |value, _| wrap(value))
+    };
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let bare = master.client();
+    let deepest = wraps.map(|wrap| {
+        let borne = |depth: &usize| {
+            bare.set_param("/deep", nested(*depth, wrap));
+            let tree = Call::multicall([Call::new("getParam", params!["/test", "/"])]);
+            let reply = bare.call("system.multicall", tree.params).unwrap();
+            matches!(reply, Reply::Value(_))
+        };
+        let depth = (470..520).take_while(borne).last();
+        bare.ok("deleteParam", params!["/test", "/deep"]);
+        depth.expect("rosmaster bears 470 levels")
+    });
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    let client = rescue.client();
+    for (wrap, (name, depth)) in wraps.iter().zip(["array", "struct"].iter().zip(deepest)) {
+        client.set_param(&format!("/{name}"), nested(depth, *wrap));
+        client.set_param(&format!("/deeper_{name}"), nested(depth + 1, *wrap));
+    }
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let after = master.client();
+    eventually("the state is back", || after.param("/struct").is_some());
+    for (wrap, (name, depth)) in wraps.iter().zip(["array", "struct"].iter().zip(deepest)) {
+        let found = after.param(&format!("/{name}"));
+        assert!(found == Some(nested(depth, *wrap)), "{name} of {depth}");
+    }
+    for name in ["array", "struct"] {
+        rescue.wait_line("what was left out", |line| {
+            line.contains(&format!("the parameter `/deeper_{name}"))
+        });
+    }
 }
 
 /// What came through rosrescue itself is kept, and left out where it would spoil a new master.

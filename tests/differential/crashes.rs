@@ -18,8 +18,9 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
     let mut dice = Dice(seed);
     let mut cast = Cast {
         apis: (0..nodes).map(node_api).collect(),
-        // What a master cannot return does not survive it.
-        poison: false,
+        // What a master cannot return does not survive it: while there is such a value no crash
+        // happens, and before and after they do.
+        poison: dice.once_in(4),
         errors: !dice.once_in(4),
         // Another master is another process.
         process: false,
@@ -36,10 +37,8 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
         let at = dice.below(steps.len() + 1);
         steps.insert(at, Step::Crash { in_flight });
     }
-    Script {
-        poison: false,
-        steps,
-    }
+    let poison = cast.poison;
+    Script { poison, steps }
 }
 
 /// rosrescue and what is behind it.
@@ -138,10 +137,20 @@ fn is_complete(model: &Master) -> bool {
         && !model.subscribers_of("/rosout").is_empty()
 }
 
+/// So many of all.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Share {
+    pub(crate) happened: usize,
+    pub(crate) asked: usize,
+}
+
 /// What a run was.
 #[derive(Default)]
 pub(crate) struct Tally {
-    pub(crate) crashes: u32,
+    /// Crashes that happened, and those that were asked for, in sequences without poison.
+    pub(crate) sound: Share,
+    /// The same with poison.
+    pub(crate) poisoned: Share,
     /// Crashes left out, since something could not have been brought back: what.
     pub(crate) spared: Vec<Skipped>,
 }
@@ -157,6 +166,7 @@ pub(crate) fn run(
     let model = rig.state();
     let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
     let mut stage = Stage::new(nodes, wires, model);
+    stage.callbacks = !script.poison;
     let mut in_flight = false;
     for (nth, step) in script.steps.iter().enumerate() {
         let done = match step {
@@ -169,6 +179,11 @@ pub(crate) fn run(
                 }
             }
             Step::Crash { in_flight: during } => {
+                let share = match script.poison {
+                    true => &mut tally.poisoned,
+                    false => &mut tally.sound,
+                };
+                share.asked += 1;
                 let mut skipped = skipped(&stage.model);
                 // The call that is under way may be part of the state.
                 if let (true, Some(Step::Call { call, .. })) = (during, script.steps.get(nth + 1)) {
@@ -180,7 +195,7 @@ pub(crate) fn run(
                     tally.spared.extend(skipped.into_iter().take(1));
                     continue;
                 }
-                tally.crashes += 1;
+                share.happened += 1;
                 in_flight = *during;
                 // What was queued is heard before; a crash loses it, which is nobody's fault.
                 stage.settle().and_then(|()| {
