@@ -287,6 +287,8 @@ impl Lifecycle {
                 self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
                 vec![Action::Kill]
             }
+            // It does not even take connections: it is stopped, with as many waiting as there may be.
+            _ if self.is_hopeless(now) => self.give_up(now),
             _ => self.connect_later(now, true),
         }
     }

@@ -161,6 +161,25 @@ fn a_master_that_was_left_hanging_is_killed() {
         .feed(Input::Exited, &[Action::Spawn]);
 }
 
+/// A process that was stopped with as many connections waiting as there may be takes no more.
+#[test]
+fn a_master_that_was_left_and_takes_no_connection_is_killed() {
+    let mut script = Script::new(Supervision::Ours);
+    script
+        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(Input::Unreachable, &[]);
+    script.now += START_LIMIT + Duration::from_secs(1);
+    script
+        .feed(Input::Wake, &[Action::Connect])
+        .feed(Input::Unreachable, &[Action::Kill])
+        .feed(Input::Exited, &[Action::Spawn]);
+    // Those of others are waited for.
+    let mut script = Script::new(Supervision::Theirs);
+    script.feed(Input::Start { left: false }, &[Action::Connect]);
+    script.now += START_LIMIT * 2;
+    script.feed(Input::Unreachable, &[]);
+}
+
 /// Whatever answers at the port of our child instead of it.
 #[test]
 fn a_child_at_whose_port_there_is_no_master_is_replaced() {
