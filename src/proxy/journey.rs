@@ -7,6 +7,7 @@ use thiserror::Error;
 use tokio::sync::oneshot;
 
 use super::{
+    activity::Deeds,
     look::LookError,
     pool::VerifyError,
     upstream::{CallError, Head, RawReply},
@@ -48,6 +49,28 @@ pub struct LaneItem {
     pub attempts: u32,
     /// What the first journey whose reply was lost must have come to, if it arrived.
     pub foretold: Option<Reply>,
+    /// Of a call of our own: what it stands on.
+    pub premise: Option<Premise>,
+}
+
+/// A node and its last deeds, as they were when it was found out that something is to be registered or
+/// unregistered for it. A node that does the contrary itself meanwhile knows better.
+#[derive(Clone, Debug)]
+pub struct Premise {
+    /// The node.
+    pub node: String,
+    /// Its last deeds then.
+    pub deeds: Deeds,
+}
+
+impl Premise {
+    /// Whether it still holds for a call of this kind, now that these are the node's last deeds.
+    pub fn holds(&self, kind: Kind, now: Deeds) -> bool {
+        match kind {
+            Kind::Unregister => self.deeds.registered == now.registered,
+            _ => self.deeds.unregistered == now.unregistered,
+        }
+    }
 }
 
 impl LaneItem {
@@ -65,6 +88,7 @@ impl LaneItem {
             answer,
             attempts: 0,
             foretold: None,
+            premise: None,
         }
     }
 
@@ -76,9 +100,13 @@ impl LaneItem {
     /// The answer of an earlier journey whose reply was lost, if `reply` shows that it was run then:
     /// what could be done before can not be done any more.
     pub fn done_before(&self, reply: &Reply) -> Option<Reply> {
-        let refused = matches!(reply, Reply::Value(Value::Array(_))) && !master::is_success(reply);
-        let first = self.foretold.as_ref().filter(|_| refused)?;
-        master::is_success(first).then(|| first.clone())
+        let method = &self.call.as_ref()?.method;
+        let first = self
+            .foretold
+            .as_ref()
+            .filter(|first| is_done(method, first))?;
+        let undone = matches!(reply, Reply::Value(Value::Array(_))) && !is_done(method, reply);
+        undone.then(|| first.clone())
     }
 
     /// The nodes whose registrations the call may change. What cannot be decoded has none that we
@@ -117,6 +145,16 @@ impl LaneItem {
     fn weight(&self) -> usize {
         self.raw.as_ref().map_or(0, |(_, body)| body.len())
     }
+}
+
+/// Whether a method has done something by this answer. An unregistration of what is not registered
+/// succeeds too, and says 0.
+fn is_done(method: &str, reply: &Reply) -> bool {
+    let nothing = |reply: &Reply| match reply {
+        Reply::Value(Value::Array(answer)) => answer.get(2) == Some(&Value::Int(0)),
+        _ => false,
+    };
+    master::is_success(reply) && !(method.starts_with("unregister") && nothing(reply))
 }
 
 /// Takes from the front of `queue` what travels next: one call, or several that may share.
@@ -269,125 +307,4 @@ fn rewritten(value: &Value, uri: &str) -> Option<Value> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn item(call: Call) -> LaneItem {
-        let body = Bytes::from(xmlrpc::encode_call(&call));
-        let raw = Some((Head::default(), body));
-        LaneItem::new(raw, Some(call), Kind::Mutate, oneshot::channel().0)
-    }
-
-    #[test]
-    fn what_was_done_by_a_lost_journey_is_answered_as_done() {
-        let answer = |code: i32| Reply::Value(vec![Value::from(code), "".into(), 0.into()].into());
-        let mut item = item(Call::new("deleteParam", vec!["/n".into(), "/a".into()]));
-        assert_eq!(item.done_before(&answer(-1)), None);
-        item.foretold = Some(answer(1));
-        assert_eq!(item.done_before(&answer(-1)), Some(answer(1)));
-        assert_eq!(item.done_before(&answer(1)), None);
-        item.foretold = Some(answer(-1));
-        assert_eq!(item.done_before(&answer(-1)), None);
-    }
-
-    fn set(key: &str, value: impl Into<Value>) -> Call {
-        Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
-    }
-
-    fn packed(calls: Vec<Call>) -> Vec<usize> {
-        let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
-        let mut sizes = Vec::new();
-        while !queue.is_empty() {
-            sizes.push(pack(&mut queue).len());
-        }
-        sizes
-    }
-
-    #[test]
-    fn calls_that_may_share_travel_together_and_keep_their_order() {
-        let subscribe = Call::new(
-            "subscribeParam",
-            vec!["/n".into(), "http://n:1/".into(), "/k".into()],
-        );
-        let calls = vec![set("/a", 1), set("/b", 2), subscribe, set("/c", 3)];
-        assert_eq!(packed(calls), [2, 1, 1]);
-        assert_eq!(
-            packed((0..250).map(|i| set("/a", i)).collect()),
-            [100, 100, 50]
-        );
-        let big = "x".repeat(TOGETHER_BYTES / 2 + 1);
-        assert_eq!(
-            packed(vec![set("/a", &*big), set("/b", &*big), set("/c", 1)]),
-            [1, 2]
-        );
-    }
-
-    #[test]
-    fn a_single_call_goes_out_as_its_own_bytes() {
-        let body = Bytes::from_static(b"<methodCall> odd </methodCall>");
-        let mut odd = item(set("/a", 1));
-        odd.raw = Some((Head::default(), body.clone()));
-        assert_eq!(outbound(&[odd]).1, body);
-        let (_, both) = outbound(&[item(set("/a", 1)), item(set("/b", 2))]);
-        let expected = Call::multicall([set("/a", 1), set("/b", 2)]);
-        assert_eq!(xmlrpc::decode_call(&both).unwrap(), expected);
-    }
-
-    #[test]
-    fn replies_come_apart_only_when_each_is_there() {
-        let fault = Struct::from([
-            ("faultCode".to_owned(), Value::Int(1)),
-            ("faultString".to_owned(), Value::from("no")),
-        ]);
-        let reply = Reply::Value(Value::Array(vec![
-            Value::from(vec![Value::from(7)]),
-            Value::Struct(fault),
-        ]));
-        let replies = vec![
-            Reply::Value(Value::Int(7)),
-            Reply::Fault {
-                code: 1,
-                text: "no".to_owned(),
-            },
-        ];
-        assert_eq!(unpack(&reply, 2), Some(replies));
-        assert_eq!(unpack(&reply, 3), None);
-        assert_eq!(
-            unpack(
-                &Reply::Fault {
-                    code: 1,
-                    text: String::new()
-                },
-                0
-            ),
-            None
-        );
-    }
-
-    #[test]
-    fn the_masters_own_address_becomes_ours() {
-        let answer = |uri: &str| Value::Array(vec![1.into(), "".into(), uri.into()]);
-        let call = Call::new("getUri", vec!["/n".into()]);
-        let reply = rewrite_uri(&call, &Reply::Value(answer("http://m:1/")), "http://us:2/");
-        assert_eq!(reply, Some(Reply::Value(answer("http://us:2/"))));
-        let both = Call::multicall([Call::new("getPid", vec!["/n".into()]), call]);
-        let results = |uri: &str| {
-            let pid = Value::Array(vec![1.into(), "".into(), 42.into()]);
-            Reply::Value(Value::Array(vec![
-                vec![pid].into(),
-                vec![answer(uri)].into(),
-            ]))
-        };
-        let reply = rewrite_uri(&both, &results("http://m:1/"), "http://us:2/");
-        assert_eq!(reply, Some(results("http://us:2/")));
-        let nested = Call::multicall([both.clone()]);
-        let within = |reply: Reply| match reply {
-            Reply::Value(value) => Reply::Value(vec![Value::Array(vec![value])].into()),
-            fault => fault,
-        };
-        let reply = rewrite_uri(&nested, &within(results("http://m:1/")), "http://us:2/");
-        assert_eq!(reply, Some(within(results("http://us:2/"))));
-        assert!(asks_uri(&both) && asks_uri(&nested));
-        assert!(!asks_uri(&Call::multicall([Call::new("getPid", vec![])])));
-    }
-}
+mod tests;

@@ -1,5 +1,6 @@
 //! Keeps the checkpoint: forces the journal to the disk, writes new generations, and re-arms after
-//! the disk has failed. Beside traffic; no call waits for it but with `--sync always`.
+//! the disk has failed. Beside traffic; a call waits for it with `--sync always`, and where what it did is
+//! in no journal.
 
 use std::{
     path::Path,
@@ -25,12 +26,13 @@ const BETWEEN: Duration = Duration::from_secs(10);
 /// Keeps the checkpoint until `stop`.
 pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
     let mut keeper = Keeping {
-        proxy,
         seq: 0,
         recorded_at: Instant::now(),
         compacted_at: None,
         failed_at: None,
-        said: None,
+        // Whoever opened the checkpoint has said it.
+        said: proxy.shadow.unprotected(),
+        proxy,
     };
     loop {
         let proxy = &keeper.proxy;
@@ -87,7 +89,11 @@ impl Keeping {
             None => store.synced_seq(),
             Some(_) => store.seq(),
         });
-        shadow.set_durable(durable.unwrap_or(u64::MAX));
+        // Without a store nothing has a number that anybody could wait for; one that is opened later
+        // counts from where its file ends.
+        if let Some(durable) = durable {
+            shadow.set_durable(durable);
+        }
     }
 
     fn compaction_is_due(&mut self) -> bool {
@@ -129,11 +135,18 @@ impl Keeping {
         };
         match finished {
             Some(Err(error)) => {
-                shadow.set_checkpoint_due();
+                shadow.set_attempted(Err(&error));
                 self.failed_at = Some(Instant::now());
                 tracing::debug!(%error, "compaction");
             }
-            _ => self.compacted_at = Some(Instant::now()),
+            _ => {
+                self.compacted_at = Some(Instant::now());
+                if self.proxy.config.sync == Sync::Always {
+                    // The new file's name is not on the disk yet.
+                    self.sync().await;
+                }
+                self.proxy.shadow.set_attempted(Ok(()));
+            }
         }
     }
 

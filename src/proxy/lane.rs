@@ -1,6 +1,7 @@
 //! The lane: mutating calls travel to the master one journey at a time, so that the journal's order
 //! is the order in which the master ran them. Calls that queue up travel together.
 
+mod overtaken;
 mod runner;
 
 use std::{sync::Arc, time::Duration};
@@ -10,7 +11,7 @@ use tokio::sync::{Semaphore, SemaphorePermit, mpsc, oneshot};
 pub use self::runner::LaneRunner;
 use super::{
     gate::Gate,
-    journey::{Answer, LaneItem},
+    journey::{Answer, LaneItem, Premise},
 };
 use crate::{
     master::Kind,
@@ -56,8 +57,18 @@ impl Lane {
 
     /// Makes a call of rosrescue's own, recorded as any other. None if the master never answers.
     pub async fn call(&self, call: Call, kind: Kind) -> Option<Reply> {
+        self.call_own(call, kind, None).await
+    }
+
+    /// As [`Self::call`]; the call is dropped, too, if `premise` no longer holds when it is to travel.
+    pub async fn call_if(&self, call: Call, kind: Kind, premise: Premise) -> Option<Reply> {
+        self.call_own(call, kind, Some(premise)).await
+    }
+
+    async fn call_own(&self, call: Call, kind: Kind, premise: Option<Premise>) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
-        let item = LaneItem::new(None, Some(call), kind, answer);
+        let mut item = LaneItem::new(None, Some(call), kind, answer);
+        item.premise = premise;
         self.items.send(item).await.ok()?;
         match answered.await.ok()? {
             Answer::Made(reply) => Some(reply),

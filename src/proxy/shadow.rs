@@ -4,6 +4,7 @@
 //! new incarnation takes over: a reply of the old master that arrives after its state was taken for
 //! the injection is not acknowledged, and the call travels again.
 
+mod keeping;
 mod words;
 
 use std::{
@@ -14,6 +15,7 @@ use std::{
 
 use tokio::sync::{Notify, watch};
 
+use self::keeping::Whole;
 use super::{activity::Activity, stats::Stats};
 use crate::{
     master::{self, Agreement, Answered, Master},
@@ -25,7 +27,8 @@ use crate::{
 /// Unregistrations that take nothing away are remembered beside so many others.
 const OWED_IDLY: usize = 1000;
 
-/// The call's incarnation has been succeeded by another one: the call must travel again.
+/// The master that answered has been succeeded by another one, or what it showed by what the mirror has
+/// taken since: it does not count, and must be asked again.
 #[derive(Debug)]
 pub struct Superseded;
 
@@ -43,6 +46,8 @@ pub struct Shadow {
     inner: Mutex<Inner>,
     stats: &'static Stats,
     durable: watch::Sender<u64>,
+    /// The mirror's version in the last whole checkpoint that was attempted.
+    attempted: watch::Sender<u64>,
     /// Wakes the keeper of the checkpoint.
     pub work: Notify,
     /// Wakes those who tell nodes the news.
@@ -59,8 +64,7 @@ struct Inner {
     incarnation: u64,
     /// Changes with every change of the mirror.
     version: u64,
-    /// The mirror changed otherwise than by journaled calls: a whole checkpoint is due.
-    checkpoint_due: bool,
+    whole: Whole,
     /// Unregistrations taken while the gate was shut: the same incarnation, should it come back,
     /// has not heard of them.
     owed: Vec<Call>,
@@ -85,7 +89,7 @@ impl Shadow {
             store,
             incarnation: 0,
             version: 0,
-            checkpoint_due: false,
+            whole: Whole::default(),
             owed: Vec::new(),
             activity: Activity::default(),
             diverged: HashSet::new(),
@@ -96,6 +100,7 @@ impl Shadow {
             inner: Mutex::new(inner),
             stats,
             durable: watch::channel(0).0,
+            attempted: watch::channel(0).0,
             work: Notify::new(),
             news: Notify::new(),
         }
@@ -168,8 +173,10 @@ impl Shadow {
             }
             if agreement == Agreement::Diverged {
                 recorded.doubtful = true;
-                // What the master refused is in no journal.
-                inner.checkpoint_due |= !answered.executed;
+                if !answered.executed {
+                    // What the master refused is in no journal.
+                    inner.changed_unrecorded();
+                }
             }
             if answered.executed {
                 entries.push(Entry::Call(answered.call));
@@ -202,8 +209,9 @@ impl Shadow {
     /// may be said without end. It may mean a registration whose reply was lost with an earlier
     /// rosrescue, and which the master that comes back has run.
     ///
-    /// None while the mirror is frozen: the call has to wait for the master.
-    pub fn unregister(&self, now: Instant, call: &Call) -> Option<Reply> {
+    /// With the reply comes the journal's last record of it, if there is one. None while the mirror is
+    /// frozen: the call has to wait for the master.
+    pub fn unregister(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         if inner.frozen {
             return None;
@@ -212,19 +220,20 @@ impl Shadow {
         let reply = inner.apply(now, call, &self.news);
         let idle = inner.mirror.counts() == before;
         if idle && (inner.owed.len() >= OWED_IDLY || inner.owed.contains(call)) {
-            return Some(reply);
+            return Some((reply, None));
         }
         let accepted = master::accepted(&inner.mirror, call, &reply).calls;
         let accepted = accepted.into_iter().filter(|of| of.executed);
         let accepted: Vec<_> = accepted.map(|of| of.call).collect();
+        let mut seq = None;
         if !idle {
             let entries: Vec<_> = accepted.iter().cloned().map(Entry::Call).collect();
-            inner.append(&entries);
+            seq = inner.append(&entries);
         }
         inner.owed.extend(accepted);
         drop(inner);
         self.work.notify_one();
-        Some(reply)
+        Some((reply, seq))
     }
 
     /// From now on, or no longer, the mirror takes no unregistration by itself. Frozen at first: it
@@ -279,19 +288,26 @@ impl Shadow {
     /// The master holds `state`: so does the mirror from now on. Answers in what it differed before,
     /// in a few sentences without values.
     pub fn adopt(&self, state: Master) -> Vec<String> {
-        let mut inner = self.lock();
-        if inner.mirror == state {
-            return Vec::new();
-        }
-        let difference = master::difference(&inner.mirror, &state);
-        let (pid, uri) = inner.identity.clone();
-        inner.mirror = state;
-        inner.mirror.set_identity(pid, uri);
-        inner.version += 1;
-        inner.checkpoint_due = true;
-        drop(inner);
+        let difference = self.lock().adopt(state);
         self.work.notify_one();
         difference
+    }
+
+    /// As [`Self::adopt`], of what the master of `incarnation` held when the mirror was at `version`.
+    pub fn adopt_if(
+        &self,
+        incarnation: u64,
+        version: u64,
+        state: Master,
+    ) -> Result<Vec<String>, Superseded> {
+        let mut inner = self.lock();
+        if (inner.incarnation, inner.version) != (incarnation, version) {
+            return Err(Superseded);
+        }
+        let difference = inner.adopt(state);
+        drop(inner);
+        self.work.notify_one();
+        Ok(difference)
     }
 
     /// Works with the mirror and what calls did to it of late.
@@ -317,70 +333,9 @@ impl Shadow {
         }
     }
 
-    /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
-    pub async fn durable(&self, seq: u64) {
-        let mut durable = self.durable.subscribe();
-        // The sender lives as long as we do.
-        let _ = durable.wait_for(|reached| *reached >= seq).await;
-    }
-
-    /// The journal up to `seq` is as safe as it will get.
-    pub fn set_durable(&self, seq: u64) {
-        self.durable.send_if_modified(|reached| {
-            let more = seq > *reached;
-            *reached = seq.max(*reached);
-            more
-        });
-    }
-
     /// What a checkpoint written now holds.
     pub fn checkpoint(&self) -> Checkpoint {
         self.lock().checkpoint()
-    }
-
-    /// Works on the store, if there is one, with the means to take the checkpoint that belongs to
-    /// this very moment.
-    pub fn with_store<T>(
-        &self,
-        work: impl FnOnce(&mut Store, &mut dyn FnMut() -> Checkpoint) -> T,
-    ) -> Option<T> {
-        let mut inner = self.lock();
-        let mut store = inner.store.take()?;
-        let seq = store.seq();
-        let result = work(&mut store, &mut || {
-            inner.checkpoint_due = false;
-            Checkpoint {
-                seq,
-                ..inner.checkpoint()
-            }
-        });
-        inner.store = Some(store);
-        Some(result)
-    }
-
-    /// There is a store now, which holds nothing yet.
-    pub fn set_store(&self, store: Store) {
-        let mut inner = self.lock();
-        inner.store = Some(store);
-        inner.checkpoint_due = true;
-    }
-
-    /// Whether the mirror changed otherwise than by journaled calls since the last checkpoint.
-    pub fn checkpoint_due(&self) -> bool {
-        self.lock().checkpoint_due
-    }
-
-    /// The last attempt at a checkpoint failed.
-    pub fn set_checkpoint_due(&self) {
-        self.lock().checkpoint_due = true;
-    }
-
-    /// Why the state is not recorded; none if all is well.
-    pub fn unprotected(&self) -> Option<String> {
-        match &self.lock().store {
-            Some(store) => store.unprotected().map(str::to_owned),
-            None => Some("the checkpoint could not be opened".to_owned()),
-        }
     }
 }
 
@@ -396,6 +351,24 @@ impl Inner {
             news.notify_one();
         }
         outcome.reply
+    }
+
+    fn adopt(&mut self, state: Master) -> Vec<String> {
+        if self.mirror == state {
+            return Vec::new();
+        }
+        let difference = master::difference(&self.mirror, &state);
+        let (pid, uri) = self.identity.clone();
+        self.mirror = state;
+        self.mirror.set_identity(pid, uri);
+        self.version += 1;
+        self.changed_unrecorded();
+        difference
+    }
+
+    /// The mirror has changed otherwise than by journaled calls: a whole checkpoint is due.
+    fn changed_unrecorded(&mut self) {
+        self.whole.unrecorded = self.version;
     }
 
     /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.

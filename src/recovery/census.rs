@@ -28,7 +28,7 @@ use crate::{
         Proxy,
         activity::{Activity, Letter},
         gate::State,
-        journey,
+        journey::{self, Premise},
     },
     ros_env::MasterUri,
     xmlrpc::{Call, Reply},
@@ -257,7 +257,7 @@ struct Asked {
 #[derive(Default)]
 struct Findings {
     strangers: Vec<Name>,
-    mendings: Vec<(Name, Verdict, Mending)>,
+    mendings: Vec<(Premise, Verdict, Mending)>,
 }
 
 impl Asked {
@@ -298,7 +298,11 @@ impl Asked {
                     && deeds.unregistered == *unregistered
                 {
                     let mending = Mending::new(mirror, &name.node, claims);
-                    findings.mendings.push((name.clone(), verdict, mending));
+                    let premise = Premise {
+                        node: name.node.clone(),
+                        deeds,
+                    };
+                    findings.mendings.push((premise, verdict, mending));
                 }
             }
         });
@@ -312,7 +316,8 @@ impl Findings {
         self.strangers.is_empty() && mendings.all(|(_, _, mending)| mending.is_empty())
     }
 
-    /// Does what is sure; what is to be taken from a node must have been found before, too.
+    /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
+    /// first: what we register for a node counts as its own deed, and ends what else was found.
     async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut Outcome) {
         for name in &self.strangers {
             let mut earlier = before.strangers.iter();
@@ -322,34 +327,35 @@ impl Findings {
                 outcome.removed.push(name.node.clone());
             }
         }
-        for (name, verdict, mending) in &self.mendings {
+        for (premise, verdict, mending) in &self.mendings {
+            let node = &premise.node;
             let mut found = before.mendings.iter();
-            let found = found.find(|(found, _, _)| found.node == name.node);
+            let found = found.find(|(found, _, _)| found.node == *node);
             let confirmed = |list: fn(&Mending) -> &Vec<Registration>, one: &Registration| {
                 found.is_some_and(|(_, _, mending)| list(mending).iter().any(|it| it.is_same(one)))
             };
             let certain = *verdict == Verdict::Itself;
-            for one in &mending.missing {
-                if certain || confirmed(|mending| &mending.missing, one) {
-                    let call = one.register(&name.node, api);
-                    mend(proxy, one, name, call, Kind::Mutate, outcome).await;
-                }
-            }
             for one in &mending.extra {
                 if confirmed(|mending| &mending.extra, one) {
-                    let call = one.unregister(&name.node, api);
-                    mend(proxy, one, name, call, Kind::Unregister, outcome).await;
+                    let call = one.unregister(node, api);
+                    mend(proxy, one, premise, call, Kind::Unregister, outcome).await;
+                }
+            }
+            for one in &mending.missing {
+                if certain || confirmed(|mending| &mending.missing, one) {
+                    let call = one.register(node, api);
+                    mend(proxy, one, premise, call, Kind::Mutate, outcome).await;
                 }
             }
         }
     }
 }
 
-/// Makes a call for a node that has not done anything itself meanwhile.
+/// Makes a call for a node, unless the node itself has done the contrary by the time at which it travels.
 async fn mend(
     proxy: &Proxy,
     one: &Registration,
-    name: &Name,
+    premise: &Premise,
     call: Call,
     kind: Kind,
     outcome: &mut Outcome,
@@ -359,12 +365,13 @@ async fn mend(
     }
     // In a multicall it travels alone, see the lane: it must not bump anybody.
     let alone = Call::multicall([call.clone()]);
-    let reply = proxy.lane.call(alone, kind).await;
+    let reply = proxy.lane.call_if(alone, kind, premise.clone()).await;
     let Some(reply) = reply else {
-        let moved = proxy
-            .shadow
-            .with_mirror(|mirror| mirror.displaced_by(&call).is_some());
-        if !moved {
+        let overtaken = proxy.shadow.with_activity(|mirror, activity| {
+            let deeds = activity.deeds(&premise.node);
+            mirror.displaced_by(&call).is_some() || !premise.holds(kind, deeds)
+        });
+        if !overtaken {
             // One master after the other took it and never answered.
             proxy.nodes.forbid(&call);
         }
@@ -374,7 +381,7 @@ async fn mend(
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
         outcome
             .mended
-            .push(format!("{sign} {}", one.describe(&name.node)));
+            .push(format!("{sign} {}", one.describe(&premise.node)));
     }
 }
 
@@ -390,14 +397,16 @@ fn is_done(reply: &Reply) -> bool {
 async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
     // What it has on its way to the master comes first.
     barrier(proxy).await;
-    let calls = proxy.shadow.with_activity(|mirror, activity| {
-        let same = mirror.api_of(&name.node) == Some(api)
-            && activity.deeds(&name.node).registered == name.registered;
-        same.then(|| mirror.unregister_calls(&name.node))
+    let found = proxy.shadow.with_activity(|mirror, activity| {
+        let deeds = activity.deeds(&name.node);
+        let same = mirror.api_of(&name.node) == Some(api) && deeds.registered == name.registered;
+        same.then(|| (mirror.unregister_calls(&name.node), deeds))
     });
-    let Some(calls) = calls.filter(|calls| !calls.is_empty()) else {
+    let Some((calls, deeds)) = found.filter(|(calls, _)| !calls.is_empty()) else {
         return false;
     };
-    let call = Call::multicall(calls);
-    proxy.lane.call(call, Kind::Unregister).await.is_some()
+    let node = name.node.clone();
+    let (call, premise) = (Call::multicall(calls), Premise { node, deeds });
+    let reply = proxy.lane.call_if(call, Kind::Unregister, premise).await;
+    reply.is_some()
 }

@@ -181,7 +181,8 @@ pub async fn examine(
     if keeper.state() == State::Shut(StandIn::Unregistrations) {
         keeper.set(State::Shut(StandIn::Reads));
     }
-    if !first.is_empty() && pay_owed(proxy, connection).await? {
+    // What bears the mark has heard our calls before, however little it holds by now.
+    if (first.marked() || !first.is_empty()) && pay_owed(proxy, connection).await? {
         first = first_look(proxy, connection).await?;
     }
     let mut examination = Examination {

@@ -9,6 +9,7 @@ use std::{
 
 use tokio::sync::mpsc;
 
+use super::overtaken::is_overtaken;
 use crate::{
     cli::Sync,
     master::{Kind, Master},
@@ -54,15 +55,17 @@ pub struct LaneRunner {
     /// When a resync is due that could not be made before.
     resync_at: Option<tokio::time::Instant>,
     retry_at: Option<tokio::time::Instant>,
-    /// A call that we do not understand, answered with success: the answer waits until the mirror
-    /// has been made anew, and knows what the call did.
-    opaque: Option<Opaque>,
+    /// Calls that we do not understand, answered with success: the answers wait until the mirror
+    /// has been made anew, and knows what the calls did.
+    opaque: Opaque,
 }
 
+#[derive(Default)]
 struct Opaque {
     incarnation: u64,
-    item: LaneItem,
-    raw: RawReply,
+    answers: Vec<(LaneItem, Answer)>,
+    /// The journal's last record of them.
+    seq: Option<u64>,
 }
 
 impl LaneRunner {
@@ -78,7 +81,7 @@ impl LaneRunner {
             resync_due: false,
             resync_at: None,
             retry_at: None,
-            opaque: None,
+            opaque: Opaque::default(),
         }
     }
 
@@ -138,8 +141,9 @@ impl LaneRunner {
             // Its master has been succeeded, and the new one never saw these calls.
             self.take_back(flight.items);
         }
-        if let Some(opaque) = self.opaque.take_if(|of| of.incarnation != incarnation) {
-            self.queue.push_front(opaque.item);
+        if self.opaque.incarnation != incarnation {
+            let opaque = std::mem::take(&mut self.opaque).answers;
+            self.take_back(opaque.into_iter().map(|(item, _)| item).collect());
         }
         if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
             // What was doubted is gone.
@@ -149,11 +153,8 @@ impl LaneRunner {
         if self.flight.is_some() || self.retry_at.is_some() {
             return;
         }
-        // A registration of our own was right when it was sent off; by now the node may have come
-        // back at another address, and must not be shut down for it.
         while let Some(own) = self.queue.front()
-            && own.raw.is_none()
-            && own.call.as_ref().is_some_and(|call| bumps(proxy, call))
+            && is_overtaken(proxy, own)
             && let Some(own) = self.queue.pop_front()
         {
             let _ = own.answer.send(Answer::Close);
@@ -200,34 +201,29 @@ impl LaneRunner {
         }
     }
 
-    fn resync(&mut self, proxy: &Proxy, incarnation: u64, version: u64, state: Master) {
-        if proxy.shadow.incarnation() != incarnation {
-            return;
-        }
-        if proxy.shadow.version() != version {
+    fn resync(&mut self, proxy: &Arc<Proxy>, incarnation: u64, version: u64, state: Master) {
+        let Ok(difference) = proxy.shadow.adopt_if(incarnation, version, state) else {
             // The gate was shut meanwhile, and the mirror has taken what this look does not show.
             self.resync_due = true;
             return;
-        }
-        let difference = proxy.shadow.adopt(state);
+        };
         if !difference.is_empty() {
             tracing::warn!(
                 ?difference,
                 "the master differed from the mirror, which was made anew from it"
             );
         }
-        self.answer_opaque();
+        self.answer_opaque(proxy);
     }
 
-    fn answer_opaque(&mut self) {
-        if let Some(Opaque { item, raw, .. }) = self.opaque.take() {
-            let _ = item.answer.send(Answer::Raw(raw));
-        }
+    fn answer_opaque(&mut self, proxy: &Arc<Proxy>) {
+        let Opaque { answers, seq, .. } = std::mem::take(&mut self.opaque);
+        send(proxy, seq, proxy.shadow.unwritten(), answers);
     }
 
     fn failed(
         &mut self,
-        proxy: &Proxy,
+        proxy: &Arc<Proxy>,
         incarnation: u64,
         mut items: Vec<LaneItem>,
         error: &TravelError,
@@ -242,7 +238,7 @@ impl LaneRunner {
             }
             if matches!(error, TravelError::Look(LookError::NotAMaster(_))) {
                 // It lives and shows nothing: a client need not wait for that.
-                self.answer_opaque();
+                self.answer_opaque(proxy);
             }
             return;
         }
@@ -318,11 +314,13 @@ impl LaneRunner {
         };
         self.resync_due |= recorded.doubtful || opaque;
         if opaque {
-            self.opaque = items.into_iter().next().map(|item| Opaque {
-                incarnation,
-                item,
-                raw,
-            });
+            // Others may be held already: after a look that failed calls travel before the next one.
+            self.opaque.incarnation = incarnation;
+            self.opaque.seq = self.opaque.seq.max(recorded.seq);
+            let answers = items
+                .into_iter()
+                .map(|item| (item, Answer::Raw(raw.clone())));
+            self.opaque.answers.extend(answers);
             return;
         }
         let alone = items.len() == 1;
@@ -339,21 +337,7 @@ impl LaneRunner {
                 (item, answer)
             })
             .collect();
-        let send = move || {
-            for (item, answer) in answers {
-                let _ = item.answer.send(answer);
-            }
-        };
-        match recorded.seq {
-            Some(seq) if proxy.config.sync == Sync::Always => {
-                let proxy = proxy.clone();
-                tokio::spawn(async move {
-                    proxy.shadow.durable(seq).await;
-                    send();
-                });
-            }
-            _ => send(),
-        }
+        send(proxy, recorded.seq, None, answers);
     }
 
     /// A multicall of ours was answered as a whole by something else than its results. The calls
@@ -380,16 +364,23 @@ impl LaneRunner {
         let flying = self.flight.as_ref().map_or(&[][..], |flight| &flight.items);
         let mut busy: BTreeSet<String> = flying.iter().flat_map(LaneItem::registrants).collect();
         let mut waiting = VecDeque::with_capacity(self.queue.len());
+        let (mut last, mut answers) = (None, Vec::new());
         for item in self.queue.drain(..) {
+            if is_overtaken(proxy, &item) {
+                let _ = item.answer.send(Answer::Close);
+                continue;
+            }
             let registrants = item.registrants();
             match &item.call {
                 Some(call)
                     if item.kind == Kind::Unregister
                         && busy.is_disjoint(&registrants)
-                        && let Some(reply) = proxy.shadow.unregister(Instant::now(), call) =>
+                        && let Some((reply, seq)) =
+                            proxy.shadow.unregister(Instant::now(), call) =>
                 {
                     proxy.stats.stood_in.count();
-                    let _ = item.answer.send(Answer::Made(reply));
+                    last = last.max(seq);
+                    answers.push((item, Answer::Made(reply)));
                 }
                 _ => {
                     busy.extend(registrants);
@@ -398,7 +389,37 @@ impl LaneRunner {
             }
         }
         self.queue = waiting;
+        send(proxy, last, None, answers);
     }
+}
+
+/// Sends answers when what they tell of is safe: the journal up to `seq` is on the disk, if `--sync` wants
+/// that, and the mirror of this version in a whole checkpoint.
+fn send(
+    proxy: &Arc<Proxy>,
+    seq: Option<u64>,
+    version: Option<u64>,
+    answers: Vec<(LaneItem, Answer)>,
+) {
+    let seq = seq.filter(|_| proxy.config.sync == Sync::Always);
+    let send = move || {
+        for (item, answer) in answers {
+            let _ = item.answer.send(answer);
+        }
+    };
+    if (seq, version) == (None, None) {
+        return send();
+    }
+    let proxy = proxy.clone();
+    tokio::spawn(async move {
+        if let Some(seq) = seq {
+            proxy.shadow.durable(seq).await;
+        }
+        if let Some(version) = version {
+            proxy.shadow.attempted(version).await;
+        }
+        send();
+    });
 }
 
 /// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.
@@ -406,13 +427,4 @@ fn subscribes_params(call: &Call) -> bool {
     let entries = call.entries();
     let mut calls = entries.iter().chain([call]);
     calls.any(|call| call.method == "subscribeParam")
-}
-
-/// Whether the master would shut a node down because of `call`, or of an entry of it.
-fn bumps(proxy: &Proxy, call: &Call) -> bool {
-    let entries = call.entries();
-    proxy.shadow.with_mirror(|mirror| {
-        let mut calls = entries.iter().chain([call]);
-        calls.any(|call| mirror.displaced_by(call).is_some())
-    })
 }

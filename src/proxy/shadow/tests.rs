@@ -1,6 +1,6 @@
 use super::*;
 use crate::proxy::activity::NOTICE_MEMORY;
-use crate::xmlrpc::Value;
+use crate::{store::StoreError, xmlrpc::Value};
 
 fn shadow() -> Shadow {
     let stats = Box::leak(Box::default());
@@ -73,7 +73,7 @@ fn an_unregistration_in_an_outage_is_owed_until_paid_or_succeeded() {
     }
     let bye = |topic| call("unregisterPublisher", &["/n", topic, "http://n:1/"]);
     let reply = shadow.unregister(now, &bye("/a"));
-    let Some(Reply::Value(reply)) = reply else {
+    let Some((Reply::Value(reply), _)) = reply else {
         panic!("{reply:?}")
     };
     assert_eq!(
@@ -164,6 +164,73 @@ fn who_the_master_is_outlasts_a_resync() {
     other.apply(&publish("/t"));
     assert_ne!(shadow.adopt(other), Vec::<String>::new());
     assert_eq!(shadow.answer(&get_pid), before);
+}
+
+#[test]
+fn a_look_counts_if_nothing_came_between() {
+    let shadow = shadow();
+    shadow.succeed();
+    let held = || {
+        let mut held = Master::default();
+        held.apply(&publish("/t"));
+        held
+    };
+    let (incarnation, version) = (shadow.incarnation(), shadow.version());
+    shadow.unregister(
+        Instant::now(),
+        &call("unregisterPublisher", &["/n", "/t", "http://n:1/"]),
+    );
+    assert!(shadow.adopt_if(incarnation, version, held()).is_err());
+    let version = shadow.version();
+    shadow.succeed();
+    assert!(shadow.adopt_if(incarnation, version, held()).is_err());
+    assert!(shadow.with_mirror(Master::is_empty));
+    assert!(shadow.adopt_if(incarnation + 1, version, held()).is_ok());
+    assert!(!shadow.with_mirror(Master::is_empty));
+}
+
+/// What is in no journal is waited for only while there is a file to write it to.
+#[tokio::test]
+async fn what_was_adopted_is_waited_for_until_a_checkpoint_was_attempted() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = |name: &str| Store::open(&folder.path().join(name)).unwrap().0;
+    let mut master = Master::default();
+    let mut adopted = |shadow: &Shadow| {
+        master.apply(&publish(&format!("/t{}", shadow.version())));
+        shadow.adopt(master.clone());
+        shadow.unwritten()
+    };
+    let shadow = shadow();
+    assert_eq!(adopted(&shadow), None, "there is no file");
+    shadow.set_store(open("c"));
+    assert_eq!(adopted(&shadow), None, "it is not begun yet");
+    let checkpoint = |shadow: &Shadow| {
+        let begun = shadow.with_store(|store, checkpoint| store.begin(&checkpoint()));
+        begun.unwrap().unwrap();
+    };
+    checkpoint(&shadow);
+    shadow.set_attempted(Ok(()));
+    assert_eq!(shadow.unwritten(), None);
+
+    let first = adopted(&shadow).expect("it is in no file");
+    checkpoint(&shadow);
+    let second = adopted(&shadow).expect("it came after the checkpoint was taken");
+    shadow.set_attempted(Ok(()));
+    shadow.attempted(first).await;
+    assert_eq!(shadow.unwritten(), Some(second));
+    // The next one fails.
+    checkpoint(&shadow);
+    let error = StoreError::Stale {
+        snapshot: 0,
+        journal: 1,
+    };
+    shadow.set_attempted(Err(&error));
+    shadow.attempted(second).await;
+    assert!(shadow.checkpoint_due() && shadow.unprotected().is_some());
+    assert_eq!(shadow.unwritten(), None);
+    checkpoint(&shadow);
+    shadow.set_attempted(Ok(()));
+    assert!(!shadow.checkpoint_due() && shadow.unprotected().is_none());
 }
 
 #[test]

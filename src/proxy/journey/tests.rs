@@ -1,0 +1,153 @@
+use super::*;
+
+fn item(call: Call) -> LaneItem {
+    let body = Bytes::from(xmlrpc::encode_call(&call));
+    let raw = Some((Head::default(), body));
+    LaneItem::new(raw, Some(call), Kind::Mutate, oneshot::channel().0)
+}
+
+#[test]
+fn what_was_done_by_a_lost_journey_is_answered_as_done() {
+    let answer = |code: i32| Reply::Value(vec![Value::from(code), "".into(), 0.into()].into());
+    let mut item = item(Call::new("deleteParam", vec!["/n".into(), "/a".into()]));
+    assert_eq!(item.done_before(&answer(-1)), None);
+    item.foretold = Some(answer(1));
+    assert_eq!(item.done_before(&answer(-1)), Some(answer(1)));
+    assert_eq!(item.done_before(&answer(1)), None);
+    item.foretold = Some(answer(-1));
+    assert_eq!(item.done_before(&answer(-1)), None);
+}
+
+#[test]
+fn what_was_unregistered_by_a_lost_journey_is_answered_as_done() {
+    let answer = |count: i32| Reply::Value(vec![1.into(), "".into(), Value::from(count)].into());
+    let params = vec!["/n".into(), "/t".into(), "http://n:1/".into()];
+    let mut item = item(Call::new("unregisterPublisher", params));
+    assert_eq!(item.done_before(&answer(0)), None);
+    item.foretold = Some(answer(1));
+    assert_eq!(item.done_before(&answer(0)), Some(answer(1)));
+    assert_eq!(item.done_before(&answer(1)), None);
+    item.foretold = Some(answer(0));
+    assert_eq!(item.done_before(&answer(0)), None);
+}
+
+#[test]
+fn a_node_knows_better_only_by_the_contrary() {
+    let deeds = |registered, unregistered| Deeds {
+        registered,
+        unregistered,
+    };
+    let premise = Premise {
+        node: "/n".to_owned(),
+        deeds: deeds(3, 2),
+    };
+    for (kind, now, holds) in [
+        (Kind::Unregister, deeds(3, 4), true),
+        (Kind::Unregister, deeds(4, 2), false),
+        (Kind::Mutate, deeds(4, 2), true),
+        (Kind::Mutate, deeds(3, 4), false),
+    ] {
+        assert_eq!(premise.holds(kind, now), holds, "{kind:?} {now:?}");
+    }
+}
+
+fn set(key: &str, value: impl Into<Value>) -> Call {
+    Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
+}
+
+fn packed(calls: Vec<Call>) -> Vec<usize> {
+    let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
+    let mut sizes = Vec::new();
+    while !queue.is_empty() {
+        sizes.push(pack(&mut queue).len());
+    }
+    sizes
+}
+
+#[test]
+fn calls_that_may_share_travel_together_and_keep_their_order() {
+    let subscribe = Call::new(
+        "subscribeParam",
+        vec!["/n".into(), "http://n:1/".into(), "/k".into()],
+    );
+    let calls = vec![set("/a", 1), set("/b", 2), subscribe, set("/c", 3)];
+    assert_eq!(packed(calls), [2, 1, 1]);
+    assert_eq!(
+        packed((0..250).map(|i| set("/a", i)).collect()),
+        [100, 100, 50]
+    );
+    let big = "x".repeat(TOGETHER_BYTES / 2 + 1);
+    assert_eq!(
+        packed(vec![set("/a", &*big), set("/b", &*big), set("/c", 1)]),
+        [1, 2]
+    );
+}
+
+#[test]
+fn a_single_call_goes_out_as_its_own_bytes() {
+    let body = Bytes::from_static(b"<methodCall> odd </methodCall>");
+    let mut odd = item(set("/a", 1));
+    odd.raw = Some((Head::default(), body.clone()));
+    assert_eq!(outbound(&[odd]).1, body);
+    let (_, both) = outbound(&[item(set("/a", 1)), item(set("/b", 2))]);
+    let expected = Call::multicall([set("/a", 1), set("/b", 2)]);
+    assert_eq!(xmlrpc::decode_call(&both).unwrap(), expected);
+}
+
+#[test]
+fn replies_come_apart_only_when_each_is_there() {
+    let fault = Struct::from([
+        ("faultCode".to_owned(), Value::Int(1)),
+        ("faultString".to_owned(), Value::from("no")),
+    ]);
+    let reply = Reply::Value(Value::Array(vec![
+        Value::from(vec![Value::from(7)]),
+        Value::Struct(fault),
+    ]));
+    let replies = vec![
+        Reply::Value(Value::Int(7)),
+        Reply::Fault {
+            code: 1,
+            text: "no".to_owned(),
+        },
+    ];
+    assert_eq!(unpack(&reply, 2), Some(replies));
+    assert_eq!(unpack(&reply, 3), None);
+    assert_eq!(
+        unpack(
+            &Reply::Fault {
+                code: 1,
+                text: String::new()
+            },
+            0
+        ),
+        None
+    );
+}
+
+#[test]
+fn the_masters_own_address_becomes_ours() {
+    let answer = |uri: &str| Value::Array(vec![1.into(), "".into(), uri.into()]);
+    let call = Call::new("getUri", vec!["/n".into()]);
+    let reply = rewrite_uri(&call, &Reply::Value(answer("http://m:1/")), "http://us:2/");
+    assert_eq!(reply, Some(Reply::Value(answer("http://us:2/"))));
+    let both = Call::multicall([Call::new("getPid", vec!["/n".into()]), call]);
+    let results = |uri: &str| {
+        let pid = Value::Array(vec![1.into(), "".into(), 42.into()]);
+        Reply::Value(Value::Array(vec![
+            vec![pid].into(),
+            vec![answer(uri)].into(),
+        ]))
+    };
+    let reply = rewrite_uri(&both, &results("http://m:1/"), "http://us:2/");
+    assert_eq!(reply, Some(results("http://us:2/")));
+    let nested = Call::multicall([both.clone()]);
+    let within = |reply: Reply| match reply {
+        Reply::Value(value) => Reply::Value(vec![Value::Array(vec![value])].into()),
+        fault => fault,
+    };
+    let reply = rewrite_uri(&nested, &within(results("http://m:1/")), "http://us:2/");
+    assert_eq!(reply, Some(within(results("http://us:2/"))));
+    assert!(asks_uri(&both) && asks_uri(&nested));
+    assert!(!asks_uri(&Call::multicall([Call::new("getPid", vec![])])));
+}
