@@ -156,13 +156,16 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
 
     robot.await_state(&after, "when the nodes that ended have been found");
     if how == Signal::KILL {
-        robot.rescue.wait_line("all of the recovery in one line", |line| {
-            let phases = ["absence_ms=", "look_ms=", "injection_ms=", "census_ms="];
-            line.contains("recovery is complete: ")
-                && line.contains("cause=\"")
-                && phases.iter().all(|phase| line.contains(phase))
-                && line.contains(r#"removed=["/gone_listener", "/gone_server", "/gone_talker"]"#)
-        });
+        robot
+            .rescue
+            .wait_line("all of the recovery in one line", |line| {
+                let phases = ["absence_ms=", "look_ms=", "injection_ms=", "census_ms="];
+                line.contains("recovery is complete: ")
+                    && line.contains("cause=\"")
+                    && phases.iter().all(|phase| line.contains(phase))
+                    && line
+                        .contains(r#"removed=["/gone_listener", "/gone_server", "/gone_talker"]"#)
+            });
     }
     eventually(
         "the subscribers are told that only one publisher is left",
