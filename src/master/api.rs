@@ -1,6 +1,6 @@
 //! The Master API: `rosmaster/master_api.py`, and the dispatcher in front of it.
 
-use super::{Kind, Master, Notice, python};
+use super::{Kind, Master, Notice, NoticeSink, python};
 use crate::xmlrpc::{Call, Reply, Value};
 
 /// What a method returns: status code, message, value.
@@ -25,7 +25,7 @@ pub(super) struct Method {
     arity: usize,
     /// The value that goes with an error.
     error: fn() -> Value,
-    run: fn(&mut Master, &str, &[Value], &mut Vec<Notice>) -> Answer,
+    run: fn(&mut Master, &str, &[Value], &mut dyn NoticeSink) -> Answer,
 }
 
 macro_rules! methods {
@@ -108,19 +108,24 @@ impl Master {
     /// rosmaster's), is answered as if its callback had been taken, and sends none.
     pub fn apply(&mut self, call: &Call) -> Outcome {
         let mut notices = Vec::new();
+        let reply = self.apply_telling(call, &mut notices);
+        Outcome { reply, notices }
+    }
+
+    /// Like [`Master::apply`], with the callbacks told to `notices`, which copies as much as it needs.
+    pub fn apply_telling(&mut self, call: &Call, notices: &mut dyn NoticeSink) -> Reply {
         let reply = if call.method == super::multicall::METHOD {
-            self.run_multicall(&call.params, &mut notices)
+            self.run_multicall(&call.params, notices)
         } else {
-            self.dispatch(&call.method, &call.params, &mut notices)
+            self.dispatch(&call.method, &call.params, notices)
         };
-        let reply = match reply {
+        match reply {
             Ok(value) => match python::write_error(&value) {
                 None => Reply::Value(value),
                 Some(text) => fault(text),
             },
             Err(text) => fault(&text),
-        };
-        Outcome { reply, notices }
+        }
     }
 
     /// `_dispatch` of anything but a multicall; an error is the text of a fault.
@@ -128,7 +133,7 @@ impl Master {
         &mut self,
         name: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Result<Value, String> {
         let Some(method) = method(name) else {
             return Err(unsupported(name, params.len()));
@@ -157,7 +162,7 @@ impl Master {
         &mut self,
         method: &Method,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let Some((caller_id, rest)) = params.split_first() else {
             return Err(Failure::Refused(

@@ -2,19 +2,19 @@
 
 use super::api::{Answer, Failure, bad_arity, strings};
 use super::registry::Shared;
-use super::{Master, Notice, checks, names};
+use super::{Master, NoticeSink, checks, names};
 use crate::xmlrpc::{Struct, Value};
 
 impl Master {
-    pub(super) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, String::new(), self.pid.into()))
     }
 
-    pub(super) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, String::new(), self.uri.as_str().into()))
     }
 
-    pub(super) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, "shutdown".to_owned(), 0.into()))
     }
 
@@ -22,13 +22,13 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let (topic, topic_type, api) = topic_params(params, caller_id)?;
         let bumped = self
             .registry
             .register(Shared::Publishers, &topic, caller_id, api);
-        notices.extend(shutdown_notice(caller_id, bumped));
+        notify_bumped(caller_id, bumped, notices);
         if topic_type != "*" || !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
@@ -42,13 +42,13 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let (topic, topic_type, api) = topic_params(params, caller_id)?;
         let bumped = self
             .registry
             .register(Shared::Subscribers, &topic, caller_id, api);
-        notices.extend(shutdown_notice(caller_id, bumped));
+        notify_bumped(caller_id, bumped, notices);
         if topic_type != "*" && !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
@@ -61,7 +61,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let [service, service_api, api] = exactly(params)?;
         let service = checks::resource("service", service, caller_id)?;
@@ -70,7 +70,7 @@ impl Master {
         let bumped = self
             .registry
             .register_service(&service, caller_id, api, service_api);
-        notices.extend(shutdown_notice(caller_id, bumped));
+        notify_bumped(caller_id, bumped, notices);
         let message = format!("Registered [{caller_id}] as provider of [{service}]");
         Ok((1, message, 1.into()))
     }
@@ -79,7 +79,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let [topic, api] = exactly(params)?;
         let topic = checks::resource("topic", topic, caller_id)?;
@@ -97,7 +97,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [topic, api] = exactly(params)?;
         let topic = checks::resource("topic", topic, caller_id)?;
@@ -112,7 +112,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [service, service_api] = exactly(params)?;
         let service = checks::resource("service", service, caller_id)?;
@@ -127,7 +127,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [service] = exactly(params)?;
         let service = checks::resource("service", service, caller_id)?;
@@ -144,7 +144,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [node] = exactly(params)?;
         let node = checks::name("node", node, caller_id)?;
@@ -158,7 +158,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [subgraph] = exactly(params)?;
         let mut subgraph = checks::subgraph(subgraph, caller_id)?;
@@ -175,14 +175,24 @@ impl Master {
         ))
     }
 
-    pub(super) fn get_topic_types(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn get_topic_types(
+        &mut self,
+        _: &str,
+        _: &[Value],
+        _: &mut dyn NoticeSink,
+    ) -> Answer {
         let pairs = self.topic_types.iter();
         let pairs = pairs.map(|(topic, topic_type)| pair(topic, topic_type));
         let message = "current system state".to_owned();
         Ok((1, message, Value::Array(pairs.collect())))
     }
 
-    pub(super) fn get_system_state(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn get_system_state(
+        &mut self,
+        _: &str,
+        _: &[Value],
+        _: &mut dyn NoticeSink,
+    ) -> Answer {
         let shared = |kind| {
             let keys = self.registry.shared(kind).iter();
             let keys = keys.map(|(key, callers)| {
@@ -206,14 +216,15 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let [key, value] = exactly(params)?;
         let key = names::resolve(checks::key(key)?, caller_id);
-        let value = checks::param_value(value)?.clone();
+        let value = checks::param_value(value)?;
+        let changed = names::param_key(&key);
         let subscribers = &self.registry.param_subscribers;
-        let updates = self.params.set(&key, value, caller_id, subscribers)?;
-        notices.extend(self.registry.param_notices(updates));
+        let updates = self.params.set(&changed, value, caller_id, subscribers)?;
+        self.registry.notify_params(updates, notices);
         Ok((1, format!("parameter {key} set"), 0.into()))
     }
 
@@ -221,14 +232,15 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let [key] = exactly(params)?;
         let key = names::resolve(checks::key(key)?, caller_id);
+        let changed = names::param_key(&key);
         let subscribers = &self.registry.param_subscribers;
-        Ok(match self.params.delete(&key, subscribers)? {
+        Ok(match self.params.delete(&changed, subscribers)? {
             Some(updates) => {
-                notices.extend(self.registry.param_notices(updates));
+                self.registry.notify_params(updates, notices);
                 (1, format!("parameter {key} deleted"), 0.into())
             }
             None => (-1, format!("parameter [{key}] is not set"), 0.into()),
@@ -239,7 +251,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [key] = exactly(params)?;
         let key = names::resolve(checks::key(key)?, caller_id);
@@ -253,7 +265,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [key] = exactly(params)?;
         let key = names::resolve(checks::key(key)?, caller_id);
@@ -265,7 +277,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [key] = exactly(params)?;
         let key = checks::key(key)?;
@@ -278,7 +290,12 @@ impl Master {
         })
     }
 
-    pub(super) fn get_param_names(&mut self, _: &str, _: &[Value], _: &mut Vec<Notice>) -> Answer {
+    pub(super) fn get_param_names(
+        &mut self,
+        _: &str,
+        _: &[Value],
+        _: &mut dyn NoticeSink,
+    ) -> Answer {
         Ok((
             1,
             "Parameter names".to_owned(),
@@ -290,7 +307,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Answer {
         let [api, key] = exactly(params)?;
         let api = checks::api("caller_api", api)?;
@@ -300,7 +317,7 @@ impl Master {
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
         let kind = Shared::ParamSubscribers;
         let bumped = self.registry.register(kind, &subscribed, caller_id, api);
-        notices.extend(shutdown_notice(caller_id, bumped));
+        notify_bumped(caller_id, bumped, notices);
         Ok((1, format!("Subscribed to parameter [{key}]"), value))
     }
 
@@ -308,7 +325,7 @@ impl Master {
         &mut self,
         caller_id: &str,
         params: &[Value],
-        _: &mut Vec<Notice>,
+        _: &mut dyn NoticeSink,
     ) -> Answer {
         let [api, key] = exactly(params)?;
         let api = checks::api("caller_api", api)?;
@@ -320,15 +337,11 @@ impl Master {
     }
 
     /// Queues the list of the topic's publishers for its subscribers, whose addresses it gives.
-    fn notify_publishers(&self, topic: &str, notices: &mut Vec<Notice>) -> Vec<String> {
+    fn notify_publishers(&self, topic: &str, notices: &mut dyn NoticeSink) -> Vec<String> {
         let subscribers = self.registry.apis(Shared::Subscribers, topic);
         if !subscribers.is_empty() {
             let publishers = self.registry.apis(Shared::Publishers, topic);
-            notices.extend(subscribers.iter().map(|to| Notice::PublisherUpdate {
-                to: to.clone(),
-                topic: topic.to_owned(),
-                publishers: publishers.clone(),
-            }));
+            notices.publisher_update(&subscribers, topic, &publishers);
         }
         subscribers
     }
@@ -354,9 +367,9 @@ fn pair(topic: &str, topic_type: &str) -> Value {
     vec![topic, topic_type].into()
 }
 
-fn shutdown_notice(caller_id: &str, bumped: Option<String>) -> Option<Notice> {
-    bumped.map(|to| Notice::Shutdown {
-        to,
-        reason: format!("[{caller_id}] Reason: new node registered with same name"),
-    })
+fn notify_bumped(caller_id: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
+    if let Some(to) = bumped {
+        let reason = format!("[{caller_id}] Reason: new node registered with same name");
+        notices.shutdown(&to, &reason);
+    }
 }

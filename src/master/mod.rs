@@ -22,6 +22,7 @@ mod mark;
 mod methods;
 mod multicall;
 mod names;
+mod notice;
 mod params;
 mod plan;
 mod python;
@@ -33,6 +34,7 @@ mod state;
 mod tell;
 #[cfg(test)]
 mod tests;
+mod updates;
 
 pub use accepted::{Accepted, Agreement, Answered, accepted, is_success};
 pub use api::Outcome;
@@ -42,8 +44,9 @@ pub use kind::{Kind, kind, registrants};
 pub use look::{FirstLook, NotAMaster};
 pub use mark::Mark;
 pub use names::CALLER_ID;
+pub use notice::{Notice, NoticeSink};
 pub use plan::{Mismatch, Plan, Skipped};
 pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
-pub use state::{Counts, InvalidSnapshot, Master, Notice};
+pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{is_plain_topic, registrant};

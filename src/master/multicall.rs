@@ -2,15 +2,18 @@
 
 use std::borrow::Cow;
 
-use super::api::{fault, method, unsupported};
-use super::{Master, Notice, python};
-use crate::xmlrpc::{Reply, Struct, Value};
+use super::api::{self, fault, unsupported};
+use super::{Kind, Master, NoticeSink, python};
+use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// The name of the method.
 pub(super) const METHOD: &str = "system.multicall";
 
 /// Multicalls within multicalls that Python's recursion limit allows, and no more than our stack does.
 pub(super) const DEEPEST: usize = 480;
+
+/// More parameters than any method takes.
+const TOO_MANY: usize = 5;
 
 /// One entry of a multicall.
 pub(super) enum Entry<'a> {
@@ -25,18 +28,24 @@ pub(super) enum Entry<'a> {
     Malformed(String),
 }
 
-/// The entries of a multicall with these parameters, or the fault if there are none to find.
+/// The entries of a multicall with these parameters, or the fault if there are none to find. Of what is
+/// iterable and no list only the first: no item of that is an entry, and the first ends the multicall.
 pub(super) fn entries(params: &[Value]) -> Result<Cow<'_, [Value]>, String> {
     match params {
         [] => Err("<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() missing 1 required positional argument: 'call_list'".to_owned()),
-        [list] => python::items(list).ok_or_else(|| {
+        [list] => python::items(list, 1).ok_or_else(|| {
             format!("<class 'TypeError'>:'{}' object is not iterable", python::type_name(list))
         }),
-        more => Err(format!(
-            "<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() takes 2 positional arguments but {} were given",
-            more.len() + 1
-        )),
+        more => Err(too_many(more.len())),
     }
+}
+
+/// The fault of a multicall with so many parameters.
+fn too_many(count: usize) -> String {
+    format!(
+        "<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() takes 2 positional arguments but {} were given",
+        count + 1
+    )
 }
 
 impl<'a> Entry<'a> {
@@ -65,8 +74,14 @@ impl<'a> Entry<'a> {
                 ),
             });
         };
-        match python::items(params) {
-            Some(params) => Self::Call { method, params },
+        let count = python::count(params);
+        match python::items(params, TOO_MANY) {
+            // What a method of the Master API says to too many is the same for any number.
+            Some(params) if params.len() == count || api::method(method).is_some() => {
+                Self::Call { method, params }
+            }
+            Some(_) if method == METHOD => Self::Refused(too_many(count)),
+            Some(_) => Self::Refused(unsupported(method, count)),
             None => Self::Refused(not_iterable(method, params)),
         }
     }
@@ -76,7 +91,7 @@ impl<'a> Entry<'a> {
 fn not_iterable(name: &str, params: &Value) -> String {
     let function = if name == METHOD {
         "xmlrpc.server.SimpleXMLRPCDispatcher.system_multicall()"
-    } else if method(name).is_some() {
+    } else if api::method(name).is_some() {
         "rosmaster.master_api.apivalidate.<locals>.check_validates.<locals>.validated_f()"
     } else if name == "param_update_task" {
         "rosmaster.master_api.ROSMasterHandler.param_update_task()"
@@ -94,7 +109,7 @@ impl Master {
     pub(super) fn run_multicall(
         &mut self,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
     ) -> Result<Value, String> {
         let result = self.run_entries(params, notices, &mut Vec::new());
         let watched = self.params.take_watched();
@@ -110,7 +125,7 @@ impl Master {
     fn run_entries(
         &mut self,
         params: &[Value],
-        notices: &mut Vec<Notice>,
+        notices: &mut dyn NoticeSink,
         at: &mut Vec<usize>,
     ) -> Result<Value, String> {
         let entries = entries(params)?;
@@ -143,6 +158,34 @@ impl Master {
             });
         }
         Ok(Value::Array(results))
+    }
+
+    /// Whether all that the reads in a multicall answer takes no more than `most` bytes of memory, about.
+    /// Each answer is made and dropped. What is no multicall fits always.
+    pub fn fits(&mut self, call: &Call, mut most: usize) -> bool {
+        call.method != METHOD || self.spend(&call.params, DEEPEST, &mut most)
+    }
+
+    fn spend(&mut self, params: &[Value], levels: usize, left: &mut usize) -> bool {
+        let (Ok(entries), Some(levels)) = (entries(params), levels.checked_sub(1)) else {
+            return true;
+        };
+        entries.iter().all(|element| {
+            let Entry::Call { method, params } = Entry::new(element) else {
+                return true;
+            };
+            if method == METHOD {
+                return self.spend(&params, levels, left);
+            }
+            let kind = api::method(method).map(|method| method.kind);
+            if !matches!(kind, Some(Kind::Read | Kind::Identity)) {
+                return true;
+            }
+            let answer = self.dispatch(method, &params, &mut ());
+            let rest = left.checked_sub(answer.as_ref().map_or(0, python::size));
+            *left = rest.unwrap_or_default();
+            rest.is_some()
+        })
     }
 
     /// Remembers where a dict of the parameter tree is part of the result.

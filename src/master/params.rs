@@ -1,10 +1,8 @@
 //! The parameter server: `rosmaster/paramserver.py`.
 
-use std::collections::HashSet;
-
-use indexmap::IndexMap;
-
 use super::api::Failure;
+use super::registry::Registrations;
+use super::updates::{GONE, Update, updates};
 use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
@@ -32,16 +30,6 @@ struct Live {
     /// The value once the dict is no longer part of the tree.
     detached: Option<Value>,
 }
-
-/// A `paramUpdate` to the subscribers of one key.
-pub(super) struct Update<'a> {
-    pub(super) subscribers: Vec<&'a str>,
-    pub(super) key: String,
-    pub(super) value: Value,
-}
-
-/// Caller ids of the subscribers by key.
-pub(super) type Subscribers = IndexMap<String, Vec<String>>;
 
 /// What is found under a key.
 enum Found<'a> {
@@ -90,13 +78,14 @@ impl Params {
         Some(found)
     }
 
-    /// `set_param`. The tree changes even where working out the updates fails.
+    /// `set_param` of a key with a trailing slash. The tree changes even where working out the updates
+    /// fails.
     pub(super) fn set<'a>(
         &mut self,
-        key: &str,
-        value: Value,
-        caller_id: &str,
-        subscribers: &'a Subscribers,
+        key: &'a str,
+        value: &'a Value,
+        caller_id: &'a str,
+        subscribers: &'a Registrations,
     ) -> Result<Vec<Update<'a>>, Failure> {
         if key == "/" {
             let Value::Struct(_) = value else {
@@ -105,10 +94,10 @@ impl Params {
                 ));
             };
         }
-        let updates = updates(subscribers, key, &value, Some(caller_id));
+        let updates = updates(subscribers, key, value, Some(caller_id));
         let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE).collect();
         self.detach(&path);
-        self.put(&path, value)?;
+        self.put(&path, value.clone())?;
         updates
     }
 
@@ -141,11 +130,11 @@ impl Params {
         self.tree
     }
 
-    /// `delete_param`; none if the parameter is not set.
+    /// `delete_param` of a key with a trailing slash; none if the parameter is not set.
     pub(super) fn delete<'a>(
         &mut self,
-        key: &str,
-        subscribers: &'a Subscribers,
+        key: &'a str,
+        subscribers: &'a Registrations,
     ) -> Result<Option<Vec<Update<'a>>>, Failure> {
         let path: Vec<&str> = names::parts(key).collect();
         let Some((last, namespaces)) = path.split_last() else {
@@ -173,7 +162,7 @@ impl Params {
             members = inner;
         }
         members.shift_remove(*last);
-        updates(subscribers, key, &Value::Struct(Struct::new()), None).map(Some)
+        updates(subscribers, key, &GONE, None).map(Some)
     }
 
     /// `search_param`.
@@ -317,76 +306,4 @@ fn cut(value: Value, levels: usize) -> Value {
 /// The path that `get_param` takes. It ignores what comes before the first slash.
 fn read_path(key: &str) -> impl Iterator<Item = &str> {
     key.split('/').skip(1).filter(|part| !part.is_empty())
-}
-
-/// `compute_param_updates`.
-fn updates<'a>(
-    subscribers: &'a Subscribers,
-    key: &str,
-    value: &Value,
-    ignored: Option<&str>,
-) -> Result<Vec<Update<'a>>, Failure> {
-    if subscribers.is_empty() {
-        return Ok(Vec::new());
-    }
-    let key = names::param_key(key);
-    let mut below = Vec::new();
-    let members = value.as_struct();
-    if let Some(members) = members {
-        keys_below(&key, members, &mut below);
-    }
-    let set: HashSet<&str> = below.iter().map(String::as_str).collect();
-    let mut updates = Vec::new();
-    for (subscribed, nodes) in subscribers {
-        if key.starts_with(subscribed.as_str()) {
-            let nodes = nodes.iter().map(String::as_str);
-            updates.push(Update {
-                subscribers: nodes.filter(|node| Some(*node) != ignored).collect(),
-                key: key.clone(),
-                value: value.clone(),
-            });
-        } else if members.is_some()
-            && subscribed.starts_with(&key)
-            && !set.contains(subscribed.as_str())
-        {
-            updates.push(Update {
-                subscribers: nodes.iter().map(String::as_str).collect(),
-                key: subscribed.clone(),
-                value: Value::Struct(Struct::new()),
-            });
-        }
-    }
-    for changed in &below {
-        if let Some(nodes) = subscribers.get(changed) {
-            // Sliced by the length of the key that was set, even if it does not start with it.
-            let rest: String = changed.chars().skip(key.chars().count()).collect();
-            updates.push(Update {
-                subscribers: nodes.iter().map(String::as_str).collect(),
-                key: changed.clone(),
-                value: descend(value, &rest)?.clone(),
-            });
-        }
-    }
-    Ok(updates)
-}
-
-/// `_compute_all_keys`.
-fn keys_below(key: &str, members: &Struct, keys: &mut Vec<String>) {
-    for (name, value) in members {
-        let key = names::join(key, name) + "/";
-        keys.push(key.clone());
-        if let Value::Struct(inner) = value {
-            keys_below(&key, inner, keys);
-        }
-    }
-}
-
-/// Members whose names hold a slash are announced, and then not found.
-fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
-    names::parts(path).try_fold(value, |value, part| match value {
-        Value::Struct(members) => members
-            .get(part)
-            .ok_or_else(|| Failure::Internal(python::repr(part))),
-        _ => Err(Failure::Type(python::subscript_error(value))),
-    })
 }

@@ -38,14 +38,47 @@ pub(super) fn is_true(value: &Value) -> bool {
     }
 }
 
-/// The items that `for x in value` or `f(*value)` sees, if it is iterable.
-pub(super) fn items(value: &Value) -> Option<Cow<'_, [Value]>> {
+/// The items that `for x in value` or `f(*value)` sees, if it is iterable. Those of a text or a dict
+/// have to be made: no more than `most` of them are, for a text may have millions.
+pub(super) fn items(value: &Value, most: usize) -> Option<Cow<'_, [Value]>> {
     match value {
         Value::Array(elements) => Some(Cow::Borrowed(elements)),
-        Value::Struct(members) => Some(members.keys().map(|key| key.as_str().into()).collect()),
-        Value::String(text) => Some(text.chars().map(|c| Value::String(c.into())).collect()),
+        Value::Struct(members) => {
+            let keys = members.keys().take(most);
+            Some(keys.map(|key| key.as_str().into()).collect())
+        }
+        Value::String(text) => {
+            let characters = text.chars().take(most);
+            Some(characters.map(|c| Value::String(c.into())).collect())
+        }
         _ => None,
     }
+}
+
+/// How many items there are in all.
+pub(super) fn count(value: &Value) -> usize {
+    match value {
+        Value::Array(elements) => elements.len(),
+        Value::Struct(members) => members.len(),
+        Value::String(text) => text.chars().count(),
+        _ => 0,
+    }
+}
+
+/// About how much memory a value takes, in bytes.
+pub(super) fn size(value: &Value) -> usize {
+    let within = match value {
+        Value::BigInt(text) | Value::String(text) | Value::DateTime(text) => text.len(),
+        Value::Base64(bytes) => bytes.len(),
+        Value::Array(elements) => elements.iter().map(size).sum(),
+        Value::Struct(members) => {
+            let members = members.iter();
+            let members = members.map(|(key, value)| size_of::<String>() + key.len() + size(value));
+            members.sum()
+        }
+        _ => 0,
+    };
+    size_of::<Value>() + within
 }
 
 /// What `value["name"]` raises for a value that is no dict.

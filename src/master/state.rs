@@ -7,10 +7,12 @@ use serde::Serialize;
 use thiserror::Error;
 
 use super::names;
-use super::params::{Params, Update};
+use super::notice::NoticeSink;
+use super::params::Params;
 use super::registry::{Node, Registry, Shared};
 use super::snapshot::{Snapshot, SnapshotNode};
-use crate::xmlrpc::{Call, Struct, Value};
+use super::updates::Update;
+use crate::xmlrpc::{Call, Struct};
 
 /// A complete master without IO: rosmaster's state, and its answers through [`Master::apply`].
 ///
@@ -23,36 +25,6 @@ pub struct Master {
     pub(super) params: Params,
     pub(super) pid: i32,
     pub(super) uri: String,
-}
-
-/// A callback that the master sends to a node.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Notice {
-    /// `publisherUpdate('/master', topic, publishers)`.
-    PublisherUpdate {
-        /// Address of the subscriber.
-        to: String,
-        /// The topic.
-        topic: String,
-        /// Addresses of all its publishers.
-        publishers: Vec<String>,
-    },
-    /// `paramUpdate('/master', key, value)`.
-    ParamUpdate {
-        /// Address of the subscriber.
-        to: String,
-        /// What changed, with a trailing slash.
-        key: String,
-        /// The new value; an empty struct for what is gone.
-        value: Value,
-    },
-    /// `shutdown('/master', reason)`, to a node whose name another one took.
-    Shutdown {
-        /// The old node's address.
-        to: String,
-        /// The reason given.
-        reason: String,
-    },
 }
 
 /// How much a master holds.
@@ -380,23 +352,18 @@ fn unknown_node(key: &str, caller_id: &str) -> InvalidSnapshot {
 }
 
 impl Registry {
-    /// The callbacks for changed parameters. A value that cannot be written is never sent.
-    pub(super) fn param_notices(&self, updates: Vec<Update<'_>>) -> Vec<Notice> {
-        let mut notices = Vec::new();
+    /// Queues the callbacks for changed parameters. A value that cannot be written is never sent.
+    pub(super) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
         for update in updates {
-            if super::python::param_error(&update.value).is_some() {
+            if super::python::param_error(update.value).is_some() {
                 continue;
             }
-            let nodes = update.subscribers.iter();
-            notices.extend(nodes.filter_map(|caller_id| {
-                Some(Notice::ParamUpdate {
-                    to: self.nodes.get(*caller_id)?.api.clone(),
-                    key: update.key.clone(),
-                    value: update.value.clone(),
-                })
-            }));
+            let nodes = update.nodes.iter();
+            let nodes = nodes.filter(|caller_id| Some(caller_id.as_str()) != update.ignored);
+            let to = nodes.filter_map(|caller_id| Some(self.nodes.get(caller_id)?.api.clone()));
+            let to: Vec<String> = to.collect();
+            notices.param_update(&to, update.key, update.value);
         }
-        notices
     }
 }
 

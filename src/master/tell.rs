@@ -1,5 +1,7 @@
 //! What a master would tell a node of its state as it is now.
 
+use std::sync::Arc;
+
 use super::registry::Shared;
 use super::{Master, names, python};
 use crate::xmlrpc::{Call, Struct, Value};
@@ -42,7 +44,7 @@ impl Master {
 
     /// Every subscription of a parameter that is set: the subscriber's address and the key, with a
     /// trailing slash.
-    pub fn param_subscribers(&self) -> Vec<(String, String)> {
+    pub fn param_subscribers(&self) -> Vec<(String, Arc<str>)> {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).keys();
         let set = subscribers.filter(|key| self.is_set(key));
         let all = set.flat_map(|key| {
@@ -50,7 +52,8 @@ impl Master {
                 .registry
                 .apis(Shared::ParamSubscribers, key)
                 .into_iter();
-            apis.map(|api| (api, key.clone()))
+            let key = Arc::<str>::from(key.as_str());
+            apis.map(move |api| (api, key.clone()))
         });
         all.collect()
     }

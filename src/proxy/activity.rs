@@ -2,13 +2,14 @@
 
 use std::{
     collections::HashMap,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use indexmap::{IndexMap, IndexSet};
 
 use crate::{
-    master::{self, Master, Notice},
+    master::{self, Master, NoticeSink},
     xmlrpc::{Call, Value},
 };
 
@@ -28,7 +29,7 @@ pub enum Letter {
     /// The full list of a topic's publishers.
     Topic(String),
     /// The value of a parameter. The key ends in a slash.
-    Param(String),
+    Param(Arc<str>),
 }
 
 /// An address and what is to be told there; to all subscribers of a topic if there is no address.
@@ -58,7 +59,7 @@ pub struct Activity {
     count: u64,
     topics: IndexMap<String, Instant>,
     /// By address and key.
-    params: IndexMap<(String, String), Instant>,
+    params: IndexMap<(String, Arc<str>), Instant>,
     deeds: HashMap<String, Deeds>,
     /// Nodes that are no more are forgotten when `deeds` is longer than this.
     prune_at: usize,
@@ -73,6 +74,26 @@ pub struct Activity {
     news: IndexSet<News>,
 }
 
+/// What a call's notices are about. What they say is read from the mirror when it is told.
+#[derive(Debug, Default)]
+pub(super) struct Noticed {
+    topics: IndexSet<String>,
+    /// By address and key.
+    params: IndexSet<(String, Arc<str>)>,
+}
+
+impl NoticeSink for Noticed {
+    fn publisher_update(&mut self, _: &[String], topic: &str, _: &[String]) {
+        self.topics.insert(topic.to_owned());
+    }
+
+    fn param_update(&mut self, to: &[String], key: &str, _: &Value) {
+        let key = Arc::<str>::from(key);
+        let params = to.iter().map(|to| (to.clone(), key.clone()));
+        self.params.extend(params);
+    }
+}
+
 impl Activity {
     /// A call has been applied, with these notices. `registered` says of a node whether the mirror
     /// knows it. Answers whether there are news.
@@ -80,7 +101,7 @@ impl Activity {
         &mut self,
         now: Instant,
         call: &Call,
-        notices: Vec<Notice>,
+        noticed: Noticed,
         registered: impl Fn(&str) -> bool,
     ) -> bool {
         self.note(now, call, LEVELS);
@@ -88,23 +109,18 @@ impl Activity {
             self.prune(registered);
         }
         let before = self.news.len();
-        for notice in notices {
-            match notice {
-                Notice::PublisherUpdate { topic, .. } => {
-                    if self.telling && self.news.len() < NOTICES {
-                        self.news.insert((None, Letter::Topic(topic.clone())));
-                    }
-                    self.topics.insert(topic, now);
-                }
-                Notice::ParamUpdate { to, key, .. } => {
-                    if self.telling && self.news.len() < NOTICES {
-                        self.news
-                            .insert((Some(to.clone()), Letter::Param(key.clone())));
-                    }
-                    self.params.insert((to, key), now);
-                }
-                Notice::Shutdown { .. } => {}
+        for topic in noticed.topics {
+            if self.telling && self.news.len() < NOTICES {
+                self.news.insert((None, Letter::Topic(topic.clone())));
             }
+            self.topics.insert(topic, now);
+        }
+        for (to, key) in noticed.params {
+            if self.telling && self.news.len() < NOTICES {
+                self.news
+                    .insert((Some(to.clone()), Letter::Param(key.clone())));
+            }
+            self.params.insert((to, key), now);
         }
         forget(&mut self.topics, now);
         forget(&mut self.params, now);
@@ -156,7 +172,7 @@ impl Activity {
     }
 
     /// As [`Self::topics_noticed`]: parameters, each as the address of a subscriber and a key.
-    pub fn params_noticed(&self, now: Instant) -> Vec<(String, String)> {
+    pub fn params_noticed(&self, now: Instant) -> Vec<(String, Arc<str>)> {
         recent(&self.params, now).cloned().collect()
     }
 
@@ -276,7 +292,7 @@ mod tests {
     }
 
     fn apply(activity: &mut Activity, now: Instant, call: &Call) {
-        activity.applied(now, call, Vec::new(), |_| true);
+        activity.applied(now, call, Noticed::default(), |_| true);
     }
 
     #[test]
@@ -316,11 +332,9 @@ mod tests {
         let now = Instant::now();
         let mut activity = Activity::default();
         let notice = || {
-            vec![Notice::PublisherUpdate {
-                to: "http://s:1/".to_owned(),
-                topic: "/t".to_owned(),
-                publishers: Vec::new(),
-            }]
+            let mut noticed = Noticed::default();
+            noticed.publisher_update(&["http://s:1/".to_owned()], "/t", &[]);
+            noticed
         };
         let publish = publish("/a", "/t");
         assert!(!activity.applied(now, &publish, notice(), |_| true));
@@ -333,6 +347,26 @@ mod tests {
             [expected]
         );
         assert_eq!(activity.topics_noticed(now), ["/t"]);
+    }
+
+    #[test]
+    fn a_key_is_kept_once_for_all_its_subscribers() {
+        let now = Instant::now();
+        let mut activity = Activity::default();
+        activity.set_telling(true);
+        let subscribers: Vec<_> = (0..NOTICES)
+            .map(|port| format!("http://s:{port}/"))
+            .collect();
+        let mut noticed = Noticed::default();
+        noticed.param_update(&subscribers, "/key/", &Value::Int(1));
+        activity.applied(now, &publish("/a", "/t"), noticed, |_| true);
+        let noticed = activity.params_noticed(now);
+        assert_eq!(noticed.len(), NOTICES);
+        let (_, first) = &noticed[0];
+        assert!(noticed.iter().all(|(_, key)| Arc::ptr_eq(key, first)));
+        let shared = |news: &News| matches!(&news.1, Letter::Param(key) if Arc::ptr_eq(key, first));
+        let news = activity.take_news();
+        assert!(news.len() == NOTICES && news.iter().all(shared));
     }
 
     #[test]

@@ -45,6 +45,8 @@ const IDENTITY_TIME: Duration = Duration::from_secs(1);
 const ROSCPP_SET_PARAM_HOLD: Duration = Duration::from_secs(24 * 3600);
 /// What roscpp calls itself.
 const ROSCPP: &[u8] = b"XMLRPC++";
+/// Why a multicall is not answered while the gate is shut.
+const UNANSWERABLE: &str = "so many answers at once are left to the master";
 /// Said to another computer of a body that rosrescue cannot decode. The master may know how to, and
 /// it may be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
@@ -175,7 +177,8 @@ async fn answer(
         (Some(call), Kind::Identity)
             if call.method == "getUri" || !matches!(proxy.gate.state(), State::Open { .. }) =>
         {
-            Ok(xml(&proxy.shadow.answer(call)))
+            let reply = proxy.shadow.answer(call).ok_or(Closed(UNANSWERABLE))?;
+            Ok(xml(&reply))
         }
         (_, Kind::Shutdown) if !door::may_shut_down(peer.ip()) => {
             tracing::warn!(%peer, "refused to shut the master down for another computer");
@@ -244,9 +247,11 @@ async fn read(
             }
             State::Shut(stand_in) => known = stand_in != StandIn::Nobody,
         }
-        if let Some(call) = call.filter(|_| known && kind != Kind::Unknown) {
+        if let Some(call) = call.filter(|_| known && kind != Kind::Unknown)
+            && let Some(reply) = proxy.shadow.answer(call)
+        {
             proxy.stats.stood_in.count();
-            return Ok(xml(&proxy.shadow.answer(call)));
+            return Ok(xml(&reply));
         }
         if !std::mem::replace(&mut parked, true) {
             proxy.stats.parked.count();

@@ -16,7 +16,8 @@ use std::{
 use tokio::sync::{Notify, watch};
 
 use self::keeping::Whole;
-use super::{activity::Activity, stats::Stats};
+use super::activity::{Activity, Noticed};
+use super::stats::Stats;
 use crate::{
     master::{self, Agreement, Answered, Master},
     record::{Checkpoint, Entry, Session},
@@ -26,6 +27,10 @@ use crate::{
 
 /// Unregistrations that take nothing away are remembered beside so many others.
 const OWED_IDLY: usize = 1000;
+
+/// Memory that the answers to the reads in one multicall may take, in bytes. A few short reads of a large
+/// state ask for any amount of it, and wait for the master instead.
+const ANSWER_MOST: usize = 64 << 20;
 
 /// The master that answered has been succeeded by another one, or what it showed by what the mirror has
 /// taken since: it does not count, and must be asked again.
@@ -116,9 +121,11 @@ impl Shadow {
         look(&self.lock().mirror)
     }
 
-    /// What the master would answer to a read.
-    pub fn answer(&self, read: &Call) -> Reply {
-        self.lock().mirror.apply(read).reply
+    /// What the master would answer to a read; none if it is a multicall that asks for too much.
+    pub fn answer(&self, read: &Call) -> Option<Reply> {
+        let mirror = &mut self.lock().mirror;
+        let fits = mirror.fits(read, ANSWER_MOST);
+        fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
     /// Tells the mirror what getPid and getUri answer.
@@ -194,7 +201,8 @@ impl Shadow {
     /// What the master would answer to these calls, one after the other.
     pub fn foretell<'a>(&self, calls: impl Iterator<Item = &'a Call>) -> Vec<Reply> {
         let mut model = self.with_mirror(Clone::clone);
-        calls.map(|call| model.apply(call).reply).collect()
+        let answer = |call| model.apply_telling(call, &mut ());
+        calls.map(answer).collect()
     }
 
     /// Records and applies a call of our own before there is any master.
@@ -210,10 +218,10 @@ impl Shadow {
     /// rosrescue, and which the master that comes back has run.
     ///
     /// With the reply comes the journal's last record of it, if there is one. None while the mirror is
-    /// frozen: the call has to wait for the master.
+    /// frozen, or if the call reads too much besides: it has to wait for the master.
     pub fn unregister(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
-        if inner.frozen {
+        if inner.frozen || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
         let before = inner.mirror.counts();
@@ -341,16 +349,14 @@ impl Shadow {
 
 impl Inner {
     fn apply(&mut self, now: Instant, call: &Call, news: &Notify) -> Reply {
-        let outcome = self.mirror.apply(call);
+        let mut noticed = Noticed::default();
+        let reply = self.mirror.apply_telling(call, &mut noticed);
         self.version += 1;
         let registered = |node: &str| self.mirror.api_of(node).is_some();
-        if self
-            .activity
-            .applied(now, call, outcome.notices, registered)
-        {
+        if self.activity.applied(now, call, noticed, registered) {
             news.notify_one();
         }
-        outcome.reply
+        reply
     }
 
     fn adopt(&mut self, state: Master) -> Vec<String> {

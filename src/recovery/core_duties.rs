@@ -34,7 +34,7 @@ fn set(key: &str, value: &str) -> Call {
 fn has(proxy: &Proxy, key: &str) -> bool {
     let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
     let yes = Value::Bool(true);
-    matches!(proxy.shadow.answer(&call), Reply::Value(Value::Array(answer)) if answer.get(2) == Some(&yes))
+    matches!(proxy.shadow.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
 }
 
 fn run_id(proxy: &Proxy) -> Call {

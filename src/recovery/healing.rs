@@ -64,7 +64,7 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
             let topics = mirror.subscriptions(name).map(str::to_owned);
             // What is not set, and may never have been, is no news.
             let keys = mirror.param_subscriptions(name);
-            let keys = keys.filter(|key| mirror.is_set(key)).map(str::to_owned);
+            let keys = keys.filter(|key| mirror.is_set(key)).map(Arc::from);
             topics.map(Letter::Topic).chain(keys.map(Letter::Param))
         });
         letters.collect::<Vec<_>>()

@@ -1,6 +1,7 @@
 //! The model on its own. That it is rosmaster's equal is for `tests/differential.rs`.
 
 mod careful;
+mod costs;
 mod looking;
 mod params;
 mod planning;

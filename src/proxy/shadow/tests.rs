@@ -166,6 +166,33 @@ fn who_the_master_is_outlasts_a_resync() {
     assert_eq!(shadow.answer(&get_pid), before);
 }
 
+/// A short call asks for what would take all the memory of a computer.
+#[test]
+fn reads_are_answered_together_within_limits() {
+    let shadow = shadow();
+    let now = Instant::now();
+    let text = Value::String("x".repeat(1 << 20));
+    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), text]);
+    for call in [&set, &publish("/t")] {
+        let reply = shadow.with_mirror(|mirror| answered(call, &mut mirror.clone()));
+        shadow.record(now, 0, &[(call, &reply)]).unwrap();
+    }
+    let read = || call("getParam", &["/n", "/"]);
+    let reads = |count| (0..count).map(|_| read());
+    let bye = || call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
+    let many = Call::multicall(reads(100_000));
+    let nested = Call::multicall([read(), many.clone()]);
+    let unregistering = Call::multicall([bye()].into_iter().chain(reads(100_000)));
+    assert_eq!(shadow.answer(&many), None);
+    assert_eq!(shadow.answer(&nested), None);
+    assert_eq!(shadow.unregister(now, &unregistering), None);
+    assert_eq!(shadow.with_mirror(|mirror| mirror.counts().publishers), 1);
+    assert!(shadow.answer(&read()).is_some());
+    assert!(shadow.answer(&Call::multicall(reads(60))).is_some());
+    let unregistering = Call::multicall([bye()].into_iter().chain(reads(60)));
+    assert!(shadow.unregister(now, &unregistering).is_some());
+}
+
 #[test]
 fn a_look_counts_if_nothing_came_between() {
     let shadow = shadow();

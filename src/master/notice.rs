@@ -1,0 +1,75 @@
+//! The callbacks that a master sends to nodes.
+
+use crate::xmlrpc::Value;
+
+/// A callback that the master sends to a node.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Notice {
+    /// `publisherUpdate('/master', topic, publishers)`.
+    PublisherUpdate {
+        /// Address of the subscriber.
+        to: String,
+        /// The topic.
+        topic: String,
+        /// Addresses of all its publishers.
+        publishers: Vec<String>,
+    },
+    /// `paramUpdate('/master', key, value)`.
+    ParamUpdate {
+        /// Address of the subscriber.
+        to: String,
+        /// What changed, with a trailing slash.
+        key: String,
+        /// The new value; an empty struct for what is gone.
+        value: Value,
+    },
+    /// `shutdown('/master', reason)`, to a node whose name another one took.
+    Shutdown {
+        /// The old node's address.
+        to: String,
+        /// The reason given.
+        reason: String,
+    },
+}
+
+/// Is told of callbacks as the master queues them. What they say is lent: one change may go to
+/// thousands of nodes, and each with a large value. What is not written here is not listened to.
+pub trait NoticeSink {
+    /// A [`Notice::PublisherUpdate`] to each of these addresses.
+    fn publisher_update(&mut self, _to: &[String], _topic: &str, _publishers: &[String]) {}
+
+    /// A [`Notice::ParamUpdate`] to each of these addresses.
+    fn param_update(&mut self, _to: &[String], _key: &str, _value: &Value) {}
+
+    /// A [`Notice::Shutdown`].
+    fn shutdown(&mut self, _to: &str, _reason: &str) {}
+}
+
+/// Nobody listens.
+impl NoticeSink for () {}
+
+/// Every callback, with all that it says.
+impl NoticeSink for Vec<Notice> {
+    fn publisher_update(&mut self, to: &[String], topic: &str, publishers: &[String]) {
+        self.extend(to.iter().map(|to| Notice::PublisherUpdate {
+            to: to.clone(),
+            topic: topic.to_owned(),
+            publishers: publishers.to_vec(),
+        }));
+    }
+
+    fn param_update(&mut self, to: &[String], key: &str, value: &Value) {
+        self.extend(to.iter().map(|to| Notice::ParamUpdate {
+            to: to.clone(),
+            key: key.to_owned(),
+            value: value.clone(),
+        }));
+    }
+
+    fn shutdown(&mut self, to: &str, reason: &str) {
+        self.push(Notice::Shutdown {
+            to: to.to_owned(),
+            reason: reason.to_owned(),
+        });
+    }
+}

@@ -1,0 +1,122 @@
+//! Whom a changed parameter concerns: `compute_param_updates` of `rosmaster/paramserver.py`.
+
+use std::{collections::HashSet, sync::LazyLock};
+
+use super::api::Failure;
+use super::registry::Registrations;
+use super::{names, python};
+use crate::xmlrpc::{Struct, Value};
+
+/// The value of what is gone, in a `paramUpdate`.
+pub(super) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
+
+/// A `paramUpdate` to the subscribers of one key. The value is that of the call, or a part of it, for
+/// whoever it goes to.
+pub(super) struct Update<'a> {
+    pub(super) nodes: &'a [String],
+    /// Of these, the one that is not told: it made the change.
+    pub(super) ignored: Option<&'a str>,
+    pub(super) key: &'a str,
+    pub(super) value: &'a Value,
+}
+
+/// The updates of `key`, which ends in a slash and has this value now, but for those to `ignored`.
+pub(super) fn updates<'a>(
+    subscribers: &'a Registrations,
+    key: &'a str,
+    value: &'a Value,
+    ignored: Option<&'a str>,
+) -> Result<Vec<Update<'a>>, Failure> {
+    if subscribers.is_empty() {
+        return Ok(Vec::new());
+    }
+    let mut below = Below {
+        subscribers,
+        longest: subscribers.keys().map(String::len).max().unwrap_or(0),
+        found: Vec::new(),
+    };
+    let members = value.as_struct();
+    if let Some(members) = members {
+        below.find(&mut key.to_owned(), members);
+    }
+    let set: HashSet<&str> = below.found.iter().map(|(key, _)| *key).collect();
+    let mut updates = Vec::new();
+    for (subscribed, nodes) in subscribers {
+        if key.starts_with(subscribed.as_str()) {
+            updates.push(Update {
+                nodes,
+                ignored,
+                key,
+                value,
+            });
+        } else if members.is_some()
+            && subscribed.starts_with(key)
+            && !set.contains(subscribed.as_str())
+        {
+            updates.push(Update {
+                nodes,
+                ignored: None,
+                key: subscribed,
+                value: &GONE,
+            });
+        }
+    }
+    let length = key.chars().count();
+    for (changed, nodes) in below.found {
+        // Sliced by the length of the key that was set, even if it does not start with it.
+        let rest: String = changed.chars().skip(length).collect();
+        updates.push(Update {
+            nodes,
+            ignored: None,
+            key: changed,
+            value: descend(value, &rest)?,
+        });
+    }
+    Ok(updates)
+}
+
+/// `_compute_all_keys`, without the keys that nobody subscribes: all together can be far longer than
+/// the call, because each member's holds the names of all that it is in.
+struct Below<'a> {
+    subscribers: &'a Registrations,
+    /// Length of the longest key that is subscribed.
+    longest: usize,
+    /// Each key with its subscribers, in the order of the members.
+    found: Vec<(&'a str, &'a [String])>,
+}
+
+impl Below<'_> {
+    /// Finds what is in `members`, whose key is `key`, and leaves that as it is.
+    fn find(&mut self, key: &mut String, members: &Struct) {
+        let length = key.len();
+        for (name, value) in members {
+            // As `ns_join` has it: such a name stands alone.
+            let mut alone = String::new();
+            let key = match name.starts_with(['/', '~']) {
+                true => &mut alone,
+                false => &mut *key,
+            };
+            key.push_str(name);
+            key.push('/');
+            if key.len() <= self.longest
+                && let Some((key, nodes)) = self.subscribers.get_key_value(key.as_str())
+            {
+                self.found.push((key, nodes));
+            }
+            if let Value::Struct(inner) = value {
+                self.find(key, inner);
+            }
+            key.truncate(length);
+        }
+    }
+}
+
+/// Members whose names hold a slash are announced, and then not found.
+fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
+    names::parts(path).try_fold(value, |value, part| match value {
+        Value::Struct(members) => members
+            .get(part)
+            .ok_or_else(|| Failure::Internal(python::repr(part))),
+        _ => Err(Failure::Type(python::subscript_error(value))),
+    })
+}
