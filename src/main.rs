@@ -13,15 +13,15 @@ use rosrescue::{
     config::Config,
     proxy::listener,
 };
-use tokio::{
-    runtime::Runtime,
-    signal::unix::{SignalKind, signal},
-};
+use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
 
 /// How long work beside the main one may go on when all is done.
 const LAST_JOBS: Duration = Duration::from_millis(500);
+/// More threads than these do not make a master faster that is Python; each keeps a heap of its own,
+/// as large as its largest task was.
+const THREADS_MAX: usize = 4;
 
 fn main() -> ExitCode {
     let cli = Cli::read();
@@ -64,7 +64,7 @@ fn main() -> ExitCode {
             .exit();
     }
     config.fit_into(raise_file_limit());
-    match run(config, hostname) {
+    match serve(config, hostname) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("rosrescue: {error}");
@@ -74,7 +74,11 @@ fn main() -> ExitCode {
 }
 
 fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
-    let runtime = Runtime::new()?;
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(cores.min(THREADS_MAX))
+        .enable_all()
+        .build()?;
     let ended = runtime.block_on(serve(config, hostname));
     // The closing checkpoint is on the disk, and has overtaken whatever was being written. What still
     // runs in a thread may be a question to a name server that never answers: the end of a process

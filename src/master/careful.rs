@@ -47,7 +47,8 @@ impl Careful {
         left_out: &[Call],
         tested: Option<&Call>,
     ) -> Self {
-        let Restore { calls, skipped, .. } = Restore::run(target, found);
+        let mut calls = Vec::new();
+        let Restore { skipped, .. } = Restore::run(target, found, |call, _| calls.push(call));
         let mut plan = Self {
             steps: Vec::with_capacity(calls.len()),
             expected: found.clone(),

@@ -231,10 +231,10 @@ fn fault_entry(text: String) -> Value {
 }
 
 /// A reply as an entry of a multicall's result.
-pub(super) fn reply_entry(reply: &Reply) -> Value {
+pub(super) fn reply_entry(reply: Reply) -> Value {
     match reply {
-        Reply::Value(value) => Value::Array(vec![value.clone()]),
-        Reply::Fault { text, .. } => fault_entry(text.clone()),
+        Reply::Value(value) => Value::Array(vec![value]),
+        Reply::Fault { text, .. } => fault_entry(text),
     }
 }
 

@@ -2,10 +2,12 @@
 
 use std::fmt;
 
+use bytes::Bytes;
+
 use super::look::lookup;
 use super::restore::Restore;
-use super::{CALLER_ID, Mark, Master, python};
-use crate::xmlrpc::{Call, Reply, Value};
+use super::{CALLER_ID, Mark, Master, multicall, python};
+use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};
 
 /// Most mismatches that are told apart.
 const MOST_MISMATCHES: usize = 20;
@@ -36,11 +38,16 @@ const MOST_MISMATCHES: usize = 20;
 /// ours win. Where the new master has subscribers of a topic that lacks several publishers, they
 /// are taken out first and put back before the last publisher: they are told once, with the complete
 /// list, while every partial list would make a roscpp node drop its live connections.
+///
+/// # Memory
+///
+/// Call and answer are text from the start. As values those of a thousand nodes take ten times as much,
+/// and the C library keeps most of what was once taken for so many small pieces.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    call: Call,
-    /// What the call's entries must answer, the mark's last.
-    predicted: Vec<Reply>,
+    request: Bytes,
+    /// What the request must be answered with.
+    answer: Bytes,
     expected: Master,
     skipped: Vec<Skipped>,
 }
@@ -181,37 +188,37 @@ impl Plan {
     ///
     /// Marks that `target` or `found` hold themselves are not brought over.
     pub fn new(target: &Master, found: &Master, mark: &Mark) -> Self {
+        let mut request = ListWriter::request(multicall::METHOD);
+        let mut answer = ListWriter::answer();
+        let mut write = |call: Call, predicted: Reply| {
+            request.push(&call.into_entry());
+            answer.push(&multicall::reply_entry(predicted));
+        };
         let Restore {
-            mut calls,
-            mut predicted,
-            mut model,
-            skipped,
-            ..
-        } = Restore::run(target, found);
+            mut model, skipped, ..
+        } = Restore::run(target, found, &mut write);
         for call in reads(&model, found) {
-            predicted.push(model.apply(&call).reply);
-            calls.push(call);
+            let predicted = model.apply(&call).reply;
+            write(call, predicted);
         }
         // The mark is no part of the mirror. It subscribes to what is not set.
-        calls.push(mark.call());
-        predicted.push(Master::default().apply(&mark.call()).reply);
+        write(mark.call(), Master::default().apply(&mark.call()).reply);
         Self {
-            call: Call::multicall(calls),
-            predicted,
+            request: request.finish().into(),
+            answer: answer.finish().into(),
             expected: model,
             skipped,
         }
     }
 
-    /// The multicall to send.
-    pub fn call(&self) -> &Call {
-        &self.call
+    /// The body of the multicall to send.
+    pub fn request(&self) -> &Bytes {
+        &self.request
     }
 
-    /// What a master answers to it if it answers each entry as the model predicted.
-    pub fn predicted(&self) -> Reply {
-        let results = self.predicted.iter().map(super::multicall::reply_entry);
-        Reply::Value(Value::Array(results.collect()))
+    /// The body that a rosmaster answers with if it answers each entry as the model predicted.
+    pub fn answer(&self) -> &Bytes {
+        &self.answer
     }
 
     /// What the master holds afterwards, the mark apart.
@@ -224,32 +231,35 @@ impl Plan {
         &self.skipped
     }
 
-    /// Whether every entry was answered as the model predicted.
+    /// Whether every entry was answered as the model predicted. Not needed for a reply that is
+    /// [`Self::answer`] to the byte.
     ///
     /// # Errors
     ///
     /// The entries that were not, up to 20 of them.
     pub fn verify(&self, reply: &Reply) -> Result<(), Vec<Mismatch>> {
         let whole = |text: String| Err(vec![Mismatch::Whole { text }]);
-        let results = match reply {
-            Reply::Value(Value::Array(results)) if results.len() == self.predicted.len() => results,
-            Reply::Value(_) => return whole("another number of results than of calls".to_owned()),
-            Reply::Fault { text, .. } => return whole(text.clone()),
-        };
-        let same = |result: &Value, predicted: &Reply| match (result, predicted) {
-            (Value::Array(only), Reply::Value(value)) => {
-                matches!(only.as_slice(), [result] if result == value)
+        let (call, predicted) = match self.decode() {
+            Ok(both) => both,
+            Err(error) => {
+                return whole(format!(
+                    "otherwise than predicted, which was no XML: {error}"
+                ));
             }
-            _ => super::multicall::entry_reply(result).as_ref() == Some(predicted),
         };
-        let entries = self
-            .call
-            .params
-            .first()
-            .and_then(Value::as_array)
-            .unwrap_or_default();
-        let mismatches: Vec<_> = (results.iter().zip(&self.predicted).zip(entries))
-            .filter(|((result, predicted), _)| !same(result, predicted))
+        let (results, predicted) = match (reply, &predicted) {
+            (Reply::Value(Value::Array(results)), Reply::Value(Value::Array(predicted)))
+                if results.len() == predicted.len() =>
+            {
+                (results, predicted)
+            }
+            (Reply::Fault { text, .. }, _) => return whole(text.clone()),
+            _ => return whole("another number of results than of calls".to_owned()),
+        };
+        let entries = call.params.first().and_then(Value::as_array);
+        let mismatches: Vec<_> = (results.iter().zip(predicted))
+            .zip(entries.unwrap_or_default())
+            .filter(|((result, predicted), _)| result != predicted)
             .map(|(_, entry)| mismatch(entry))
             .take(MOST_MISMATCHES)
             .collect();
@@ -258,6 +268,12 @@ impl Plan {
         } else {
             Err(mismatches)
         }
+    }
+
+    /// Request and answer as values.
+    fn decode(&self) -> Result<(Call, Reply), DecodeError> {
+        let call = xmlrpc::decode_call(&self.request)?;
+        Ok((call, xmlrpc::decode_reply(&self.answer)?))
     }
 }
 

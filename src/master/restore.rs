@@ -8,10 +8,12 @@ use super::plan::Skipped;
 use super::{Mark, Master, python};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
-/// The calls that change state, what they answer, and the model of the master after them.
-pub(super) struct Restore<'a> {
-    pub(super) calls: Vec<Call>,
-    pub(super) predicted: Vec<Reply>,
+/// Gives the calls that change state, each with its answer, to `write`; the model of the master after
+/// them.
+pub(super) struct Restore<'a, W> {
+    write: W,
+    /// How many calls there were.
+    count: usize,
     pub(super) model: Master,
     pub(super) skipped: Vec<Skipped>,
     target: &'a Master,
@@ -20,12 +22,12 @@ pub(super) struct Restore<'a> {
     types_in: usize,
 }
 
-impl<'a> Restore<'a> {
+impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
     /// Brings a model of `found` to `target`.
-    pub(super) fn run(target: &'a Master, found: &'a Master) -> Self {
+    pub(super) fn run(target: &'a Master, found: &'a Master, write: W) -> Self {
         let mut restore = Self {
-            calls: Vec::new(),
-            predicted: Vec::new(),
+            write,
+            count: 0,
             model: found.clone(),
             skipped: Vec::new(),
             target,
@@ -46,8 +48,9 @@ impl<'a> Restore<'a> {
 
     fn push(&mut self, method: &str, params: Vec<Value>) {
         let call = Call::new(method, params);
-        self.predicted.push(self.model.apply(&call).reply);
-        self.calls.push(call);
+        let predicted = self.model.apply(&call).reply;
+        self.count += 1;
+        (self.write)(call, predicted);
     }
 
     fn params(&mut self) {
@@ -294,7 +297,7 @@ impl<'a> Restore<'a> {
 
     /// The same where nobody provides the service any more: a helper takes it and gives it up.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
-        let before = self.calls.len();
+        let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
             for caller_id in losers {
                 self.skip_unnameable(service, caller_id);
@@ -302,7 +305,7 @@ impl<'a> Restore<'a> {
             return;
         };
         self.lose(service, losers);
-        if self.calls.len() > before {
+        if self.count > before {
             self.take_and_give_up(helper, name);
         }
     }

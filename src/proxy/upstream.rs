@@ -3,9 +3,10 @@
 use std::{io, net::SocketAddr, time::Duration};
 
 use bytes::Bytes;
-use http_body_util::{BodyExt, Full, Limited};
+use http_body_util::{BodyExt, Collected, Full, Limited};
 use hyper::{
     HeaderMap, Request, StatusCode,
+    body::Body,
     client::conn::http1::SendRequest,
     ext::ReasonPhrase,
     header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
@@ -318,6 +319,22 @@ impl Connection {
 
     /// Sends `body` as it is; the reply comes back as it is.
     pub async fn forward(&mut self, head: &Head, body: Bytes) -> Result<RawReply, CallError> {
+        self.exchange(head, body, None).await
+    }
+
+    /// Sends a body of our own. As far as the reply is what was `foretold` it is only compared, and
+    /// takes no memory.
+    pub async fn foretold(&mut self, body: Bytes, foretold: &Bytes) -> Result<RawReply, CallError> {
+        let head = Head::default();
+        self.exchange(&head, body, Some(foretold)).await
+    }
+
+    async fn exchange(
+        &mut self,
+        head: &Head,
+        body: Bytes,
+        foretold: Option<&Bytes>,
+    ) -> Result<RawReply, CallError> {
         // rosmaster gzips replies when it may, in Python: it may not.
         let mut request = Request::post(head.path.as_str())
             .header(HOST, &self.host)
@@ -341,15 +358,16 @@ impl Connection {
             Err(error) => return Err(CallError::MaybeSent(error)),
         };
         let (parts, body) = reply.into_parts();
-        let body = Limited::new(body, self.max_reply)
-            .collect()
-            .await
-            .map_err(CallError::BrokenReply)?;
+        let body = Limited::new(body, self.max_reply);
+        let body = match foretold {
+            Some(foretold) => collect(body, foretold).await,
+            None => body.collect().await.map(Collected::to_bytes),
+        };
         Ok(RawReply {
             status: parts.status,
             reason: parts.extensions.get().cloned(),
             headers: parts.headers,
-            body: body.to_bytes(),
+            body: body.map_err(CallError::BrokenReply)?,
         })
     }
 
@@ -357,5 +375,74 @@ impl Connection {
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
         let body = Bytes::from(xmlrpc::encode_call(call));
         self.forward(&Head::default(), body).await?.decode()
+    }
+}
+
+/// The whole of `body`. As far as it is what was `foretold`, that stands for it.
+async fn collect<B: Body<Data = Bytes> + Unpin>(
+    mut body: B,
+    foretold: &Bytes,
+) -> Result<Bytes, B::Error> {
+    let mut same = 0;
+    while let Some(frame) = body.frame().await {
+        let Ok(data) = frame?.into_data() else {
+            continue;
+        };
+        let (before, ahead) = foretold.split_at(same);
+        if !ahead.starts_with(&data) {
+            let rest = body.collect().await?.to_bytes();
+            return Ok([before, &data, &rest].concat().into());
+        }
+        same += data.len();
+    }
+    Ok(foretold.slice(..same))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        convert::Infallible,
+        pin::Pin,
+        task::{Context, Poll},
+    };
+
+    use hyper::body::Frame;
+
+    use super::*;
+
+    /// A body that comes in these pieces.
+    struct Pieces(std::vec::IntoIter<&'static str>);
+
+    impl Body for Pieces {
+        type Data = Bytes;
+        type Error = Infallible;
+
+        fn poll_frame(
+            mut self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+        ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+            let piece = self.0.next();
+            Poll::Ready(piece.map(|piece| Ok(Frame::data(Bytes::from(piece)))))
+        }
+    }
+
+    #[tokio::test]
+    async fn a_foretold_reply_is_kept_once_and_any_other_as_it_is() {
+        let foretold = Bytes::from("what is foretold");
+        for pieces in [
+            vec!["what is ", "foretold"],
+            vec!["what is ", "", "foretold", " and more"],
+            vec!["what is ", "fore", "seen", "?"],
+            vec!["what", " is"],
+            vec!["nothing of it"],
+            vec![],
+        ] {
+            let whole = pieces.concat();
+            let got = collect(Pieces(pieces.into_iter()), &foretold).await;
+            let got = got.unwrap_or_default();
+            assert_eq!(got, whole);
+            let is_kept = got.as_ptr() == foretold.as_ptr();
+            assert_eq!(is_kept, foretold.starts_with(whole.as_bytes()), "{whole}");
+        }
     }
 }

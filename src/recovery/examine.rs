@@ -5,7 +5,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bytes::Bytes;
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
@@ -17,9 +16,9 @@ use crate::{
         Proxy,
         gate::{Keeper, StandIn, State},
         look::{self, LookError},
-        upstream::{CallError, Connection, Head},
+        upstream::{CallError, Connection},
     },
-    xmlrpc::{self, Call},
+    xmlrpc::Call,
 };
 
 /// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
@@ -115,9 +114,6 @@ pub struct Manner {
 pub struct Prepared {
     version: u64,
     plan: Plan,
-    body: Bytes,
-    /// The whole reply of a rosmaster that answers each entry as predicted.
-    answer: Vec<u8>,
     /// Whether such a master holds exactly what the mirror holds.
     complete: bool,
 }
@@ -127,8 +123,6 @@ impl Prepared {
         let plan = Plan::new(target, found, &proxy.mark);
         Self {
             version,
-            body: Bytes::from(xmlrpc::encode_call(plan.call())),
-            answer: xmlrpc::encode_reply(&plan.predicted()),
             complete: plan.expected() == target,
             plan,
         }
@@ -279,21 +273,15 @@ async fn inject(
         .filter(|ready| ready.version == version)
         .unwrap_or_else(|| Prepared::new(proxy, version, &target(), &found));
     for round in 1..=ROUNDS {
-        let Prepared {
-            plan,
-            body,
-            answer,
-            complete,
-            ..
-        } = next;
+        let Prepared { plan, complete, .. } = next;
         manner.progress.set(InFlight::Whole);
-        let head = Head::default();
-        let raw = while_alive(proxy, connection.forward(&head, body)).await?;
+        let reply = connection.foretold(plan.request().clone(), plan.answer());
+        let raw = while_alive(proxy, reply).await?;
         manner.progress.take();
         examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
         // The reply is long, and everybody waits: it is decoded only if it differs from the
         // predicted one at all.
-        let verdict = match raw.body == answer {
+        let verdict = match raw.body == plan.answer() {
             true => Ok(()),
             false => plan.verify(&raw.decode()?),
         };
@@ -304,7 +292,7 @@ async fn inject(
             }
             proxy.stats.injections.count();
             // Thousands of small pieces, freed beside traffic.
-            tokio::task::spawn_blocking(move || drop((plan, answer)));
+            tokio::task::spawn_blocking(move || drop(plan));
             return Ok(());
         };
         examination.mismatches = mismatches.iter().map(ToString::to_string).collect();

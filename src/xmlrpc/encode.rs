@@ -23,10 +23,7 @@ const BASE64_LINE: usize = 57;
 /// reference, because a bare one would arrive as a line feed. Characters that XML does not have
 /// (they cannot come out of a decoded document) go as they are, and the other side refuses them.
 pub fn encode_call(call: &Call) -> Vec<u8> {
-    let mut writer = Writer::new(Form::Compact);
-    writer.raw("<?xml version=\"1.0\"?><methodCall><methodName>");
-    writer.escaped(&call.method);
-    writer.raw("</methodName><params>");
+    let mut writer = Writer::request(&call.method);
     for param in &call.params {
         writer.raw("<param>");
         writer.value(param);
@@ -42,32 +39,80 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
 /// A value that it cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes the
 /// fault that it answers then. Like there, a date's text is not escaped.
 pub fn encode_reply(reply: &Reply) -> Vec<u8> {
-    const OPEN: &str = "<?xml version='1.0'?>\n<methodResponse>\n";
-    let (code, text) = match reply {
+    match reply {
         Reply::Value(value) => {
-            let mut writer = Writer::new(Form::Python);
-            writer.raw(OPEN);
-            writer.raw("<params>\n<param>\n");
+            let mut writer = Writer::answer();
             writer.value(value);
-            writer.raw("</param>\n</params>\n</methodResponse>\n");
-            match writer.refusal {
-                None => return writer.out.into_bytes(),
-                Some(text) => (1, text),
-            }
+            writer.end_answer()
         }
-        Reply::Fault { code, text } => (*code, text.as_str()),
-    };
+        Reply::Fault { code, text } => encode_fault(*code, text),
+    }
+}
+
+/// Opens an answer.
+const ANSWER: &str = "<?xml version='1.0'?>\n<methodResponse>\n";
+
+fn encode_fault(code: i32, text: &str) -> Vec<u8> {
     let members = Value::Struct(Struct::from([
         ("faultCode".to_owned(), Value::Int(code)),
         ("faultString".to_owned(), Value::from(text)),
     ]));
     let mut writer = Writer::new(Form::Python);
-    writer.raw(OPEN);
+    writer.raw(ANSWER);
     writer.raw("<fault>\n");
     writer.value(&members);
     writer.raw("</fault>\n</methodResponse>\n");
     writer.out.into_bytes()
 }
+
+/// Room for a long text, beyond 32 MiB: what is larger the C library maps for itself, gives back when
+/// it is freed, and does not take as a hint to keep more of what is freed later. Pages that nobody
+/// writes to are none.
+const ROOM: usize = 33 << 20;
+
+/// A request or an answer whose only value is an array, written element by element: as text it takes
+/// a tenth of the memory that all of its values would take.
+pub struct ListWriter(Writer);
+
+impl ListWriter {
+    /// A request of `method`, as [`encode_call`] writes it.
+    pub fn request(method: &str) -> Self {
+        let mut writer = Writer::request(method);
+        writer.raw("<param>");
+        Self::open(writer)
+    }
+
+    /// An answer, as [`encode_reply`] writes it.
+    pub fn answer() -> Self {
+        Self::open(Writer::answer())
+    }
+
+    fn open(mut writer: Writer) -> Self {
+        writer.out.reserve(ROOM);
+        writer.line(OPEN_ARRAY);
+        Self(writer)
+    }
+
+    /// Writes the next element.
+    pub fn push(&mut self, element: &Value) {
+        self.0.value_at(element, 1);
+    }
+
+    /// The whole text.
+    pub fn finish(mut self) -> Vec<u8> {
+        self.0.line(CLOSE_ARRAY);
+        match self.0.form {
+            Form::Compact => {
+                self.0.raw("</param></params></methodCall>");
+                self.0.out.into_bytes()
+            }
+            Form::Python => self.0.end_answer(),
+        }
+    }
+}
+
+const OPEN_ARRAY: &str = "<value><array><data>";
+const CLOSE_ARRAY: &str = "</data></array></value>";
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Form {
@@ -97,6 +142,29 @@ impl Writer {
             form,
             out: String::new(),
             refusal: None,
+        }
+    }
+
+    fn request(method: &str) -> Self {
+        let mut writer = Self::new(Form::Compact);
+        writer.raw("<?xml version=\"1.0\"?><methodCall><methodName>");
+        writer.escaped(method);
+        writer.raw("</methodName><params>");
+        writer
+    }
+
+    fn answer() -> Self {
+        let mut writer = Self::new(Form::Python);
+        writer.raw(ANSWER);
+        writer.raw("<params>\n<param>\n");
+        writer
+    }
+
+    fn end_answer(mut self) -> Vec<u8> {
+        self.raw("</param>\n</params>\n</methodResponse>\n");
+        match self.refusal {
+            None => self.out.into_bytes(),
+            Some(text) => encode_fault(1, text),
         }
     }
 
@@ -136,21 +204,25 @@ impl Writer {
         self.line("></value>");
     }
 
-    /// One value, of any depth and without recursion.
     fn value(&mut self, value: &Value) {
+        self.value_at(value, 0);
+    }
+
+    /// One value inside `outer` arrays, of any depth and without recursion.
+    fn value_at(&mut self, value: &Value, outer: usize) {
         let mut open: Vec<Open<'_>> = Vec::new();
         let mut next = Some(value);
         loop {
             if let Some(value) = next.take() {
                 if self.form == Form::Python && self.refusal.is_none() {
-                    self.refusal = refusal(value, open.len());
+                    self.refusal = refusal(value, outer + open.len());
                 }
                 if self.refusal.is_some() {
                     return;
                 }
                 match value {
                     Value::Array(elements) => {
-                        self.line("<value><array><data>");
+                        self.line(OPEN_ARRAY);
                         open.push(Open::Array(elements.iter()));
                     }
                     Value::Struct(members) => {
@@ -168,7 +240,7 @@ impl Writer {
                 Some(Open::Array(elements)) => {
                     next = elements.next();
                     if next.is_none() {
-                        self.line("</data></array></value>");
+                        self.line(CLOSE_ARRAY);
                         open.pop();
                     }
                 }

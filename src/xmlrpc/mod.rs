@@ -11,6 +11,6 @@ mod tests;
 mod value;
 
 pub use decode::{MAX_DEPTH, decode_call, decode_reply};
-pub use encode::{encode_call, encode_reply};
+pub use encode::{ListWriter, encode_call, encode_reply};
 pub use error::DecodeError;
 pub use value::{Call, Reply, Struct, Value};

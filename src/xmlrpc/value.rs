@@ -144,13 +144,16 @@ impl Call {
 
     /// `system.multicall` of `calls`, in order.
     pub fn multicall(calls: impl IntoIterator<Item = Self>) -> Self {
-        let entries = calls.into_iter().map(|call| {
-            Value::Struct(Struct::from([
-                ("methodName".to_owned(), Value::String(call.method)),
-                ("params".to_owned(), Value::Array(call.params)),
-            ]))
-        });
+        let entries = calls.into_iter().map(Self::into_entry);
         Self::new("system.multicall", vec![Value::Array(entries.collect())])
+    }
+
+    /// This call as an entry of a multicall.
+    pub fn into_entry(self) -> Value {
+        Value::Struct(Struct::from([
+            ("methodName".to_owned(), Value::String(self.method)),
+            ("params".to_owned(), Value::Array(self.params)),
+        ]))
     }
 
     /// The well-formed entries of a multicall; nothing for any other call.

@@ -1,7 +1,7 @@
 //! The model against a bare rosmaster.
 
 use rosrescue::master::{FirstLook, Mark, Master, NotAMaster, Notice, Plan, Skipped, difference};
-use rosrescue::xmlrpc::Call;
+use rosrescue::xmlrpc::{Call, decode_call};
 
 use crate::dice::{Cast, Dice};
 use crate::nodes::Node;
@@ -105,10 +105,11 @@ fn succeed(
             .map_err(|why| format!("{call:?} {why}"))?;
     }
     let plan = Plan::new(&target, &stage.model, &Mark::new("test"));
-    let reply = stage.wires[0].call(plan.call())?;
+    let call = decode_call(plan.request()).map_err(|error| error.to_string())?;
+    let reply = stage.wires[0].call(&call)?;
     plan.verify(&reply)
         .map_err(|mismatches| format!("the injection: {mismatches:?}"))?;
-    let notices = stage.model.clone().apply(plan.call()).notices;
+    let notices = stage.model.clone().apply(&call).notices;
     let is_complete = |notice: &Notice| match notice {
         Notice::PublisherUpdate {
             topic, publishers, ..

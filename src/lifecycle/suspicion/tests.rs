@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::{
     master::{Careful, Mark, Master, Plan},
-    xmlrpc::{Struct, Value},
+    xmlrpc::{Struct, Value, decode_call},
 };
 
 /// What a master counts.
@@ -121,11 +121,8 @@ fn live(suspicion: &Suspicion, target: &Master, sickness: &Sickness, number: usi
     }
     let Some(trial) = suspicion.trial() else {
         let plan = Plan::new(target, &Master::default(), &mark);
-        for entry in plan.call().params[0].as_array().unwrap() {
-            let entry = entry.as_struct().unwrap();
-            let name = entry["methodName"].as_str().unwrap();
-            let params = entry["params"].as_array().unwrap().to_vec();
-            if !life.survives(&Call::new(name, params)) {
+        for entry in decode_call(plan.request()).unwrap().entries() {
+            if !life.survives(&entry) {
                 return Ended::Died(InFlight::Whole);
             }
         }
