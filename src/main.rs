@@ -64,7 +64,7 @@ fn main() -> ExitCode {
             .exit();
     }
     config.fit_into(raise_file_limit());
-    match serve(config, hostname) {
+    match run(config, hostname) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("rosrescue: {error}");
