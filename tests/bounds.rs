@@ -20,8 +20,8 @@ use std::time::{Duration, Instant};
 use flate2::{Compression, write::GzEncoder};
 use rustix::process::{Pid, Resource, Rlimit, Signal, prlimit};
 use support::{
-    Client, Mode, PATIENCE, Process, Rescue, Robot, Scratch, Setup, Wire, encode_call, eventually,
-    free_port, http_request, params, request, ros_command, signal,
+    Client, Mode, PATIENCE, Process, Rescue, Robot, Scratch, Setup, Wire, behind, encode_call,
+    eventually, free_port, http_request, params, request, ros_command, signal,
 };
 
 /// A value of `/proc/PID/status`, in MB.
@@ -188,15 +188,7 @@ fn core_with_files(scratch: &Scratch, limit: usize) -> Rescue {
     let setup = setup.wrapped(|own| {
         let mut shell = Command::new("sh");
         shell.args(["-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")]);
-        shell.arg(own.get_program()).args(own.get_args());
-        for (key, value) in own.get_envs() {
-            match value {
-                Some(value) => shell.env(key, value),
-                None => shell.env_remove(key),
-            };
-        }
-        shell.current_dir(scratch.path(""));
-        shell
+        behind(shell, own)
     });
     setup.start()
 }

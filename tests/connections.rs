@@ -295,23 +295,3 @@ fn ipv6_on_both_sides() {
     Client::at("[::1]", listen).set_param("/from", "one address");
     assert_eq!(bare.param("/from"), Some("one address".into()));
 }
-
-#[test]
-fn core_serves_ipv4_and_ipv6_where_ros_does_not_say_loopback() {
-    let scratch = Scratch::new();
-    let port = free_port();
-    let rescue = Setup::bare(&scratch, ["core", "-p", &port.to_string()])
-        .env("ROS_IP", "")
-        .env("ROS_HOSTNAME", "localhost")
-        .at_port(port)
-        .start();
-    rescue.client().set_param("/host", "v4");
-    assert_eq!(
-        Client::at("localhost", port).param("/host"),
-        Some("v4".into())
-    );
-    assert_eq!(
-        rescue.client().ok("getUri", params!["/c"]),
-        Value::from(format!("http://localhost:{port}/"))
-    );
-}

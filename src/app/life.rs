@@ -6,11 +6,12 @@ use std::{
     time::Duration,
 };
 
-use tokio::{net::lookup_host, task::JoinSet, time::timeout};
+use tokio::{task::JoinSet, time::timeout};
 
 use crate::{
     master::{CALLER_ID, Master},
     recovery::node::{self, Sign},
+    resolver,
     ros_env::MasterUri,
     xmlrpc::Call,
 };
@@ -44,8 +45,8 @@ async fn is_elsewhere(api: &str) -> bool {
     let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
         return false;
     };
-    match timeout(LIFE_SIGN, lookup_host((host, port))).await {
-        Ok(Ok(mut addresses)) => !addresses.any(|address| is_own(address.ip())),
+    match timeout(LIFE_SIGN, resolver::addresses(&host, port)).await {
+        Ok(Ok(addresses)) => !addresses.iter().any(|address| is_own(address.ip())),
         _ => false,
     }
 }

@@ -14,6 +14,8 @@ use tokio::{
     time::{Instant, timeout, timeout_at},
 };
 
+use crate::xmlrpc::Value;
+
 /// Larger bodies, in bytes, need room in memory and are decoded outside the runtime's threads: so much
 /// takes some 0.3 ms.
 pub const SMALL: usize = 64 << 10;
@@ -170,6 +172,23 @@ pub async fn unpack(
     Ok(unpacked.await.map(Bytes::from))
 }
 
+/// Takes room for what a large body says when it is taken apart: of short values that is many times
+/// their text.
+pub async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
+    const OPEN: &[u8] = b"<value";
+    let searched = text.clone();
+    let count = move || {
+        Ok(searched
+            .windows(OPEN.len())
+            .filter(|it| *it == OPEN)
+            .count())
+    };
+    let values = in_a_thread(count).await.unwrap_or_default();
+    // A list that grows has room for twice what is in it.
+    let size = 2 * (text.len() + values * size_of::<Value>());
+    room.grow_in_time(size, text.len()).await
+}
+
 /// Does `work` beside the runtime's threads.
 async fn in_a_thread<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
@@ -210,6 +229,15 @@ mod tests {
             assert_eq!(unpack(bytes, limit, &mut room).await, Ok(None));
             assert_eq!(pool.available_permits(), 80 << 10);
         }
+    }
+
+    #[tokio::test]
+    async fn short_values_take_more_room_than_their_text() {
+        let pool = Semaphore::new(80 << 10);
+        let mut room = Room::of(&pool);
+        let text = Bytes::from("<value/>".repeat(100_000));
+        room_for_values(&text, &mut room).await.unwrap();
+        assert!(pool.available_permits() < (80 << 10) - 100 * 2 * size_of::<Value>());
     }
 
     /// Each has a part of the room and needs more than is left.

@@ -388,10 +388,10 @@ async fn decode(
     let Some(body) = body else {
         return Ok(None);
     };
-    let small = body.len() <= body::SMALL;
+    if body.len() <= body::SMALL {
+        return Ok(xmlrpc::decode_call(&body).ok());
+    }
+    body::room_for_values(&body, room).await?;
     let work = move || xmlrpc::decode_call(&body).ok();
-    Ok(match small {
-        true => work(),
-        false => tokio::task::spawn_blocking(work).await.ok().flatten(),
-    })
+    Ok(tokio::task::spawn_blocking(work).await.ok().flatten())
 }
