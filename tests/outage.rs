@@ -186,10 +186,11 @@ fn calls_in_the_gap_get_what_their_senders_need() {
     let setters: Vec<_> = (0..5)
         .map(|i| {
             let client = client.clone();
+            let before = robot.counter("parked");
             let waiting =
                 thread::spawn(move || client.status("setParam", params!["/test", "/last", i]));
             // Sent one after the other, so that there is an order.
-            thread::sleep(Duration::from_millis(50));
+            eventually("the call is parked", || robot.counter("parked") > before);
             waiting
         })
         .collect();

@@ -17,6 +17,8 @@ use super::rpc::Client;
 pub(crate) struct Heard {
     pub(crate) method: String,
     pub(crate) params: Vec<Value>,
+    /// rosrescue itself made the call: it names the master as the caller, as nodes expect.
+    pub(crate) from_rosrescue: bool,
 }
 
 #[derive(Debug, Default)]
@@ -47,15 +49,26 @@ impl FakeNode {
 
     /// Starts one at `port`, such as that of a node that has ended; 0 for any.
     pub(crate) fn start_at(name: &str, port: u16) -> Self {
+        Self::start_on(name, Ipv4Addr::LOCALHOST, port)
+    }
+
+    /// As [`Self::start_at`], on another address of this computer.
+    pub(crate) fn start_on(name: &str, address: Ipv4Addr, port: u16) -> Self {
         let inner = Arc::new(Inner::default());
         let state = Arc::clone(&inner);
-        let server = Server::start_at(port, move |stream| serve_node(&state, stream));
+        let server = Server::start_at(address, port, move |stream| serve_node(&state, stream));
         Self {
             name: name.to_owned(),
-            api: format!("http://127.0.0.1:{}/", server.port),
+            api: format!("http://{address}:{}/", server.port),
             inner,
             server,
         }
+    }
+
+    /// Registers under this host name from now on, which leads to the address on which it was started.
+    pub(crate) fn at_host(mut self, host: &str) -> Self {
+        self.api = format!("http://{host}:{}/", self.server.port);
+        self
     }
 
     pub(crate) fn port(&self) -> u16 {
@@ -75,6 +88,11 @@ impl FakeNode {
             .filter(|call| call.method == method)
             .map(|call| call.params.clone())
             .collect()
+    }
+
+    /// All that it was sent, as it came.
+    pub(crate) fn calls(&self) -> Vec<Heard> {
+        lock(&self.inner.heard).clone()
     }
 
     /// The publishers of every publisherUpdate for `topic`, as they came.
@@ -183,13 +201,15 @@ impl Drop for FakeNode {
 
 fn serve_node(inner: &Inner, stream: TcpStream) {
     let mut stream = BufReader::new(stream);
-    while let Some((_, body)) = read_request(&mut stream) {
+    while let Some((head, body)) = read_request(&mut stream) {
         let Ok(call) = xmlrpc::decode_call(&body) else {
             break;
         };
+        let head = head.to_ascii_lowercase();
         lock(&inner.heard).push(Heard {
             method: call.method.clone(),
             params: call.params,
+            from_rosrescue: head.contains("\nuser-agent: rosrescue/"),
         });
         let mut holding = lock(&inner.holding);
         while *holding {
@@ -302,6 +322,7 @@ fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String, Vec<u8>)> 
 /// A listener with a thread a connection; all connections end on drop.
 #[derive(Debug)]
 struct Server {
+    address: Ipv4Addr,
     port: u16,
     done: Arc<AtomicBool>,
     open: Arc<Mutex<Vec<TcpStream>>>,
@@ -310,11 +331,15 @@ struct Server {
 
 impl Server {
     fn start(serve: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
-        Self::start_at(0, serve)
+        Self::start_at(Ipv4Addr::LOCALHOST, 0, serve)
     }
 
-    fn start_at(port: u16, serve: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
-        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
+    fn start_at(
+        address: Ipv4Addr,
+        port: u16,
+        serve: impl Fn(TcpStream) + Send + Sync + 'static,
+    ) -> Self {
+        let listener = TcpListener::bind((address, port))
             .unwrap_or_else(|error| panic!("port {port}: {error}"));
         let port = listener.local_addr().unwrap().port();
         let done = Arc::new(AtomicBool::new(false));
@@ -343,6 +368,7 @@ impl Server {
             }
         });
         Self {
+            address,
             port,
             done,
             open,
@@ -354,7 +380,7 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.done.store(true, Ordering::SeqCst);
-        let _ = TcpStream::connect((Ipv4Addr::LOCALHOST, self.port));
+        let _ = TcpStream::connect((self.address, self.port));
         // From here on the port refuses.
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();

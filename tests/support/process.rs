@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
@@ -65,6 +65,7 @@ pub(crate) struct Process {
     child: Child,
     ended: Option<ExitStatus>,
     lines: Arc<Mutex<Vec<Line>>>,
+    readers: [JoinHandle<()>; 2],
 }
 
 impl Process {
@@ -79,13 +80,16 @@ impl Process {
             .unwrap_or_else(|error| panic!("cannot start {name} ({command:?}): {error}"));
         let lines = Arc::new(Mutex::new(Vec::new()));
         let start = Instant::now();
-        collect(child.stdout.take().unwrap(), Stream::Out, start, &lines);
-        collect(child.stderr.take().unwrap(), Stream::Err, start, &lines);
+        let readers = [
+            collect(child.stdout.take().unwrap(), Stream::Out, start, &lines),
+            collect(child.stderr.take().unwrap(), Stream::Err, start, &lines),
+        ];
         Self {
             name,
             child,
             ended: None,
             lines,
+            readers,
         }
     }
 
@@ -125,6 +129,16 @@ impl Process {
     pub(crate) fn wait(&mut self) -> ExitStatus {
         let what = format!("{} ends", self.name);
         eventually_some(&what, || self.exited())
+    }
+
+    /// The exit status once the process has ended by itself and all that it wrote has been read. Whoever
+    /// inherited its pipes must have ended too.
+    #[track_caller]
+    pub(crate) fn wait_output(&mut self) -> ExitStatus {
+        let status = self.wait();
+        let what = format!("the output of {} is whole", self.name);
+        eventually(&what, || self.readers.iter().all(JoinHandle::is_finished));
+        status
     }
 
     /// What it wrote to standard output so far, line by line.
@@ -216,7 +230,7 @@ fn collect(
     stream: Stream,
     start: Instant,
     lines: &Arc<Mutex<Vec<Line>>>,
-) {
+) -> JoinHandle<()> {
     let lines = Arc::clone(lines);
     thread::spawn(move || {
         let mut from = BufReader::new(from);
@@ -234,7 +248,7 @@ fn collect(
             });
             bytes.clear();
         }
-    });
+    })
 }
 
 /// `inner`, run by `outer`, which takes a command behind its own arguments.

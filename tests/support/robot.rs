@@ -1,6 +1,9 @@
 //! A robot's ROS with rosrescue in it, in either mode: what a test kills and brings back.
 
 use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -10,7 +13,7 @@ use super::node::{Library, Node};
 use super::patience::{PATIENCE, eventually, eventually_some};
 use super::process::{alive, signal};
 use super::rescue::{Rescue, Setup};
-use super::ros::Rosmaster;
+use super::ros::{NODES, Rosmaster, find_program};
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 use super::state::State;
@@ -32,6 +35,10 @@ pub(crate) struct Robot {
     pub(crate) rescue: Rescue,
     master: Option<Rosmaster>,
     master_port: u16,
+    /// The program and arguments of a proxy's master.
+    program: (PathBuf, Vec<String>),
+    /// While this file is there, a core's next master waits (`tests/nodes/waiting_rosmaster.py`).
+    away: Option<PathBuf>,
     pub(crate) scratch: Scratch,
 }
 
@@ -44,12 +51,52 @@ impl Robot {
     /// Starts one with more options for rosrescue.
     #[track_caller]
     pub(crate) fn start_with(mode: Mode, options: &[&str]) -> Self {
+        Self::begin(mode, options, find_program("rosmaster"), &[])
+    }
+
+    /// Starts one whose masters are `program` with `arguments`, in either mode.
+    #[track_caller]
+    pub(crate) fn start_under(mode: Mode, program: &str, arguments: &[&str]) -> Self {
+        Self::start_under_with(mode, program, arguments, &[])
+    }
+
+    /// As [`Self::start_under`], with more options for rosrescue.
+    #[track_caller]
+    pub(crate) fn start_under_with(
+        mode: Mode,
+        program: &str,
+        arguments: &[&str],
+        options: &[&str],
+    ) -> Self {
+        let program = Path::new(NODES).join(program);
+        match mode {
+            Mode::Core => {
+                let supervised = ["--rosmaster", program.to_str().unwrap()];
+                Self::start_with(mode, &[&supervised, arguments, options].concat())
+            }
+            Mode::Proxy => Self::begin(mode, options, program, arguments),
+        }
+    }
+
+    /// Starts one whose master, once it is killed, stays away until [`Self::revive_master`], also that
+    /// of a core.
+    #[track_caller]
+    pub(crate) fn start_for_outages(mode: Mode) -> Self {
+        let mut robot = Self::start_under(mode, "waiting_rosmaster.py", &[]);
+        robot.away = (mode == Mode::Core).then(|| robot.scratch.path("away"));
+        robot
+    }
+
+    #[track_caller]
+    fn begin(mode: Mode, options: &[&str], program: PathBuf, arguments: &[&str]) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
+        let arguments: Vec<_> = arguments.iter().map(|&word| word.to_owned()).collect();
+        let program = (program, arguments);
         let (master, setup) = match mode {
             Mode::Core => (None, Setup::core(&scratch, master_port)),
             Mode::Proxy => (
-                Some(Rosmaster::start_at(&scratch, master_port)),
+                Some(start_master(&scratch, master_port, &program)),
                 Setup::proxy(&scratch, master_port),
             ),
         };
@@ -59,6 +106,8 @@ impl Robot {
             rescue,
             master,
             master_port,
+            program,
+            away: None,
             scratch,
         };
         if mode == Mode::Core && !options.contains(&"--no-rosout") {
@@ -142,6 +191,9 @@ impl Robot {
     /// SIGKILL to the real master.
     #[track_caller]
     pub(crate) fn kill_master(&mut self) {
+        if let Some(away) = &self.away {
+            fs::write(away, "").unwrap();
+        }
         match &mut self.master {
             Some(master) => master.kill(),
             None => signal(self.master_pid(), Signal::KILL),
@@ -160,7 +212,11 @@ impl Robot {
     #[track_caller]
     pub(crate) fn revive_master(&mut self) {
         if self.mode == Mode::Proxy {
-            self.master = Some(Rosmaster::start_at(&self.scratch, self.master_port));
+            let master = start_master(&self.scratch, self.master_port, &self.program);
+            self.master = Some(master);
+        }
+        if let Some(away) = &self.away {
+            fs::remove_file(away).unwrap();
         }
     }
 
@@ -225,4 +281,19 @@ impl Robot {
             .map(|(pid, _)| pid)
             .collect()
     }
+}
+
+/// A proxy's master: `program` with its arguments.
+#[track_caller]
+fn start_master(
+    scratch: &Scratch,
+    port: u16,
+    (program, arguments): &(PathBuf, Vec<String>),
+) -> Rosmaster {
+    Rosmaster::start_with(scratch, port, |command| {
+        *command = Command::new(program);
+        scratch.prepare(command);
+        command.args(["--core", "-p", &port.to_string()]);
+        command.args(arguments);
+    })
 }

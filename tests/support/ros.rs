@@ -5,7 +5,6 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::OnceLock;
-use std::time::Duration;
 
 use rosrescue::xmlrpc::Value;
 
@@ -130,9 +129,7 @@ impl Tool {
     pub(crate) fn run(scratch: &Scratch, port: u16, name: &str, arguments: &[&str]) -> Self {
         let mut command = ros_command(scratch, find_program(name), port);
         let mut process = Process::start(format!("{name} {arguments:?}"), command.args(arguments));
-        let status = process.wait();
-        // The readers of the pipes may be a moment behind the end of the process.
-        std::thread::sleep(Duration::from_millis(50));
+        let status = process.wait_output();
         Self {
             status,
             stdout: process.stdout().join("\n"),
