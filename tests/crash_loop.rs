@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::Value;
 use support::{
-    Client, FakeNode, Rescue, SICK_ROSMASTER, Scratch, Setup, Sickness, State, eventually,
+    Client, FakeNode, Heard, Rescue, SICK_ROSMASTER, Scratch, Setup, Sickness, State, eventually,
     free_port, holds, http_request, page, params, signal, status, tree,
 };
 
@@ -130,6 +130,38 @@ impl Patient {
             .collect()
     }
 
+    /// How many calls each node has got, once all that was to be told has been told.
+    fn heard(&self) -> Vec<usize> {
+        let heard = || {
+            let nodes = self.nodes.iter();
+            nodes.map(|node| node.calls().len()).collect::<Vec<_>>()
+        };
+        eventually("what was still to be told has been told", || {
+            let before = heard();
+            holds(Duration::from_millis(500), || heard() == before)
+        });
+        heard()
+    }
+
+    /// Panics if a master has called a node since it had `heard` so much, or rosrescue has told a node
+    /// anything but how things are and were before.
+    #[track_caller]
+    fn assert_nobody_disturbed(&self, heard: &[usize]) {
+        for (node, heard) in self.nodes.iter().zip(heard) {
+            let calls = node.calls();
+            let (before, since) = calls.split_at(*heard);
+            let told: Vec<_> = since.iter().filter(|call| !is_question(call)).collect();
+            assert!(told.iter().all(|call| call.from_rosrescue), "{told:?}");
+            for call in told {
+                let mut earlier = before.iter().rev().filter(|it| it.method == call.method);
+                let earlier = earlier.find(|it| it.params[1] == call.params[1]);
+                let earlier = earlier.map(|it| &it.params);
+                // What nobody has told before is what `registerSubscriber` answered.
+                assert!(earlier.is_none_or(|it| *it == call.params), "{call:?}");
+            }
+        }
+    }
+
     /// The files of what was set aside.
     fn kept(&self) -> Vec<String> {
         let folder = self.rescue.checkpoint().parent().unwrap().to_owned();
@@ -139,6 +171,11 @@ impl Patient {
             .map(|file| fs::read_to_string(file.path()).unwrap())
             .collect()
     }
+}
+
+/// Whether it is what the census asks.
+fn is_question(call: &Heard) -> bool {
+    ["getPid", "getPublications", "getSubscriptions"].contains(&call.method.as_str())
 }
 
 #[test]
@@ -151,10 +188,11 @@ fn a_master_that_dies_at_once() {
     assert_eq!(patient.client().param("/robot/name"), Some("r2".into()));
     let setters: Vec<_> = (0..4)
         .map(|i| {
-            let client = patient.client();
+            let parked = || status(&patient.client())["counters"]["parked"].as_u64();
+            let (client, before) = (patient.client(), parked());
             let setter = thread::spawn(move || client.set_param("/last", i));
             // Sent one after the other, so that there is an order.
-            thread::sleep(Duration::from_millis(50));
+            eventually("the call is parked", || parked() > before);
             setter
         })
         .collect();
@@ -240,6 +278,7 @@ fn a_master_that_dies_only_when_it_is_given_the_state() {
 fn five_deaths_in_a_row_during_recovery() {
     for sickness in ["registration 7", "registration 14", "call 12", "call 21"] {
         let patient = Patient::new(&[]);
+        let heard = patient.heard();
         let call = {
             let client = patient.client();
             move || client.status("setParam", params!["/test", "/held", 1])
@@ -253,6 +292,7 @@ fn five_deaths_in_a_row_during_recovery() {
         patient.await_state(&patient.before, &format!("after five deaths ({sickness})"));
         assert_eq!(patient.sickness.deaths().len(), 5);
         assert_eq!(patient.set_aside(), Vec::<String>::new());
+        patient.assert_nobody_disturbed(&heard);
     }
 }
 
