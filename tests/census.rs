@@ -10,10 +10,13 @@
 
 mod support;
 
+use std::fs;
 use std::time::Duration;
 
+use rustix::process::Signal;
 use support::{
-    FakeNode, Library, Mode, Robot, State, eventually, eventually_some, holds, names, status,
+    Client, FakeNode, Library, Mode, Robot, State, encode_call, eventually, eventually_some, holds,
+    http_request, names, params, status,
 };
 
 /// Waits for the report of a recovery whose census is over, and checks what every report has.
@@ -213,6 +216,59 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
         now.is_ok_and(|now| now == before)
     }));
     drop((client, after));
+}
+
+/// The same with the node that is the reason: roscpp holds its list of subscriptions while it registers
+/// one, and whatever asks for that list holds its only thread for calls.
+#[test]
+fn a_roscpp_node_in_a_parked_registration_is_neither_dead_nor_suspect() {
+    let options = ["--hold", "40", "--census-timeout", "1500"];
+    let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let node = robot.node(Library::Roscpp, "late", &[]);
+    let before = robot.settled_state();
+    let (_, api) = before
+        .nodes
+        .iter()
+        .find(|(name, _)| name == "/late")
+        .unwrap();
+    let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
+    let itself = Client::new(port.parse().unwrap());
+    let answers = |method: &str| {
+        let body = http_request(&encode_call(method, params!["/test"]));
+        let mut wire = itself.connect().unwrap();
+        wire.set_patience(Duration::from_millis(500));
+        wire.send(&body).unwrap();
+        wire.response().is_ok()
+    };
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+    node.signal(Signal::USR1);
+    eventually("it cannot answer", || !answers("getSubscriptions"));
+    assert!(!answers("getPid"));
+    assert!(!node.said("done").contains(&"subscribe".to_owned()));
+    // When calls pass again, this one takes longer than a node has time to answer.
+    fs::write(robot.scratch.path("slow"), "3 registerSubscriber").unwrap();
+    robot.revive_master();
+    robot.await_recovery(dead);
+    report(&robot, "that the census is over", |report| {
+        report["master_pid"] != dead && report["census_ms"].is_number()
+    });
+    let last = status(&client)["last_recovery"].clone();
+    assert_eq!(names(&last["removed"]), Vec::<String>::new());
+    assert_eq!(names(&last["suspects"]), Vec::<String>::new());
+    assert!(answers("getPid"));
+    eventually("everything has got through", || {
+        let mut done = node.said("done");
+        done.sort();
+        done == ["offer", "publish", "read", "set", "subscribe"]
+    });
+    let state = robot.state();
+    assert_eq!(state.publishers_of("/late/published"), ["/late"]);
+    assert_eq!(state.subscribers_of("/late/subscribed"), ["/late"]);
+    assert_eq!(state.nodes, before.nodes);
 }
 
 /// A roscpp node that waits in a parked registration cannot answer: that is no death, and its call

@@ -11,6 +11,7 @@
 mod support;
 
 use std::fs;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -28,13 +29,17 @@ const PROBES: [&str; 6] = [
     "2",
 ];
 
-/// The values that a node was told of a parameter, as they came.
+/// The values that the master told a node of a parameter, as they came.
 fn told(node: &FakeNode, key: &str) -> Vec<i32> {
-    let updates = node.heard("paramUpdate");
-    let of_key = updates
-        .iter()
-        .filter(|call| call[1].as_str().map(|key| key.trim_end_matches('/')) == Some(key));
-    of_key.map(|call| call[2].as_int().unwrap()).collect()
+    let calls = node.calls().into_iter();
+    let updates = calls.filter(|call| call.method == "paramUpdate" && !call.from_rosrescue);
+    let of_key = updates.filter(|call| {
+        let told = call.params[1].as_str();
+        told.map(|key| key.trim_end_matches('/')) == Some(key)
+    });
+    of_key
+        .map(|call| call.params[2].as_int().unwrap())
+        .collect()
 }
 
 /// The gate shuts, the mirror answers, and what was under way or parked is done once when the same master
@@ -131,6 +136,124 @@ fn a_proxy_stands_in_for_a_hung_master_and_nothing_is_done_twice() {
     );
 }
 
+/// Ends what others do, after a panic too.
+struct Finish<'a>(&'a AtomicBool);
+
+impl Drop for Finish<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Many hangs, too short to be noticed or long enough, with writes under way all the time.
+#[test]
+fn ten_hangs_under_writes_lose_nothing_and_do_nothing_twice() {
+    let robot = Robot::start_with(Mode::Proxy, &PROBES);
+    let client = robot.client();
+    let pid = robot.master_pid();
+    let injections = robot.counter("injections");
+    let watcher = FakeNode::start("/watcher");
+    let keys = ["/first", "/second"];
+    for key in keys {
+        watcher.watch_param(&client, key);
+    }
+    let leaving = FakeNode::start("/leaving");
+    for round in 0..10 {
+        leaving.publish(&client, &format!("/leaving{round}"), "std_msgs/String");
+    }
+    let done = AtomicBool::new(false);
+    let seed = std::process::id();
+    println!("seed {seed}");
+    let (written, publisher, shut) = thread::scope(|scope| {
+        let finish = Finish(&done);
+        let writers = keys.map(|key| {
+            let (client, done) = (&client, &done);
+            scope.spawn(move || {
+                let mut number = 0;
+                while !done.load(Ordering::Relaxed) {
+                    number += 1;
+                    // Panics if it is answered with anything but success, or not at all.
+                    client.set_param(key, number);
+                    thread::sleep(Duration::from_millis(5));
+                }
+                number
+            })
+        });
+        let registering = scope.spawn(|| {
+            let node = FakeNode::start("/publisher");
+            let mut number = 0;
+            while !done.load(Ordering::Relaxed) {
+                number += 1;
+                // Each one for itself: what is lost is not made up for by the next.
+                let topic = format!("/topic{number}");
+                node.publish(&client, &topic, "std_msgs/String");
+                node.unpublish(&client, &topic);
+                thread::sleep(Duration::from_millis(20));
+            }
+            node.publish(&client, "/last", "std_msgs/String");
+            node
+        });
+        let mut dice = u64::from(seed);
+        let mut roll = |most: u64| {
+            dice = dice
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            (dice >> 33) % most
+        };
+        let mut shut = 0;
+        for round in 0..10 {
+            support::stop(pid);
+            // The faults themselves take a time, by dice. A master that hangs for a second is noticed.
+            let length = match round % 3 {
+                0 => 1800 + roll(800),
+                _ => 10 + roll(700),
+            };
+            thread::sleep(Duration::from_millis(length));
+            if !robot.is_open() {
+                shut += 1;
+                // Answered at once, by the mirror.
+                leaving.unpublish(&client, &format!("/leaving{round}"));
+            }
+            support::signal(pid, Signal::CONT);
+            robot.await_gate();
+            thread::sleep(Duration::from_millis(roll(200)));
+        }
+        println!("{shut} of 10 hangs were noticed");
+        assert!(shut >= 3, "{shut}");
+        drop(finish);
+        (
+            writers.map(|it| it.join().unwrap()),
+            registering.join().unwrap(),
+            shut,
+        )
+    });
+    assert_eq!(robot.master_pid(), pid, "the same master goes on");
+    assert_eq!(robot.counter("injections"), injections);
+    for (key, written) in keys.into_iter().zip(written) {
+        assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
+        eventually("the node is told of the last value", || {
+            told(&watcher, key).last() == Some(&written)
+        });
+        // Every value from the master once, in order.
+        let every: Vec<_> = (1..=written).collect();
+        assert_eq!(told(&watcher, key), every, "{key}");
+    }
+    let state = robot.state();
+    let mut publishers = state.publishers.clone();
+    publishers.retain(|(_, nodes)| nodes.contains(&publisher.name));
+    assert_eq!(
+        publishers,
+        [("/last".to_owned(), vec![publisher.name.clone()])]
+    );
+    let left = state.publishers.iter();
+    let left = left.filter(|(_, nodes)| nodes.contains(&leaving.name));
+    assert_eq!(left.count(), 10 - shut, "what was unregistered is back");
+    state.assert_same(&State::read(&client), "through rosrescue");
+    for node in [&watcher, &publisher, &leaving] {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+    }
+}
+
 /// What was unregistered while the master did not answer is unregistered in the master that goes on.
 #[test]
 fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
@@ -152,7 +275,9 @@ fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
         leaving.withdraw(&client, "/leaving/service");
         leaving
     });
-    holds(Duration::from_secs(3), || !unregistering.is_finished());
+    eventually("it is answered, or rosrescue knows of the hang", || {
+        unregistering.is_finished() || !robot.is_open()
+    });
     support::signal(pid, Signal::CONT);
     let _leaving = unregistering.join().unwrap();
     robot.await_gate();
@@ -221,7 +346,7 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
     talker.assert_no_link_lost();
 }
 
-/// Two seconds a call are no reason to end a master that is given three, and four seconds are.
+/// Up to two seconds a call are no reason to end a master that is given three, and twenty seconds are.
 #[test]
 fn a_slow_master_is_left_alone_below_the_threshold() {
     let program = format!("{NODES}/slow_rosmaster.py");
@@ -242,17 +367,22 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
     let pid = robot.master_pid();
     let slow = robot.scratch.path("slow");
 
-    fs::write(&slow, "2").unwrap();
-    let start = Instant::now();
-    for number in 1..=3 {
+    // The second one takes almost as long as a probe may, and the third longer than one may.
+    for (number, seconds) in (1..).zip(["0.3", "1.4", "2"]) {
+        fs::write(&slow, seconds).unwrap();
+        let start = Instant::now();
         client.set_param("/kept", number);
         assert_eq!(client.param("/kept"), Some(Value::Int(number)));
+        let delay = Duration::from_secs_f64(seconds.parse().unwrap());
+        assert!(
+            start.elapsed() >= delay * 2,
+            "it was not slow: {:?}",
+            start.elapsed()
+        );
+        // So many probes have met it.
+        let probes = Duration::from_millis(3500);
+        assert!(holds(probes, || robot.is_open()), "{seconds} s a call");
     }
-    assert!(
-        start.elapsed() > Duration::from_secs(11),
-        "it was not slow: {:?}",
-        start.elapsed()
-    );
     let ask = Instant::now();
     assert_eq!(client.master_pid(), Some(pid));
     assert!(

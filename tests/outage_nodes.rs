@@ -34,8 +34,17 @@ fn await_ready(nodes: &mut [Node]) {
 
 /// A node whose `getParam` fails goes on with its default, and a robot drives with the wrong gains.
 #[test]
-fn whoever_reads_notices_nothing() {
-    let mut robot = Robot::start(Mode::Proxy);
+fn whoever_reads_notices_nothing_in_proxy_mode() {
+    whoever_reads_notices_nothing(Mode::Proxy);
+}
+
+#[test]
+fn whoever_reads_notices_nothing_in_core_mode() {
+    whoever_reads_notices_nothing(Mode::Core);
+}
+
+fn whoever_reads_notices_nothing(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
     let client = robot.client();
     client.set_param("/gain", 7);
     let mut readers = spawn_both(&robot, "reader", "reader", &["/gain"]);
@@ -163,8 +172,17 @@ fn calls_get_through_after_twenty_seconds_without_a_master() {
 /// What a node says for itself when it starts waits for the master; a node that ends before that is not
 /// registered after its end.
 #[test]
-fn nodes_that_start_and_end_without_a_master_leave_nothing() {
-    let mut robot = Robot::start(Mode::Proxy);
+fn nodes_that_start_and_end_without_a_master_leave_nothing_in_proxy_mode() {
+    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Proxy);
+}
+
+#[test]
+fn nodes_that_start_and_end_without_a_master_leave_nothing_in_core_mode() {
+    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Core);
+}
+
+fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
     let mut leaving = spawn_both(&robot, "talker", "leaving", &[]);
     let mut staying = spawn_both(&robot, "listener", "staying", &[]);
     await_ready(&mut leaving);

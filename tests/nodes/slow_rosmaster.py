@@ -1,5 +1,6 @@
 #!/usr/bin/python3
-"""A rosmaster that takes its time for each call: so many seconds as the file `slow` in `ROS_HOME` says."""
+"""A rosmaster that takes its time for each call: so many seconds as the file `slow` in `ROS_HOME` says, or if
+that names a method too, for requests in which it occurs."""
 
 import os
 import time
@@ -10,14 +11,16 @@ import rosmaster
 _dispatch = SimpleXMLRPCDispatcher._marshaled_dispatch
 
 
-def slow_dispatch(self, *arguments, **options):
+def slow_dispatch(self, data, *arguments, **options):
     """Waits, then does what is to be done."""
     try:
         with open(os.path.join(os.environ["ROS_HOME"], "slow")) as seconds:
-            time.sleep(float(seconds.read() or 0))
+            seconds, *method = (seconds.read() or "0").split()
+        if not method or method[0].encode() in data:
+            time.sleep(float(seconds))
     except OSError:
         pass
-    return _dispatch(self, *arguments, **options)
+    return _dispatch(self, data, *arguments, **options)
 
 
 SimpleXMLRPCDispatcher._marshaled_dispatch = slow_dispatch

@@ -1,0 +1,301 @@
+//! Nodes that are registered under names of hosts: names that resolve slowly or not at all delay nobody, and
+//! a node is found where its name leads now.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::process::Command;
+use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use support::{
+    Client, FakeNode, Rescue, Scratch, Setup, State, behind, eventually, free_port, holds, names,
+    params, status,
+};
+
+/// By then a living subscriber knows a new publisher.
+const SOON: Duration = Duration::from_secs(1);
+
+/// The hosts that a name server knows.
+type Hosts = Arc<Mutex<BTreeMap<String, Ipv4Addr>>>;
+
+/// A name server at an address of its own.
+struct NameServer {
+    address: String,
+    hosts: Hosts,
+    socket: UdpSocket,
+}
+
+impl NameServer {
+    /// One that never answers.
+    fn silent() -> Self {
+        static COUNT: AtomicU8 = AtomicU8::new(53);
+        let (id, number) = (std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let address = format!("127.{}.{}.{number}", 64 + (id >> 8) % 128, id & 255);
+        let socket = UdpSocket::bind((address.as_str(), 53));
+        Self {
+            address,
+            hosts: Hosts::default(),
+            socket: socket.expect("root, and the port of name servers"),
+        }
+    }
+
+    /// One that answers for the hosts it knows, and that there are no others.
+    fn start() -> Self {
+        let this = Self::silent();
+        let (socket, hosts) = (this.socket.try_clone().unwrap(), this.hosts.clone());
+        thread::spawn(move || {
+            let mut packet = [0; 512];
+            while let Ok((length, from)) = socket.recv_from(&mut packet) {
+                let answer = answer(&packet[..length], &hosts.lock().unwrap());
+                let _ = socket.send_to(&answer, from);
+            }
+        });
+        this
+    }
+
+    fn set(&self, host: &str, address: Ipv4Addr) {
+        self.hosts.lock().unwrap().insert(host.to_owned(), address);
+    }
+
+    /// `rosrescue core` that asks this name server and no other, and so does its master: `unshare` gives them
+    /// a resolv.conf of their own.
+    fn core(&self, scratch: &Scratch, master_port: u16) -> Rescue {
+        let resolv = scratch.path("resolv.conf");
+        let text = format!("nameserver {}\noptions timeout:5\n", self.address);
+        std::fs::write(&resolv, text).unwrap();
+        let setup = Setup::core(scratch, master_port).wrapped(|own| {
+            let mut command = Command::new("unshare");
+            command
+                .args(["--mount", "sh", "-c"])
+                .arg(r#"mount --bind "$0" /etc/resolv.conf && exec "$@""#)
+                .arg(&resolv);
+            behind(command, own)
+        });
+        setup.start()
+    }
+}
+
+/// The answer to a question for an address; NXDOMAIN for a host that is not there.
+fn answer(question: &[u8], hosts: &BTreeMap<String, Ipv4Addr>) -> Vec<u8> {
+    let (mut host, mut at) = (Vec::new(), 12);
+    while question[at] != 0 {
+        let end = at + 1 + usize::from(question[at]);
+        host.push(String::from_utf8_lossy(&question[at + 1..end]).into_owned());
+        at = end;
+    }
+    let known = hosts.get(&host.join("."));
+    let wants_v4 = question[at + 1..at + 3] == [0, 1];
+    let address = known.filter(|_| wants_v4);
+    let code = if known.is_some() { 0 } else { 3 };
+    let mut answer = [&question[..2], &[0x81, 0x80 | code]].concat();
+    answer.extend([0, 1, 0, u8::from(address.is_some()), 0, 0, 0, 0]);
+    answer.extend(&question[12..at + 5]);
+    if let Some(address) = address {
+        // The name of the question, an IPv4 address of the Internet, not to be kept, of four bytes.
+        answer.extend([0xc0, 12, 0, 1, 0, 1, 0, 0, 0, 0, 0, 4]);
+        answer.extend(address.octets());
+    }
+    answer
+}
+
+fn kill_master(client: &Client) -> u32 {
+    let dead = client.master_pid().expect("a master");
+    support::signal(dead, rustix::process::Signal::KILL);
+    dead
+}
+
+/// Waits for the report of the recovery after the death of `dead`, with its census.
+fn report(client: &Client, dead: u32) -> serde_json::Value {
+    let mut last = serde_json::Value::Null;
+    eventually("the recovery is complete", || {
+        last = status(client)["last_recovery"].clone();
+        last["master_pid"] != dead && last["census_ms"].is_number()
+    });
+    last
+}
+
+#[test]
+fn names_that_resolve_slowly_delay_nobody() {
+    let scratch = Scratch::new();
+    let server = NameServer::silent();
+    let rescue = server.core(&scratch, free_port());
+    let client = rescue.client();
+    for i in 0..40 {
+        let (name, api) = (format!("/slow{i}"), format!("http://slow{i}.test:4711/"));
+        client.ok(
+            "registerSubscriber",
+            params![name.as_str(), "/chatter", "std_msgs/String", api],
+        );
+    }
+    let living = FakeNode::start("/living");
+    // By a name that the computer knows itself.
+    let api = format!("http://localhost:{}/", living.port());
+    living.claim_subscription("/chatter", "std_msgs/String");
+    client.ok(
+        "registerSubscriber",
+        params!["/living", "/chatter", "std_msgs/String", api],
+    );
+    let dead = client.master_pid().expect("a master");
+    support::signal(dead, rustix::process::Signal::KILL);
+    let start = Instant::now();
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let parked = start.elapsed();
+    eventually("the living subscriber is told", || {
+        living.updates("/chatter").last() == Some(&vec![publisher.api.clone()])
+    });
+    let told = start.elapsed() - parked;
+    println!("recovery and registration {parked:?}, told {told:?} later");
+    assert!(parked < Duration::from_secs(4), "{parked:?}");
+    assert!(told < SOON, "{told:?}");
+    // While the lookups are under way: calls pass, and so do new publishers.
+    for i in 0..50 {
+        let start = Instant::now();
+        client.set_param("/n", i);
+        assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    }
+    eventually("the slow ones are suspect, and only they", || {
+        names(&status(&client)["suspects"]).len() == 40
+    });
+    let second = FakeNode::start("/second");
+    let start = Instant::now();
+    second.publish(&client, "/chatter", "std_msgs/String");
+    eventually("the living subscriber is told of the second", || {
+        living
+            .updates("/chatter")
+            .last()
+            .is_some_and(|list| list.len() == 2)
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    assert_eq!(living.heard("shutdown").len(), 0);
+    // Nobody waits for a name server at the end either.
+    let mut rescue = rescue;
+    let start = Instant::now();
+    rescue.terminate();
+    assert!(
+        start.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        start.elapsed()
+    );
+}
+
+/// A name that does not exist may exist tomorrow: its node is suspect, and kept.
+#[test]
+fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
+    const COUNT: usize = 20;
+    let scratch = Scratch::new();
+    let server = NameServer::start();
+    let port = free_port();
+    let rescue = server.core(&scratch, port);
+    let client = rescue.client();
+    let nobody: Vec<_> = (0..COUNT)
+        .map(|i| FakeNode::start(&format!("/nobody{i}")).at_host(&format!("nobody{i}.test")))
+        .collect();
+    let living = FakeNode::start("/living");
+    for node in nobody.iter().chain([&living]) {
+        node.subscribe(&client, "/chatter", "std_msgs/String");
+    }
+    let dead = kill_master(&client);
+    let start = Instant::now();
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    assert!(
+        start.elapsed() < Duration::from_secs(4),
+        "{:?}",
+        start.elapsed()
+    );
+    let start = Instant::now();
+    let all = vec![publisher.api.clone()];
+    eventually("the living subscriber is told", || {
+        living.updates("/chatter").last() == Some(&all)
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    let report = report(&client, dead);
+    assert_eq!(names(&report["removed"]), Vec::<String>::new());
+    let mut suspects: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
+    suspects.sort();
+    assert_eq!(names(&report["suspects"]), suspects);
+    assert_eq!(names(&status(&client)["suspects"]), suspects);
+    let state = State::read(&Client::new(port));
+    assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
+
+    // The name that begins to exist leads to a node that is whole.
+    let found = &nobody[0];
+    assert!(found.calls().is_empty(), "{:?}", found.calls());
+    server.set("nobody0.test", Ipv4Addr::LOCALHOST);
+    eventually("it is found", || {
+        found.updates("/chatter").last() == Some(&all)
+    });
+    eventually("it is suspect no more, and the others are", || {
+        let suspects = names(&status(&client)["suspects"]);
+        suspects.len() == COUNT - 1 && !suspects.contains(&found.name)
+    });
+    for node in nobody.iter().chain([&living]) {
+        assert_eq!(node.heard("shutdown").len(), 0);
+    }
+}
+
+/// A node's host gets another address, and the node's address stays the same text.
+#[test]
+fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
+    let scratch = Scratch::new();
+    let server = NameServer::start();
+    let master_port = free_port();
+    let rescue = server.core(&scratch, master_port);
+    let client = rescue.client();
+    let port = free_port();
+    let host = |number: u8| Ipv4Addr::new(127, 0, 0, number);
+    let start = |number| FakeNode::start_on("/mover", host(number), port).at_host("mover.test");
+    let first = start(1);
+    server.set("mover.test", host(1));
+    first.subscribe(&client, "/chatter", "std_msgs/String");
+    let kept = || {
+        let state = State::read(&Client::new(master_port));
+        state.subscribers_of("/chatter") == ["/mover"]
+    };
+
+    // It moves during an outage. At the old address the port refuses: that would be death.
+    let second = start(2);
+    second.claim_subscription("/chatter", "std_msgs/String");
+    server.set("mover.test", host(2));
+    drop(first);
+    let dead = kill_master(&client);
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let recovered = report(&client, dead);
+    assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
+    assert_eq!(names(&recovered["suspects"]), Vec::<String>::new());
+    let all = vec![publisher.api.clone()];
+    eventually("it is told at the new address", || {
+        second.updates("/chatter").last() == Some(&all)
+    });
+    let asked = second.calls().into_iter().any(|call| call.from_rosrescue);
+    assert!(asked && kept());
+
+    // It moves while it is suspect.
+    second.hold();
+    let dead = kill_master(&client);
+    assert_eq!(names(&report(&client, dead)["suspects"]), ["/mover"]);
+    let third = start(3);
+    third.claim_subscription("/chatter", "std_msgs/String");
+    server.set("mover.test", host(3));
+    eventually("it is suspect no more", || {
+        names(&status(&client)["suspects"]).is_empty()
+    });
+    eventually("it is told all at the new address", || {
+        third.updates("/chatter").last() == Some(&all)
+    });
+    assert!(kept());
+    assert!(holds(SOON, || third.heard("shutdown").is_empty()));
+}
