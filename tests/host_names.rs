@@ -10,103 +10,21 @@
 
 mod support;
 
-use std::collections::BTreeMap;
-use std::net::{Ipv4Addr, UdpSocket};
-use std::process::Command;
-use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex};
-use std::thread;
+use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
 use support::{
-    Client, FakeNode, Rescue, Scratch, Setup, State, behind, eventually, free_port, holds, names,
-    params, status,
+    Client, FakeNode, NameServer, Rescue, Scratch, Setup, State, eventually, free_port, holds,
+    names, params, status,
 };
 
 /// By then a living subscriber knows a new publisher.
 const SOON: Duration = Duration::from_secs(1);
 
-/// The hosts that a name server knows.
-type Hosts = Arc<Mutex<BTreeMap<String, Ipv4Addr>>>;
-
-/// A name server at an address of its own.
-struct NameServer {
-    address: String,
-    hosts: Hosts,
-    socket: UdpSocket,
-}
-
-impl NameServer {
-    /// One that never answers.
-    fn silent() -> Self {
-        static COUNT: AtomicU8 = AtomicU8::new(53);
-        let (id, number) = (std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let address = format!("127.{}.{}.{number}", 64 + (id >> 8) % 128, id & 255);
-        let socket = UdpSocket::bind((address.as_str(), 53));
-        Self {
-            address,
-            hosts: Hosts::default(),
-            socket: socket.expect("root, and the port of name servers"),
-        }
-    }
-
-    /// One that answers for the hosts it knows, and that there are no others.
-    fn start() -> Self {
-        let this = Self::silent();
-        let (socket, hosts) = (this.socket.try_clone().unwrap(), this.hosts.clone());
-        thread::spawn(move || {
-            let mut packet = [0; 512];
-            while let Ok((length, from)) = socket.recv_from(&mut packet) {
-                let answer = answer(&packet[..length], &hosts.lock().unwrap());
-                let _ = socket.send_to(&answer, from);
-            }
-        });
-        this
-    }
-
-    fn set(&self, host: &str, address: Ipv4Addr) {
-        self.hosts.lock().unwrap().insert(host.to_owned(), address);
-    }
-
-    /// `rosrescue core` that asks this name server and no other, and so does its master: `unshare` gives them
-    /// a resolv.conf of their own.
-    fn core(&self, scratch: &Scratch, master_port: u16) -> Rescue {
-        let resolv = scratch.path("resolv.conf");
-        let text = format!("nameserver {}\noptions timeout:5\n", self.address);
-        std::fs::write(&resolv, text).unwrap();
-        let setup = Setup::core(scratch, master_port).wrapped(|own| {
-            let mut command = Command::new("unshare");
-            command
-                .args(["--mount", "sh", "-c"])
-                .arg(r#"mount --bind "$0" /etc/resolv.conf && exec "$@""#)
-                .arg(&resolv);
-            behind(command, own)
-        });
-        setup.start()
-    }
-}
-
-/// The answer to a question for an address; NXDOMAIN for a host that is not there.
-fn answer(question: &[u8], hosts: &BTreeMap<String, Ipv4Addr>) -> Vec<u8> {
-    let (mut host, mut at) = (Vec::new(), 12);
-    while question[at] != 0 {
-        let end = at + 1 + usize::from(question[at]);
-        host.push(String::from_utf8_lossy(&question[at + 1..end]).into_owned());
-        at = end;
-    }
-    let known = hosts.get(&host.join("."));
-    let wants_v4 = question[at + 1..at + 3] == [0, 1];
-    let address = known.filter(|_| wants_v4);
-    let code = if known.is_some() { 0 } else { 3 };
-    let mut answer = [&question[..2], &[0x81, 0x80 | code]].concat();
-    answer.extend([0, 1, 0, u8::from(address.is_some()), 0, 0, 0, 0]);
-    answer.extend(&question[12..at + 5]);
-    if let Some(address) = address {
-        // The name of the question, an IPv4 address of the Internet, not to be kept, of four bytes.
-        answer.extend([0xc0, 12, 0, 1, 0, 1, 0, 0, 0, 0, 0, 4]);
-        answer.extend(address.octets());
-    }
-    answer
+/// `rosrescue core` that asks `server` and no other, and so does its master.
+fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
+    let setup = Setup::core(scratch, master_port);
+    setup.wrapped(|own| server.serving(own)).start()
 }
 
 fn kill_master(client: &Client) -> u32 {
@@ -128,8 +46,8 @@ fn report(client: &Client, dead: u32) -> serde_json::Value {
 #[test]
 fn names_that_resolve_slowly_delay_nobody() {
     let scratch = Scratch::new();
-    let server = NameServer::silent();
-    let rescue = server.core(&scratch, free_port());
+    let server = NameServer::silent(&scratch);
+    let rescue = core(&server, &scratch, free_port());
     let client = rescue.client();
     for i in 0..40 {
         let (name, api) = (format!("/slow{i}"), format!("http://slow{i}.test:4711/"));
@@ -195,9 +113,9 @@ fn names_that_resolve_slowly_delay_nobody() {
 fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
     const COUNT: usize = 20;
     let scratch = Scratch::new();
-    let server = NameServer::start();
+    let server = NameServer::of_hosts(&scratch);
     let port = free_port();
-    let rescue = server.core(&scratch, port);
+    let rescue = core(&server, &scratch, port);
     let client = rescue.client();
     let nobody: Vec<_> = (0..COUNT)
         .map(|i| FakeNode::start(&format!("/nobody{i}")).at_host(&format!("nobody{i}.test")))
@@ -250,9 +168,9 @@ fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
 #[test]
 fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
     let scratch = Scratch::new();
-    let server = NameServer::start();
+    let server = NameServer::of_hosts(&scratch);
     let master_port = free_port();
-    let rescue = server.core(&scratch, master_port);
+    let rescue = core(&server, &scratch, master_port);
     let client = rescue.client();
     let port = free_port();
     let host = |number: u8| Ipv4Addr::new(127, 0, 0, number);

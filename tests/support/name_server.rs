@@ -1,5 +1,6 @@
-//! A name server that gives every name the same address, late or never, for single processes.
+//! A name server of a test's own, for single processes.
 
+use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::PathBuf;
 use std::process::Command;
@@ -8,76 +9,99 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use super::process::behind;
 use super::scratch::Scratch;
 
 /// A name server on a loopback address of its own. Needs root. Ends with the test's process.
 #[derive(Debug)]
 pub(crate) struct NameServer {
     resolv: PathBuf,
-    folder: PathBuf,
-    answer: Arc<Mutex<Option<(Ipv4Addr, Duration)>>>,
+    says: Arc<Mutex<Says>>,
+}
+
+/// What it says to a question.
+#[derive(Debug)]
+enum Says {
+    Nothing,
+    /// Every name is this one's, said after some time.
+    Always(Ipv4Addr, Duration),
+    /// There are these hosts and no others.
+    Hosts(BTreeMap<String, Ipv4Addr>),
 }
 
 impl NameServer {
     /// One that never answers.
     #[track_caller]
     pub(crate) fn silent(scratch: &Scratch) -> Self {
+        Self::start(scratch, Says::Nothing)
+    }
+
+    /// One that knows no host yet.
+    #[track_caller]
+    pub(crate) fn of_hosts(scratch: &Scratch) -> Self {
+        Self::start(scratch, Says::Hosts(BTreeMap::new()))
+    }
+
+    #[track_caller]
+    fn start(scratch: &Scratch, says: Says) -> Self {
         static COUNT: AtomicU8 = AtomicU8::new(0);
         let id = std::process::id();
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
-        let host = format!("127.{}.{}.{}", 64 + (id >> 8) % 128, id & 255, 153 + number);
+        let host = format!("127.{}.{}.{}", 64 + (id >> 8) % 128, id & 255, 53 + number);
         let socket = UdpSocket::bind((host.as_str(), 53));
         let socket = socket.expect("root, and the port of name servers");
         let resolv = scratch.path("resolv.conf");
         let text = format!("nameserver {host}\noptions timeout:5\n");
         std::fs::write(&resolv, text).unwrap();
-        let answer = Arc::default();
-        let says = Arc::clone(&answer);
-        thread::spawn(move || serve(&socket, &says));
-        Self {
+        let says = Arc::new(Mutex::new(says));
+        let this = Self {
             resolv,
-            folder: scratch.path(""),
-            answer,
-        }
+            says: says.clone(),
+        };
+        thread::spawn(move || serve(&socket, &says));
+        this
     }
 
     /// Every name is that of `address` from now on; it says so after `delay`.
     pub(crate) fn say(&self, address: Ipv4Addr, delay: Duration) {
-        *self.answer.lock().unwrap() = Some((address, delay));
+        *self.says.lock().unwrap() = Says::Always(address, delay);
     }
 
     /// It answers no more.
     pub(crate) fn fall_silent(&self) {
-        *self.answer.lock().unwrap() = None;
+        *self.says.lock().unwrap() = Says::Nothing;
+    }
+
+    /// The host is there from now on, or has moved.
+    pub(crate) fn set(&self, host: &str, address: Ipv4Addr) {
+        let mut says = self.says.lock().unwrap();
+        let Says::Hosts(hosts) = &mut *says else {
+            panic!("it knows no hosts");
+        };
+        hosts.insert(host.to_owned(), address);
     }
 
     /// `command`, to be run with this as its name server: `unshare` gives it a resolv.conf of its own.
     pub(crate) fn serving(&self, command: &Command) -> Command {
-        let mut serving = Command::new("unshare");
-        serving
+        let mut unshare = Command::new("unshare");
+        unshare
             .args(["--mount", "sh", "-c"])
             .arg(r#"mount --bind "$0" /etc/resolv.conf && exec "$@""#)
-            .arg(&self.resolv)
-            .arg(command.get_program())
-            .args(command.get_args())
-            .current_dir(&self.folder);
-        for (key, value) in command.get_envs() {
-            match value {
-                Some(value) => serving.env(key, value),
-                None => serving.env_remove(key),
-            };
-        }
-        serving
+            .arg(&self.resolv);
+        behind(unshare, command)
     }
 }
 
-fn serve(socket: &UdpSocket, says: &Mutex<Option<(Ipv4Addr, Duration)>>) {
+fn serve(socket: &UdpSocket, says: &Mutex<Says>) {
     let mut query = [0; 512];
     while let Ok((length, client)) = socket.recv_from(&mut query) {
-        let Some((address, delay)) = *says.lock().unwrap() else {
-            continue;
+        let query = &query[..length];
+        let (address, delay) = match &*says.lock().unwrap() {
+            Says::Nothing => continue,
+            Says::Always(address, delay) => (Some(*address), *delay),
+            Says::Hosts(hosts) => (hosts.get(&host(query)).copied(), Duration::ZERO),
         };
-        let reply = reply(&query[..length], address);
+        let reply = reply(query, address);
         let socket = socket.try_clone().unwrap();
         thread::spawn(move || {
             thread::sleep(delay);
@@ -86,16 +110,30 @@ fn serve(socket: &UdpSocket, says: &Mutex<Option<(Ipv4Addr, Duration)>>) {
     }
 }
 
-/// The reply to a query of one question: the address if it asks for one of IPv4, else none.
-fn reply(query: &[u8], address: Ipv4Addr) -> Vec<u8> {
+/// The host that a query of one question is about.
+fn host(query: &[u8]) -> String {
+    let (mut labels, mut at) = (Vec::new(), 12);
+    while query[at] != 0 {
+        let end = at + 1 + usize::from(query[at]);
+        labels.push(String::from_utf8_lossy(&query[at + 1..end]));
+        at = end;
+    }
+    labels.join(".")
+}
+
+/// The reply to a query of one question: the address if it asks for one of IPv4; NXDOMAIN if the host is
+/// not there.
+fn reply(query: &[u8], address: Option<Ipv4Addr>) -> Vec<u8> {
     let name = query[12..].iter().position(|&byte| byte == 0).unwrap();
     let question = &query[12..12 + name + 5];
-    let wanted = question[name + 1..] == [0, 1, 0, 1];
-    // Id, "a reply, recursion available, no error", counts, the question as it came.
+    let code = if address.is_some() { 0 } else { 3 };
+    let address = address.filter(|_| question[name + 1..] == [0, 1, 0, 1]);
+    // Id, "a reply, recursion available" with the code, counts, the question as it came.
     let mut reply = query[..2].to_vec();
-    reply.extend([0x81, 0x80, 0, 1, 0, u8::from(wanted), 0, 0, 0, 0]);
+    let count = u8::from(address.is_some());
+    reply.extend([0x81, 0x80 | code, 0, 1, 0, count, 0, 0, 0, 0]);
     reply.extend(question);
-    if wanted {
+    if let Some(address) = address {
         // The name of the question, type A, class IN, for no time at all, four bytes.
         reply.extend([0xc0, 12, 0, 1, 0, 1, 0, 0, 0, 0, 0, 4]);
         reply.extend(address.octets());
