@@ -18,13 +18,18 @@ pub struct Answered {
 impl Answered {
     /// How the answer of a mirror of that master to the same call compares. `live`: parameters may
     /// have been written later in the same request. The value that `subscribeParam` answers may then
-    /// hold them already, for rosmaster writes the dictionary itself, when all has been run.
+    /// hold them already, for rosmaster writes the dictionary itself, when all has been run; what could not
+    /// be written may have been replaced by then.
     pub fn compare(&self, mirror: &Reply, live: bool) -> Agreement {
         let same = match (&self.reply, mirror) {
-            (Reply::Value(Value::Array(master)), Reply::Value(Value::Array(mirror)))
+            (Reply::Value(Value::Array(master)), mirror)
                 if live && self.call.method == "subscribeParam" =>
             {
-                master.first() == mirror.first()
+                match mirror {
+                    Reply::Value(Value::Array(mirror)) => master.first() == mirror.first(),
+                    Reply::Fault { text, .. } => is_write_error(text) && self.executed,
+                    Reply::Value(_) => false,
+                }
             }
             (master, mirror) => master == mirror,
         };
@@ -268,6 +273,14 @@ mod tests {
             .remove(0);
         assert_eq!(of.compare(&answer(1), true), Agreement::Same);
         assert_eq!(of.compare(&answer(1), false), Agreement::Diverged);
+        // What could not have been written has been replaced.
+        let fault = |class: &str| Reply::Fault {
+            code: 1,
+            text: format!("<class '{class}'>:cannot marshal it"),
+        };
+        assert_eq!(of.compare(&fault("TypeError"), true), Agreement::Same);
+        assert_eq!(of.compare(&fault("TypeError"), false), Agreement::Diverged);
+        assert_eq!(of.compare(&fault("Exception"), true), Agreement::Diverged);
     }
 
     fn set(key: &str, value: impl Into<Value>) -> Call {
