@@ -57,6 +57,12 @@ const NO_METHODS: &[&str] = &[
     "",
     "getParam.x",
     "reg_manager",
+    "thread_pool",
+    "ps_lock",
+    "publishers",
+    "services",
+    "param_subscribers",
+    "param_server",
 ];
 
 impl Dice {
@@ -187,7 +193,9 @@ impl Dice {
                 "unregisterSubscriber"
             }
             51..=54 => {
-                let service_api = self.pick(&["rosrpc://h:1", "rosrpc://h:2"]).into();
+                let service_api = self
+                    .pick(&["rosrpc://h:1", "rosrpc://h:2", "http://h"])
+                    .into();
                 params.extend([self.odd(NAMES, ODD_NAMES), service_api]);
                 "unregisterService"
             }
@@ -216,7 +224,7 @@ impl Dice {
                 self.pick(&["lookupService", "getPublishedTopics"])
             }
             95 => {
-                params.push(self.pick(CALLERS).into());
+                params.push(self.odd(CALLERS, ODD_NAMES));
                 "lookupNode"
             }
             96..=98 => match self.pick(READS) {
