@@ -45,8 +45,9 @@ const STD: [&str; 13] = [
 ];
 
 /// The packages that the core may name: they work on values and bytes.
-const PURE: [&str; 7] = [
+const PURE: [&str; 8] = [
     "base64",
+    "bytes",
     "crc32c",
     "indexmap",
     "quick_xml",
