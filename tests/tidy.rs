@@ -28,7 +28,7 @@ const CORE: [&str; 6] = [
 ];
 
 /// What of the standard library the core may name: nothing that reaches the outside world.
-const STD: [&str; 13] = [
+const STD: [&str; 14] = [
     "borrow",
     "cmp",
     "collections",
@@ -41,6 +41,7 @@ const STD: [&str; 13] = [
     "ops",
     "slice",
     "str",
+    "sync",
     "time",
 ];
 
@@ -56,8 +57,8 @@ const PURE: [&str; 8] = [
     "thiserror",
 ];
 
-/// What reaches the outside world all the same: clocks and the standard streams.
-const OUTSIDE: [&str; 8] = [
+/// What reaches the outside world all the same, or another thread: clocks, the standard streams, locks.
+const OUTSIDE: [&str; 12] = [
     "::now(",
     ".elapsed(",
     "SystemTime",
@@ -66,6 +67,10 @@ const OUTSIDE: [&str; 8] = [
     "io::stderr",
     "print!(",
     "println!(",
+    "Mutex",
+    "RwLock",
+    "Condvar",
+    "mpsc",
 ];
 
 fn root() -> &'static Path {
