@@ -10,10 +10,11 @@ pub(crate) fn describe() -> String {
     let date = clock::wall_text(clock::wall_time());
     let date = date.split('T').next().unwrap_or_default();
     let uname = rustix::system::uname();
+    let release = uname.release().to_string_lossy();
     format!(
         "{}, {cores} cores, Linux {}, {}, rosmaster {}, {date}",
         processor(),
-        uname.release().to_string_lossy(),
+        release.split('-').next().unwrap_or_default(),
         said("/usr/bin/python3", &["--version"]),
         said("rosversion", &["rosmaster"]),
     )
