@@ -56,7 +56,7 @@ pub struct CoreArgs {
     #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]
     pub port: Option<u16>,
-    /// Print more: rosrescue's own log at level debug
+    /// Print more: rosrescue's own log at level debug, unless --log says otherwise
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
@@ -95,11 +95,11 @@ pub struct ProxyArgs {
     /// The real master, http://HOST:PORT
     #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
     pub master: String,
-    /// Address and port to serve, ADDR:PORT, :PORT or PORT [default: all addresses, port of
+    /// Address and port to serve, ADDR:PORT, ADDR, :PORT or PORT [default: all addresses, port of
     /// ROS_MASTER_URI, else 11311]
     #[arg(short, long, env = "ROSRESCUE_LISTEN", value_name = "ADDR:PORT")]
     pub listen: Option<String>,
-    /// Print more: rosrescue's own log at level debug
+    /// Print more: rosrescue's own log at level debug, unless --log says otherwise
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,

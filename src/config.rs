@@ -299,24 +299,27 @@ fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, UsageError> {
     }
 }
 
-/// `ADDR:PORT`, `:PORT`, `PORT` or nothing.
+/// `ADDR:PORT`, `ADDR`, `:PORT`, `PORT` or nothing.
 fn listen_addresses(given: Option<&str>, env: Lookup<'_>) -> Result<Vec<SocketAddr>, UsageError> {
-    const FORM: &str = "ADDR:PORT, :PORT or PORT, as in 127.0.0.1:11311";
-    let Some(text) = given else {
-        let port = ros_env::master_port(env).map_err(UsageError::MasterUri)?;
-        let addresses = ros_env::bind_addresses(env).into_iter();
-        return Ok(addresses
-            .map(|address| SocketAddr::new(address, port))
-            .collect());
-    };
-    let (address, port) = text.rsplit_once(':').unwrap_or(("", text));
-    let port = port.parse().map_err(|_| UsageError::Listen {
-        given: text.to_owned(),
-        form: FORM,
-    })?;
-    let addresses = match address {
-        "" => ros_env::bind_addresses(env),
-        _ => vec![parse_address(address, FORM)?],
+    const FORM: &str = "ADDR:PORT, ADDR, :PORT or PORT, as in 127.0.0.1:11311";
+    let usual_port = || ros_env::master_port(env).map_err(UsageError::MasterUri);
+    let usual_addresses = || ros_env::bind_addresses(env);
+    let (addresses, port) = match given.map(|text| (text, text.parse())) {
+        None => (usual_addresses(), usual_port()?),
+        // As `core` has it: both may read the same environment.
+        Some((_, Ok(address))) => (vec![address], usual_port()?),
+        Some((text, Err(_))) => {
+            let (address, port) = text.rsplit_once(':').unwrap_or(("", text));
+            let port = port.parse().map_err(|_| UsageError::Listen {
+                given: text.to_owned(),
+                form: FORM,
+            })?;
+            let addresses = match address {
+                "" => usual_addresses(),
+                _ => vec![parse_address(address, FORM)?],
+            };
+            (addresses, port)
+        }
     };
     Ok(addresses
         .into_iter()
@@ -364,6 +367,8 @@ mod tests {
             (":4000", "0.0.0.0:4000"),
             ("4000", "0.0.0.0:4000"),
             ("localhost:0", "127.0.0.1:0"),
+            ("127.0.0.3", "127.0.0.3:12345"),
+            ("::1", "[::1]:12345"),
         ] {
             let config = config(&["proxy", "--master", "http://m:1", "--listen", given]).unwrap();
             assert_eq!(config.listen.first().unwrap().to_string(), first, "{given}");

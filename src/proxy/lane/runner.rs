@@ -371,21 +371,17 @@ impl LaneRunner {
                 continue;
             }
             let registrants = item.registrants();
-            match &item.call {
-                Some(call)
-                    if item.kind == Kind::Unregister
-                        && busy.is_disjoint(&registrants)
-                        && let Some((reply, seq)) =
-                            proxy.shadow.unregister(Instant::now(), call) =>
-                {
-                    proxy.stats.stood_in.count();
-                    last = last.max(seq);
-                    answers.push((item, Answer::Made(reply)));
-                }
-                _ => {
-                    busy.extend(registrants);
-                    waiting.push_back(item);
-                }
+            if item.kind == Kind::Unregister
+                && busy.is_disjoint(&registrants)
+                && let Some(call) = &item.call
+                && let Some((reply, seq)) = proxy.shadow.unregister(Instant::now(), call)
+            {
+                proxy.stats.stood_in.count();
+                last = last.max(seq);
+                answers.push((item, Answer::Made(reply)));
+            } else {
+                busy.extend(registrants);
+                waiting.push_back(item);
             }
         }
         self.queue = waiting;
