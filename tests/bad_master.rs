@@ -223,12 +223,8 @@ fn garbage_from_the_master() {
     });
     assert_eq!(status(&client)["state"]["params"], 1);
     // Nobody has unpacked the bomb.
-    let memory = fs::read_to_string(format!("/proc/{}/status", poisoned.rescue.pid())).unwrap();
-    let most = memory.lines().find(|line| line.starts_with("VmHWM:"));
-    let most = most
-        .and_then(|line| line.split_whitespace().nth(1))
-        .unwrap();
-    assert!(most.parse::<u64>().unwrap() < 300 << 10, "{most} KiB");
+    let most = poisoned.rescue.kib("VmHWM");
+    assert!(most < 300 << 10, "{most} KiB");
 }
 
 /// Such as a master that is out of memory.

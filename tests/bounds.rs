@@ -24,14 +24,6 @@ use support::{
     eventually, free_port, http_request, params, request, ros_command, signal,
 };
 
-/// A value of `/proc/PID/status`, in MB.
-fn megabytes(process: &Process, name: &str) -> u64 {
-    let status = fs::read_to_string(format!("/proc/{}/status", process.pid())).unwrap();
-    let line = status.lines().find(|line| line.starts_with(name)).unwrap();
-    let kib: u64 = line.split_whitespace().nth(1).unwrap().parse().unwrap();
-    kib / 1000
-}
-
 /// Open file descriptors.
 fn files(process: &Process) -> usize {
     fs::read_dir(format!("/proc/{}/fd", process.pid()))
@@ -118,7 +110,7 @@ fn memory_for(robot: &Robot, request: &[u8], times: usize) -> u64 {
         }
         done.store(true, Ordering::Relaxed);
     });
-    megabytes(&robot.rescue, "VmHWM")
+    robot.rescue.kib("VmHWM") / 1000
 }
 
 #[test]
@@ -178,7 +170,7 @@ fn two_thousand_idle_connections_take_little_memory() {
     client.set_param("/x", 1);
     eventually("2,000 are left", || files(&robot.rescue) < 2050);
     assert!(files(&robot.rescue) > 2000);
-    let memory = megabytes(&robot.rescue, "VmRSS");
+    let memory = robot.rescue.kib("VmRSS") / 1000;
     assert!(memory < 64, "{memory} MB");
     drop(wires);
 }

@@ -97,6 +97,14 @@ impl Process {
         self.child.id()
     }
 
+    /// A value of its `/proc/PID/status` that is in KiB, such as `VmRSS`, and `VmHWM`, the most that it was.
+    #[track_caller]
+    pub(crate) fn kib(&self, name: &str) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
+        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    }
+
     pub(crate) fn signal(&self, which: Signal) {
         if self.ended.is_none() {
             signal(self.pid(), which);
