@@ -88,7 +88,6 @@ struct Below<'a> {
 impl Below<'_> {
     /// Finds what is in `members`, whose key is `key`, and leaves that as it is.
     fn find(&mut self, key: &mut String, members: &Struct) {
-        let length = key.len();
         for (name, value) in members {
             // As `ns_join` has it: such a name stands alone.
             let mut alone = String::new();
@@ -96,6 +95,7 @@ impl Below<'_> {
                 true => &mut alone,
                 false => &mut *key,
             };
+            let length = key.len();
             key.push_str(name);
             key.push('/');
             if key.len() <= self.longest

@@ -34,7 +34,7 @@ const ODD_KEYS: &[&str] = &[
     "/", "//", "~", "", "a b", "a:b/c", "~/a", "b~", "/é", "/a/~b", "/a//",
 ];
 const MEMBERS: &[&str] = &[
-    "a", "b", "c", "d", "x", "b/c", "/a", "", "~p", "é", "it's/c", "c/",
+    "a", "b", "c", "d", "x", "b/c", "/a", "", "~p", "é", "it's/c", "c/", "/€",
 ];
 const TYPES: &[&str] = &["a/B", "a/C", "*"];
 const ODD_TYPES: &[&str] = &["", "a", "a/b/C", "/", " / "];

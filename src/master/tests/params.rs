@@ -173,3 +173,16 @@ fn no_key_and_no_value_makes_the_tree_deeper_than_the_stack() {
         1
     );
 }
+
+/// `ns_join` lets such a name stand alone, whatever it is below.
+#[test]
+fn members_whose_names_begin_with_a_slash_may_have_any_characters() {
+    for name in ["/€", "~€", "/", "/€/€"] {
+        let members = tree([(name, tree([("€", 1.into())])), ("b", 2.into())]);
+        let mut master = Master::default();
+        master.apply(&call("subscribeParam", &["/n", "http://n:1/", "/a/b"]));
+        let reply = master.apply(&set("/a", members)).reply;
+        let (code, _, value) = answer(&mut master, &call("getParam", &["/n", "/a/b"]));
+        assert_eq!((code, value), (1, 2.into()), "{name}: {reply:?}");
+    }
+}
