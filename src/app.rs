@@ -35,7 +35,7 @@ use crate::{
     record::Session,
     recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
     ros_env::MasterUri,
-    session::{self, Decision, Evidence, Restore},
+    session::{self, Decision, Evidence, Rebuilt, Restore},
     store::{self, OpenError, Store},
     supervisor::{Rosmaster, SupervisorError},
 };
@@ -299,7 +299,12 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         for sentence in &loaded.damage {
             tracing::error!("checkpoint: {sentence}");
         }
-        let (mirror, session, trouble) = session::rebuild(loaded.checkpoint, loaded.records);
+        let Rebuilt {
+            mirror,
+            session,
+            trouble,
+            ..
+        } = session::rebuild(loaded.checkpoint, loaded.records);
         if let Some(trouble) = trouble {
             tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
         }
@@ -349,6 +354,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
             seq: open.seq(),
             session: session.clone(),
             snapshot: mirror.snapshot(),
+            pending: Vec::new(),
         };
         if let Err(error) = open.begin(&checkpoint) {
             tracing::error!(

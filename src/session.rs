@@ -5,6 +5,7 @@
 use crate::{
     master::Master,
     record::{Checkpoint, Entry, Record, Session},
+    xmlrpc::Call,
 };
 
 /// When a checkpoint is restored at start.
@@ -59,41 +60,109 @@ pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     }
 }
 
-/// The state that a checkpoint and the records after it make, and the session at its end. A
-/// snapshot that is no state of a master is left out, which the text says.
-pub fn rebuild(
-    checkpoint: Option<Checkpoint>,
-    records: Vec<Record>,
-) -> (Master, Option<Session>, Option<String>) {
-    let mut session = None;
-    let mut mirror = Master::default();
-    let mut trouble = None;
-    if let Some(Checkpoint {
-        session: of,
-        snapshot,
-        ..
-    }) = checkpoint
-    {
-        session = Some(of);
-        match Master::from_snapshot(snapshot) {
-            Ok(state) => mirror = state,
-            Err(error) => trouble = Some(error.to_string()),
+/// What a checkpoint and the records after it make.
+#[derive(Debug, Default)]
+pub struct Rebuilt {
+    /// The master's state.
+    pub mirror: Master,
+    /// The newest session.
+    pub session: Option<Session>,
+    /// The writes that have not reached the master yet, in order.
+    pub pending: Vec<Call>,
+    /// Why the snapshot was left out: it is no state of a master.
+    pub trouble: Option<String>,
+}
+
+/// Applies the records to the checkpoint.
+pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
+    let mut rebuilt = Rebuilt::default();
+    // Each with the number of its record; those of the snapshot with the snapshot's.
+    let mut pending: Vec<(u64, Call)> = Vec::new();
+    if let Some(checkpoint) = checkpoint {
+        let writes = checkpoint.pending.into_iter();
+        pending.extend(writes.map(|call| (checkpoint.seq, call)));
+        rebuilt.session = Some(checkpoint.session);
+        match Master::from_snapshot(checkpoint.snapshot) {
+            Ok(state) => rebuilt.mirror = state,
+            Err(error) => rebuilt.trouble = Some(error.to_string()),
         }
     }
-    for record in records {
-        match record.entry {
-            Entry::Call(call) => {
-                mirror.apply(&call);
+    let delivered = |session: &Option<Session>| session.as_ref().map_or(0, |it| it.delivered);
+    for Record { seq, entry } in records {
+        match entry {
+            Entry::Call {
+                call,
+                pending: waits,
+            } => {
+                rebuilt.mirror.apply(&call);
+                if waits {
+                    pending.push((seq, call));
+                }
             }
-            Entry::Session(of) => session = Some(of),
+            Entry::Session(session) => {
+                if session.delivered > delivered(&rebuilt.session) {
+                    pending.retain(|(seq, _)| *seq > session.delivered);
+                }
+                rebuilt.session = Some(session);
+            }
         }
     }
-    (mirror, session, trouble)
+    rebuilt.pending = pending.into_iter().map(|(_, call)| call).collect();
+    rebuilt
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn write(seq: u64, pending: bool) -> Record {
+        let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
+        let call = Call::new("setParam", params);
+        let entry = Entry::Call { call, pending };
+        Record { seq, entry }
+    }
+
+    fn delivered(seq: u64, delivered: u64) -> Record {
+        let entry = Entry::Session(Session {
+            delivered,
+            ..Session::default()
+        });
+        Record { seq, entry }
+    }
+
+    /// The numbers of the writes that wait, of those in a snapshot as of record 5 and in `records`.
+    fn waiting(records: &[Record]) -> Vec<String> {
+        let Entry::Call { call, .. } = write(4, true).entry else {
+            unreachable!()
+        };
+        let mut checkpoint = Checkpoint {
+            seq: 5,
+            pending: vec![call],
+            ..Checkpoint::default()
+        };
+        checkpoint.session.delivered = 3;
+        let rebuilt = rebuild(Some(checkpoint), records.to_vec());
+        let name = |call: &Call| call.params[1].as_str().unwrap().to_owned();
+        rebuilt.pending.iter().map(name).collect()
+    }
+
+    #[test]
+    fn writes_wait_until_they_were_delivered() {
+        let mut records = vec![write(6, false), write(7, true), write(8, true)];
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        // The session changed for another reason.
+        records.push(delivered(9, 3));
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        // That of the snapshot counts as of the snapshot.
+        records.push(delivered(10, 4));
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        records.push(delivered(11, 7));
+        assert_eq!(waiting(&records), ["/p8"]);
+        records.extend([write(12, true), delivered(13, 12)]);
+        assert_eq!(waiting(&records), [""; 0]);
+        records.push(write(14, true));
+        assert_eq!(waiting(&records), ["/p14"]);
+    }
 
     fn restores(policy: Restore, same_boot: bool, closed: bool, node_alive: bool) -> bool {
         let evidence = Evidence {

@@ -36,7 +36,7 @@ fn write_until_killed(path: &Path) -> ! {
             "setParam",
             vec!["/w".into(), "/n".into(), (next as i32).into()],
         );
-        let seq = store.append(&[Entry::Call(call)]).unwrap();
+        let seq = store.append(&[Entry::call(call)]).unwrap();
         writeln!(output, "recorded {seq}").unwrap();
     };
     loop {
@@ -101,7 +101,7 @@ fn what_was_said_to_be_recorded_survives_a_kill() {
             loaded.damage
         );
         let state = match loaded.records.last().map(|record| &record.entry) {
-            Some(Entry::Call(call)) => call.params[2].clone(),
+            Some(Entry::Call { call, .. }) => call.params[2].clone(),
             _ => loaded.checkpoint.unwrap().snapshot.params["n"].clone(),
         };
         assert_eq!(state, Value::from(store.seq() as i32));

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 
 use rosrescue::master::Master;
 use rosrescue::record::{self, Checkpoint, Entry, Record};
-use rosrescue::session::rebuild;
+use rosrescue::session::{Rebuilt, rebuild};
 use rosrescue::store::{Loaded, Storage, Store};
 use rosrescue::xmlrpc::Call;
 
@@ -98,7 +98,12 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         records,
         ..
     } = loaded;
-    let (mirror, session, _) = rebuild(checkpoint, records.clone());
+    let Rebuilt {
+        mirror,
+        session,
+        pending,
+        ..
+    } = rebuild(checkpoint, records);
     let snapshot = mirror.snapshot();
     assert_eq!(Master::from_snapshot(snapshot.clone()), Ok(mirror));
 
@@ -106,12 +111,19 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         seq: store.seq(),
         session: session.unwrap_or_default(),
         snapshot,
+        pending,
     };
     store
         .begin(&expected)
         .expect("what was loaded can be written");
     let call = Call::new("deleteParam", vec!["/n".into(), "/p".into()]);
-    let entries = [Entry::Call(call), Entry::Session(expected.session.clone())];
+    let entries = [
+        Entry::Call {
+            call,
+            pending: true,
+        },
+        Entry::Session(expected.session.clone()),
+    ];
     store.append(&entries).expect("records can follow it");
     drop(store);
 

@@ -186,7 +186,7 @@ impl Shadow {
                 }
             }
             if answered.executed {
-                entries.push(Entry::Call(answered.call));
+                entries.push(Entry::call(answered.call));
             }
         }
         if !entries.is_empty() {
@@ -209,7 +209,7 @@ impl Shadow {
     pub fn seed(&self, call: &Call) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, &self.news);
-        inner.append(&[Entry::Call(call.clone())]);
+        inner.append(&[Entry::call(call.clone())]);
     }
 
     /// Takes an unregistration while the gate is shut: records it, applies it, and answers as the
@@ -235,7 +235,7 @@ impl Shadow {
         let accepted: Vec<_> = accepted.map(|of| of.call).collect();
         let mut seq = None;
         if !idle {
-            let entries: Vec<_> = accepted.iter().cloned().map(Entry::Call).collect();
+            let entries: Vec<_> = accepted.iter().cloned().map(Entry::call).collect();
             seq = inner.append(&entries);
         }
         inner.owed.extend(accepted);
@@ -397,6 +397,7 @@ impl Inner {
             seq: self.store.as_ref().map_or(0, Store::seq),
             session: self.session.clone(),
             snapshot: self.mirror.snapshot(),
+            pending: Vec::new(),
         }
     }
 

@@ -13,6 +13,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         seq,
         session,
         snapshot,
+        pending,
     } = checkpoint;
     let mut out = Vec::with_capacity(64 * 1024);
     let out = &mut out;
@@ -61,6 +62,14 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
             names(out, ids);
         },
     );
+    if !pending.is_empty() {
+        out.extend_from_slice(b"pending:\n");
+        for call in pending {
+            out.extend_from_slice(b"- {");
+            write_call(out, call)?;
+            out.extend_from_slice(b"}\n");
+        }
+    }
     if snapshot.params.is_empty() {
         out.extend_from_slice(b"parameters: {}\n");
     } else {
@@ -121,8 +130,15 @@ fn names(out: &mut Vec<u8>, ids: &[String]) {
     out.push(b'\n');
 }
 
-fn session_members(session: &Session) -> [(&'static str, Value); 6] {
-    [
+fn write_call(out: &mut Vec<u8>, call: &Call) -> Result<(), EncodeError> {
+    out.extend_from_slice(b"call: ");
+    quoted(out, &call.method);
+    out.extend_from_slice(b", params: ");
+    flow_list(out, &call.params, |out, value| flow(out, value, 0))
+}
+
+fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
+    let mut members = vec![
         ("id", session.id.as_str().into()),
         ("boot_id", session.boot_id.as_str().into()),
         ("closed", session.closed.into()),
@@ -135,7 +151,19 @@ fn session_members(session: &Session) -> [(&'static str, Value); 6] {
                 .map_or(Value::Nil, Value::from),
         ),
         ("started", session.started.as_str().into()),
-    ]
+    ];
+    let counts = [
+        ("incarnation", session.incarnation),
+        ("delivered", session.delivered),
+    ];
+    // A count that is missing is read as 0.
+    let counts = counts.into_iter().filter(|(_, count)| *count > 0);
+    members.extend(counts.map(|(name, count)| (name, integer(count))));
+    members
+}
+
+fn integer(count: u64) -> Value {
+    i32::try_from(count).map_or_else(|_| Value::BigInt(count.to_string()), Value::Int)
 }
 
 /// A record's line without its check.
@@ -143,11 +171,12 @@ pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result
     out.extend_from_slice(b"- {seq: ");
     decimal(out, seq);
     match entry {
-        Entry::Call(call) => {
-            out.extend_from_slice(b", call: ");
-            quoted(out, &call.method);
-            out.extend_from_slice(b", params: ");
-            flow_list(out, &call.params, |out, value| flow(out, value, 0))?;
+        Entry::Call { call, pending } => {
+            out.extend_from_slice(b", ");
+            write_call(out, call)?;
+            if *pending {
+                out.extend_from_slice(b", pending: true");
+            }
         }
         Entry::Session(session) => {
             out.extend_from_slice(b", session: {");
@@ -172,7 +201,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         return Err("it is no mapping".to_owned());
     };
     let document = &mut document;
-    let seq = seq(document)?;
+    let seq = count(document, "seq")?.ok_or("`seq` is missing")?;
     let session = read_session(members(document, "session")?)?;
     let snapshot = Snapshot {
         nodes: entries(document, "nodes", |value| {
@@ -199,10 +228,19 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
         param_subscribers: entries(document, "param_subscribers", texts)?,
         params: members(document, "parameters")?,
     };
+    let pending = match document.swap_remove("pending") {
+        None => Vec::new(),
+        Some(Value::Array(calls)) => calls
+            .into_iter()
+            .map(|call| read_call(&mut structure(call).ok_or("`pending` has a malformed entry")?))
+            .collect::<Result<_, _>>()?,
+        Some(_) => return Err("`pending` is no list".to_owned()),
+    };
     Ok(Checkpoint {
         seq,
         session,
         snapshot,
+        pending,
     })
 }
 
@@ -218,9 +256,15 @@ pub(super) fn read_record(line: &str) -> Result<Entry, String> {
     if entry.contains_key("session") {
         return read_session(members(&mut entry, "session")?).map(Entry::Session);
     }
-    let method = text(&mut entry, "call")?;
-    match entry.shift_remove("params") {
-        Some(Value::Array(params)) => Ok(Entry::Call(Call { method, params })),
+    let pending = entry.get("pending") == Some(&Value::Bool(true));
+    let call = read_call(&mut entry)?;
+    Ok(Entry::Call { call, pending })
+}
+
+fn read_call(members: &mut Struct) -> Result<Call, String> {
+    let method = text(members, "call")?;
+    match members.shift_remove("params") {
+        Some(Value::Array(params)) => Ok(Call { method, params }),
         _ => Err("`params` is no list".to_owned()),
     }
 }
@@ -234,16 +278,22 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         mark: text(session, "mark")?,
         master_uri: session.shift_remove("master_uri").and_then(string),
         started: text(session, "started")?,
+        incarnation: count(session, "incarnation")?.unwrap_or(0),
+        delivered: count(session, "delivered")?.unwrap_or(0),
     })
 }
 
-fn seq(document: &Struct) -> Result<u64, String> {
-    match document.get("seq") {
+fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
+    let count = match members.get(key) {
+        None => return Ok(None),
         Some(Value::Int(number)) => u64::try_from(*number).ok(),
         Some(Value::BigInt(digits)) => frame::count(digits),
-        _ => None,
+        Some(_) => None,
+    };
+    match count {
+        Some(count) => Ok(Some(count)),
+        None => Err(format!("`{key}` is no count")),
     }
-    .ok_or_else(|| "`seq` is no number".to_owned())
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {

@@ -47,15 +47,33 @@ pub struct Session {
     pub master_uri: Option<String>,
     /// Wall clock time of the start as text, for people only.
     pub started: String,
+    /// Number of the master's incarnation, which its token bears.
+    pub incarnation: u64,
+    /// All pending writes up to this record have reached the master. A snapshot's pending writes
+    /// count as of the snapshot's last record.
+    pub delivered: u64,
 }
 
 /// What one record says.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Entry {
-    /// A mutating call that the master accepted.
-    Call(Call),
+    /// A write that was answered with success.
+    Call {
+        /// The write.
+        call: Call,
+        /// Whether the mirror answered it and no master had run it yet.
+        pending: bool,
+    },
     /// Replaces the session.
     Session(Session),
+}
+
+impl Entry {
+    /// A write that the master has run.
+    pub fn call(call: Call) -> Self {
+        let pending = false;
+        Self::Call { call, pending }
+    }
 }
 
 /// One line of the journal.
@@ -76,6 +94,8 @@ pub struct Checkpoint {
     pub session: Session,
     /// The master's state.
     pub snapshot: Snapshot,
+    /// Those of the writes in `snapshot` that no master has run yet, in order.
+    pub pending: Vec<Call>,
 }
 
 /// A checkpoint's text, and the stamp that its records must carry.
@@ -187,7 +207,7 @@ pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Enc
 pub fn encode_calls(comment: &str, calls: &[Call]) -> Result<Vec<u8>, EncodeError> {
     let mut text = format!("# {comment}\n").into_bytes();
     for (seq, call) in (1..).zip(calls) {
-        push_body(&mut text, seq, &Entry::Call(call.clone()))?;
+        push_body(&mut text, seq, &Entry::call(call.clone()))?;
         text.push(b'\n');
     }
     Ok(text)

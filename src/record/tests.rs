@@ -17,7 +17,7 @@ fn file() -> (Vec<u8>, Vec<usize>) {
         ];
         let record = Record {
             seq: seq as u64,
-            entry: Entry::Call(Call::new("setParam", params)),
+            entry: Entry::call(Call::new("setParam", params)),
         };
         bytes.extend(encode_record(&record, encoded.stamp).unwrap());
         starts.push(bytes.len());

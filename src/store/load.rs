@@ -34,7 +34,7 @@ impl Loaded {
             .rev()
             .find_map(|record| match &record.entry {
                 Entry::Session(session) => Some(session),
-                Entry::Call(_) => None,
+                Entry::Call { .. } => None,
             });
         later.or_else(|| Some(&self.checkpoint.as_ref()?.session))
     }

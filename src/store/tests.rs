@@ -72,7 +72,7 @@ impl Model {
 }
 
 fn entry(number: u64) -> Entry {
-    Entry::Call(Call::new("setParam", vec![number.to_string().into()]))
+    Entry::call(Call::new("setParam", vec![number.to_string().into()]))
 }
 
 /// The set of numbers, in order of their application.
@@ -84,7 +84,9 @@ fn state(loaded: &Loaded) -> Vec<u64> {
     let mut numbers: Vec<u64> = snapshot.map(|key| key.parse().unwrap()).collect();
     for record in &loaded.records {
         match &record.entry {
-            Entry::Call(call) => numbers.push(call.params[0].as_str().unwrap().parse().unwrap()),
+            Entry::Call { call, .. } => {
+                numbers.push(call.params[0].as_str().unwrap().parse().unwrap())
+            }
             Entry::Session(_) => {}
         }
     }

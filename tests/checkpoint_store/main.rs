@@ -14,7 +14,7 @@ use rosrescue::store::{OpenError, Store, StoreError};
 use rosrescue::xmlrpc::{Call, Value};
 
 fn entry(nth: i32) -> Entry {
-    Entry::Call(Call::new(
+    Entry::call(Call::new(
         "setParam",
         vec!["/n".into(), format!("/p{nth}").into(), nth.into()],
     ))

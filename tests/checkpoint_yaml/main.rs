@@ -28,6 +28,18 @@ fn in_struct(value: Value) -> Value {
     Value::Struct(Struct::from([("k".to_owned(), value)]))
 }
 
+/// A state with `value` as a parameter, which one that waits for the master has set.
+fn with_value(value: &Value) -> Checkpoint {
+    Checkpoint {
+        pending: vec![set_param(value), Call::new("deleteParam", vec![])],
+        ..with_params(Struct::from([("p".to_owned(), value.clone())]))
+    }
+}
+
+fn set_param(value: &Value) -> Call {
+    Call::new("setParam", vec!["/n".into(), "/p".into(), value.clone()])
+}
+
 fn with_params(params: Struct) -> Checkpoint {
     let ids = |ids: &[&str]| ids.iter().map(|id| (*id).to_owned()).collect::<Vec<_>>();
     Checkpoint {
@@ -39,6 +51,8 @@ fn with_params(params: Struct) -> Checkpoint {
             mark: "/rosrescue_mark".to_owned(),
             master_uri: Some("http://127.0.0.1:11312/".to_owned()),
             started: "2024-01-31 12:00:00".to_owned(),
+            incarnation: 3,
+            delivered: 4_999_999_999,
         },
         snapshot: Snapshot {
             nodes: IndexMap::from([
@@ -71,17 +85,18 @@ fn with_params(params: Struct) -> Checkpoint {
             param_subscribers: IndexMap::from([("/p/".to_owned(), ids(&["~"]))]),
             params,
         },
+        pending: Vec::new(),
     }
 }
 
-/// One file that holds `value` as a parameter and in a record.
+/// One file that holds `value` as a parameter and in a record, and both still to be delivered.
 fn file_with(value: &Value) -> Result<Vec<u8>, EncodeError> {
-    let checkpoint = with_params(Struct::from([("p".to_owned(), value.clone())]));
+    let checkpoint = with_value(value);
     let encoded = encode_checkpoint(&checkpoint, 3)?;
-    let entry = Entry::Call(Call::new(
-        "setParam",
-        vec!["/n".into(), "/p".into(), value.clone()],
-    ));
+    let entry = Entry::Call {
+        call: set_param(value),
+        pending: true,
+    };
     let mut file = encoded.bytes;
     file.extend(encode_record(
         &Record {
@@ -100,15 +115,14 @@ fn assert_round_trip(value: &Value) {
     let checkpoint = decoded
         .checkpoint
         .unwrap_or_else(|error| panic!("{error}\n{text}"));
-    assert_eq!(
-        checkpoint,
-        with_params(Struct::from([("p".to_owned(), value.clone())])),
-        "{text}"
-    );
+    assert_eq!(checkpoint, with_value(value), "{text}");
     let [
         Record {
             seq: 5_000_000_001,
-            entry: Entry::Call(call),
+            entry: Entry::Call {
+                call,
+                pending: true,
+            },
         },
     ] = decoded.records.as_slice()
     else {
@@ -134,11 +148,26 @@ fn every_character_comes_back() {
 }
 
 #[test]
+fn a_write_that_the_master_has_run_is_not_pending() {
+    let encoded = encode_checkpoint(&Checkpoint::default(), 1).unwrap();
+    let record = Record {
+        seq: 1,
+        entry: Entry::call(set_param(&1.into())),
+    };
+    let line = encode_record(&record, encoded.stamp).unwrap();
+    let file = [encoded.bytes, line].concat();
+    assert!(!String::from_utf8_lossy(&file).contains("pending"));
+    assert_eq!(decode(&file).unwrap().records, [record]);
+}
+
+#[test]
 fn a_session_record_comes_back() {
     let encoded = encode_checkpoint(&Checkpoint::default(), 1).unwrap();
     let session = Session {
         id: "x".to_owned(),
         master_uri: None,
+        incarnation: 2,
+        delivered: u64::MAX / 2,
         ..Session::default()
     };
     let record = Record {

@@ -35,8 +35,9 @@ for name in sys.stdin.read().split():
     with open(name, 'rb') as f: content = f.read()
     document = yaml.safe_load(content)
     assert list(yaml.safe_load_all(content)) == [document] or b'.nan' in content
-    journal = document['journal'] or []
-    print(show(document['parameters']), show(journal[0]['params'][2] if journal else None))
+    journal = document['journal']
+    assert journal[0]['pending'] is True
+    print(show(document['parameters']), show(document['pending'][0]['params'][2]), show(journal[0]['params'][2]))
 "#;
 
 fn hex(bytes: &[u8]) -> String {
@@ -111,7 +112,7 @@ fn assert_python_agrees(values: &[Value]) {
     assert_eq!(output.lines().count(), values.len());
     for (value, line) in values.iter().zip(output.lines()) {
         let value = shown(value);
-        assert_eq!(line, format!("{{str:70={value}}} {value}"));
+        assert_eq!(line, format!("{{str:70={value}}} {value} {value}"));
     }
 }
 
