@@ -11,26 +11,30 @@ use std::{
 
 use hyper::header::{HeaderValue, InvalidHeaderValue};
 use thiserror::Error;
-use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
+use tokio::{
+    net::TcpListener,
+    sync::{Notify, Semaphore},
+    task::JoinSet,
+};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
     admin::Board,
     clock,
     config::{Config, MasterConfig},
-    master::{Mark, Master},
+    master::Master,
     proxy::{
         Proxy,
         clients::Clients,
         gate,
         idle::Idle,
         keeper,
-        lane::{self, LaneRunner},
+        ledger::Ledger,
         listener::{self, ListenError},
         pool::Pool,
-        shadow::Shadow,
         stats::Stats,
         upstream::Upstream,
+        write_queue::{self, Worker},
     },
     record::Session,
     recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
@@ -38,6 +42,7 @@ use crate::{
     session::{self, Decision, Evidence, Rebuilt, Restore},
     store::{self, OpenError, Store},
     supervisor::{Rosmaster, SupervisorError},
+    xmlrpc::Call,
 };
 
 mod life;
@@ -78,6 +83,8 @@ pub enum RunError {
 struct Beginning {
     mirror: Master,
     session: Session,
+    /// Writes that the session's last master may not have run.
+    pending: Vec<Call>,
     store: Option<Store>,
     restored: bool,
     /// In words, for the person who started us.
@@ -130,14 +137,15 @@ pub async fn run(
     let port = last.map(|uri| uri.port);
     let process = supervised.map(|(_, rosmaster)| MasterProcess::new(rosmaster, port));
     let left = process.as_ref().is_some_and(MasterProcess::is_left);
-    let (gate_keeper, gate) = gate::gate();
-    let (lane, lane_runner) = lane::lane(config.max_parked);
+    let (gate_tx, gate) = gate::gate();
+    let (write_queue, worker) = write_queue::write_queue();
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     // Counted for as long as the process lives.
     let stats: &'static Stats = Box::leak(Box::default());
     let Beginning {
         mirror,
         session,
+        pending,
         store,
         restored,
         story,
@@ -146,9 +154,9 @@ pub async fn run(
         uri,
         names,
         looped: AtomicBool::new(false),
-        mark: Mark::new(&session.mark),
         gate,
-        lane,
+        slow: Notify::new(),
+        write_queue,
         pool: Pool::new(config.master_connections),
         upstream: Upstream::new(
             address,
@@ -157,7 +165,7 @@ pub async fn run(
             config.probing.count,
         ),
         instance,
-        shadow: Shadow::new(mirror, session, store, stats),
+        ledger: Ledger::new(mirror, session, pending, store, stats),
         clients: Clients::default(),
         idle: Idle::among(config.max_connections),
         bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
@@ -168,7 +176,7 @@ pub async fn run(
         config,
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
-    proxy.shadow.set_identity(pid, proxy.uri.clone());
+    proxy.ledger.set_identity(pid, proxy.uri.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
         if !left {
@@ -187,9 +195,12 @@ pub async fn run(
             halt.cancel();
         }
     });
-    let guard = Guard::new(proxy.clone(), gate_keeper, process, restored);
-    let process = serve(&proxy, listeners, lane_runner, guard, &halt, || {
-        let counts = proxy.shadow.with_mirror(Master::counts);
+    // A master of ours begins with nothing but what we give it; what an earlier one holds must be seen.
+    let known = restored || (process.is_some() && !left);
+    proxy.board.set_open(false);
+    let guard = Guard::new(proxy.clone(), gate_tx, process, known);
+    let process = serve(&proxy, listeners, worker, guard, &halt, || {
+        let counts = proxy.ledger.with_mirror(Master::counts);
         say(&format!("{story}: {counts}"));
         say("ROS Rescue enabled. Master is now fault tolerant!!");
     })
@@ -205,7 +216,7 @@ pub async fn run(
 async fn serve(
     proxy: &Arc<Proxy>,
     listeners: Vec<TcpListener>,
-    lane_runner: LaneRunner,
+    worker: Worker,
     guard: Guard,
     stop: &CancellationToken,
     announce: impl Fn(),
@@ -223,7 +234,7 @@ async fn serve(
             stop.clone(),
         ));
     }
-    tasks.spawn(lane_runner.run(proxy.clone()));
+    tasks.spawn(worker.run(proxy.clone()));
     tasks.spawn(keeper::keep(proxy.clone(), stop.clone()));
     tasks.spawn(nodes::watch(proxy.clone()));
     let mut guard = tokio::spawn(guard.run(stop.clone()));
@@ -261,9 +272,9 @@ async fn serve(
 async fn close(proxy: &Arc<Proxy>) {
     let proxy = proxy.clone();
     let closed = tokio::task::spawn_blocking(move || {
-        proxy.shadow.update_session(|session| session.closed = true);
+        proxy.ledger.update_session(|session| session.closed = true);
         proxy
-            .shadow
+            .ledger
             .with_store(|store, checkpoint| store.close(&checkpoint()))
     });
     match closed.await {
@@ -302,8 +313,8 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         let Rebuilt {
             mirror,
             session,
+            pending,
             trouble,
-            ..
         } = session::rebuild(loaded.checkpoint, loaded.records);
         if let Some(trouble) = trouble {
             tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
@@ -319,7 +330,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
                 story = format!("restored ({why})");
-                beginning = Some((mirror, session));
+                beginning = Some((mirror, session, pending));
             }
             Decision::Fresh(why) => {
                 // A master that a rosrescue left behind when it crashed is taken over.
@@ -340,7 +351,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
     }
     let restored = beginning.is_some();
-    let (mirror, mut session) = beginning.unwrap_or_default();
+    let (mirror, mut session, pending) = beginning.unwrap_or_default();
     if !restored || session.mark.is_empty() {
         session.master_uri = master_uri;
         session.id = kernel_id("/proc/sys/kernel/random/uuid");
@@ -354,7 +365,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
             seq: open.seq(),
             session: session.clone(),
             snapshot: mirror.snapshot(),
-            pending: Vec::new(),
+            pending: pending.clone(),
         };
         if let Err(error) = open.begin(&checkpoint) {
             tracing::error!(
@@ -367,6 +378,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
     Ok(Beginning {
         mirror,
         session,
+        pending,
         store,
         restored,
         story,

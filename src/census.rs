@@ -49,6 +49,12 @@ impl Claims {
         })
     }
 
+    /// Whether it has one of these topics that not every node has.
+    pub fn shares(&self, topics: &[String]) -> bool {
+        let mut own = self.all().filter(|topic| !COMMON.contains(topic));
+        own.any(|topic| topics.iter().any(|other| other == topic))
+    }
+
     fn all(&self) -> impl Iterator<Item = &str> {
         let both = self.publications.keys().chain(self.subscriptions.keys());
         both.map(String::as_str)

@@ -129,7 +129,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=60_000))]
     pub sync_interval: u64,
-    /// How long a call waits for the master to come back before its connection is closed, in seconds
+    /// How long a call that only a master can answer, because it is not in the Master API, waits for one
+    /// to come back before its connection is closed, in seconds
     #[arg(
         long,
         env = "ROSRESCUE_HOLD",
@@ -138,15 +139,6 @@ pub struct CommonArgs {
         default_value_t = 8.0
     )]
     pub hold: f64,
-    /// Number of calls that may wait for the master at the same time
-    #[arg(
-        long,
-        env = "ROSRESCUE_MAX_PARKED",
-        value_name = "COUNT",
-        default_value_t = 4096
-    )]
-    #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    pub max_parked: u32,
     /// Pause between two probes of the master, in milliseconds
     #[arg(
         long,
@@ -161,7 +153,7 @@ pub struct CommonArgs {
         long,
         env = "ROSRESCUE_PROBE_TIMEOUT",
         value_name = "MS",
-        default_value_t = 2000
+        default_value_t = 500
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub probe_timeout: u64,

@@ -88,10 +88,8 @@ pub struct Config {
     pub sync: Sync,
     /// Pause between two such times with [`Sync::Interval`].
     pub sync_interval: Duration,
-    /// How long a call may be parked.
+    /// How long a call that only a master can answer waits for one.
     pub hold: Duration,
-    /// How many calls may be parked.
-    pub max_parked: usize,
     /// When a master counts as hung.
     pub probing: Probing,
     /// How long the master may take to answer a probe.
@@ -230,7 +228,6 @@ impl Config {
             sync: args.sync,
             sync_interval: Duration::from_millis(args.sync_interval),
             hold: seconds("--hold", args.hold, 3600.0)?,
-            max_parked: usize_of(args.max_parked),
             probing: Probing {
                 interval,
                 count: args.probe_count,

@@ -8,10 +8,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-mod suspicion;
 mod words;
 
-pub use suspicion::{InFlight, Suspicion, Trial};
 pub use words::{Action, Cause, Input, Probing, Supervision};
 
 /// Deaths older than this no longer count towards a crash loop.
@@ -156,10 +154,17 @@ impl Lifecycle {
                 }
                 actions
             }
-            Input::ThreadEnded if self.phase != Phase::Serving => Vec::new(),
+            Input::ThreadEnded | Input::BatchLost | Input::Slow if self.phase != Phase::Serving => {
+                Vec::new()
+            }
+            // Not while one is under way.
+            Input::Slow => match self.timer.take_if(|(_, timer)| *timer == Timer::Probe) {
+                Some(_) => vec![Action::Probe],
+                None => Vec::new(),
+            },
             // Of a killed master the rest follows within milliseconds; if not, connecting shows that it
             // lives.
-            Input::ConnectionLost | Input::ThreadEnded => {
+            Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
                     Input::ThreadEnded => Cause::ThreadEnded,

@@ -9,13 +9,11 @@ use serde::Serialize;
 use tokio::sync::watch;
 
 use crate::{
+    clock,
     master::{Counts, Master},
-    proxy::{Proxy, clients::Client},
+    proxy::{Proxy, clients::Client, gate::State},
     recovery::{census::Census, report::Report},
 };
-
-/// Most records set aside that are named.
-const SET_ASIDE_MOST: usize = 1000;
 
 /// Where those who recover the master say how it goes.
 #[derive(Debug, Default)]
@@ -27,10 +25,11 @@ pub struct Board {
 #[derive(Debug, Default)]
 struct Inner {
     open: bool,
+    /// When the gate was shut, by the wall clock.
+    shut_at: Option<f64>,
     crash_loop: bool,
     deaths: u64,
     recoveries: u64,
-    set_aside: Vec<String>,
     report: Option<Report>,
 }
 
@@ -41,7 +40,10 @@ impl Board {
 
     /// The gate has been opened or shut.
     pub fn set_open(&self, open: bool) {
-        self.lock().open = open;
+        let mut inner = self.lock();
+        inner.open = open;
+        inner.shut_at = (!open).then(clock::wall_time);
+        drop(inner);
         if open {
             self.opened.send_replace(true);
         }
@@ -61,14 +63,6 @@ impl Board {
     /// So many masters have died.
     pub fn set_deaths(&self, deaths: u64) {
         self.lock().deaths = deaths;
-    }
-
-    /// A record has been set aside because each new master died of it.
-    pub fn add_set_aside(&self, record: String) {
-        let set_aside = &mut self.lock().set_aside;
-        if set_aside.len() < SET_ASIDE_MOST {
-            set_aside.push(record);
-        }
     }
 
     /// A master has been examined.
@@ -118,13 +112,16 @@ pub struct Status {
     pub master: String,
     /// Whether calls pass to it.
     pub open: bool,
+    /// Whether calls are answered, by it or by the mirror.
+    pub ready: bool,
+    /// Since when the mirror stands in for it: seconds since 1970 by the wall clock.
+    pub standing_in_since: Option<f64>,
+    /// Writes that the mirror has answered and the master has not run yet.
+    pub pending_writes: usize,
     /// Whether it dies again and again.
     pub crash_loop: bool,
     /// Masters that have died since the start.
     pub deaths: u64,
-    /// What was set aside since the start because each new master died of it; kept in files beside
-    /// the checkpoint.
-    pub set_aside: Vec<String>,
     /// The checkpoint file.
     pub checkpoint: String,
     /// Why the state is not recorded; none if all is well.
@@ -150,18 +147,23 @@ impl Status {
         let counters = counters
             .into_iter()
             .map(|(name, _, value)| (name.to_owned(), value.into()));
-        let unprotected = proxy.shadow.unprotected();
-        let state = proxy.shadow.with_mirror(Master::counts);
-        let suspects = proxy.nodes.suspects(&proxy.shadow);
+        let unprotected = proxy.ledger.unprotected();
+        let state = proxy.ledger.with_mirror(Master::counts);
+        let suspects = proxy.nodes.suspects(&proxy.ledger);
+        let pending_writes = proxy.ledger.pending();
+        let state_of_gate = proxy.gate.state();
+        let stands_in = matches!(state_of_gate, State::StandingIn | State::Injecting);
         let inner = proxy.board.lock();
         Self {
             version: env!("CARGO_PKG_VERSION"),
             uri: proxy.uri.clone(),
             master: proxy.upstream.address().to_string(),
             open: inner.open,
+            ready: state_of_gate != State::Unknown,
+            standing_in_since: inner.shut_at.filter(|_| stands_in),
+            pending_writes,
             crash_loop: inner.crash_loop,
             deaths: inner.deaths,
-            set_aside: inner.set_aside.clone(),
             checkpoint: proxy.config.checkpoint.display().to_string(),
             unprotected,
             state,
@@ -178,20 +180,21 @@ impl fmt::Display for Status {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "rosrescue {}", self.version)?;
         writeln!(f, "ROS_MASTER_URI  {}", self.uri)?;
-        let gate = if self.open {
-            "open"
-        } else {
-            "shut: the master is away"
+        let gate = match (self.standing_in_since, self.ready) {
+            (Some(since), _) => format!(
+                "away, standing in since {}, {} pending writes",
+                clock::wall_text(since),
+                self.pending_writes
+            ),
+            (None, true) => "calls pass".to_owned(),
+            (None, false) => "not seen yet, calls wait".to_owned(),
         };
-        writeln!(f, "master          {} (gate {gate})", self.master)?;
+        writeln!(f, "master          {} ({gate})", self.master)?;
         if self.crash_loop {
             writeln!(
                 f,
                 "                crash loop: the master dies again and again"
             )?;
-        }
-        if !self.set_aside.is_empty() {
-            writeln!(f, "set aside       {}", self.set_aside.join(", "))?;
         }
         let protection = self.unprotected.as_deref().map_or_else(
             || "protected".to_owned(),

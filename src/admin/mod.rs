@@ -6,7 +6,7 @@
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
 //! | `/metrics` | counters in Prometheus' text format |
 //! | `/live` | 200 while rosrescue runs |
-//! | `/ready` | 200 while the gate is open, else 503 |
+//! | `/ready` | 200 while calls are answered, by the master or by the mirror, else 503 |
 
 mod board;
 
@@ -41,11 +41,11 @@ pub fn page(proxy: &Proxy, path: &str) -> HttpReply {
             metrics(proxy, &status),
         ),
         "/live" => (StatusCode::OK, TEXT, "live\n".to_owned()),
-        "/ready" if status.open => (StatusCode::OK, TEXT, "ready\n".to_owned()),
+        "/ready" if status.ready => (StatusCode::OK, TEXT, "ready\n".to_owned()),
         "/ready" => (
             StatusCode::SERVICE_UNAVAILABLE,
             TEXT,
-            "the gate is shut\n".to_owned(),
+            "no master was ever seen: calls wait for one\n".to_owned(),
         ),
         _ => (
             StatusCode::NOT_FOUND,
@@ -83,6 +83,18 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
         flag(status.open),
     );
     add(
+        "standing_in",
+        "gauge",
+        "whether the mirror answers, because the master is away",
+        flag(status.standing_in_since.is_some()),
+    );
+    add(
+        "pending_writes",
+        "gauge",
+        "writes answered by the mirror that the master has not run yet",
+        status.pending_writes as f64,
+    );
+    add(
         "protected",
         "gauge",
         "whether the state is recorded",
@@ -105,12 +117,6 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
         "counter",
         "masters that have died",
         status.deaths as f64,
-    );
-    add(
-        "set_aside",
-        "gauge",
-        "records set aside because each new master died of them",
-        status.set_aside.len() as f64,
     );
     let counts = status.state;
     add("nodes", "gauge", "nodes registered", counts.nodes as f64);

@@ -39,6 +39,10 @@ pub enum Input {
     ConnectionLost,
     /// A thread of the master has ended, as all do when it is killed.
     ThreadEnded,
+    /// A batch of writes got no reply.
+    BatchLost,
+    /// The master has not answered a call for longer than it should take.
+    Slow,
     /// The master holds the whole state.
     Examined {
         /// It is not the incarnation that was served before.

@@ -1,9 +1,7 @@
 //! What sort of call a call is.
 
-use std::collections::BTreeSet;
-
-use super::api;
 use super::multicall::{self, Entry};
+use super::{api, names, python};
 use crate::xmlrpc::{Call, Value};
 
 /// What a call may do, by its method's name alone; for a multicall, by its entries.
@@ -91,29 +89,55 @@ fn kind_within(method: &str, params: &[Value], levels: usize) -> Kind {
     if entries.is_empty() { Kind::Read } else { kind }
 }
 
-/// The caller ids whose registrations this call may change; for a multicall, those of its entries,
-/// nested ones too. A call that only sets or deletes parameters touches nobody's.
-pub fn registrants(call: &Call) -> BTreeSet<String> {
-    let mut found = BTreeSet::new();
-    registrants_within(&call.method, &call.params, multicall::DEEPEST, &mut found);
+/// Whether the mirror may answer the call alone: it, and every entry of a multicall, is one of the
+/// Master API, well formed and no `shutdown`, so that the model answers it as any master does; and a
+/// master can be brought to what it leads to, which one cannot to a parameter that it could not return.
+pub fn is_answerable(call: &Call) -> bool {
+    is_answerable_within(&call.method, &call.params, multicall::DEEPEST)
+}
+
+fn is_answerable_within(method: &str, params: &[Value], levels: usize) -> bool {
+    if method != multicall::METHOD {
+        let known = api::method(method).is_some_and(|method| method.kind != Kind::Shutdown);
+        return known && (method != "setParam" || is_restorable(params));
+    }
+    let (Ok(entries), Some(levels)) = (multicall::entries(params), levels.checked_sub(1)) else {
+        return false;
+    };
+    entries.iter().all(|element| match Entry::new(element) {
+        Entry::Call { method, params } => is_answerable_within(method, &params, levels),
+        Entry::Refused(_) | Entry::Malformed(_) => false,
+    })
+}
+
+/// Whether a `setParam` with these parameters sets what a master can return.
+fn is_restorable(params: &[Value]) -> bool {
+    let [Value::String(caller_id), Value::String(key), value] = params else {
+        // It is refused.
+        return true;
+    };
+    let key = names::resolve(key, caller_id);
+    python::is_readable_at(names::parts(&key).count(), value)
+}
+
+/// The writes in `call`, taken out of multicalls, in order.
+pub fn writes(call: &Call) -> Vec<Call> {
+    let mut found = Vec::new();
+    collect_writes(&call.method, &call.params, multicall::DEEPEST, &mut found);
     found
 }
 
-fn registrants_within(method: &str, params: &[Value], levels: usize, found: &mut BTreeSet<String>) {
+fn collect_writes(method: &str, params: &[Value], levels: usize, found: &mut Vec<Call>) {
     if method != multicall::METHOD {
-        let registers = api::method(method).is_some_and(|method| method.kind.mutates())
-            && !matches!(method, "setParam" | "deleteParam");
-        if let Some(caller_id) = params.first().and_then(Value::as_str)
-            && registers
-        {
-            found.insert(caller_id.to_owned());
+        if api::method(method).is_some_and(|method| method.kind.mutates()) {
+            found.push(Call::new(method, params.to_vec()));
         }
         return;
     }
     if let (Ok(entries), Some(levels)) = (multicall::entries(params), levels.checked_sub(1)) {
         for element in entries.iter() {
             if let Entry::Call { method, params } = Entry::new(element) {
-                registrants_within(method, &params, levels, found);
+                collect_writes(method, &params, levels, found);
             }
         }
     }
@@ -146,17 +170,21 @@ mod tests {
     }
 
     #[test]
-    fn whose_registrations_a_call_may_change() {
-        let by = |method: &str, caller: &str| Call::new(method, vec![caller.into()]);
-        let of = |call: &Call| registrants(call).into_iter().collect::<Vec<_>>();
-        assert_eq!(of(&by("registerService", "/a")), ["/a"]);
-        assert_eq!(of(&by("subscribeParam", "/a")), ["/a"]);
-        for method in ["setParam", "deleteParam", "getSystemState", "nonsense"] {
-            assert!(of(&by(method, "/a")).is_empty(), "{method}");
+    fn what_only_a_master_could_know_is_told_apart() {
+        for method in ["registerService", "getPid", "unsubscribeParam"] {
+            assert!(is_answerable(&call(method)), "{method}");
         }
-        let inner = Call::multicall([by("unregisterPublisher", "/b"), by("setParam", "/c")]);
-        let outer = Call::multicall([inner, by("registerPublisher", "/a")]);
-        assert_eq!(of(&outer), ["/a", "/b"]);
+        for method in ["shutdown", "nonsense", "system.listMethods"] {
+            assert!(!is_answerable(&call(method)), "{method}");
+            let inner = Call::multicall([call("setParam"), call(method)]);
+            assert!(!is_answerable(&Call::multicall([inner])), "{method}");
+        }
+        let inner = Call::multicall([call("setParam"), call("getParam")]);
+        assert!(is_answerable(&Call::multicall([inner])));
+        let malformed = vec![Value::Array(vec![Value::Int(1)])];
+        assert!(!is_answerable(&Call::new(multicall::METHOD, malformed)));
+        let set = |value| Call::new("setParam", vec!["/n".into(), "/a".into(), value]);
+        assert!(is_answerable(&set(1.into())) && !is_answerable(&set(vec![Value::Nil].into())));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use indexmap::IndexMap;
 use thiserror::Error;
 
 use super::names::{self, CALLER_ID};
-use super::{Mark, Master, ServiceEntry, Snapshot, SnapshotNode};
+use super::{Bears, Master, ServiceEntry, Snapshot, SnapshotNode, Token};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// Why a reply to a look is not that of a master.
@@ -44,7 +44,7 @@ pub enum NotAMaster {
 #[derive(Clone, Debug)]
 pub struct FirstLook {
     pid: i32,
-    marked: bool,
+    bears: Bears,
     publishers: IndexMap<String, Vec<String>>,
     subscribers: IndexMap<String, Vec<String>>,
     /// Provider by service.
@@ -59,7 +59,7 @@ impl FirstLook {
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
-            marked: false,
+            bears: Bears::Nothing,
             publishers: IndexMap::new(),
             subscribers: IndexMap::new(),
             services: IndexMap::new(),
@@ -79,23 +79,24 @@ impl FirstLook {
         self
     }
 
-    /// The look itself: one multicall of `getPid`, `lookupNode` of the mark, `getSystemState`,
+    /// The look itself: one multicall of `getPid`, `lookupNode` of the token and its session, `getSystemState`,
     /// `getTopicTypes` and `getParam('/')`. Changes nothing.
-    pub fn call(mark: &Mark) -> Call {
+    pub fn call(token: &Token) -> Call {
         let params = Call::new("getParam", vec![CALLER_ID.into(), "/".into()]);
-        Call::multicall(Self::reads(mark).into_iter().chain([params]))
+        Call::multicall(Self::reads(token).into_iter().chain([params]))
     }
 
     /// The look at a master whose parameters cannot be read.
-    pub fn call_without_params(mark: &Mark) -> Call {
-        Call::multicall(Self::reads(mark))
+    pub fn call_without_params(token: &Token) -> Call {
+        Call::multicall(Self::reads(token))
     }
 
-    fn reads(mark: &Mark) -> [Call; 4] {
+    fn reads(token: &Token) -> [Call; 5] {
         let read = |method| Call::new(method, vec![CALLER_ID.into()]);
         [
             read("getPid"),
-            mark.lookup(),
+            token.lookup(),
+            token.lookup_session(),
             read("getSystemState"),
             read("getTopicTypes"),
         ]
@@ -109,10 +110,8 @@ impl FirstLook {
     /// look.
     pub fn decode(reply: &Reply) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
-        let (pid, mark, state, types, params) = match results {
-            [pid, mark, state, types] => (pid, mark, state, types, None),
-            [pid, mark, state, types, params] => (pid, mark, state, types, Some(params)),
-            _ => return Err(form("system.multicall")),
+        let [pid, token, session, state, types, params @ ..] = results else {
+            return Err(form("system.multicall"));
         };
         let success = |result, method| match answer(result) {
             Some((1, value)) => Ok(value),
@@ -121,7 +120,12 @@ impl FirstLook {
         let pid = success(pid, "getPid")?
             .as_int()
             .ok_or_else(|| form("getPid"))?;
-        let (code, _) = answer(mark).ok_or_else(|| form("lookupNode"))?;
+        let found = |result| Ok(answer(result).ok_or_else(|| form("lookupNode"))?.0 == 1);
+        let bears = match (found(token)?, found(session)?) {
+            (true, _) => Bears::Present,
+            (false, true) => Bears::Earlier,
+            (false, false) => Bears::Nothing,
+        };
         let state = success(state, "getSystemState")?.as_array();
         let Some([publishers, subscribers, services]) = state else {
             return Err(form("getSystemState"));
@@ -132,15 +136,15 @@ impl FirstLook {
             Ok((service, provider.ok_or_else(|| form("getSystemState"))?))
         });
         let params = match params {
-            None => None,
-            Some(params) => {
+            [] => None,
+            [params, ..] => {
                 let tree = success(params, "getParam")?.as_struct();
                 Some(tree.ok_or_else(|| form("getParam"))?.clone())
             }
         };
         Ok(Self {
             pid,
-            marked: code == 1,
+            bears,
             publishers: lists(publishers)?,
             subscribers: lists(subscribers)?,
             services: services.collect::<Result<_, NotAMaster>>()?,
@@ -155,9 +159,9 @@ impl FirstLook {
         self.pid
     }
 
-    /// Whether the master bears the mark asked for.
-    pub fn marked(&self) -> bool {
-        self.marked
+    /// Which token the master bears.
+    pub fn bears(&self) -> Bears {
+        self.bears
     }
 
     /// Whether the master holds nothing that a look can show.
@@ -175,7 +179,7 @@ impl FirstLook {
         let registered = shared.into_iter().flat_map(IndexMap::values).flatten();
         let seen = registered.chain(self.services.values()).map(String::as_str);
         let known = previous.nodes().map(|(caller_id, _)| caller_id);
-        let known = known.filter(|caller_id| !Mark::is_ours(caller_id));
+        let known = known.filter(|caller_id| !Token::is_ours(caller_id));
         let mut once = HashSet::new();
         seen.chain(known)
             .filter(|caller_id| once.insert(*caller_id))

@@ -369,7 +369,6 @@ fn pair(topic: &str, topic_type: &str) -> Value {
 
 fn notify_bumped(caller_id: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
     if let Some(to) = bumped {
-        let reason = format!("[{caller_id}] Reason: new node registered with same name");
-        notices.shutdown(&to, &reason);
+        notices.shutdown(&to, &super::tell::bump_reason(caller_id));
     }
 }

@@ -2,10 +2,10 @@
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`kind`] and [`accepted`]: what a call may do, and what of it a master has done.
-//! * [`Mark`], [`FirstLook`] and [`Salvage`]: recognising a master, and learning the state of an
+//! * [`Token`], [`FirstLook`] and [`Salvage`]: recognising a master, and learning the state of an
 //!   unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
-//! * [`Careful`]: the same entry by entry, for masters that die of it.
+//! * [`reconcile`]: what a master that was out of reach is to hold when it is reached again.
 //! * [`difference`]: what two states do not have in common, for people.
 //!
 //! Everything follows rosmaster 1.15.15 under Python 3.11, function by function; its quirks are
@@ -13,12 +13,10 @@
 
 mod accepted;
 mod api;
-mod careful;
 mod checks;
 mod difference;
 mod kind;
 mod look;
-mod mark;
 mod methods;
 mod multicall;
 mod names;
@@ -26,6 +24,7 @@ mod notice;
 mod params;
 mod plan;
 mod python;
+mod reconcile;
 mod registry;
 mod restore;
 mod salvage;
@@ -34,19 +33,20 @@ mod state;
 mod tell;
 #[cfg(test)]
 mod tests;
+mod token;
 mod updates;
 
 pub use accepted::{Accepted, Agreement, Answered, accepted, is_success};
 pub use api::Outcome;
-pub use careful::{Careful, Step, Told};
 pub use difference::difference;
-pub use kind::{Kind, kind, registrants};
+pub use kind::{Kind, is_answerable, kind, writes};
 pub use look::{FirstLook, NotAMaster};
-pub use mark::Mark;
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
 pub use plan::{Mismatch, Plan, Skipped};
+pub use reconcile::{Authority, reconcile};
 pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
-pub use tell::{is_plain_topic, registrant};
+pub use tell::{is_plain_topic, param_update, publisher_update, registrant, shutdown};
+pub use token::{Bears, Token};

@@ -5,14 +5,14 @@ use std::fmt;
 use bytes::Bytes;
 
 use super::look::lookup;
-use super::restore::Restore;
-use super::{CALLER_ID, Mark, Master, multicall, python};
+use super::restore::{self, Restore};
+use super::{CALLER_ID, Master, Token, multicall, python};
 use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};
 
 /// Most mismatches that are told apart.
 const MOST_MISMATCHES: usize = 20;
 
-/// One multicall that brings a master to a state, reads it back and leaves a mark.
+/// One multicall that brings a master to a state, reads it back and leaves a token.
 ///
 /// # Order
 ///
@@ -26,7 +26,7 @@ const MOST_MISMATCHES: usize = 20;
 /// 5. Reads of everything, for [`Plan::verify`]. Of addresses only those that the master had before:
 ///    a registration that was answered with success has the address that it was made with, and a
 ///    question for each would cost a tenth of the injection.
-/// 6. The mark: a master that bears it has been brought to the state as a whole.
+/// 6. The token: a master that bears it has been brought to the state as a whole.
 ///
 /// On an empty master no callback is sent at all, and every read is answered afterwards as it was
 /// before.
@@ -184,25 +184,54 @@ impl fmt::Display for Mismatch {
 }
 
 impl Plan {
-    /// The plan that brings a master that holds `found` to `target` and leaves `mark`.
+    /// The plan that brings a master that holds `found` to `target` and leaves `token`.
     ///
-    /// Marks that `target` or `found` hold themselves are not brought over.
-    pub fn new(target: &Master, found: &Master, mark: &Mark) -> Self {
+    /// Tokens that `target` or `found` hold themselves are not brought over.
+    pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
+        Self::write(target, found, None, token)
+    }
+
+    /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token
+    /// `before` by `token`: everything is taken out, subscribers first, and brought in anew. No node
+    /// is called back by it.
+    pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
+        Self::write(target, found, Some(before), token)
+    }
+
+    fn write(target: &Master, found: &Master, before: Option<&Token>, token: &Token) -> Self {
         let mut request = ListWriter::request(multicall::METHOD);
         let mut answer = ListWriter::answer();
         let mut write = |call: Call, predicted: Reply| {
             request.push(&call.into_entry());
             answer.push(&multicall::reply_entry(predicted));
         };
+        // Tokens are no part of the mirror. They subscribe to what is not set.
+        let aside = |call: Call| {
+            let predicted = Master::default().apply(&call).reply;
+            (call, predicted)
+        };
+        let mut emptied = None;
+        if let Some(before) = before {
+            let (call, predicted) = aside(before.remove());
+            write(call, predicted);
+            let mut model = found.clone();
+            for call in restore::removal(found, target) {
+                let predicted = model.apply(&call).reply;
+                write(call, predicted);
+            }
+            emptied = Some(model);
+        }
         let Restore {
             mut model, skipped, ..
-        } = Restore::run(target, found, &mut write);
+        } = Restore::run(target, emptied.as_ref().unwrap_or(found), &mut write);
         for call in reads(&model, found) {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
         }
-        // The mark is no part of the mirror. It subscribes to what is not set.
-        write(mark.call(), Master::default().apply(&mark.call()).reply);
+        for call in token.leave() {
+            let (call, predicted) = aside(call);
+            write(call, predicted);
+        }
         Self {
             request: request.finish().into(),
             answer: answer.finish().into(),
@@ -221,7 +250,7 @@ impl Plan {
         &self.answer
     }
 
-    /// What the master holds afterwards, the mark apart.
+    /// What the master holds afterwards, the token apart.
     pub fn expected(&self) -> &Master {
         &self.expected
     }
@@ -279,7 +308,7 @@ impl Plan {
 
 /// Reads that show everything a master in the target state can show, but for addresses that it was
 /// given in the same call.
-pub(super) fn reads(model: &Master, found: &Master) -> Vec<Call> {
+fn reads(model: &Master, found: &Master) -> Vec<Call> {
     let own = |method| Call::new(method, vec![CALLER_ID.into()]);
     let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
     // A single value that cannot be returned would fault the whole multicall.

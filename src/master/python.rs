@@ -239,6 +239,12 @@ pub(super) fn is_readable(value: &Value) -> bool {
     is_returnable(value, DEEPEST_NAMESPACE)
 }
 
+/// Whether a multicall can return the whole tree with `value` at a key of so many `names`.
+pub(super) fn is_readable_at(names: usize, value: &Value) -> bool {
+    let levels = DEEPEST_NAMESPACE.checked_sub(names.saturating_sub(1));
+    levels.is_some_and(|levels| is_returnable(value, levels))
+}
+
 /// The tree without what a master could take but never return, and the keys of what was left out.
 pub(super) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();

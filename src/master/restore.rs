@@ -2,10 +2,10 @@
 
 use std::collections::HashMap;
 
-use super::mark::{HELPER, NO_API};
 use super::names::{self, CALLER_ID};
 use super::plan::Skipped;
-use super::{Mark, Master, python};
+use super::token::{HELPER, NO_API};
+use super::{Master, Token, python};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// Gives the calls that change state, each with its answer, to `write`; the model of the master after
@@ -75,7 +75,7 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
         for (caller_id, api) in self.target.nodes() {
             if let Some(found_api) = self.found.api_of(caller_id)
                 && found_api != api
-                && !Mark::is_ours(caller_id)
+                && !Token::is_ours(caller_id)
             {
                 self.skipped.push(Skipped::Node {
                     caller_id: caller_id.to_owned(),
@@ -93,7 +93,7 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             .found
             .api_of(caller_id)
             .is_none_or(|found| found == api);
-        (free && !Mark::is_ours(caller_id)).then_some(api)
+        (free && !Token::is_ours(caller_id)).then_some(api)
     }
 
     /// Of `callers`, those who are brought in and not there yet: caller id, name for `key`, address.
@@ -410,8 +410,24 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
     }
 }
 
+/// The calls that empty a master that holds `found`, for one that is to hold `target` exactly: what
+/// would be told comes before nobody is left to be told of it. Parameters stay if they are right.
+pub(super) fn removal(found: &Master, target: &Master) -> Vec<Call> {
+    let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
+    let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
+    let (publishers, mut first): (Vec<_>, Vec<_>) =
+        calls.partition(|call| call.method == "unregisterPublisher");
+    if !found.params().iter().eq(target.params()) {
+        let nothing = Value::Struct(Struct::new());
+        let params = vec![CALLER_ID.into(), "/".into(), nothing];
+        first.push(Call::new("setParam", params));
+    }
+    first.extend(publishers);
+    first
+}
+
 /// `ours` over `theirs`, namespace by namespace.
-fn merged(ours: &Struct, theirs: &Struct) -> Struct {
+pub(super) fn merged(ours: &Struct, theirs: &Struct) -> Struct {
     let mut tree = ours.clone();
     for (key, value) in theirs {
         match (tree.get_mut(key), value) {

@@ -12,9 +12,7 @@ const MASTER: &str = "/master";
 impl Master {
     /// The `publisherUpdate` with the full list of a topic's publishers.
     pub fn publisher_update(&self, topic: &str) -> Call {
-        let publishers = self.publishers_of(topic).into_iter().map(Value::String);
-        let list = Value::Array(publishers.collect());
-        Call::new("publisherUpdate", vec![MASTER.into(), topic.into(), list])
+        publisher_update(topic, &self.publishers_of(topic))
     }
 
     /// The `paramUpdate` with the value under `key`, which ends in a slash; an empty struct for what
@@ -25,8 +23,7 @@ impl Master {
         if python::param_error(&value).is_some() {
             return None;
         }
-        let params = vec![MASTER.into(), key.into(), value];
-        Some(Call::new("paramUpdate", params))
+        Some(param_update(key, value))
     }
 
     /// Whether anything is set under `key`, which may end in a slash.
@@ -87,6 +84,28 @@ impl Master {
         let held = self.api_of(node).filter(|held| *held != api)?;
         Some((node.to_owned(), held.to_owned()))
     }
+}
+
+/// The `publisherUpdate` with this list.
+pub fn publisher_update(topic: &str, publishers: &[String]) -> Call {
+    let publishers = publishers.iter().cloned().map(Value::String);
+    let list = Value::Array(publishers.collect());
+    Call::new("publisherUpdate", vec![MASTER.into(), topic.into(), list])
+}
+
+/// The `paramUpdate` with this value.
+pub fn param_update(key: &str, value: Value) -> Call {
+    Call::new("paramUpdate", vec![MASTER.into(), key.into(), value])
+}
+
+/// The `shutdown` to a node whose name another one has taken.
+pub fn shutdown(node: &str) -> Call {
+    Call::new("shutdown", vec![MASTER.into(), bump_reason(node).into()])
+}
+
+/// What rosmaster says to such a node.
+pub(super) fn bump_reason(node: &str) -> String {
+    format!("[{node}] Reason: new node registered with same name")
 }
 
 /// Caller id and address of the node that `call` registers something for.

@@ -23,17 +23,60 @@ const NODES: usize = 1024;
 /// Levels of multicalls that are looked into.
 const LEVELS: usize = 8;
 
-/// Something that a node may be told.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Letter {
-    /// The full list of a topic's publishers.
+/// Something that a node is notified of.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Notification {
+    /// What a master would have sent at that moment.
+    Call(Arc<Call>),
+    /// The full list of a topic's publishers, as it is when it is sent.
     Topic(String),
-    /// The value of a parameter. The key ends in a slash.
+    /// The value of a parameter, as it is when it is sent. The key ends in a slash.
     Param(Arc<str>),
 }
 
-/// An address and what is to be told there; to all subscribers of a topic if there is no address.
-pub type News = (Option<String>, Letter);
+/// Something that has changed, which a master may tell late.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Change {
+    /// The publishers of a topic.
+    Topic(String),
+    /// A parameter, for the subscriber at an address. The key ends in a slash.
+    Param(String, Arc<str>),
+}
+
+/// A node whose name another one has taken at another address: it is to shut down.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Displaced {
+    /// Its name.
+    pub node: String,
+    /// Its address.
+    pub api: String,
+    /// The process id that was last seen behind the address.
+    pub pid: Option<i32>,
+    /// What it published and subscribed.
+    pub topics: Vec<String>,
+}
+
+/// What a master that died may not have told.
+#[derive(Debug, Default)]
+pub struct Owed {
+    /// Topics, to all their subscribers.
+    pub topics: Vec<String>,
+    /// Parameters, each as the address of a subscriber and a key.
+    pub params: Vec<(String, Arc<str>)>,
+    /// Nodes that are to shut down.
+    pub displaced: Vec<Displaced>,
+}
+
+/// What nodes are to be notified of, since the last time.
+#[derive(Debug, Default)]
+pub struct Outbox {
+    /// By address, in order.
+    pub calls: Vec<(String, Arc<Call>)>,
+    /// Nodes that are to shut down.
+    pub displaced: Vec<Displaced>,
+    /// Changes that a master tells, and may tell late.
+    pub changes: IndexSet<Change>,
+}
 
 /// When a node's registrations last changed, as numbers that grow with every call: equal numbers
 /// mean that nothing came between.
@@ -53,41 +96,70 @@ struct Pid {
     pid: i32,
 }
 
+/// A change that nodes are to be notified of.
+#[derive(Clone, Copy, Debug)]
+struct Noted {
+    at: Instant,
+    /// We have notified them, and not only a master that may have died before it could.
+    told: bool,
+}
+
 /// What calls did of late. Bounded.
 #[derive(Debug, Default)]
 pub struct Activity {
     count: u64,
-    topics: IndexMap<String, Instant>,
+    topics: IndexMap<String, Noted>,
     /// By address and key.
-    params: IndexMap<(String, Arc<str>), Instant>,
+    params: IndexMap<(String, Arc<str>), Noted>,
     deeds: HashMap<String, Deeds>,
     /// Nodes that are no more are forgotten when `deeds` is longer than this.
     prune_at: usize,
     pids: HashMap<String, Pid>,
     /// Nodes that registered and have not been asked for their process id since, and when.
     strangers: IndexMap<String, Instant>,
-    /// Nodes with the address that a parked registration is about to take their name from.
-    displaced: IndexSet<(String, String)>,
-    displaced_seen: usize,
-    /// Whether news are collected.
+    /// Nodes that a master was to shut down, and when.
+    displaced: Vec<(Instant, Displaced)>,
+    /// Whether changes that a master tells are collected.
     telling: bool,
-    news: IndexSet<News>,
+    outbox: Outbox,
 }
 
-/// What a call's notices are about. What they say is read from the mirror when it is told.
+/// Whom a call is told to.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
     /// By address and key.
     params: IndexSet<(String, Arc<str>)>,
+    /// The calls themselves, if no master makes them.
+    calls: Option<Vec<(String, Arc<Call>)>>,
+    pub(super) displaced: Vec<Displaced>,
+}
+
+impl Noticed {
+    /// `standing_in`: no master notifies anybody.
+    pub(super) fn new(standing_in: bool) -> Self {
+        Self {
+            calls: standing_in.then(Vec::new),
+            ..Self::default()
+        }
+    }
+
+    fn add(&mut self, to: &[String], call: impl FnOnce() -> Call) {
+        if let Some(calls) = &mut self.calls {
+            let call = Arc::new(call());
+            calls.extend(to.iter().map(|to| (to.clone(), call.clone())));
+        }
+    }
 }
 
 impl NoticeSink for Noticed {
-    fn publisher_update(&mut self, _: &[String], topic: &str, _: &[String]) {
+    fn publisher_update(&mut self, to: &[String], topic: &str, publishers: &[String]) {
         self.topics.insert(topic.to_owned());
+        self.add(to, || master::publisher_update(topic, publishers));
     }
 
-    fn param_update(&mut self, to: &[String], key: &str, _: &Value) {
+    fn param_update(&mut self, to: &[String], key: &str, value: &Value) {
+        self.add(to, || master::param_update(key, value.clone()));
         let key = Arc::<str>::from(key);
         let params = to.iter().map(|to| (to.clone(), key.clone()));
         self.params.extend(params);
@@ -96,7 +168,7 @@ impl NoticeSink for Noticed {
 
 impl Activity {
     /// A call has been applied, with these notices. `registered` says of a node whether the mirror
-    /// knows it. Answers whether there are news.
+    /// knows it. Answers whether there is something new in the outbox.
     pub(super) fn applied(
         &mut self,
         now: Instant,
@@ -108,23 +180,61 @@ impl Activity {
         if self.deeds.len() > self.prune_at.max(NODES) {
             self.prune(registered);
         }
-        let before = self.news.len();
+        let standing_in = noticed.calls.is_some();
+        let telling = self.telling && !standing_in;
+        let noted = Noted {
+            at: now,
+            told: standing_in,
+        };
+        let outbox = &mut self.outbox;
+        let before = outbox.len();
+        if let Some(calls) = noticed.calls {
+            outbox.calls.extend(calls);
+        }
         for topic in noticed.topics {
-            if self.telling && self.news.len() < NOTICES {
-                self.news.insert((None, Letter::Topic(topic.clone())));
+            if telling && outbox.changes.len() < NOTICES {
+                outbox.changes.insert(Change::Topic(topic.clone()));
             }
-            self.topics.insert(topic, now);
+            self.topics.insert(topic, noted);
         }
         for (to, key) in noticed.params {
-            if self.telling && self.news.len() < NOTICES {
-                self.news
-                    .insert((Some(to.clone()), Letter::Param(key.clone())));
+            if telling && outbox.changes.len() < NOTICES {
+                outbox
+                    .changes
+                    .insert(Change::Param(to.clone(), key.clone()));
             }
-            self.params.insert((to, key), now);
+            self.params.insert((to, key), noted);
         }
+        if standing_in {
+            outbox.displaced.extend(noticed.displaced);
+        } else if self.displaced.len() < NOTICES {
+            self.displaced
+                .extend(noticed.displaced.into_iter().map(|it| (now, it)));
+        }
+        let news = outbox.len() > before;
         forget(&mut self.topics, now);
         forget(&mut self.params, now);
-        self.news.len() > before
+        self.displaced.retain(|(at, _)| is_recent(*at, now));
+        news
+    }
+
+    /// The nodes that `call` takes the names of, as they are before it is applied.
+    pub(super) fn displaced_by(&self, mirror: &Master, call: &Call) -> Vec<Displaced> {
+        let entries = call.entries();
+        let calls = entries.iter().chain([call]);
+        let found = calls.filter_map(|call| {
+            let (node, api) = mirror.displaced_by(call)?;
+            let topics = mirror
+                .publications(&node)
+                .chain(mirror.subscriptions(&node));
+            Some(Displaced {
+                pid: self.pid_of(&node, &api).map(|(pid, _)| pid),
+                topics: topics.map(str::to_owned).collect(),
+                node,
+                api,
+            })
+        });
+        found.collect()
     }
 
     fn note(&mut self, now: Instant, call: &Call, levels: usize) {
@@ -165,46 +275,71 @@ impl Activity {
         self.deeds.get(node).copied().unwrap_or_default()
     }
 
-    /// Topics whose publishers changed so shortly before `now`, or since, that a master which died
-    /// then may have owed its subscribers the news.
-    pub fn topics_noticed(&self, now: Instant) -> Vec<String> {
-        recent(&self.topics, now).cloned().collect()
+    /// Changes so shortly before `now`, or since, that a master which died then may not have told
+    /// them, and we have not. From now on they count as told.
+    pub fn take_owed(&mut self, now: Instant) -> Owed {
+        fn take<K: Clone>(noted: &mut IndexMap<K, Noted>, now: Instant) -> Vec<K> {
+            let untold = noted.iter_mut().filter(|(_, noted)| !noted.told);
+            let recent = untold.filter(|(_, noted)| is_recent(noted.at, now));
+            recent
+                .map(|(key, noted)| {
+                    noted.told = true;
+                    key.clone()
+                })
+                .collect()
+        }
+        let displaced = std::mem::take(&mut self.displaced).into_iter();
+        let recent = displaced.filter(|(at, _)| is_recent(*at, now));
+        Owed {
+            topics: take(&mut self.topics, now),
+            params: take(&mut self.params, now),
+            displaced: recent.map(|(_, displaced)| displaced).collect(),
+        }
     }
 
-    /// As [`Self::topics_noticed`]: parameters, each as the address of a subscriber and a key.
-    pub fn params_noticed(&self, now: Instant) -> Vec<(String, Arc<str>)> {
-        recent(&self.params, now).cloned().collect()
+    /// All that changed so shortly before `now`, or since, is to be told once more: a master that goes
+    /// on may tell what it knew before.
+    pub fn tell_again(&mut self) {
+        let params = self.params.values_mut();
+        for noted in self.topics.values_mut().chain(params) {
+            noted.told = false;
+        }
     }
 
-    /// Collects news from now on, or no longer. Answers whether that changes anything.
+    /// Collects what a master tells from now on, or no longer. Answers whether that changes anything.
     pub fn set_telling(&mut self, telling: bool) -> bool {
         if !telling {
-            self.news.clear();
+            self.outbox.changes.clear();
         }
         std::mem::replace(&mut self.telling, telling) != telling
     }
 
-    /// The news since the last time.
-    pub fn take_news(&mut self) -> IndexSet<News> {
-        std::mem::take(&mut self.news)
+    /// What nodes are to be notified of.
+    pub fn take_outbox(&mut self) -> Outbox {
+        std::mem::take(&mut self.outbox)
     }
 
     /// Takes everything that a node may be told for changed just now.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
+        let noted = Noted {
+            at: now,
+            told: false,
+        };
         let topics = mirror.subscribed_topics();
         self.topics
-            .extend(topics.map(|topic| (topic.to_owned(), now)));
+            .extend(topics.map(|topic| (topic.to_owned(), noted)));
         let params = mirror.param_subscribers().into_iter();
-        self.params.extend(params.map(|param| (param, now)));
+        self.params.extend(params.map(|param| (param, noted)));
     }
 
-    /// What the master may not have told by `now` is news once more.
-    pub fn repeat_news(&mut self, now: Instant) {
-        let topics = self.topics_noticed(now).into_iter();
-        let params = self.params_noticed(now).into_iter();
-        let params = params.map(|(api, key)| (Some(api), Letter::Param(key)));
-        let topics = topics.map(|topic| (None, Letter::Topic(topic)));
-        self.news.extend(topics.chain(params));
+    /// What the master may not have told by `now` is collected once more.
+    pub fn repeat_changes(&mut self, now: Instant) {
+        let recent = |noted: &Noted| is_recent(noted.at, now);
+        let topics = self.topics.iter().filter(|(_, noted)| recent(noted));
+        let topics = topics.map(|(topic, _)| Change::Topic(topic.clone()));
+        let params = self.params.iter().filter(|(_, noted)| recent(noted));
+        let params = params.map(|((api, key), _)| Change::Param(api.clone(), key.clone()));
+        self.outbox.changes.extend(topics.chain(params));
     }
 
     /// `pid` is behind `api`, at which `node` is registered, and was asked for after the deed that
@@ -243,37 +378,21 @@ impl Activity {
         });
         taken
     }
+}
 
-    /// A call is parked that would take the name of `node`, which is registered at `api`. Answers
-    /// whether that is new.
-    pub(super) fn displace(&mut self, node: String, api: String) -> bool {
-        self.displaced.len() < NOTICES && self.displaced.insert((node, api))
-    }
-
-    /// What was displaced since the last time.
-    pub fn take_displaced(&mut self) -> Vec<(String, String)> {
-        let new = self.displaced.iter().skip(self.displaced_seen);
-        let new: Vec<_> = new.cloned().collect();
-        self.displaced_seen = self.displaced.len();
-        new
-    }
-
-    /// A new incarnation: what was parked travels.
-    pub(super) fn forget_displaced(&mut self) {
-        self.displaced.clear();
-        self.displaced_seen = 0;
+impl Outbox {
+    fn len(&self) -> usize {
+        self.calls.len() + self.displaced.len() + self.changes.len()
     }
 }
 
-fn recent<K>(notices: &IndexMap<K, Instant>, now: Instant) -> impl Iterator<Item = &K> {
-    let recent = notices.iter();
-    let recent = recent.filter(move |(_, at)| now.duration_since(**at) < NOTICE_MEMORY);
-    recent.map(|(key, _)| key)
+fn is_recent(at: Instant, now: Instant) -> bool {
+    now.duration_since(at) < NOTICE_MEMORY
 }
 
-fn forget<K: std::hash::Hash + Eq>(notices: &mut IndexMap<K, Instant>, now: Instant) {
+fn forget<K: std::hash::Hash + Eq>(notices: &mut IndexMap<K, Noted>, now: Instant) {
     if notices.len() > NOTICES {
-        notices.retain(|_, at| now.duration_since(*at) < NOTICE_MEMORY);
+        notices.retain(|_, noted| is_recent(noted.at, now));
         notices.truncate(NOTICES);
     }
 }
@@ -327,26 +446,68 @@ mod tests {
         assert_eq!(activity.take_strangers(start + second), none);
     }
 
+    fn subscribed() -> (Master, Call) {
+        let mut master = Master::default();
+        let subscribe = call("registerSubscriber", &["/s", "/t", "*", "http://s:1/"]);
+        master.apply(&subscribe);
+        (master, publish("/a", "/t"))
+    }
+
     #[test]
-    fn news_are_collected_only_while_somebody_tells_them() {
+    fn changes_are_collected_only_while_a_master_may_be_late() {
         let now = Instant::now();
         let mut activity = Activity::default();
-        let notice = || {
-            let mut noticed = Noticed::default();
-            noticed.publisher_update(&["http://s:1/".to_owned()], "/t", &[]);
-            noticed
+        let (mut master, publish) = subscribed();
+        let mut apply = |activity: &mut Activity, standing_in| {
+            let mut noticed = Noticed::new(standing_in);
+            master.apply_telling(&publish, &mut noticed);
+            activity.applied(now, &publish, noticed, |_| true)
         };
-        let publish = publish("/a", "/t");
-        assert!(!activity.applied(now, &publish, notice(), |_| true));
-        assert!(activity.take_news().is_empty());
+        assert!(!apply(&mut activity, false));
         activity.set_telling(true);
-        assert!(activity.applied(now, &publish, notice(), |_| true));
-        let expected = (None, Letter::Topic("/t".to_owned()));
+        assert!(apply(&mut activity, false));
+        let changes = activity.take_outbox().changes;
+        assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
+        assert_eq!(activity.take_owed(now).topics, ["/t"]);
+        assert_eq!(activity.take_owed(now).topics, Vec::<String>::new());
+        // While no master is there, it is told at once and in the master's words.
+        assert!(apply(&mut activity, true));
+        let outbox = activity.take_outbox();
+        assert!(outbox.changes.is_empty());
+        let [(to, call)] = &outbox.calls[..] else {
+            panic!("{outbox:?}")
+        };
         assert_eq!(
-            activity.take_news().into_iter().collect::<Vec<_>>(),
-            [expected]
+            (to.as_str(), call.method.as_str()),
+            ("http://s:1/", "publisherUpdate")
         );
-        assert_eq!(activity.topics_noticed(now), ["/t"]);
+        assert_eq!(**call, master.publisher_update("/t"));
+    }
+
+    #[test]
+    fn who_is_displaced_is_known_with_what_it_did() {
+        let now = Instant::now();
+        let mut activity = Activity::default();
+        let (mut master, publish) = subscribed();
+        master.apply(&publish);
+        apply(&mut activity, now, &publish);
+        let registered = activity.deeds("/a").registered;
+        activity.remember_pid("/a", "http://n:1/", registered, 7);
+        let again = call("registerPublisher", &["/a", "/u", "x/Y", "http://n:2/"]);
+        let expected = Displaced {
+            node: "/a".to_owned(),
+            api: "http://n:1/".to_owned(),
+            pid: Some(7),
+            topics: vec!["/t".to_owned()],
+        };
+        for again in [again.clone(), Call::multicall([again])] {
+            let mut noticed = Noticed::new(false);
+            noticed.displaced = activity.displaced_by(&master, &again);
+            assert_eq!(noticed.displaced, std::slice::from_ref(&expected));
+            activity.applied(now, &again, noticed, |_| true);
+        }
+        assert_eq!(activity.take_owed(now).displaced.len(), 2);
+        assert_eq!(activity.take_owed(now).displaced, []);
     }
 
     #[test]
@@ -357,29 +518,16 @@ mod tests {
         let subscribers: Vec<_> = (0..NOTICES)
             .map(|port| format!("http://s:{port}/"))
             .collect();
-        let mut noticed = Noticed::default();
+        let mut noticed = Noticed::new(false);
         noticed.param_update(&subscribers, "/key/", &Value::Int(1));
         activity.applied(now, &publish("/a", "/t"), noticed, |_| true);
-        let noticed = activity.params_noticed(now);
+        let noticed = activity.take_owed(now).params;
         assert_eq!(noticed.len(), NOTICES);
         let (_, first) = &noticed[0];
         assert!(noticed.iter().all(|(_, key)| Arc::ptr_eq(key, first)));
-        let shared = |news: &News| matches!(&news.1, Letter::Param(key) if Arc::ptr_eq(key, first));
-        let news = activity.take_news();
-        assert!(news.len() == NOTICES && news.iter().all(shared));
-    }
-
-    #[test]
-    fn what_is_displaced_is_named_once_in_an_outage() {
-        let mut activity = Activity::default();
-        let displace =
-            |activity: &mut Activity| activity.displace("/a".to_owned(), "http://n:1/".to_owned());
-        assert!(displace(&mut activity) && !displace(&mut activity));
-        assert_eq!(activity.take_displaced().len(), 1);
-        assert!(!displace(&mut activity));
-        assert_eq!(activity.take_displaced().len(), 0);
-        activity.forget_displaced();
-        assert!(displace(&mut activity));
-        assert_eq!(activity.take_displaced().len(), 1);
+        let is_shared =
+            |change: &Change| matches!(change, Change::Param(_, key) if Arc::ptr_eq(key, first));
+        let changes = activity.take_outbox().changes;
+        assert!(changes.len() == NOTICES && changes.iter().all(is_shared));
     }
 }

@@ -31,14 +31,14 @@ pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
         compacted_at: None,
         failed_at: None,
         // Whoever opened the checkpoint has said it.
-        said: proxy.shadow.unprotected(),
+        said: proxy.ledger.unprotected(),
         proxy,
     };
     loop {
         let proxy = &keeper.proxy;
         tokio::select! {
             () = stop.cancelled() => return,
-            () = proxy.shadow.work.notified() => {}
+            () = proxy.ledger.work.notified() => {}
             () = tokio::time::sleep(ROUND) => {}
         }
         keeper.round().await;
@@ -64,7 +64,7 @@ struct Keeping {
 
 impl Keeping {
     async fn round(&mut self) {
-        if self.proxy.shadow.with_store(|_, _| ()).is_none() {
+        if self.proxy.ledger.with_store(|_, _| ()).is_none() {
             self.open_again().await;
         }
         if self.proxy.config.sync != Sync::Never {
@@ -77,29 +77,29 @@ impl Keeping {
     }
 
     async fn sync(&self) {
-        let shadow = &self.proxy.shadow;
-        let job = shadow.with_store(|store, _| store.sync_job()).flatten();
+        let ledger = &self.proxy.ledger;
+        let job = ledger.with_store(|store, _| store.sync_job()).flatten();
         if let Some(job) = job
             && let Ok(done) = tokio::task::spawn_blocking(move || SyncJob::run(job)).await
         {
             // Its failure is the store's to remember and `say_protection`'s to tell.
-            let _ = shadow.with_store(|store, _| store.synced(done));
+            let _ = ledger.with_store(|store, _| store.synced(done));
         }
-        let durable = shadow.with_store(|store, _| match store.unprotected() {
+        let durable = ledger.with_store(|store, _| match store.unprotected() {
             None => store.synced_seq(),
             Some(_) => store.seq(),
         });
         // Without a store nothing has a number that anybody could wait for; one that is opened later
         // counts from where its file ends.
         if let Some(durable) = durable {
-            shadow.set_durable(durable);
+            ledger.set_durable(durable);
         }
     }
 
     fn compaction_is_due(&mut self) -> bool {
         let now = Instant::now();
-        let due = self.proxy.shadow.checkpoint_due();
-        let state = self.proxy.shadow.with_store(|store, _| {
+        let due = self.proxy.ledger.checkpoint_due();
+        let state = self.proxy.ledger.with_store(|store, _| {
             (
                 store.unprotected().is_some(),
                 store.wants_compaction(),
@@ -126,16 +126,16 @@ impl Keeping {
     }
 
     async fn compact(&mut self) {
-        let shadow = &self.proxy.shadow;
-        let begun = shadow.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
+        let ledger = &self.proxy.ledger;
+        let begun = ledger.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
         let Some(Ok(job)) = begun else { return };
         let finished = match tokio::task::spawn_blocking(move || job.run()).await {
-            Ok(done) => shadow.with_store(|store, _| finish(store, done)),
+            Ok(done) => ledger.with_store(|store, _| finish(store, done)),
             Err(_) => return,
         };
         match finished {
             Some(Err(error)) => {
-                shadow.set_attempted(Err(&error));
+                ledger.set_attempted(Err(&error));
                 self.failed_at = Some(Instant::now());
                 tracing::debug!(%error, "compaction");
             }
@@ -145,7 +145,7 @@ impl Keeping {
                     // The new file's name is not on the disk yet.
                     self.sync().await;
                 }
-                self.proxy.shadow.set_attempted(Ok(()));
+                self.proxy.ledger.set_attempted(Ok(()));
             }
         }
     }
@@ -155,13 +155,13 @@ impl Keeping {
         let path = self.proxy.config.checkpoint.clone();
         let opened = tokio::task::spawn_blocking(move || open_fresh(&path)).await;
         if let Ok(Ok(store)) = opened {
-            self.proxy.shadow.set_store(store);
+            self.proxy.ledger.set_store(store);
         }
     }
 
     /// Says, once, that the state is no longer recorded, and that it is again.
     fn say_protection(&mut self) {
-        let unprotected = self.proxy.shadow.unprotected();
+        let unprotected = self.proxy.ledger.unprotected();
         if unprotected == self.said {
             return;
         }

@@ -19,7 +19,7 @@ use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use super::{
     Proxy,
-    pace::{Pace, Paced, Shared},
+    pace::{Pace, Paced},
     service,
 };
 
@@ -166,10 +166,9 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
     let clients = proxy.clone();
     let _present = clients.clients.enter(peer);
-    let stream = Arc::new(stream);
-    let pace = Pace::of(stream.clone());
+    let pace = Pace::default();
     let close = Arc::new(Notify::new());
-    let paced = Paced::new(Shared(stream), pace.clone(), &clients.idle, close.clone());
+    let paced = Paced::new(stream, pace.clone(), &clients.idle, close.clone());
     let service = |request| {
         // On the heap: idle connections do not keep space for it.
         Box::pin(service::serve(proxy.clone(), peer, pace.clone(), request))

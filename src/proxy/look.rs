@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use super::upstream::{CallError, Connection};
-use crate::master::{FirstLook, Mark, Master, NotAMaster, Salvage};
+use crate::master::{FirstLook, Master, NotAMaster, Salvage, Token};
 use crate::xmlrpc::Call;
 
 /// A look that showed nothing.
@@ -19,14 +19,14 @@ pub enum LookError {
 }
 
 /// The first look; without the parameters if the master cannot return one of them.
-pub async fn first(connection: &mut Connection, mark: &Mark) -> Result<FirstLook, LookError> {
-    let whole = look(connection, &FirstLook::call(mark)).await;
+pub async fn first(connection: &mut Connection, token: &Token) -> Result<FirstLook, LookError> {
+    let whole = look(connection, &FirstLook::call(token)).await;
     match whole {
         Err(LookError::NotAMaster(
             NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
-        )) => look(connection, &FirstLook::call_without_params(mark)).await,
+        )) => look(connection, &FirstLook::call_without_params(token)).await,
         Err(error) if is_broken_document(&error) => {
-            let rest = look(connection, &FirstLook::call_without_params(mark)).await;
+            let rest = look(connection, &FirstLook::call_without_params(token)).await;
             // Whoever speaks no XML-RPC at all may have closed the connection.
             rest.map_err(|_| error)
         }

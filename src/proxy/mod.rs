@@ -1,29 +1,29 @@
-//! Between the nodes and the master: listener, door, gate, lane, pool, mirror.
+//! Between the nodes and the master: listener, door, gate, write queue, pool, ledger.
 
 pub mod activity;
+pub mod batch;
 pub mod body;
 pub mod clients;
 pub mod door;
-mod flight;
 pub mod gate;
 pub mod idle;
-pub mod journey;
 pub mod keeper;
-pub mod lane;
+pub mod ledger;
 pub mod listener;
 pub mod look;
 pub mod pace;
 pub mod pool;
 pub mod service;
-pub mod shadow;
+pub(crate) mod sockets;
 pub mod stats;
 pub mod upstream;
+pub mod write_queue;
 
 use std::sync::atomic::{AtomicBool, AtomicU32};
 
-use tokio::sync::Semaphore;
+use tokio::sync::{Notify, Semaphore};
 
-use crate::{admin::Board, config::Config, master::Mark, recovery::Nodes};
+use crate::{admin::Board, config::Config, recovery::Nodes};
 
 /// What every part of the proxy works with.
 pub struct Proxy {
@@ -37,18 +37,18 @@ pub struct Proxy {
     pub instance: String,
     /// Set when a request of our own came back to us: the master's address is our own.
     pub looped: AtomicBool,
-    /// The mark that the master bears when it holds the state.
-    pub mark: Mark,
-    /// The gate.
-    pub gate: gate::Gate,
-    /// The way to the master for mutating calls.
-    pub lane: lane::Lane,
+    /// Whether calls pass to the master.
+    pub gate: gate::Rx,
+    /// Notified when the master has not answered a call for longer than it should take.
+    pub slow: Notify,
+    /// The way to the master for writes.
+    pub write_queue: write_queue::WriteQueue,
     /// The way to the master for reads.
     pub pool: pool::Pool,
     /// The master.
     pub upstream: upstream::Upstream,
-    /// The mirror and its checkpoint.
-    pub shadow: shadow::Shadow,
+    /// The mirror and its journal.
+    pub ledger: ledger::Ledger,
     /// Who is connected.
     pub clients: clients::Clients,
     /// Those of them without a request.

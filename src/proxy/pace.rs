@@ -15,10 +15,8 @@ use std::{
     time::Duration,
 };
 
-use socket2::SockRef;
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
-    net::TcpStream,
     sync::Notify,
     time::{Instant, Sleep},
 };
@@ -34,7 +32,6 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 #[derive(Clone, Debug, Default)]
 pub struct Pace {
     place: Arc<AtomicU8>,
-    stream: Option<Arc<TcpStream>>,
 }
 
 const IDLE: u8 = 0;
@@ -43,25 +40,6 @@ const SERVING: u8 = 2;
 const REPLYING: u8 = 3;
 
 impl Pace {
-    /// The pace of `stream`.
-    pub fn of(stream: Arc<TcpStream>) -> Self {
-        Self {
-            place: Arc::default(),
-            stream: Some(stream),
-        }
-    }
-
-    /// Returns when the peer has closed its side behind the request, as it does when it ends.
-    /// Never if it has sent more.
-    pub async fn hung_up(&self) {
-        if let Some(stream) = &self.stream
-            && !matches!(stream.peek(&mut [0]).await, Ok(1..))
-        {
-            return;
-        }
-        std::future::pending().await
-    }
-
     /// The head has been read; the body and the answer have limits of their own.
     pub fn serving(&self) {
         self.place.store(SERVING, Ordering::Relaxed);
@@ -187,74 +165,6 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<'_, S> {
 
     fn is_write_vectored(&self) -> bool {
         self.stream.is_write_vectored()
-    }
-}
-
-/// A stream that [`Pace::hung_up`] may look at beside its reader.
-#[derive(Debug)]
-pub struct Shared(pub Arc<TcpStream>);
-
-impl Shared {
-    /// Tries until it is done, fails, or has to wait for readiness.
-    fn attempt<T>(
-        ready: impl Fn() -> Poll<io::Result<()>>,
-        mut attempt: impl FnMut() -> io::Result<T>,
-    ) -> Poll<io::Result<T>> {
-        loop {
-            std::task::ready!(ready())?;
-            match attempt() {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                done => return Poll::Ready(done),
-            }
-        }
-    }
-}
-
-impl AsyncRead for Shared {
-    fn poll_read(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        buf: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        let cx = std::cell::RefCell::new(cx);
-        let ready = || self.0.poll_read_ready(&mut cx.borrow_mut());
-        let read = std::task::ready!(Self::attempt(ready, || {
-            self.0.try_read(buf.initialize_unfilled())
-        }))?;
-        buf.advance(read);
-        Poll::Ready(Ok(()))
-    }
-}
-
-impl AsyncWrite for Shared {
-    fn poll_write(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        buf: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        self.poll_write_vectored(cx, &[io::IoSlice::new(buf)])
-    }
-
-    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Poll::Ready(Ok(()))
-    }
-
-    fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Poll::Ready(SockRef::from(&*self.0).shutdown(std::net::Shutdown::Write))
-    }
-
-    fn poll_write_vectored(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        bufs: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        let cx = std::cell::RefCell::new(cx);
-        let ready = || self.0.poll_write_ready(&mut cx.borrow_mut());
-        Self::attempt(ready, || self.0.try_write_vectored(bufs))
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        true
     }
 }
 

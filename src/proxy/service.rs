@@ -1,24 +1,29 @@
 //! One request from its head to its answer.
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    net::SocketAddr,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use bytes::Bytes;
 use http_body_util::Full;
 use hyper::{
     Method, Request, Response, StatusCode,
     body::Incoming,
-    header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER, USER_AGENT},
+    header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER},
 };
 use thiserror::Error;
 use tokio::sync::oneshot;
 
 use super::{
     Proxy,
+    batch::{self, Answer, Item},
     body::{self, BodyError, Room},
     door::{self, Refusal},
-    gate::{StandIn, State},
-    journey::{self, Answer, LaneItem},
+    gate::State,
     pace::Pace,
+    pool,
     upstream::{Head, INSTANCE_HEADER, RawReply},
 };
 use crate::{
@@ -36,16 +41,10 @@ pub type HttpReply = Response<Full<Bytes>>;
 #[error("closed without an answer: {0}")]
 pub struct Closed(&'static str);
 
-/// A master that takes longer to say its process id is answered for: roslaunch waits 5 s for that,
-/// and then starts a master of its own on our port.
-const IDENTITY_TIME: Duration = Duration::from_secs(1);
-/// How long a `setParam` of roscpp is held. `ros::param::set` keeps a lock until the master answers, and
-/// says that it failed under that lock: if another thread of the node has said anything meanwhile, the
-/// two wait for each other for ever. It has no time limit of its own.
-const ROSCPP_SET_PARAM_HOLD: Duration = Duration::from_secs(24 * 3600);
-/// What roscpp calls itself.
-const ROSCPP: &[u8] = b"XMLRPC++";
-/// Why a multicall is not answered while the gate is shut.
+/// A master that takes longer is answered for by the mirror, where that is exact. A rosmaster answers
+/// in less than a millisecond, and behind a call that keeps its interpreter busy in some ten.
+const PATIENCE: Duration = Duration::from_millis(100);
+/// Why a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "so many answers at once are left to the master";
 /// Said to another computer of a body that rosrescue cannot decode. The master may know how to, and
 /// it may be a `shutdown`.
@@ -60,7 +59,7 @@ pub async fn serve(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     pace.serving();
-    let reply = route(proxy, peer, &pace, request).await;
+    let reply = route(proxy, peer, request).await;
     pace.replying();
     reply
 }
@@ -68,7 +67,6 @@ pub async fn serve(
 async fn route(
     proxy: Arc<Proxy>,
     peer: SocketAddr,
-    pace: &Pace,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
@@ -76,7 +74,7 @@ async fn route(
             Ok(()) => admin::page(&proxy, request.uri().path()),
             Err(refusal) => refuse(&proxy, peer, &refusal),
         }),
-        Method::POST => post(proxy, peer, pace, request).await,
+        Method::POST => post(proxy, peer, request).await,
         ref method => Ok(text(
             StatusCode::NOT_IMPLEMENTED,
             format!("method {method} is not supported; XML-RPC is POST, the status page GET\n"),
@@ -87,7 +85,6 @@ async fn route(
 async fn post(
     proxy: Arc<Proxy>,
     peer: SocketAddr,
-    pace: &Pace,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     if request
@@ -106,10 +103,6 @@ async fn post(
     if let Err(refusal) = door::check_post(request.headers(), &proxy.names) {
         return Ok(refuse(&proxy, peer, &refusal));
     }
-    let roscpp = request
-        .headers()
-        .get(USER_AGENT)
-        .is_some_and(|agent| agent.as_bytes().starts_with(ROSCPP));
     let head = Head {
         path: request.uri().to_string(),
         encoding: request.headers().get(CONTENT_ENCODING).cloned(),
@@ -156,28 +149,20 @@ async fn post(
         }
         proxy.stats.undecoded.count();
     }
-    let hold = match &call {
-        Some(call) if roscpp && call.method == "setParam" => ROSCPP_SET_PARAM_HOLD,
-        _ => proxy.config.hold,
-    };
-    answer(&proxy, peer, pace, hold, head, body, call).await
+    answer(&proxy, peer, head, body, call).await
 }
 
 async fn answer(
     proxy: &Arc<Proxy>,
     peer: SocketAddr,
-    pace: &Pace,
-    hold: Duration,
     head: Head,
     body: Bytes,
     call: Option<Call>,
 ) -> Result<HttpReply, Closed> {
     let kind = call.as_ref().map_or(Kind::Mutate, master::kind);
     match (&call, kind) {
-        (Some(call), Kind::Identity)
-            if call.method == "getUri" || !matches!(proxy.gate.state(), State::Open { .. }) =>
-        {
-            let reply = proxy.shadow.answer(call).ok_or(Closed(UNANSWERABLE))?;
+        (Some(call), Kind::Identity) if call.method == "getUri" || !proxy.gate.is_open() => {
+            let reply = proxy.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
             Ok(xml(&reply))
         }
         (_, Kind::Shutdown) if !door::may_shut_down(peer.ip()) => {
@@ -194,25 +179,12 @@ async fn answer(
             read(proxy, head, body, call.as_ref(), kind).await
         }
         (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-            let Some(_place) = proxy.lane.place(&proxy.gate, kind).await else {
-                proxy.stats.hold_expired.count();
-                return Err(Closed(
-                    "too many calls wait for the master, see --max-parked",
-                ));
-            };
-            let (tx, rx) = oneshot::channel();
-            let names_uri = call
-                .as_ref()
-                .filter(|call| journey::asks_uri(call))
-                .cloned();
-            let item = LaneItem::new(Some((head, body)), call, kind, tx);
-            proxy.lane.submit(item).await;
-            await_lane(proxy, pace, hold, rx, names_uri.as_ref()).await
+            write(proxy, head, body, call.map(Arc::new), kind).await
         }
     }
 }
 
-/// Forwards a read; while the gate is shut, or when the master fails, the mirror answers.
+/// Forwards a read. While the master is away, fails or takes too long the mirror answers.
 async fn read(
     proxy: &Arc<Proxy>,
     head: Head,
@@ -220,41 +192,56 @@ async fn read(
     call: Option<&Call>,
     kind: Kind,
 ) -> Result<HttpReply, Closed> {
+    let from_mirror = || {
+        let call = call.filter(|_| kind != Kind::Unknown)?;
+        let reply = proxy.ledger.answer(call)?;
+        proxy.stats.stood_in.count();
+        Some(xml(&reply))
+    };
     let mut gate = proxy.gate.clone();
-    let mut parked = false;
     let mut hold = std::pin::pin!(tokio::time::sleep(proxy.config.hold));
     loop {
-        let mut known = true;
         match gate.look() {
             State::Open { incarnation } => {
-                let Proxy {
-                    pool,
-                    upstream,
-                    mark,
-                    ..
-                } = &**proxy;
-                let limit = match kind {
-                    Kind::Identity => IDENTITY_TIME,
-                    _ => Duration::MAX,
+                if proxy.pool.is_stalled()
+                    && let Some(reply) = from_mirror()
+                {
+                    return Ok(reply);
+                }
+                let mut forwarding = Box::pin({
+                    let (proxy, head, body) = (proxy.clone(), head.clone(), body.clone());
+                    async move { pool::forward(&proxy, incarnation, &head, &body).await }
+                });
+                let reply = match tokio::time::timeout(PATIENCE, &mut forwarding).await {
+                    Ok(reply) => reply,
+                    Err(_) => {
+                        proxy.slow.notify_one();
+                        if let Some(reply) = from_mirror() {
+                            // Its end tells that the master answers again.
+                            let proxy = proxy.clone();
+                            tokio::spawn(async move {
+                                let _stalled = proxy.pool.stalled();
+                                let _ = forwarding.await;
+                            });
+                            return Ok(reply);
+                        }
+                        forwarding.await
+                    }
                 };
-                let mut watch = gate.clone();
-                let reply = pool.forward(upstream, mark, &mut watch, incarnation, &head, &body);
-                match tokio::time::timeout(limit, reply).await {
-                    Ok(Ok(raw)) => return Ok(forwarded(proxy, call, raw)),
-                    Ok(Err(error)) => tracing::debug!(%error, "read"),
-                    Err(_) => tracing::debug!("the master is slow to say who it is"),
+                match reply {
+                    Ok(raw) => return Ok(forwarded(proxy, call, raw)),
+                    Err(error) => tracing::debug!(%error, "read"),
+                }
+                if let Some(reply) = from_mirror() {
+                    return Ok(reply);
                 }
             }
-            State::Shut(stand_in) => known = stand_in != StandIn::Nobody,
-        }
-        if let Some(call) = call.filter(|_| known && kind != Kind::Unknown)
-            && let Some(reply) = proxy.shadow.answer(call)
-        {
-            proxy.stats.stood_in.count();
-            return Ok(xml(&reply));
-        }
-        if !std::mem::replace(&mut parked, true) {
-            proxy.stats.parked.count();
+            State::StandingIn | State::Injecting => {
+                if let Some(reply) = from_mirror() {
+                    return Ok(reply);
+                }
+            }
+            State::Unknown => {}
         }
         tokio::select! {
             () = gate.changed() => {}
@@ -266,46 +253,67 @@ async fn read(
     }
 }
 
-async fn await_lane(
+/// Queues a write. While the master is away the mirror answers it from there; behind a master that takes
+/// too long, only if it changes nothing.
+async fn write(
     proxy: &Arc<Proxy>,
-    pace: &Pace,
-    hold: Duration,
-    mut answered: oneshot::Receiver<Answer>,
-    names_uri: Option<&Call>,
+    head: Head,
+    body: Bytes,
+    call: Option<Arc<Call>>,
+    kind: Kind,
 ) -> Result<HttpReply, Closed> {
-    let mut gate = proxy.gate.clone();
-    if matches!(gate.state(), State::Shut(_)) {
-        proxy.stats.parked.count();
-    }
-    // While the master is there, a client may close its half and wait for the answer. A call that
-    // is parked is not run for a client that has gone: it would register a node that is dead.
-    let abandoned = async {
-        let mut gate = proxy.gate.clone();
-        pace.hung_up().await;
-        gate.shut_for(Duration::ZERO).await;
+    let (answer, mut answered) = oneshot::channel();
+    let item = Item {
+        raw: Some((head, body)),
+        call: call.clone(),
+        kind,
+        answer,
+        condition: None,
     };
-    tokio::select! {
-        answer = &mut answered => match answer {
-            Ok(Answer::Raw(raw)) => Ok(forwarded(proxy, names_uri, raw)),
-            Ok(Answer::Made(reply)) => {
-                let ours = names_uri.and_then(|it| journey::rewrite_uri(it, &reply, &proxy.uri));
-                Ok(xml(ours.as_ref().unwrap_or(&reply)))
+    proxy.write_queue.submit(item).await;
+    let call = call.as_deref();
+    let mut gate = proxy.gate.clone();
+    let mut held = std::pin::pin!(gate.shut_for(proxy.config.hold));
+    let mut patience = std::pin::pin!(tokio::time::sleep(PATIENCE));
+    let mut patient = true;
+    loop {
+        tokio::select! {
+            answer = &mut answered => return match answer {
+                Ok(Answer::Raw(raw)) => Ok(forwarded(proxy, call, raw)),
+                Ok(Answer::Made(reply)) => Ok(made(proxy, call, &reply)),
+                Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
+            },
+            () = &mut held => {
+                proxy.stats.hold_expired.count();
+                return Err(Closed("the master did not come back in time, see --hold"));
             }
-            Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
-        },
-        () = gate.shut_for(hold) => {
-            proxy.stats.hold_expired.count();
-            Err(Closed("the master did not come back in time, see --hold"))
+            () = &mut patience, if patient => {
+                patient = false;
+                if !proxy.gate.is_open() {
+                    continue;
+                }
+                proxy.slow.notify_one();
+                let idle = call.filter(|call| master::is_answerable(call));
+                if let Some(reply) = idle.and_then(|call| proxy.ledger.answer_idle(Instant::now(), call)) {
+                    proxy.stats.stood_in.count();
+                    return Ok(xml(&reply));
+                }
+            }
         }
-        () = abandoned => Err(Closed("the client has gone")),
     }
+}
+
+fn made(proxy: &Proxy, call: Option<&Call>, reply: &Reply) -> HttpReply {
+    let ours = call.filter(|call| batch::asks_uri(call));
+    let ours = ours.and_then(|call| batch::rewrite_uri(call, reply, &proxy.uri));
+    xml(ours.as_ref().unwrap_or(reply))
 }
 
 /// A master's reply, with our address for its own.
 fn forwarded(proxy: &Proxy, call: Option<&Call>, raw: RawReply) -> HttpReply {
-    if let Some(call) = call.filter(|call| journey::asks_uri(call))
+    if let Some(call) = call.filter(|call| batch::asks_uri(call))
         && let Ok(reply) = xmlrpc::decode_reply(&raw.body)
-        && let Some(rewritten) = journey::rewrite_uri(call, &reply, &proxy.uri)
+        && let Some(rewritten) = batch::rewrite_uri(call, &reply, &proxy.uri)
     {
         return xml(&rewritten);
     }

@@ -28,16 +28,16 @@ impl Counter {
 pub struct Stats {
     /// Calls that clients made.
     pub calls: Counter,
-    /// Calls that were answered by the mirror, because the gate was shut or the master's answer broke off.
+    /// Calls that were answered by the mirror: the master was away, or did not answer in time.
     pub stood_in: Counter,
-    /// Calls that waited at the shut gate.
-    pub parked: Counter,
-    /// Calls whose connection was closed because the gate stayed shut.
+    /// Calls whose connection was closed because only a master could answer and none came in time.
     pub hold_expired: Counter,
-    /// Mutating calls that the master accepted and the journal holds.
+    /// Writes that were answered with success and went into the journal.
     pub recorded: Counter,
-    /// Round trips to the master in which mutating calls travelled.
-    pub journeys: Counter,
+    /// Round trips to the master with writes.
+    pub batches: Counter,
+    /// Notifications that we sent to nodes.
+    pub notifications: Counter,
     /// Requests that could not be decoded, and were forwarded as they were.
     pub undecoded: Counter,
     /// Replies in which the mirror and the master differed.
@@ -55,28 +55,28 @@ impl Stats {
             ("calls", "calls that clients made", self.calls.value()),
             (
                 "stood_in",
-                "calls answered by the mirror: the gate was shut, or the master's answer broke off",
+                "calls answered by the mirror: the master was away, or did not answer in time",
                 self.stood_in.value(),
             ),
             (
-                "parked",
-                "calls that waited at the shut gate",
-                self.parked.value(),
-            ),
-            (
                 "hold_expired",
-                "calls that waited in vain",
+                "calls that waited for a master in vain",
                 self.hold_expired.value(),
             ),
             (
                 "recorded",
-                "mutating calls accepted and journaled",
+                "writes answered with success and journaled",
                 self.recorded.value(),
             ),
             (
-                "journeys",
-                "round trips of mutating calls",
-                self.journeys.value(),
+                "batches",
+                "round trips to the master with writes",
+                self.batches.value(),
+            ),
+            (
+                "notifications",
+                "notifications that rosrescue sent to nodes",
+                self.notifications.value(),
             ),
             (
                 "undecoded",

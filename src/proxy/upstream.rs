@@ -132,6 +132,18 @@ pub struct Upstream {
     probe_count: u32,
     /// What the master's name was found to mean the last time.
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
+    /// How many connections for writes there are.
+    writers: watch::Sender<usize>,
+}
+
+/// Counts a connection for writes until it has ended.
+#[derive(Debug)]
+struct Writer(watch::Sender<usize>);
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        self.0.send_modify(|count| *count = count.saturating_sub(1));
+    }
 }
 
 impl Upstream {
@@ -149,6 +161,7 @@ impl Upstream {
             probe_timeout,
             probe_count,
             found: watch::Sender::new(None),
+            writers: watch::Sender::new(0),
         }
     }
 
@@ -164,6 +177,22 @@ impl Upstream {
 
     /// A new connection to the master.
     pub async fn connect(&self) -> Result<Connection, ConnectError> {
+        self.connect_with(None).await
+    }
+
+    /// A new connection to the master that carries writes; see [`Self::no_writers`].
+    pub async fn connect_for_writes(&self) -> Result<Connection, ConnectError> {
+        self.writers.send_modify(|count| *count += 1);
+        self.connect_with(Some(Writer(self.writers.clone()))).await
+    }
+
+    /// Returns when every connection for writes has ended.
+    pub async fn no_writers(&self) {
+        // We hold a sender.
+        let _ = self.writers.subscribe().wait_for(|count| *count == 0).await;
+    }
+
+    async fn connect_with(&self, writer: Option<Writer>) -> Result<Connection, ConnectError> {
         let address = self.address();
         let unreachable = |source| ConnectError::Unreachable {
             master: address.to_string(),
@@ -182,7 +211,7 @@ impl Upstream {
         };
         // Where the kernel cannot do that, the connection is as good as it was.
         let _ = self.bound_silence(&stream);
-        Connection::over(stream, &address, self.instance.clone(), MAX_REPLY)
+        Connection::open(stream, &address, self.instance.clone(), MAX_REPLY, writer)
             .await
             .map_err(unreachable)
     }
@@ -260,6 +289,7 @@ pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
     ended: watch::Receiver<()>,
     local: bool,
+    peer: SocketAddr,
     host: HeaderValue,
     instance: HeaderValue,
     max_reply: usize,
@@ -274,8 +304,18 @@ impl Connection {
         instance: HeaderValue,
         max_reply: usize,
     ) -> io::Result<Self> {
+        Self::open(stream, address, instance, max_reply, None).await
+    }
+
+    async fn open(
+        stream: TcpStream,
+        address: &MasterUri,
+        instance: HeaderValue,
+        max_reply: usize,
+        writer: Option<Writer>,
+    ) -> io::Result<Self> {
         stream.set_nodelay(true)?;
-        let local = is_local(&stream)?;
+        let (local, peer) = (is_local(&stream)?, stream.peer_addr()?);
         let (sender, driver) = hyper::client::conn::http1::Builder::new()
             .title_case_headers(true)
             .handshake(TokioIo::new(stream))
@@ -285,13 +325,14 @@ impl Connection {
         tokio::spawn(async move {
             // Its error, if any, is also that of the call under way.
             let _ = driver.await;
-            drop(end);
+            drop((end, writer));
         });
         let host = HeaderValue::from_str(&address.authority()).map_err(io::Error::other)?;
         Ok(Self {
             sender,
             ended,
             local,
+            peer,
             host,
             instance,
             max_reply,
@@ -308,6 +349,11 @@ impl Connection {
         self.local
     }
 
+    /// The other end.
+    pub fn peer(&self) -> SocketAddr {
+        self.peer
+    }
+
     /// Returns when the connection has ended.
     pub fn ended(&self) -> impl Future<Output = ()> + Send + 'static {
         let mut ended = self.ended.clone();
@@ -322,18 +368,22 @@ impl Connection {
         self.exchange(head, body, None).await
     }
 
-    /// Sends a body of our own. As far as the reply is what was `foretold` it is only compared, and
+    /// Sends a body of our own. As far as the reply is what was `predicted` it is only compared, and
     /// takes no memory.
-    pub async fn foretold(&mut self, body: Bytes, foretold: &Bytes) -> Result<RawReply, CallError> {
+    pub async fn predicted(
+        &mut self,
+        body: Bytes,
+        predicted: &Bytes,
+    ) -> Result<RawReply, CallError> {
         let head = Head::default();
-        self.exchange(&head, body, Some(foretold)).await
+        self.exchange(&head, body, Some(predicted)).await
     }
 
     async fn exchange(
         &mut self,
         head: &Head,
         body: Bytes,
-        foretold: Option<&Bytes>,
+        predicted: Option<&Bytes>,
     ) -> Result<RawReply, CallError> {
         // rosmaster gzips replies when it may, in Python: it may not.
         let mut request = Request::post(head.path.as_str())
@@ -359,8 +409,8 @@ impl Connection {
         };
         let (parts, body) = reply.into_parts();
         let body = Limited::new(body, self.max_reply);
-        let body = match foretold {
-            Some(foretold) => collect(body, foretold).await,
+        let body = match predicted {
+            Some(predicted) => collect(body, predicted).await,
             None => body.collect().await.map(Collected::to_bytes),
         };
         Ok(RawReply {
@@ -378,24 +428,24 @@ impl Connection {
     }
 }
 
-/// The whole of `body`. As far as it is what was `foretold`, that stands for it.
+/// The whole of `body`. As far as it is what was `predicted`, that stands for it.
 async fn collect<B: Body<Data = Bytes> + Unpin>(
     mut body: B,
-    foretold: &Bytes,
+    predicted: &Bytes,
 ) -> Result<Bytes, B::Error> {
     let mut same = 0;
     while let Some(frame) = body.frame().await {
         let Ok(data) = frame?.into_data() else {
             continue;
         };
-        let (before, ahead) = foretold.split_at(same);
+        let (before, ahead) = predicted.split_at(same);
         if !ahead.starts_with(&data) {
             let rest = body.collect().await?.to_bytes();
             return Ok([before, &data, &rest].concat().into());
         }
         same += data.len();
     }
-    Ok(foretold.slice(..same))
+    Ok(predicted.slice(..same))
 }
 
 #[cfg(test)]
@@ -427,22 +477,22 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_foretold_reply_is_kept_once_and_any_other_as_it_is() {
-        let foretold = Bytes::from("what is foretold");
+    async fn a_predicted_reply_is_kept_once_and_any_other_as_it_is() {
+        let predicted = Bytes::from("what is predicted");
         for pieces in [
-            vec!["what is ", "foretold"],
-            vec!["what is ", "", "foretold", " and more"],
+            vec!["what is ", "predicted"],
+            vec!["what is ", "", "predicted", " and more"],
             vec!["what is ", "fore", "seen", "?"],
             vec!["what", " is"],
             vec!["nothing of it"],
             vec![],
         ] {
             let whole = pieces.concat();
-            let got = collect(Pieces(pieces.into_iter()), &foretold).await;
+            let got = collect(Pieces(pieces.into_iter()), &predicted).await;
             let got = got.unwrap_or_default();
             assert_eq!(got, whole);
-            let is_kept = got.as_ptr() == foretold.as_ptr();
-            assert_eq!(is_kept, foretold.starts_with(whole.as_bytes()), "{whole}");
+            let is_kept = got.as_ptr() == predicted.as_ptr();
+            assert_eq!(is_kept, predicted.starts_with(whole.as_bytes()), "{whole}");
         }
     }
 }

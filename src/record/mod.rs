@@ -199,20 +199,6 @@ pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Enc
     Ok(frame::frame_snapshot(&body, checkpoint.seq, generation))
 }
 
-/// Calls as a YAML document, one to a line, in the form of the journal but without check sums.
-///
-/// # Errors
-///
-/// [`EncodeError::TooDeep`] for a value that is nested deeper than [`DEPTH_MAX`].
-pub fn encode_calls(comment: &str, calls: &[Call]) -> Result<Vec<u8>, EncodeError> {
-    let mut text = format!("# {comment}\n").into_bytes();
-    for (seq, call) in (1..).zip(calls) {
-        push_body(&mut text, seq, &Entry::call(call.clone()))?;
-        text.push(b'\n');
-    }
-    Ok(text)
-}
-
 /// The line of `record` in the file whose stamp is `stamp`, its line feed included.
 ///
 /// # Errors

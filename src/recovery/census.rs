@@ -16,19 +16,19 @@ use tokio::{
 };
 
 use super::{
-    healing,
     node::{self, Interview, Sign},
-    nodes::Nodes,
+    nodes::{self, Nodes},
+    notifications,
     report::{self, Outcome as Recovered},
 };
 use crate::{
     census::{Mending, Name, Registration, Verdict, judge},
-    master::{self, CALLER_ID, Kind, Mark, Master},
+    master::{self, CALLER_ID, Kind, Master, Token},
     proxy::{
         Proxy,
-        activity::{Activity, Letter},
+        activity::Activity,
+        batch::{self, Condition},
         gate::State,
-        journey::{self, Premise},
     },
     ros_env::MasterUri,
     xmlrpc::{Call, Reply},
@@ -75,35 +75,34 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     // As if somebody did not answer, until the questions have been put.
     let waiting = Waiting::new(&proxy);
     let mut gate = proxy.gate.clone();
-    while !matches!(gate.look(), State::Open { .. }) {
-        gate.changed().await;
-    }
+    gate.wait_for(|state| matches!(state, State::Open { .. }))
+        .await;
     let start = Instant::now();
-    let incarnation = proxy.shadow.incarnation();
+    let incarnation = proxy.ledger.incarnation();
     // Parked calls first: they wait, and what nodes say in them is newer than what they say to us.
     barrier(&proxy).await;
-    let (mut healed, params) = match outcome {
+    let mut healed = match outcome {
         // A master that lives on tells its news itself.
-        Recovered::Adopted => Default::default(),
-        _ => proxy.shadow.with_activity(|_, activity| {
-            let params = activity.params_noticed(outage);
-            (activity.topics_noticed(outage), params)
-        }),
+        Recovered::Adopted => Vec::new(),
+        Recovered::Reconciled => {
+            // It may tell now what it knew before.
+            proxy
+                .ledger
+                .with_activity(|_, activity| activity.tell_again());
+            nodes::tell_owed(&proxy, outage)
+        }
+        _ => nodes::tell_owed(&proxy, outage),
     };
-    healed.retain(|topic| healing::tell_subscribers(&proxy, topic));
     healed.sort();
-    for (api, key) in params {
-        healing::send(&proxy, &api, Letter::Param(key));
-    }
     let visits = begin_visits(&proxy);
     drop(waiting);
     let census = collect(visits).await;
     drop(under_way);
-    if proxy.shadow.incarnation() != incarnation {
+    if proxy.ledger.incarnation() != incarnation {
         // The next recovery reports.
         return;
     }
-    let suspects = proxy.nodes.suspects(&proxy.shadow);
+    let suspects = proxy.nodes.suspects(&proxy.ledger);
     let census_ms = report::ms(start.elapsed());
     if let Some(report) = proxy
         .board
@@ -113,11 +112,11 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     }
 }
 
-/// Returns when the calls that are in the lane now have travelled.
+/// Returns when the writes that are queued now have been answered.
 async fn barrier(proxy: &Proxy) {
     let last = Call::new("getPid", vec![CALLER_ID.into()]);
     // Its answer does not matter.
-    proxy.lane.call(last, Kind::Mutate).await;
+    proxy.write_queue.call(last, Kind::Mutate).await;
 }
 
 /// Asks every node, all at the same time.
@@ -126,8 +125,8 @@ pub async fn census(proxy: &Arc<Proxy>) -> Census {
 }
 
 fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<Outcome> {
-    let apis: BTreeSet<String> = proxy.shadow.with_mirror(|mirror| {
-        let nodes = mirror.nodes().filter(|(name, _)| !Mark::is_ours(name));
+    let apis: BTreeSet<String> = proxy.ledger.with_mirror(|mirror| {
+        let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
         let apis = nodes.map(|(_, api)| api.to_owned());
         // What nobody can call, the master cannot either.
         apis.filter(|api| MasterUri::parse(api).is_ok()).collect()
@@ -216,7 +215,7 @@ async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> Outcome {
             Sign::Alive => {
                 if proxy.nodes.clear(proxy, api) {
                     // Whatever was to be told meanwhile.
-                    healing::tell_all(proxy, api);
+                    notifications::tell_all(proxy, api);
                 }
             }
         }
@@ -257,12 +256,12 @@ struct Asked {
 #[derive(Default)]
 struct Findings {
     strangers: Vec<Name>,
-    mendings: Vec<(Premise, Verdict, Mending)>,
+    mendings: Vec<(Condition, Verdict, Mending)>,
 }
 
 impl Asked {
     fn new(proxy: &Proxy, api: &str) -> Self {
-        proxy.shadow.with_activity(|mirror, activity| {
+        proxy.ledger.with_activity(|mirror, activity| {
             let names = names_at(mirror, activity, api);
             let last = names.iter().map(|name| activity.deeds(&name.node));
             Self {
@@ -276,7 +275,7 @@ impl Asked {
     fn findings(&self, proxy: &Proxy, api: &str, interview: &Interview) -> Findings {
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();
-        proxy.shadow.with_activity(|mirror, activity| {
+        proxy.ledger.with_activity(|mirror, activity| {
             let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
             let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
             for ((name, unregistered), verdict) in judged {
@@ -298,11 +297,11 @@ impl Asked {
                     && deeds.unregistered == *unregistered
                 {
                     let mending = Mending::new(mirror, &name.node, claims);
-                    let premise = Premise {
+                    let condition = Condition {
                         node: name.node.clone(),
                         deeds,
                     };
-                    findings.mendings.push((premise, verdict, mending));
+                    findings.mendings.push((condition, verdict, mending));
                 }
             }
         });
@@ -327,8 +326,8 @@ impl Findings {
                 outcome.removed.push(name.node.clone());
             }
         }
-        for (premise, verdict, mending) in &self.mendings {
-            let node = &premise.node;
+        for (condition, verdict, mending) in &self.mendings {
+            let node = &condition.node;
             let mut found = before.mendings.iter();
             let found = found.find(|(found, _, _)| found.node == *node);
             let confirmed = |list: fn(&Mending) -> &Vec<Registration>, one: &Registration| {
@@ -338,13 +337,13 @@ impl Findings {
             for one in &mending.extra {
                 if confirmed(|mending| &mending.extra, one) {
                     let call = one.unregister(node, api);
-                    mend(proxy, one, premise, call, Kind::Unregister, outcome).await;
+                    mend(proxy, one, condition, call, Kind::Unregister, outcome).await;
                 }
             }
             for one in &mending.missing {
                 if certain || confirmed(|mending| &mending.missing, one) {
                     let call = one.register(node, api);
-                    mend(proxy, one, premise, call, Kind::Mutate, outcome).await;
+                    mend(proxy, one, condition, call, Kind::Mutate, outcome).await;
                 }
             }
         }
@@ -355,40 +354,30 @@ impl Findings {
 async fn mend(
     proxy: &Proxy,
     one: &Registration,
-    premise: &Premise,
+    condition: &Condition,
     call: Call,
     kind: Kind,
     outcome: &mut Outcome,
 ) {
-    if proxy.nodes.is_forbidden(&call) {
-        return;
-    }
-    // In a multicall it travels alone, see the lane: it must not bump anybody.
-    let alone = Call::multicall([call.clone()]);
-    let reply = proxy.lane.call_if(alone, kind, premise.clone()).await;
-    let Some(reply) = reply else {
-        let overtaken = proxy.shadow.with_activity(|mirror, activity| {
-            let deeds = activity.deeds(&premise.node);
-            mirror.displaced_by(&call).is_some() || !premise.holds(kind, deeds)
-        });
-        if !overtaken {
-            // One master after the other took it and never answered.
-            proxy.nodes.forbid(&call);
-        }
-        return;
-    };
+    // In a multicall it goes alone: it must not displace anybody.
+    let alone = Call::multicall([call]);
+    let reply = proxy
+        .write_queue
+        .call_if(alone, kind, condition.clone())
+        .await;
+    let Some(reply) = reply else { return };
     if is_done(&reply) {
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
         outcome
             .mended
-            .push(format!("{sign} {}", one.describe(&premise.node)));
+            .push(format!("{sign} {}", one.describe(&condition.node)));
     }
 }
 
 /// Whether the one entry of a multicall was answered with success: a node may claim a type that no
 /// master takes.
 fn is_done(reply: &Reply) -> bool {
-    let replies = journey::unpack(reply, 1).unwrap_or_default();
+    let replies = batch::unpack(reply, 1).unwrap_or_default();
     replies.iter().any(master::is_success)
 }
 
@@ -397,7 +386,7 @@ fn is_done(reply: &Reply) -> bool {
 async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
     // What it has on its way to the master comes first.
     barrier(proxy).await;
-    let found = proxy.shadow.with_activity(|mirror, activity| {
+    let found = proxy.ledger.with_activity(|mirror, activity| {
         let deeds = activity.deeds(&name.node);
         let same = mirror.api_of(&name.node) == Some(api) && deeds.registered == name.registered;
         same.then(|| (mirror.unregister_calls(&name.node), deeds))
@@ -406,7 +395,10 @@ async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
         return false;
     };
     let node = name.node.clone();
-    let (call, premise) = (Call::multicall(calls), Premise { node, deeds });
-    let reply = proxy.lane.call_if(call, Kind::Unregister, premise).await;
+    let (call, condition) = (Call::multicall(calls), Condition { node, deeds });
+    let reply = proxy
+        .write_queue
+        .call_if(call, Kind::Unregister, condition)
+        .await;
     reply.is_some()
 }

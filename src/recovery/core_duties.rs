@@ -34,18 +34,18 @@ fn set(key: &str, value: &str) -> Call {
 fn has(proxy: &Proxy, key: &str) -> bool {
     let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
     let yes = Value::Bool(true);
-    matches!(proxy.shadow.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
+    matches!(proxy.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
 }
 
 fn run_id(proxy: &Proxy) -> Call {
-    set("/run_id", &proxy.shadow.session().id)
+    set("/run_id", &proxy.ledger.session().id)
 }
 
 /// Gives a new session its run id before there is a master: it is injected with the rest, so that
 /// no roslaunch ever sees a master without one. Not if there may be a master that has one.
 pub fn seed_run_id(proxy: &Proxy) {
     if !has(proxy, "/run_id") {
-        proxy.shadow.seed(&run_id(proxy));
+        proxy.ledger.seed(&run_id(proxy));
     }
 }
 
@@ -64,7 +64,10 @@ pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
             .flatten()
             .collect();
         if !calls.is_empty() {
-            proxy.lane.call(Call::multicall(calls), Kind::Mutate).await;
+            proxy
+                .write_queue
+                .call(Call::multicall(calls), Kind::Mutate)
+                .await;
         }
     };
     let rosout = async {
@@ -134,7 +137,7 @@ async fn keep_rosout(proxy: &Proxy) {
 /// The process id of the registered rosout, if it answers.
 async fn living_rosout(proxy: &Proxy) -> Option<u32> {
     let api = proxy
-        .shadow
+        .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
     let call = Call::new("getPid", vec![CALLER_ID.into()]);
     match node::ask_for(&api, &call, proxy.config.census_timeout).await {

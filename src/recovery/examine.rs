@@ -1,30 +1,40 @@
 //! Brings a connected master to the mirror's state, or the mirror to the master's.
 
 use std::{
-    sync::{Arc, Mutex, PoisonError},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::{beside, report::Outcome, set_aside};
+use super::{beside, report::Outcome};
 use crate::{
-    lifecycle::{InFlight, Input, Trial},
-    master::{CALLER_ID, Careful, Counts, FirstLook, Master, Plan},
+    config::MasterConfig,
+    lifecycle::Input,
+    master::{self, Authority, Bears, Counts, FirstLook, Master, Plan, Token},
     proxy::{
         Proxy,
-        gate::{Keeper, StandIn, State},
+        gate::{State, Tx},
+        ledger::Basis,
         look::{self, LookError},
+        sockets,
         upstream::{CallError, Connection},
     },
-    xmlrpc::Call,
 };
 
 /// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
 /// A master that differs from what was injected is looked at and mended so often.
 const ROUNDS: u32 = 3;
+/// How long the end of calls of closed connections is waited for. A `setParam` of 60,000 keys takes
+/// some 10 s.
+const SETTLE_LIMIT: Duration = Duration::from_secs(60);
+/// How often it is looked whether they have ended: nothing tells.
+const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
 /// A master that could not be examined.
 #[derive(Debug, Error)]
@@ -71,29 +81,12 @@ pub struct Examination {
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
-    /// What was set aside because each new master died of it.
-    pub set_aside: Vec<String>,
     /// Where it differs nevertheless.
     pub mismatches: Vec<String>,
     /// How long the look took.
     pub look: Duration,
     /// How long the injection took.
     pub injection: Duration,
-}
-
-/// What the master is at; outlives the examination, which ends with the master.
-#[derive(Clone, Debug, Default)]
-pub struct Progress(Arc<Mutex<InFlight>>);
-
-impl Progress {
-    fn set(&self, at: InFlight) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = at;
-    }
-
-    /// What it was at; nothing from now on.
-    pub fn take(&self) -> InFlight {
-        std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner))
-    }
 }
 
 /// How an examination is to go.
@@ -103,39 +96,31 @@ pub struct Manner {
     pub known: Known,
     /// The injection into an empty master, made ready.
     pub prepared: Option<JoinHandle<Prepared>>,
-    /// How to inject carefully, if that is to be done.
-    pub trial: Option<Trial>,
-    /// Where to say what the master is at.
-    pub progress: Progress,
+    /// Set as long as the master works for us.
+    pub injecting: Arc<AtomicBool>,
 }
 
-/// An injection into an empty master, made ready while the new master starts.
+/// An injection, made ready.
 #[derive(Debug)]
 pub struct Prepared {
-    version: u64,
+    /// Of the mirror; none if it was made for this very moment.
+    basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether such a master holds exactly what the mirror holds.
+    /// Whether a master holds exactly the mirror's state after it.
     complete: bool,
 }
 
-impl Prepared {
-    fn new(proxy: &Proxy, version: u64, target: &Master, found: &Master) -> Self {
-        let plan = Plan::new(target, found, &proxy.mark);
-        Self {
-            version,
-            complete: plan.expected() == target,
-            plan,
-        }
-    }
-}
-
-/// Makes an injection ready beside everything else.
+/// Makes the injection into an empty master ready, beside everything else.
 pub fn prepare(proxy: &Arc<Proxy>) -> JoinHandle<Prepared> {
     let proxy = proxy.clone();
     tokio::task::spawn_blocking(move || {
-        let version = proxy.shadow.version();
-        let target = proxy.shadow.with_mirror(Clone::clone);
-        Prepared::new(&proxy, version, &target, &Master::default())
+        let (version, target, token) = proxy.ledger.next();
+        let plan = Plan::new(&target, &Master::default(), &token);
+        Prepared {
+            complete: plan.expected() == &target,
+            basis: Some((version, token)),
+            plan,
+        }
     })
 }
 
@@ -144,10 +129,10 @@ pub fn prepare(proxy: &Arc<Proxy>) -> JoinHandle<Prepared> {
 pub enum Known {
     /// Nothing.
     Nothing,
-    /// If it bears the mark, this process has served it before.
-    ServedIfMarked,
-    /// If it bears the mark, it has been injected, and nobody has seen it answer.
-    InjectedIfMarked,
+    /// If it bears the token, this process has served it before.
+    ServedIfPresent,
+    /// If it bears the token, it has been injected, and nobody has seen it answer.
+    InjectedIfPresent,
     /// This process has just started it, as the successor of one that it served, on a loopback port
     /// that was free: it is empty. That saves a look, and reading back would show if it were not.
     New {
@@ -159,24 +144,22 @@ pub enum Known {
 /// Examines the master behind `connection`.
 pub async fn examine(
     proxy: &Arc<Proxy>,
-    keeper: &Keeper,
+    tx: &Tx,
     connection: &mut Connection,
     manner: Manner,
 ) -> Result<Examination, ExamineError> {
     let start = Instant::now();
+    let served = matches!(manner.known, Known::ServedIfPresent);
+    // Every call that it was sent has been answered, or it is not the one.
+    let resumes = |first: &FirstLook| {
+        served && first.bears() == Bears::Present && proxy.ledger.pending() == 0
+    };
     let mut first = match manner.known {
         Known::New { pid } => FirstLook::at_new(pid),
-        Known::Nothing | Known::ServedIfMarked | Known::InjectedIfMarked => {
-            first_look(proxy, connection).await?
-        }
+        _ => first_look(proxy, connection).await?,
     };
-    // From here to the open gate the mirror must not change: the master is compared with it.
-    proxy.shadow.set_frozen(true);
-    if keeper.state() == State::Shut(StandIn::Unregistrations) {
-        keeper.set(State::Shut(StandIn::Reads));
-    }
-    // What bears the mark has heard our calls before, however little it holds by now.
-    if (first.marked() || !first.is_empty()) && pay_owed(proxy, connection).await? {
+    if !matches!(manner.known, Known::New { .. }) && !resumes(&first) {
+        settle(proxy, connection).await?;
         first = first_look(proxy, connection).await?;
     }
     let mut examination = Examination {
@@ -184,100 +167,195 @@ pub async fn examine(
         pid: first.pid(),
         counts: Counts::default(),
         skipped: Vec::new(),
-        set_aside: Vec::new(),
         mismatches: Vec::new(),
         look: start.elapsed(),
         injection: Duration::ZERO,
     };
-    if !first.marked() {
-        inject(proxy, connection, first, manner, start, &mut examination).await?;
-    } else if !matches!(manner.known, Known::ServedIfMarked) {
-        let previous = proxy.shadow.with_mirror(Clone::clone);
-        let held = second_look(proxy, first, connection, &previous).await?;
-        proxy.shadow.succeed();
-        let difference = proxy.shadow.adopt(held);
-        if !difference.is_empty() {
-            tracing::info!(
-                ?difference,
-                "the master went on without us; the mirror follows it"
-            );
-        }
-        examination.outcome = match manner.known {
-            Known::Nothing => Outcome::Adopted,
-            _ => Outcome::Injected,
-        };
-        examination.look = start.elapsed();
+    if !resumes(&first) {
+        inject(
+            proxy,
+            tx,
+            connection,
+            first,
+            manner,
+            start,
+            &mut examination,
+        )
+        .await?;
     }
     examination.injection = start.elapsed().saturating_sub(examination.look);
-    examination.counts = proxy.shadow.with_mirror(Master::counts);
+    examination.counts = proxy.ledger.with_mirror(Master::counts);
     Ok(examination)
 }
 
-/// Tells the master of the unregistrations that were taken while it did not answer. Answers whether
-/// there were any.
-async fn pay_owed(proxy: &Proxy, connection: &mut Connection) -> Result<bool, ExamineError> {
-    let owed = proxy.shadow.owed();
-    if owed.is_empty() {
-        return Ok(false);
+/// Returns when the master can no longer be running a call of a connection that has been closed: what
+/// it holds counts only then.
+async fn settle(proxy: &Proxy, connection: &Connection) -> Result<(), ExamineError> {
+    let settled = async {
+        proxy.upstream.no_writers().await;
+        while sockets::may_run_a_call(connection.peer()) {
+            tokio::time::sleep(SETTLE_PAUSE).await;
+        }
+    };
+    if tokio::time::timeout(SETTLE_LIMIT, settled).await.is_ok() {
+        return Ok(());
     }
-    let count = owed.len();
-    while_alive(proxy, connection.call(&Call::multicall(owed))).await?;
-    proxy.shadow.paid(count);
-    Ok(true)
+    match proxy.config.master {
+        // Replaced, like one that hangs.
+        MasterConfig::Supervised(_) => Err(ExamineError::Silent {
+            limit: SETTLE_LIMIT,
+        }),
+        MasterConfig::External(_) => {
+            tracing::warn!(
+                "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or \
+                 it does not close them; what they do from now on may be lost"
+            );
+            Ok(())
+        }
+    }
+}
+
+/// What is to be brought to a master, and how.
+struct Target {
+    state: Master,
+    found: Master,
+    /// The token that it bears, if everything that it holds is to be replaced.
+    replaced: Option<Token>,
 }
 
 async fn inject(
     proxy: &Arc<Proxy>,
+    tx: &Tx,
     connection: &mut Connection,
     first: FirstLook,
     manner: Manner,
     start: Instant,
     examination: &mut Examination,
 ) -> Result<(), ExamineError> {
-    proxy.shadow.succeed();
-    let target = || proxy.shadow.with_mirror(Clone::clone);
-    let empty = first.is_empty();
+    let (bears, empty) = (first.bears(), first.is_empty());
+    let fresh = bears == Bears::Nothing && empty;
     let ready = match manner.prepared {
-        Some(prepared) if empty => prepared.await.ok(),
+        Some(prepared) if fresh => prepared.await.ok(),
         _ => None,
     };
-    let found = match empty {
+    let found = match fresh {
         true => Master::default(),
-        false => second_look(proxy, first, connection, &Master::default()).await?,
+        false => {
+            // What cannot be read back is taken from the mirror, of a master that was given it.
+            let previous = match bears {
+                Bears::Nothing => Master::default(),
+                _ => proxy.ledger.with_mirror(Clone::clone),
+            };
+            while_alive(proxy, look::second(first, connection, &previous)).await?
+        }
     };
     examination.look = start.elapsed();
+    // From here to the open gate the mirror must not change: the master is compared with it.
+    tx.set(State::Injecting);
+    let Basis {
+        mirror,
+        version,
+        pending,
+    } = proxy.ledger.begin_injection();
+    let before = proxy.ledger.token();
     // Nothing of ours to bring: a running system is taken over.
-    let takes_over = !found.is_empty() && proxy.shadow.with_mirror(Master::is_empty);
-    examination.outcome = if takes_over {
-        Outcome::Adopted
-    } else if proxy.shadow.with_mirror(Master::is_empty) {
-        Outcome::Begun
-    } else {
-        Outcome::Injected
+    let takes_over = !found.is_empty() && mirror.is_empty();
+    let (state, replaced) = match bears {
+        Bears::Nothing => {
+            examination.outcome = match mirror.is_empty() {
+                _ if takes_over => Outcome::Adopted,
+                true => Outcome::Begun,
+                false => Outcome::Injected,
+            };
+            (mirror.clone(), None)
+        }
+        // It has been succeeded since: whatever it holds is older than the mirror.
+        Bears::Earlier => {
+            examination.outcome = Outcome::Injected;
+            (mirror.clone(), Some(before))
+        }
+        Bears::Present => {
+            let (authority, outcome) = match manner.known {
+                Known::ServedIfPresent => (Authority::PendingWrites, Outcome::Reconciled),
+                Known::Nothing => (Authority::Mirror, Outcome::Adopted),
+                _ => (Authority::Mirror, Outcome::Injected),
+            };
+            examination.outcome = outcome;
+            let state = master::reconcile(&mirror, &found, &pending, authority);
+            // No look shows who subscribes parameters.
+            let hidden = |call: &crate::xmlrpc::Call| call.method.ends_with("bscribeParam");
+            if state == found && !pending.iter().any(hidden) {
+                proxy.ledger.delivered();
+                say_difference(&proxy.ledger.adopt(state));
+                return Ok(());
+            }
+            (state, Some(before))
+        }
     };
-    if let Some(trial) = &manner.trial {
-        let progress = &manner.progress;
-        return inject_carefully(
-            proxy,
-            connection,
-            found,
-            trial,
-            progress,
-            start,
-            examination,
-        )
-        .await;
+    if state != mirror {
+        say_difference(&proxy.ledger.adopt(state.clone()));
     }
-    let version = proxy.shadow.version();
-    let mut next = ready
-        .filter(|ready| ready.version == version)
-        .unwrap_or_else(|| Prepared::new(proxy, version, &target(), &found));
+    let token = proxy.ledger.succeed();
+    let target = Target {
+        state,
+        found,
+        replaced,
+    };
+    let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
+    bring(
+        proxy,
+        connection,
+        &target,
+        &token,
+        ready,
+        &manner.injecting,
+        examination,
+    )
+    .await
+}
+
+/// Says what the master has that the mirror did not know, or no longer.
+fn say_difference(difference: &[String]) {
+    if !difference.is_empty() {
+        tracing::warn!(
+            ?difference,
+            "the master was changed past rosrescue; the mirror follows it"
+        );
+    }
+}
+
+/// Brings the master to `target`, reads it back and leaves `token`.
+async fn bring(
+    proxy: &Arc<Proxy>,
+    connection: &mut Connection,
+    target: &Target,
+    token: &Token,
+    ready: Option<Prepared>,
+    injecting: &AtomicBool,
+    examination: &mut Examination,
+) -> Result<(), ExamineError> {
+    let Target {
+        state,
+        found,
+        replaced,
+    } = target;
+    let mut next = ready.unwrap_or_else(|| {
+        let plan = match replaced {
+            Some(before) => Plan::replace(state, found, before, token),
+            None => Plan::new(state, found, token),
+        };
+        Prepared {
+            basis: None,
+            complete: plan.expected() == state,
+            plan,
+        }
+    });
     for round in 1..=ROUNDS {
         let Prepared { plan, complete, .. } = next;
-        manner.progress.set(InFlight::Whole);
-        let reply = connection.foretold(plan.request().clone(), plan.answer());
+        injecting.store(true, Ordering::Relaxed);
+        let reply = connection.predicted(plan.request().clone(), plan.answer());
         let raw = while_alive(proxy, reply).await?;
-        manner.progress.take();
+        injecting.store(false, Ordering::Relaxed);
         examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
         // The reply is long, and everybody waits: it is decoded only if it differs from the
         // predicted one at all.
@@ -288,8 +366,9 @@ async fn inject(
         let Err(mismatches) = verdict else {
             examination.mismatches.clear();
             if !complete {
-                proxy.shadow.adopt(plan.expected().clone());
+                proxy.ledger.adopt(plan.expected().clone());
             }
+            proxy.ledger.delivered();
             proxy.stats.injections.count();
             // Thousands of small pieces, freed beside traffic.
             tokio::task::spawn_blocking(move || drop(plan));
@@ -303,107 +382,23 @@ async fn inject(
         );
         // The truth of the master wins over what we expected of it; the rest is tried again.
         let first = first_look(proxy, connection).await?;
-        let found = second_look(proxy, first, connection, plan.expected()).await?;
-        next = Prepared::new(proxy, version, &target(), &found);
+        let found = look::second(first, connection, plan.expected());
+        let found = while_alive(proxy, found).await?;
+        let plan = Plan::new(state, &found, token);
+        next = Prepared {
+            basis: None,
+            complete: plan.expected() == state,
+            plan,
+        };
         if round == ROUNDS {
-            proxy.shadow.adopt(found);
+            proxy.ledger.adopt(found);
         }
-    }
-    Ok(())
-}
-
-/// Injects entry by entry, because masters have died of it.
-async fn inject_carefully(
-    proxy: &Arc<Proxy>,
-    connection: &mut Connection,
-    mut found: Master,
-    trial: &Trial,
-    progress: &Progress,
-    start: Instant,
-    examination: &mut Examination,
-) -> Result<(), ExamineError> {
-    let target = proxy.shadow.with_mirror(Clone::clone);
-    let tested = trial.tested.as_ref().map(|(call, _)| call);
-    for round in 1..=ROUNDS {
-        progress.set(InFlight::NoRecord);
-        let plan = Careful::new(&target, &found, &proxy.mark, &trial.left_out, tested);
-        examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
-        examination.mismatches.clear();
-        let mut index = 0;
-        for step in plan.steps() {
-            if step.tested
-                && let Some((_, age)) = trial.tested
-            {
-                outlive(proxy, connection, start, age).await?;
-            }
-            if step.record {
-                progress.set(InFlight::Record {
-                    call: step.call.clone(),
-                    index,
-                    age: start.elapsed(),
-                });
-                index += 1;
-            }
-            let reply = while_alive(proxy, connection.call(&step.call)).await?;
-            progress.set(InFlight::NoRecord);
-            if reply != step.predicted {
-                let text = format!("{} was answered otherwise than predicted", step.call.method);
-                examination.mismatches.push(text);
-            }
-        }
-        if examination.mismatches.is_empty() {
-            progress.take();
-            // Only now is it known that the rest is harmless.
-            examination.set_aside = set_aside::set_aside(proxy, plan.left_out());
-            if plan.expected() != &target {
-                proxy.shadow.adopt(plan.expected().clone());
-            }
-            proxy.stats.injections.count();
-            return Ok(());
-        }
-        tracing::error!(
-            round,
-            mismatches = ?examination.mismatches,
-            "the master differs from what was injected"
-        );
-        let first = first_look(proxy, connection).await?;
-        found = second_look(proxy, first, connection, plan.expected()).await?;
-    }
-    progress.take();
-    proxy.shadow.adopt(found);
-    Ok(())
-}
-
-/// Waits until the master is of this `age`, and keeps it from closing an idle connection.
-async fn outlive(
-    proxy: &Proxy,
-    connection: &mut Connection,
-    start: Instant,
-    age: Duration,
-) -> Result<(), ExamineError> {
-    let sign_of_life = Call::new("getPid", vec![CALLER_ID.into()]);
-    while let Some(rest) = age
-        .checked_sub(start.elapsed())
-        .filter(|rest| !rest.is_zero())
-    {
-        tokio::time::sleep(rest.min(Duration::from_millis(500))).await;
-        while_alive(proxy, connection.call(&sign_of_life)).await?;
     }
     Ok(())
 }
 
 async fn first_look(proxy: &Proxy, connection: &mut Connection) -> Result<FirstLook, ExamineError> {
-    let limit = proxy.config.probe_timeout * proxy.config.probing.count;
-    within(limit, look::first(connection, &proxy.mark)).await
-}
-
-async fn second_look(
-    proxy: &Proxy,
-    first: FirstLook,
-    connection: &mut Connection,
-    previous: &Master,
-) -> Result<Master, ExamineError> {
-    while_alive(proxy, look::second(first, connection, previous)).await
+    while_alive(proxy, look::first(connection, &proxy.ledger.token())).await
 }
 
 /// Waits for what may take long, as long as the master shows signs of life.

@@ -73,10 +73,10 @@ impl MasterProcess {
         };
         let uri = address.to_string();
         proxy.upstream.relocate(address);
-        if proxy.shadow.session().master_uri.as_ref() != Some(&uri) {
+        if proxy.ledger.session().master_uri.as_ref() != Some(&uri) {
             // Before it runs: a rosrescue that dies now leaves a master that the next one can find.
             proxy
-                .shadow
+                .ledger
                 .update_session(|session| session.master_uri = Some(uri));
         }
         let mut child = self.rosmaster.spawn(port)?;

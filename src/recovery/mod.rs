@@ -5,31 +5,37 @@ pub mod census;
 pub mod core_duties;
 mod early_end;
 pub mod examine;
-pub mod healing;
 pub mod master_process;
 pub mod node;
 pub mod nodes;
+pub mod notifications;
 pub mod report;
 mod saying;
-mod set_aside;
 
 pub use nodes::Nodes;
 
-use std::{pin::Pin, sync::Arc, time::Instant};
+use std::{
+    pin::Pin,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Instant,
+};
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use self::{
-    examine::{Examination, ExamineError, Known, Prepared, Progress},
+    examine::{Examination, ExamineError, Known, Prepared},
     master_process::MasterProcess,
     report::{Outage, Outcome},
 };
 use crate::{
-    lifecycle::{Action, Cause, InFlight, Input, Lifecycle, Supervision, Suspicion},
+    lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
     proxy::{
         Proxy,
-        gate::{Keeper, StandIn, State},
+        gate::{State, Tx},
         pool::{VerifyError, connect_verified},
         upstream::{ConnectError, Connection},
     },
@@ -51,7 +57,7 @@ type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 /// Carries out what the lifecycle decides.
 pub struct Guard {
     proxy: Arc<Proxy>,
-    keeper: Keeper,
+    gate: Tx,
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     connection: Option<Connection>,
@@ -62,9 +68,8 @@ pub struct Guard {
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
     prepared: Option<JoinHandle<Prepared>>,
-    suspicion: Suspicion,
-    /// What the master is at while it is examined.
-    progress: Progress,
+    /// Whether the master is being brought to the mirror's state.
+    injecting: Arc<AtomicBool>,
     outage: Outage,
     /// The incarnation that was served last.
     served: Option<u64>,
@@ -74,14 +79,9 @@ pub struct Guard {
 }
 
 impl Guard {
-    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
-    /// mirror comes from a checkpoint whose session goes on.
-    pub fn new(
-        proxy: Arc<Proxy>,
-        keeper: Keeper,
-        process: Option<MasterProcess>,
-        restored: bool,
-    ) -> Self {
+    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `known`: the mirror is
+    /// what a master would hold.
+    pub fn new(proxy: Arc<Proxy>, gate: Tx, process: Option<MasterProcess>, known: bool) -> Self {
         let supervision = match process {
             Some(_) => Supervision::Ours,
             None => Supervision::Theirs,
@@ -89,7 +89,7 @@ impl Guard {
         Self {
             lifecycle: Lifecycle::new(supervision, proxy.config.probing),
             proxy,
-            keeper,
+            gate,
             process,
             connection: None,
             ended: None,
@@ -97,11 +97,10 @@ impl Guard {
             step: None,
             probe_deadline: None,
             prepared: None,
-            suspicion: Suspicion::default(),
-            progress: Progress::default(),
+            injecting: Arc::default(),
             outage: Outage::begin(Instant::now(), "start"),
             served: None,
-            known: restored,
+            known,
             said: None,
         }
     }
@@ -117,7 +116,7 @@ impl Guard {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
         let mut input = Input::Start { left };
         loop {
-            self.suspect(input);
+            self.note_death(input);
             let actions = self.lifecycle.on(Instant::now(), input);
             self.proxy.board.set_deaths(self.lifecycle.deaths());
             for action in actions {
@@ -134,25 +133,15 @@ impl Guard {
         }
     }
 
-    /// Takes note of what a master died at.
-    fn suspect(&mut self, input: Input) {
-        match input {
-            Input::ConnectionLost | Input::Exited | Input::Unreachable => {
-                let careful = self.suspicion.trial().is_some();
-                let at = self.progress.take();
-                if at != InFlight::Nothing {
-                    self.lifecycle.answered();
-                }
-                self.suspicion.died(at);
-                if !careful && self.suspicion.trial().is_some() {
-                    tracing::warn!(
-                        "masters die while they are given the state: it is given entry by entry, \
-                         to find the one that they die of"
-                    );
-                }
-            }
-            Input::NotAMaster => drop(self.progress.take()),
-            _ => {}
+    /// A master that dies while it is brought to the state had answered before.
+    fn note_death(&mut self, input: Input) {
+        let died = matches!(
+            input,
+            Input::ConnectionLost | Input::Exited | Input::Unreachable
+        );
+        if died && self.injecting.swap(false, Ordering::Relaxed) {
+            tracing::warn!("the master died while it was brought to the mirror's state");
+            self.lifecycle.answered();
         }
     }
 
@@ -166,7 +155,7 @@ impl Guard {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
                 () = wait::for_some(self.ended.as_mut()) => {
-                    if matches!(self.keeper.state(), State::Shut(_)) {
+                    if !matches!(self.gate.state(), State::Open { .. }) {
                         let master = self.proxy.upstream.address();
                         self.say_waiting(&format!("{master} closes the connection unasked"));
                     }
@@ -187,6 +176,8 @@ impl Guard {
                         return input;
                     }
                 }
+                () = self.proxy.write_queue.lost() => return Input::BatchLost,
+                () = self.proxy.slow.notified() => return Input::Slow,
                 () = wait::until(self.probe_deadline) => {
                     self.probe_deadline = None;
                     return Input::ProbeMissed;
@@ -202,9 +193,7 @@ impl Guard {
                 self.disconnect();
                 // Whatever comes of it: the one before may have gone to a master that died then.
                 let proxy = &self.proxy;
-                if self.suspicion.trial().is_none() {
-                    self.prepared.get_or_insert_with(|| examine::prepare(proxy));
-                }
+                self.prepared.get_or_insert_with(|| examine::prepare(proxy));
                 let proxy = self.proxy.clone();
                 self.step = Some(Box::pin(async move {
                     match proxy.upstream.connect().await {
@@ -217,22 +206,21 @@ impl Guard {
                 let Some(mut connection) = self.connection.take() else {
                     return Ok(());
                 };
-                let (proxy, keeper) = (self.proxy.clone(), self.keeper.clone());
+                let (proxy, gate) = (self.proxy.clone(), self.gate.clone());
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
-                let incarnation = self.proxy.shadow.incarnation();
+                let incarnation = self.proxy.ledger.incarnation();
                 let manner = examine::Manner {
                     known: match (self.served, new) {
                         (None, _) => Known::Nothing,
                         (_, Some(pid)) => Known::New { pid },
-                        (served, None) if served == Some(incarnation) => Known::ServedIfMarked,
-                        _ => Known::InjectedIfMarked,
+                        (served, None) if served == Some(incarnation) => Known::ServedIfPresent,
+                        _ => Known::InjectedIfPresent,
                     },
                     prepared: self.prepared.take(),
-                    trial: self.suspicion.trial(),
-                    progress: self.progress.clone(),
+                    injecting: self.injecting.clone(),
                 };
                 self.step = Some(Box::pin(async move {
-                    let examined = examine::examine(&proxy, &keeper, &mut connection, manner);
+                    let examined = examine::examine(&proxy, &gate, &mut connection, manner);
                     let examined = examined.await;
                     Done::Examined(connection, examined)
                 }));
@@ -244,7 +232,7 @@ impl Guard {
                 if self.step.is_none() {
                     let proxy = self.proxy.clone();
                     self.step = Some(Box::pin(async move {
-                        let fresh = connect_verified(&proxy.upstream, &proxy.mark).await;
+                        let fresh = connect_verified(&proxy.upstream, &proxy.ledger.token()).await;
                         Done::Probed(fresh)
                     }));
                 }
@@ -297,19 +285,19 @@ impl Guard {
                 })
             }
             Done::Examined(connection, Ok(examination)) => {
-                let new = examination.outcome != Outcome::Resumed;
-                if !new {
+                let outcome = examination.outcome;
+                if outcome == Outcome::Resumed {
                     // Somebody may have written past us.
-                    self.proxy.shadow.doubt();
+                    self.proxy.ledger.doubt();
                 } else {
-                    self.suspicion.survived();
                     self.thread_ended = thread_of(&connection, examination.pid);
                 }
                 self.connection = Some(connection);
-                // Whatever it dies of from now on, it is not the injection.
-                self.progress.take();
+                self.injecting.store(false, Ordering::Relaxed);
                 self.report(examination);
-                Some(Input::Examined { new })
+                Some(Input::Examined {
+                    new: outcome.is_new(),
+                })
             }
             Done::Examined(_, Err(error)) => {
                 self.disconnect();
@@ -327,7 +315,7 @@ impl Guard {
                 Some(input)
             }
             // Another incarnation is there, and nobody has closed the connection to the one before.
-            Done::Probed(Err(VerifyError::Unmarked)) => {
+            Done::Probed(Err(VerifyError::OtherIncarnation)) => {
                 self.disconnect();
                 Some(Input::ConnectionLost)
             }
@@ -350,8 +338,8 @@ impl Guard {
     }
 
     fn disconnect(&mut self) {
-        // An injection that was under way froze the mirror.
-        if matches!(self.keeper.state(), State::Shut(_)) {
+        // An injection that was under way has failed.
+        if !matches!(self.gate.state(), State::Open { .. }) {
             self.keep_shut();
         }
         self.connection = None;
@@ -360,14 +348,13 @@ impl Guard {
         self.probe_deadline = None;
     }
 
-    /// Lets nothing pass; the mirror stands in as far as it may.
+    /// Lets nothing pass; the mirror stands in if it is known.
     fn keep_shut(&self) {
-        let stand_in = match self.known {
-            true => StandIn::Unregistrations,
-            false => StandIn::Nobody,
-        };
-        self.proxy.shadow.set_frozen(!self.known);
-        self.keeper.set(State::Shut(stand_in));
+        self.proxy.ledger.end_injection();
+        self.gate.set(match self.known {
+            true => State::StandingIn,
+            false => State::Unknown,
+        });
     }
 
     fn shut_gate(&mut self, cause: Cause) {
@@ -379,7 +366,7 @@ impl Guard {
         if cause == Cause::Hung {
             self.disconnect();
         }
-        tracing::warn!(cause = cause.as_str(), "the gate is shut");
+        tracing::warn!(cause = cause.as_str(), "standing in for the master");
         self.proxy.board.set_open(false);
         // What was prepared before is of another time.
         self.prepared = None;
@@ -388,9 +375,10 @@ impl Guard {
     fn open_gate(&mut self) {
         self.known = true;
         self.said = None;
-        let incarnation = self.proxy.shadow.incarnation();
+        self.proxy.ledger.end_injection();
+        let incarnation = self.proxy.ledger.incarnation();
         self.served = Some(incarnation);
-        self.keeper.set(State::Open { incarnation });
+        self.gate.set(State::Open { incarnation });
         self.proxy.board.set_open(true);
     }
 

@@ -13,19 +13,19 @@ use tokio::sync::Notify;
 
 use super::{
     census::{self, Outcome},
-    healing::{self, Post},
     node::{self, Sign},
+    notifications::{self, Notifications},
 };
 use crate::{
-    census::{Repeats, Suspects, Verdict},
+    census::{Repeats, Suspects},
     proxy::{
         Proxy,
-        activity::{Letter, News},
-        gate::{StandIn, State},
-        shadow::Shadow,
+        activity::{Change, Notification, Owed},
+        gate::State,
+        ledger::Ledger,
     },
     wait,
-    xmlrpc::{Call, Value},
+    xmlrpc::Call,
 };
 
 /// A node is asked for its process id so long after it last registered something: starting nodes
@@ -33,19 +33,16 @@ use crate::{
 const ACQUAINTANCE: Duration = Duration::from_secs(2);
 /// How often it is looked whether a node is to be asked.
 const ROUND: Duration = Duration::from_millis(500);
-/// So many registrations that masters died of are remembered: one is rare.
-const DEADLY: usize = 1000;
-/// How long a node whose name another one is about to take may need to answer.
-const DISPLACED_TIME: Duration = Duration::from_secs(1);
+/// How long the master must have been away before what it may have owed its nodes is told by us: most
+/// that only closed an idle connection are back by then.
+const OWED_AFTER: Duration = Duration::from_millis(50);
 
 /// What is known of the nodes beyond their registrations.
 #[derive(Debug, Default)]
 pub struct Nodes {
-    /// Letters under way.
-    pub(super) post: Post,
+    /// Notifications under way.
+    pub(super) notifications: Notifications,
     suspects: Mutex<Suspects>,
-    /// Registrations that masters died of: method, node and topic.
-    deadly: Mutex<HashSet<Vec<String>>>,
     /// Recoveries whose census is not over.
     censuses: AtomicUsize,
     /// Nodes that are being asked, or are about to be, and have not answered yet.
@@ -63,25 +60,11 @@ impl Nodes {
         self.lock().contains(api)
     }
 
-    /// A master died of this call: it is not made again to mend what a node says.
-    pub(super) fn forbid(&self, call: &Call) {
-        let mut deadly = self.deadly.lock().unwrap_or_else(PoisonError::into_inner);
-        if deadly.len() < DEADLY {
-            deadly.insert(essence(call));
-        }
-    }
-
-    /// Whether [`Nodes::forbid`] was told so.
-    pub(super) fn is_forbidden(&self, call: &Call) -> bool {
-        let deadly = self.deadly.lock().unwrap_or_else(PoisonError::into_inner);
-        deadly.contains(&essence(call))
-    }
-
     /// The names of the suspects.
-    pub fn suspects(&self, shadow: &Shadow) -> Vec<String> {
+    pub fn suspects(&self, ledger: &Ledger) -> Vec<String> {
         // No lock is held while the other one is taken.
         let suspects = self.lock().clone();
-        let mut names: Vec<String> = shadow.with_mirror(|mirror| {
+        let mut names: Vec<String> = ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| suspects.contains(api));
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
@@ -100,9 +83,9 @@ impl Nodes {
         if self.update_telling(proxy) {
             // What changed before, the master may be about to tell this very node first.
             proxy
-                .shadow
-                .with_activity(|_, activity| activity.repeat_news(now));
-            proxy.shadow.news.notify_one();
+                .ledger
+                .with_activity(|_, activity| activity.repeat_changes(now));
+            proxy.ledger.news.notify_one();
         }
     }
 
@@ -121,7 +104,7 @@ impl Nodes {
         let suspects = self.lock();
         let telling = !suspects.is_empty() || self.censuses.load(Ordering::Relaxed) > 0;
         proxy
-            .shadow
+            .ledger
             .with_activity(|_, activity| activity.set_telling(telling))
             && telling
     }
@@ -134,15 +117,6 @@ impl Nodes {
     }
 }
 
-/// What a registration is about, whatever its type and address.
-fn essence(call: &Call) -> Vec<String> {
-    let subject = call.params.iter().take(2).filter_map(Value::as_str);
-    std::iter::once(call.method.as_str())
-        .chain(subject)
-        .map(str::to_owned)
-        .collect()
-}
-
 /// The census of a recovery.
 pub(super) struct CensusUnderWay(Arc<Proxy>);
 
@@ -153,7 +127,7 @@ impl Drop for CensusUnderWay {
     }
 }
 
-/// Watches over the nodes for as long as it is polled: tells news, asks suspects again, gets
+/// Watches over the nodes for as long as it is polled: sends notifications, asks suspects again, gets
 /// acquainted with new nodes, and takes the census that is due.
 pub async fn watch(proxy: Arc<Proxy>) {
     let mut round = tokio::time::interval(ROUND);
@@ -161,24 +135,38 @@ pub async fn watch(proxy: Arc<Proxy>) {
         .config
         .reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
-    let mut repeats = Repeats::<News>::default();
+    let mut repeats = Repeats::<Change>::default();
+    let mut gate = proxy.gate.clone();
+    // When to tell what the master that is away may have owed, and whether it has been told.
+    let (mut owed_at, mut owed_told) = (None, false);
     loop {
         let next = proxy.nodes.lock().next().map(Into::into);
         tokio::select! {
-            () = proxy.shadow.news.notified() => take_news(&proxy, &mut repeats),
+            () = proxy.ledger.news.notified() => empty_outbox(&proxy, &mut repeats),
+            () = gate.changed() => match gate.look() {
+                State::StandingIn if !owed_told => {
+                    owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
+                }
+                State::Open { .. } => (owed_at, owed_told) = (None, false),
+                _ => {}
+            },
+            () = wait::until(owed_at) => {
+                (owed_at, owed_told) = (None, true);
+                tell_owed(&proxy, Instant::now());
+            }
             () = wait::until(next) => ask_suspects(&proxy),
             () = wait::until(repeats.next().map(Into::into)) => {
                 let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
                 let holding_up = unanswered || !proxy.nodes.lock().is_empty();
-                for news in repeats.due(Instant::now(), holding_up) {
-                    tell(&proxy, news);
+                for change in repeats.due(Instant::now(), holding_up) {
+                    tell(&proxy, change);
                 }
             }
             // A suspect that is new may be due before the others.
             () = proxy.nodes.changed.notified() => {}
             _ = round.tick() => get_acquainted(&proxy),
             () = wait::tick(&mut reaping) => {
-                if matches!(proxy.gate.state(), State::Open { .. }) {
+                if proxy.gate.is_open() {
                     tokio::spawn(reap(proxy.clone()));
                 }
             }
@@ -186,30 +174,51 @@ pub async fn watch(proxy: Arc<Proxy>) {
     }
 }
 
-fn take_news(proxy: &Arc<Proxy>, repeats: &mut Repeats<News>) {
-    let (news, displaced) = proxy
-        .shadow
-        .with_activity(|_, activity| (activity.take_news(), activity.take_displaced()));
-    for news in news {
-        repeats.changed(news, Instant::now());
+fn empty_outbox(proxy: &Arc<Proxy>, repeats: &mut Repeats<Change>) {
+    let outbox = proxy
+        .ledger
+        .with_activity(|_, activity| activity.take_outbox());
+    for (api, call) in outbox.calls {
+        notifications::send(proxy, &api, Notification::Call(call));
     }
-    for (node, api) in displaced {
-        tokio::spawn(displace(proxy.clone(), node, api));
+    for displaced in outbox.displaced {
+        notifications::shut_down(proxy, displaced);
+    }
+    for change in outbox.changes {
+        repeats.changed(change, Instant::now());
     }
 }
 
-fn tell(proxy: &Arc<Proxy>, news: News) {
-    match news {
-        (Some(api), letter) => healing::send(proxy, &api, letter),
-        (None, Letter::Topic(topic)) => {
-            healing::tell_subscribers(proxy, &topic);
+/// Tells what a master that went away at `outage` may not have told before. The topics of it.
+pub(super) fn tell_owed(proxy: &Arc<Proxy>, outage: Instant) -> Vec<String> {
+    let Owed {
+        mut topics,
+        params,
+        displaced,
+    } = proxy
+        .ledger
+        .with_activity(|_, activity| activity.take_owed(outage));
+    topics.retain(|topic| notifications::tell_subscribers(proxy, topic));
+    for (api, key) in params {
+        notifications::send(proxy, &api, Notification::Param(key));
+    }
+    for displaced in displaced {
+        notifications::shut_down(proxy, displaced);
+    }
+    topics
+}
+
+fn tell(proxy: &Arc<Proxy>, change: Change) {
+    match change {
+        Change::Param(api, key) => notifications::send(proxy, &api, Notification::Param(key)),
+        Change::Topic(topic) => {
+            notifications::tell_subscribers(proxy, &topic);
         }
-        (None, Letter::Param(_)) => {}
     }
 }
 
 fn ask_suspects(proxy: &Arc<Proxy>) {
-    let registered = proxy.shadow.with_mirror(|mirror| {
+    let registered = proxy.ledger.with_mirror(|mirror| {
         let apis = mirror.nodes().map(|(_, api)| api.to_owned());
         apis.collect::<HashSet<_>>()
     });
@@ -244,7 +253,7 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
     let Some(before) = Instant::now().checked_sub(ACQUAINTANCE) else {
         return;
     };
-    let new = proxy.shadow.with_activity(|mirror, activity| {
+    let new = proxy.ledger.with_activity(|mirror, activity| {
         let new = activity.take_strangers(before).into_iter();
         let new = new.filter_map(|name| {
             let api = mirror.api_of(&name)?.to_owned();
@@ -261,7 +270,7 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
             let answer = node::ask_for(&api, &call, proxy.config.census_timeout).await;
             drop(permit);
             if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
-                proxy.shadow.with_activity(|_, activity| {
+                proxy.ledger.with_activity(|_, activity| {
                     activity.remember_pid(&name, &api, registered, pid);
                 });
             }
@@ -275,39 +284,5 @@ async fn reap(proxy: Arc<Proxy>) {
     if !outcome.removed.is_empty() || !outcome.mended.is_empty() {
         let (removed, mended) = (outcome.removed, outcome.mended);
         tracing::info!(?removed, ?mended, "standing census");
-    }
-}
-
-/// A parked registration is about to take the name `node` from `api`. A master that never died would
-/// have told the node there to shut down when the call came; the one that comes back will do it then,
-/// and the port may be another node's by that time. So if the old node is gone it is taken out now.
-async fn displace(proxy: Arc<Proxy>, node: String, api: String) {
-    let interview = node::interview(&api, DISPLACED_TIME).await;
-    let gone = match interview.sign {
-        Sign::Dead => true,
-        Sign::Silent => false,
-        Sign::Alive => proxy.shadow.with_activity(|mirror, activity| {
-            let names = census::names_at(mirror, activity, &api);
-            let verdicts =
-                crate::census::judge(mirror, &names, interview.pid, interview.claims.as_ref());
-            let mut judged = names.iter().zip(verdicts);
-            judged.any(|(name, verdict)| name.node == node && verdict == Verdict::Stranger)
-        }),
-    };
-    let calls = proxy.shadow.with_mirror(|mirror| {
-        let same = gone && mirror.api_of(&node) == Some(&*api);
-        same.then(|| mirror.unregister_calls(&node))
-    });
-    let Some(calls) = calls.filter(|calls| !calls.is_empty()) else {
-        return;
-    };
-    if proxy.gate.state() == State::Shut(StandIn::Unregistrations) {
-        tracing::info!(
-            node,
-            api,
-            "came back at another address; the old node is gone"
-        );
-        let call = Call::multicall(calls);
-        proxy.shadow.unregister(Instant::now(), &call);
     }
 }

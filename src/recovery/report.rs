@@ -21,8 +21,17 @@ pub enum Outcome {
     Injected,
     /// The mirror took over what a running master holds.
     Adopted,
+    /// It is the same incarnation as before, and was brought to the mirror's state again.
+    Reconciled,
     /// It is the same incarnation as before.
     Resumed,
+}
+
+impl Outcome {
+    /// Whether the master is not the incarnation that was served before.
+    pub fn is_new(self) -> bool {
+        !matches!(self, Self::Reconciled | Self::Resumed)
+    }
 }
 
 impl fmt::Display for Outcome {
@@ -31,6 +40,7 @@ impl fmt::Display for Outcome {
             Self::Begun => "an empty master is served",
             Self::Injected => "the master has been restored",
             Self::Adopted => "a running master has been taken over",
+            Self::Reconciled => "the same master goes on, and knows what was written meanwhile",
             Self::Resumed => "the same master goes on",
         })
     }
@@ -68,8 +78,6 @@ pub struct Report {
     pub restored: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
-    /// What was set aside because each new master died of it.
-    pub set_aside: Vec<String>,
     /// Where the master, read back, differs from what was injected. Should be empty.
     pub mismatches: Vec<String>,
     /// Nodes that were found dead and taken out.
@@ -101,7 +109,6 @@ impl Report {
             census_ms = self.census_ms,
             master_pid = self.master_pid,
             skipped = some(&self.skipped),
-            set_aside = some(&self.set_aside),
             mismatches = some(&self.mismatches),
             removed = some(&self.removed),
             mended = some(&self.mended),
@@ -165,7 +172,6 @@ impl Outage {
             census_ms: None,
             restored: examination.counts,
             skipped: examination.skipped,
-            set_aside: examination.set_aside,
             mismatches: examination.mismatches,
             removed: Vec::new(),
             mended: Vec::new(),

@@ -22,7 +22,7 @@ impl Guard {
         let Outage { cause, since, .. } = self.outage;
         let report = self.outage.report(Instant::now(), examination);
         let uri = self.proxy.uri.clone();
-        self.proxy.shadow.set_identity(report.master_pid, uri);
+        self.proxy.ledger.set_identity(report.master_pid, uri);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
             // Such as after each idle connection that a master with `-t` closes; or it is being
@@ -35,7 +35,7 @@ impl Guard {
         self.proxy.board.set_report(report);
         if self.served.is_none() {
             // What happened just before we died ourselves, nobody knows any more.
-            self.proxy.shadow.with_activity(|mirror, activity| {
+            self.proxy.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
         }

@@ -41,25 +41,6 @@ impl<S: Storage> Store<S> {
     }
 }
 
-impl<S: Storage> Store<S> {
-    /// Writes `bytes` to a file of their own beside the checkpoint, `PATH.KIND-NUMBER`, and returns
-    /// its path when they are on the medium. `kind` is made of letters and hyphens.
-    ///
-    /// # Errors
-    ///
-    /// If they cannot be written; there may be a part of them.
-    pub fn keep_beside(&self, kind: &str, bytes: &[u8]) -> Result<PathBuf, StoreError> {
-        let kept = self.names.aside(&self.storage, kind).and_then(|aside| {
-            let file = self.storage.create(&aside)?;
-            append_all(&self.storage, &file, bytes)?;
-            self.storage.sync(&file)?;
-            self.storage.sync_dir(self.names.folder())?;
-            Ok(aside)
-        });
-        kept.map_err(failed("keep something beside", &self.names.path))
-    }
-}
-
 /// Keeps what is damaged, and says under which name.
 pub(super) fn keep_aside(
     storage: &impl Storage,

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{FirstLook, Mark, Master, Plan, Skipped};
+use rosrescue::master::{FirstLook, Master, Plan, Skipped, Token, is_answerable};
 use rosrescue::xmlrpc::Call;
 use rustix::process::Signal;
 
@@ -33,9 +33,15 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
         })
         .collect();
     for _ in 0..crashes {
-        let in_flight = dice.once_in(2);
         let at = dice.below(steps.len() + 1);
-        steps.insert(at, Step::Crash { in_flight });
+        if dice.once_in(3) {
+            let end = (at + 1 + dice.below(calls / 4 + 1)).min(steps.len());
+            steps.insert(end, Step::Back);
+            steps.insert(at, Step::Away);
+        } else {
+            let in_flight = dice.once_in(2);
+            steps.insert(at, Step::Crash { in_flight });
+        }
     }
     let poison = cast.poison;
     Script { poison, steps }
@@ -43,7 +49,8 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
 
 /// rosrescue and what is behind it.
 struct Rig {
-    /// rosrescue's own child if there is none here.
+    /// Whether rosrescue runs the master.
+    supervised: bool,
     master: Option<Rosmaster>,
     master_port: u16,
     /// The process id of a master that was killed.
@@ -65,9 +72,10 @@ impl Rig {
                 (Setup::proxy(&scratch, master_port), Some(master))
             }
         };
-        // Calls are parked as long as a busy computer needs.
+        // What only a master answers waits as long as a busy computer needs.
         let rescue = setup.args(["--hold", "60"]).start();
         Self {
+            supervised: core,
             master,
             master_port,
             killed: 0,
@@ -85,9 +93,9 @@ impl Rig {
         let mut wire = self.wire();
         let deadline = Instant::now() + Duration::from_secs(60);
         let mut model = Master::default();
-        while self.master.is_none() && !is_complete(&model) {
+        while self.supervised && !is_complete(&model) {
             assert!(Instant::now() < deadline, "core is never complete");
-            let look = wire.call(&FirstLook::call(&Mark::new("none"))).unwrap();
+            let look = wire.call(&FirstLook::call(&Token::new("none", 1))).unwrap();
             let look = FirstLook::decode(&look).unwrap();
             let nothing = Master::default();
             let second = look
@@ -106,25 +114,55 @@ impl Rig {
 
     /// SIGKILL for the master. Another one is on its way when this returns.
     fn crash(&mut self) -> Result<(), Failure> {
-        if let Some(master) = &mut self.master {
-            master.kill();
-            *master = Rosmaster::start_at(self.master_port);
-            return Ok(());
-        }
+        self.kill()?;
+        self.revive();
+        Ok(())
+    }
+
+    /// SIGKILL for the master. A core starts the next one by itself.
+    fn kill(&mut self) -> Result<(), Failure> {
         let deadline = Instant::now() + patience();
         let mut wire = self.wire();
         loop {
             let (pid, _) = wire.identity();
             if pid != self.killed {
-                signal(u32::try_from(pid).unwrap(), Signal::KILL);
                 self.killed = pid;
+                match &mut self.master {
+                    Some(master) => master.kill(),
+                    None => signal(u32::try_from(pid).unwrap(), Signal::KILL),
+                }
+                self.master = None;
                 return Ok(());
             }
             if Instant::now() > deadline {
-                return Err("core starts no other master".to_owned());
+                return Err("there is no other master".to_owned());
             }
             std::thread::sleep(Duration::from_millis(2));
         }
+    }
+
+    fn revive(&mut self) {
+        if !self.supervised && self.master.is_none() {
+            self.master = Some(Rosmaster::start_at(self.master_port));
+        }
+    }
+
+    /// Whether calls pass to a master that lives.
+    fn is_open(&self) -> bool {
+        let status = status(&self.rescue.client());
+        status["open"] == true && status["last_recovery"]["master_pid"] != self.killed
+    }
+
+    /// Waits until calls pass to a master, or no longer.
+    fn await_gate(&self, open: bool) -> Result<(), Failure> {
+        let deadline = Instant::now() + patience();
+        while self.is_open() != open {
+            if Instant::now() > deadline {
+                return Err(format!("the gate never becomes open: {open}"));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Ok(())
     }
 }
 
@@ -173,6 +211,18 @@ pub(crate) fn run(
             Step::Call { by, call } => {
                 let call = stage.real(call);
                 let by = by % CLIENTS;
+                let mut after = stage.model.clone();
+                after.apply(&call);
+                if stage.away && !is_answerable(&call) {
+                    // It waits for a master.
+                    rig.revive();
+                }
+                if stage.away && !skipped(&after).is_empty() {
+                    // What cannot be brought to another master is for one that is there.
+                    rig.revive();
+                    rig.await_gate(true)?;
+                }
+                stage.away &= !rig.is_open();
                 match std::mem::take(&mut in_flight) {
                     false => stage.call(by, &call),
                     true => crash_under(&mut rig, &mut stage, by, &call, nth),
@@ -184,6 +234,7 @@ pub(crate) fn run(
                     false => &mut tally.sound,
                 };
                 share.asked += 1;
+                rig.revive();
                 let mut skipped = skipped(&stage.model);
                 // The call that is under way may be part of the state.
                 if let (true, Some(Step::Call { call, .. })) = (during, script.steps.get(nth + 1)) {
@@ -205,11 +256,26 @@ pub(crate) fn run(
                     if *during { Ok(()) } else { rig.crash() }
                 })
             }
-            Step::Successor(_) => Ok(()),
+            Step::Away if skipped(&stage.model).is_empty() && rig.master.is_some() => {
+                stage.settle().and_then(|()| {
+                    let repeats = stage.repeats.get_or_insert_default();
+                    repeats.crash(&stage.model);
+                    stage.away = true;
+                    rig.kill()?;
+                    rig.await_gate(false)
+                })
+            }
+            Step::Back => {
+                rig.revive();
+                Ok(())
+            }
+            Step::Away | Step::Successor(_) => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
-    let end = stage.settle().and_then(|()| {
+    rig.revive();
+    let end = rig.await_gate(true).and_then(|()| stage.settle());
+    let end = end.and_then(|()| {
         let divergences = &status(&rig.rescue.client())["counters"]["divergences"];
         if *divergences != 0 {
             return Err(format!("{divergences} replies were taken for divergences"));
@@ -236,12 +302,13 @@ fn crash_under(
     let micros = Dice(nth as u64).next() % 2_000;
     std::thread::sleep(Duration::from_micros(micros));
     rig.crash()?;
+    stage.away = true;
     let reply = stage.wires[by].receive()?;
     stage.answered(call, &reply, true)
 }
 
 /// What of that state cannot be brought to an empty master.
 fn skipped(model: &Master) -> Vec<Skipped> {
-    let plan = Plan::new(model, &Master::default(), &Mark::new("test"));
+    let plan = Plan::new(model, &Master::default(), &Token::new("test", 1));
     plan.skipped().to_vec()
 }

@@ -1,6 +1,8 @@
 //! The model against a bare rosmaster.
 
-use rosrescue::master::{FirstLook, Mark, Master, NotAMaster, Notice, Plan, Skipped, difference};
+use rosrescue::master::{
+    Bears, FirstLook, Master, NotAMaster, Notice, Plan, Skipped, Token, difference,
+};
 use rosrescue::xmlrpc::{Call, decode_call};
 
 use crate::dice::{Cast, Dice};
@@ -68,7 +70,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
                 real = next;
                 succeed(&mut stage, wires, model, found)
             }),
-            Step::Crash { .. } => Ok(()),
+            Step::Crash { .. } | Step::Away | Step::Back => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
@@ -104,7 +106,7 @@ fn succeed(
             .call(0, &call)
             .map_err(|why| format!("{call:?} {why}"))?;
     }
-    let plan = Plan::new(&target, &stage.model, &Mark::new("test"));
+    let plan = Plan::new(&target, &stage.model, &Token::new("test", 1));
     let call = decode_call(plan.request()).map_err(|error| error.to_string())?;
     let reply = stage.wires[0].call(&call)?;
     plan.verify(&reply)
@@ -143,7 +145,7 @@ fn succeed(
 
 /// A look at the real master, with the model as the state known before, must show the model.
 fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
-    let mark = Mark::new("none");
+    let mark = Token::new("none", 1);
     let look = match FirstLook::decode(&wire.call(&FirstLook::call(&mark))?) {
         Err(NotAMaster::ParamsUnreadable { .. }) => {
             FirstLook::decode(&wire.call(&FirstLook::call_without_params(&mark))?)
@@ -151,7 +153,7 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
         look => look,
     };
     let look = look.map_err(|error| error.to_string())?;
-    if look.marked() {
+    if look.bears() != Bears::Nothing {
         return Err("a mark that nobody left".to_owned());
     }
     let second = match look.second_call(model) {

@@ -18,6 +18,10 @@ pub(crate) enum Step {
         /// Whether it is while the next call is under way.
         in_flight: bool,
     },
+    /// The master is killed, and no other one comes before [`Step::Back`].
+    Away,
+    /// A master comes.
+    Back,
     /// The state is brought to a fresh master, on which others have made these calls before. The
     /// sequence goes on with that one.
     Successor(Vec<Call>),
@@ -75,6 +79,8 @@ impl Script {
                 Step::Call { by, call } => text += &format!("{by} {}\n", call_to_json(call)),
                 Step::Crash { in_flight: true } => text += "crash in flight\n",
                 Step::Crash { in_flight: false } => text += "crash\n",
+                Step::Away => text += "away\n",
+                Step::Back => text += "back\n",
                 Step::Successor(found) => {
                     text += "successor\n";
                     for call in found {
@@ -97,6 +103,8 @@ impl Script {
                 "poison" => poison = true,
                 "crash" => steps.push(Step::Crash { in_flight: false }),
                 "crash in flight" => steps.push(Step::Crash { in_flight: true }),
+                "away" => steps.push(Step::Away),
+                "back" => steps.push(Step::Back),
                 "successor" => steps.push(Step::Successor(Vec::new())),
                 _ => {
                     let (by, call) = line.split_once(' ').expect("a client and a call");
@@ -118,7 +126,7 @@ impl Script {
     pub(crate) fn calls(&self) -> usize {
         let calls = self.steps.iter().map(|step| match step {
             Step::Call { .. } => 1,
-            Step::Crash { .. } => 0,
+            Step::Crash { .. } | Step::Away | Step::Back => 0,
             Step::Successor(found) => found.len(),
         });
         calls.sum()
@@ -148,7 +156,7 @@ pub(crate) fn simpler(step: &Step) -> Vec<Step> {
                 Step::Successor(fewer)
             })
             .collect(),
-        Step::Crash { .. } => Vec::new(),
+        Step::Crash { .. } | Step::Away | Step::Back => Vec::new(),
     }
 }
 

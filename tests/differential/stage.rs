@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Kind, Master, Notice, accepted, difference, kind};
+use rosrescue::master::{Master, Notice, accepted, difference};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 use crate::dice::{CALLERS, KEYS, NAMES};
@@ -31,7 +31,7 @@ pub(crate) struct Stage<'n> {
     told: Vec<Vec<Expected>>,
     /// What may be repeated because of a crash.
     pub(crate) repeats: Option<TrueLists>,
-    /// Whether the master may still be away: no call has been answered that only a master answers.
+    /// Whether the master may be away: rosrescue notifies the nodes then.
     pub(crate) away: bool,
 }
 
@@ -78,14 +78,7 @@ impl<'n> Stage<'n> {
                 outcome.reply
             ));
         }
-        // An unregistration that no master has seen is told to nodes with what follows it.
-        let kind = kind(call);
-        self.note(
-            &outcome.notices,
-            risky || self.away && kind == Kind::Unregister,
-        );
-        // The call that was under way may have been answered by the master that died.
-        self.away &= risky || kind != Kind::Mutate;
+        self.note(&outcome.notices, risky);
         let accepted = accepted(&before, call, reply);
         let mut mirror = before;
         for answered in accepted.calls.iter().filter(|of| of.executed) {
@@ -102,7 +95,11 @@ impl<'n> Stage<'n> {
 
     /// The callbacks that the nodes must hear.
     pub(crate) fn note(&mut self, notices: &[Notice], risky: bool) {
-        for (to, call) in notices.iter().map(nodes::as_call) {
+        for notice in notices {
+            let (to, call) = nodes::as_call(notice);
+            // rosrescue tells nobody to shut down without evidence that it is the one who is meant, and
+            // these nodes give none.
+            let risky = risky || self.away && matches!(notice, Notice::Shutdown { .. });
             if let Some(index) = self.apis.iter().position(|api| api == to) {
                 self.told[index].push(Expected { call, risky });
             }

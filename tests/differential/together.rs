@@ -285,16 +285,16 @@ fn play(seed: u64, poison: bool) {
         .filter(|call| matches!(kind(call), Kind::Mutate | Kind::Unregister));
     let (shared, alone): (Vec<_>, Vec<_>) =
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
-    let journeys = usize::try_from(counter("journeys")).unwrap() - alone.len();
+    let batches = usize::try_from(counter("batches")).unwrap() - alone.len();
     println!(
-        "seed {seed}, poison {poison}: {} calls, of which {} travelled alone and {} in {journeys} journeys",
+        "seed {seed}, poison {poison}: {} calls, of which {} went alone and {} in {batches} batches",
         CALLERS * CALLS,
         alone.len(),
         shared.len()
     );
     assert!(
-        journeys * 3 < shared.len(),
-        "{} calls made {journeys} journeys: hardly any travelled together",
+        batches * 3 < shared.len(),
+        "{} calls made {batches} batches: hardly any went together",
         shared.len()
     );
 

@@ -13,6 +13,9 @@ type Hunger = Arc<Mutex<(Vec<u8>, u32)>>;
 pub(crate) struct Relay {
     port: u16,
     hunger: Hunger,
+    target: Arc<Mutex<u16>>,
+    /// The connections to the present target.
+    open: Arc<Mutex<Vec<TcpStream>>>,
 }
 
 impl Relay {
@@ -20,15 +23,20 @@ impl Relay {
     pub(crate) fn to(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
         let hunger = Hunger::default();
+        let (target, open) = (Arc::new(Mutex::new(port)), Arc::default());
         let relay = Self {
             port: listener.local_addr().unwrap().port(),
             hunger: hunger.clone(),
+            target: Arc::clone(&target),
+            open: Arc::clone(&open),
         };
         thread::spawn(move || {
             for near in listener.incoming().map_while(Result::ok) {
+                let port = *target.lock().unwrap();
                 // Without a master the connection is closed.
                 if let Ok(far) = TcpStream::connect(("127.0.0.1", port)) {
                     let hunger = hunger.clone();
+                    open.lock().unwrap().push(near.try_clone().unwrap());
                     thread::spawn(move || carry(&near, &far, &hunger));
                 }
             }
@@ -39,6 +47,15 @@ impl Relay {
     /// Where it listens.
     pub(crate) fn port(&self) -> u16 {
         self.port
+    }
+
+    /// From now on it leads to `port`, and its connections end: a virtual address moves, or a cable is
+    /// cut if nobody listens there.
+    pub(crate) fn turn_to(&self, port: u16) {
+        *self.target.lock().unwrap() = port;
+        for connection in self.open.lock().unwrap().drain(..) {
+            let _ = connection.shutdown(Shutdown::Both);
+        }
     }
 
     /// The next `count` requests that hold `marker` reach the master, and their replies do not come

@@ -1,13 +1,13 @@
 use super::*;
-use crate::master::{FirstLook, Mark, NotAMaster, difference};
+use crate::master::{Bears, FirstLook, NotAMaster, Token, difference};
 
 /// Looks at `master` as rosrescue does over the wire.
 fn look(master: &mut Master, previous: &Master) -> Master {
-    let mark = Mark::new("m");
-    let reply = master.apply(&FirstLook::call(&mark)).reply;
+    let token = Token::new("m", 1);
+    let reply = master.apply(&FirstLook::call(&token)).reply;
     let look = match FirstLook::decode(&reply) {
         Err(NotAMaster::ParamsUnreadable { .. }) => {
-            let reply = master.apply(&FirstLook::call_without_params(&mark)).reply;
+            let reply = master.apply(&FirstLook::call_without_params(&token)).reply;
             FirstLook::decode(&reply).unwrap()
         }
         look => look.unwrap(),
@@ -74,22 +74,24 @@ fn what_changed_since_is_believed_to_the_master() {
 }
 
 #[test]
-fn an_empty_master_is_empty_and_bears_no_mark() {
-    let mark = Mark::new("m");
+fn an_empty_master_is_empty_and_bears_no_token() {
+    let token = Token::new("m", 1);
     let mut master = Master::default();
     master.set_identity(42, "http://h/".to_owned());
     let look = |master: &mut Master| {
-        FirstLook::decode(&master.apply(&FirstLook::call(&mark)).reply).unwrap()
+        FirstLook::decode(&master.apply(&FirstLook::call(&token)).reply).unwrap()
     };
     let first = look(&mut master);
     assert_eq!(
-        (first.pid(), first.marked(), first.is_empty()),
-        (42, false, true)
+        (first.pid(), first.bears(), first.is_empty()),
+        (42, Bears::Nothing, true)
     );
     assert_eq!(first.second_call(&Master::default()), None);
-    master.apply(&mark.call());
-    let second = look(&mut master);
-    assert_eq!((second.marked(), second.is_empty()), (true, true));
+    for (call, bears) in token.leave().iter().zip([Bears::Earlier, Bears::Present]) {
+        master.apply(call);
+        let next = look(&mut master);
+        assert_eq!((next.bears(), next.is_empty()), (bears, true));
+    }
     master.apply(&set("/a", 1));
     assert!(!look(&mut master).is_empty());
 }
@@ -105,8 +107,8 @@ fn poisoned_params_come_from_the_previous_state() {
 #[test]
 fn what_vanishes_between_the_looks_is_left_out() {
     let mut master = busy();
-    let mark = Mark::new("m");
-    let first = FirstLook::decode(&master.apply(&FirstLook::call(&mark)).reply).unwrap();
+    let token = Token::new("m", 1);
+    let first = FirstLook::decode(&master.apply(&FirstLook::call(&token)).reply).unwrap();
     for call in master.unregister_calls("/q") {
         master.apply(&call);
     }

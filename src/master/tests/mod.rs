@@ -1,6 +1,5 @@
 //! The model on its own. That it is rosmaster's equal is for `tests/differential.rs`.
 
-mod careful;
 mod costs;
 mod looking;
 mod params;

@@ -1,9 +1,9 @@
 use super::*;
-use crate::master::{Kind, Mark, Mismatch, Plan, Skipped, difference, kind};
+use crate::master::{Kind, Mismatch, Plan, Skipped, Token, difference, kind};
 use crate::xmlrpc::{decode_call, encode_call, encode_reply};
 
-fn mark() -> Mark {
-    Mark::new("m")
+fn token() -> Token {
+    Token::new("m", 1)
 }
 
 /// The multicall that the plan sends.
@@ -19,19 +19,17 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     let outcome = master.apply(&sent(plan));
     assert_eq!(plan.verify(&outcome.reply), Ok(()));
     assert_eq!(plan.answer(), &encode_reply(&outcome.reply));
-    assert!(Mark::is_found(&master.apply(&mark().lookup()).reply));
-    let gone = call(
-        "unsubscribeParam",
-        &[mark().name(), "rosrpc://rosrescue:0", "~"],
-    );
-    master.apply(&gone);
+    assert!(Token::is_found(&master.apply(&token().lookup()).reply));
+    let [session, _] = token().leave();
+    master.apply(&token().remove());
+    master.apply(&Call::new("unsubscribeParam", session.params));
     assert_eq!(&master, plan.expected());
     (master, outcome.notices)
 }
 
 /// Brings the state to an empty master, which must hold it then and have sent nothing.
 fn restores(target: &Master) -> Plan {
-    let plan = Plan::new(target, &Master::default(), &mark());
+    let plan = Plan::new(target, &Master::default(), &token());
     let (master, notices) = run(&plan, &Master::default());
     assert_eq!(difference(target, &master), Vec::<String>::new());
     assert_eq!(&master, target);
@@ -50,12 +48,13 @@ fn count(plan: &Plan, method: &str) -> usize {
 }
 
 #[test]
-fn an_empty_state_needs_only_reads_and_the_mark() {
+fn an_empty_state_needs_only_reads_and_the_token() {
     let plan = restores(&Master::default());
     let names = [
         "getSystemState",
         "getTopicTypes",
         "getParam",
+        "subscribeParam",
         "subscribeParam",
     ];
     assert_eq!(entries(&plan), names);
@@ -90,7 +89,7 @@ fn only_addresses_that_the_master_had_before_are_asked_for() {
     assert_eq!(count(&restores(&target), "lookupNode"), 0);
     assert_eq!(count(&restores(&target), "lookupService"), 0);
     let found = after([provide("/two", "/r")]);
-    let plan = Plan::new(&target, &found, &mark());
+    let plan = Plan::new(&target, &found, &token());
     run(&plan, &found);
     assert_eq!(count(&plan, "lookupNode"), 1);
     assert_eq!(count(&plan, "lookupService"), 1);
@@ -160,7 +159,7 @@ fn poison_stays_behind_and_is_named_by_key() {
         set("/ns/big", Value::BigInt("5000000000".into())),
         set("/ns/fine", 2),
     ]);
-    let plan = Plan::new(&master, &Master::default(), &mark());
+    let plan = Plan::new(&master, &Master::default(), &token());
     let skipped: Vec<_> = plan.skipped().iter().map(ToString::to_string).collect();
     assert_eq!(skipped.len(), 2);
     assert!(skipped[0].contains("`/ns/nil`") && skipped[1].contains("`/ns/big`"));
@@ -168,12 +167,57 @@ fn poison_stays_behind_and_is_named_by_key() {
     assert_eq!(restored, after([set("/good", 1), set("/ns/fine", 2)]));
 }
 
+/// Whatever a master holds, it can be brought to exactly another state, and no node hears of it.
 #[test]
-fn marks_are_not_brought_over() {
+fn a_state_is_replaced_in_silence() {
+    let roscore = roscore();
+    let other = after([
+        publish("/p", "/t", "a/B"),
+        publish("/q", "/t", "a/B"),
+        subscribe("/rosout", "/t", "a/B"),
+        subscribe("/s", "/rosout_agg", "*"),
+        call("subscribeParam", &["/s", &api("/s"), "/run_id"]),
+        call(
+            "registerService",
+            &["/p", "/sv", "rosrpc://p:2", &api("/p")],
+        ),
+        set("/run_id", "old"),
+        set("/gain", 1),
+    ]);
+    for (found, target) in [
+        (&roscore, &other),
+        (&other, &roscore),
+        (&other, &Master::default()),
+    ] {
+        let mut target = target.clone();
+        // Types stay for ever.
+        for (topic, topic_type) in &found.topic_types {
+            target
+                .topic_types
+                .entry(topic.clone())
+                .or_insert(topic_type.clone());
+        }
+        let plan = Plan::replace(&target, found, &Token::new("m", 0), &token());
+        let (master, notices) = run(&plan, found);
+        assert_eq!(notices, []);
+        assert_eq!(plan.skipped(), []);
+        let expected = master.snapshot();
+        let wanted = target.snapshot();
+        assert_eq!(expected.nodes, wanted.nodes);
+        assert_eq!(expected.publishers, wanted.publishers);
+        assert_eq!(expected.subscribers, wanted.subscribers);
+        assert_eq!(expected.services, wanted.services);
+        assert_eq!(expected.param_subscribers, wanted.param_subscribers);
+        assert_eq!(expected.params, wanted.params);
+    }
+}
+
+#[test]
+fn tokens_are_not_brought_over() {
     let mut master = after([publish("/p", "/t", "a/B")]);
     let bare = master.clone();
-    master.apply(&Mark::new("old").call());
-    let plan = Plan::new(&master, &Master::default(), &mark());
+    master.apply(&Token::new("old", 1).leave()[0]);
+    let plan = Plan::new(&master, &Master::default(), &token());
     assert_eq!(run(&plan, &Master::default()).0, bare);
     assert_eq!(plan.skipped(), []);
 }
@@ -215,7 +259,7 @@ fn what_the_new_master_holds_stays_and_nobody_is_bumped() {
     for node in nodes {
         target.apply(&publish(node, "/rosout", "rosgraph_msgs/Log"));
     }
-    let plan = Plan::new(&target, &roscore(), &mark());
+    let plan = Plan::new(&target, &roscore(), &token());
     let (master, notices) = run(&plan, &roscore());
     assert_eq!(master.api_of("/rosout"), Some("http://new"));
     assert!(matches!(plan.skipped(), [Skipped::Node { caller_id, .. }] if caller_id == "/rosout"));
@@ -243,7 +287,7 @@ fn a_state_that_is_there_already_is_not_registered_again() {
         watch("/s", "/k"),
         set("/k", 1),
     ]);
-    let plan = Plan::new(&target, &target, &mark());
+    let plan = Plan::new(&target, &target, &token());
     let (master, notices) = run(&plan, &target);
     assert_eq!((master, notices), (target, vec![]));
     for method in [
@@ -260,7 +304,7 @@ fn a_state_that_is_there_already_is_not_registered_again() {
 fn a_service_that_somebody_has_in_the_new_master_stays_with_him() {
     let target = after([provide("/lost", "/s"), provide("/old", "/s")]);
     let found = after([provide("/new", "/s")]);
-    let plan = Plan::new(&target, &found, &mark());
+    let plan = Plan::new(&target, &found, &token());
     assert_eq!(run(&plan, &found).0, found);
     assert!(matches!(
         plan.skipped(),
@@ -276,7 +320,7 @@ fn params_are_merged_namespace_by_namespace() {
         set("/ns/clash", tree([("x", 1.into())])),
     ]);
     let found = after([set("/ns/theirs", 2), set("/both", 2), set("/ns/clash", 2)]);
-    let (master, _) = run(&Plan::new(&target, &found, &mark()), &found);
+    let (master, _) = run(&Plan::new(&target, &found, &token()), &found);
     let ns = tree([
         ("ours", 1.into()),
         ("clash", tree([("x", 1.into())])),
@@ -289,7 +333,7 @@ fn params_are_merged_namespace_by_namespace() {
 #[test]
 fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
     let target = after([publish("/p", "/t", "a/B"), set("/secret", "s3cret")]);
-    let plan = Plan::new(&target, &Master::default(), &mark());
+    let plan = Plan::new(&target, &Master::default(), &token());
     let mut other = after([publish("/q", "/t", "a/B")]);
     let mismatches = plan.verify(&other.apply(&sent(&plan)).reply).unwrap_err();
     let text: String = mismatches.iter().map(ToString::to_string).collect();
@@ -334,7 +378,7 @@ fn a_star_is_left_out_where_its_subscribers_would_be_told_of_a_helper() {
     let mut target = after([publish("/p", "/star", "*"), publish("/p", "/t", "a/B")]);
     target.apply(&call("unregisterPublisher", &["/p", "/star", &api("/p")]));
     let found = after([subscribe("/s", "/star", "*")]);
-    let plan = Plan::new(&target, &found, &mark());
+    let plan = Plan::new(&target, &found, &token());
     let (_, notices) = run(&plan, &found);
     assert_eq!(notices, []);
     let topic = "/star".to_owned();
@@ -346,7 +390,7 @@ fn no_helper_takes_the_name_of_a_node() {
     // Only `/o d` itself can say this topic, by `~`: as a helper it would bump itself.
     let mut target = after([publish("/o d", "/t", "a/B"), subscribe("/o d", "~", "a/B")]);
     target.apply(&call("unregisterSubscriber", &["/o d", "~", &api("/o d")]));
-    let plan = Plan::new(&target, &Master::default(), &mark());
+    let plan = Plan::new(&target, &Master::default(), &token());
     let (master, notices) = run(&plan, &Master::default());
     assert_eq!(
         (master.publishers_of("/t"), notices),

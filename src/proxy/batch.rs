@@ -1,69 +1,62 @@
-//! What travels through the lane, how calls are packed together, and what comes back.
+//! Writes in the queue, how they are packed into one request, and what comes back.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::{collections::VecDeque, sync::Arc};
 
 use bytes::Bytes;
-use thiserror::Error;
 use tokio::sync::oneshot;
 
 use super::{
     activity::Deeds,
-    look::LookError,
-    pool::VerifyError,
-    upstream::{CallError, Head, RawReply},
+    upstream::{Head, RawReply},
 };
 use crate::{
-    master::{self, Kind},
+    master::Kind,
     xmlrpc::{self, Call, Reply, Struct, Value},
 };
 
-/// Most calls that travel together. A compact multicall costs the master some 40 us a call, so
-/// that nobody waits for more than a few milliseconds.
-const TOGETHER: usize = 100;
-/// Most bytes of bodies that travel together.
-const TOGETHER_BYTES: usize = 1 << 20;
+/// Most calls in a batch. A compact multicall costs the master some 40 us a call, so that nobody
+/// waits for more than a few milliseconds.
+const CALLS_MAX: usize = 100;
+/// Most bytes of bodies in a batch.
+const BYTES_MAX: usize = 1 << 20;
 
-/// The answer to a call in the lane.
+/// The answer to a call in the queue.
 #[derive(Debug)]
 pub enum Answer {
     /// The master's reply as it came.
     Raw(RawReply),
-    /// A reply that we write out, because the call did not travel alone.
+    /// A reply that we write out: the mirror's, or one out of a batch.
     Made(Reply),
     /// No answer: close the connection, so that the client asks again.
     Close,
 }
 
-/// A call in the lane.
+/// A call in the queue.
 #[derive(Debug)]
-pub struct LaneItem {
+pub struct Item {
     /// The client's bytes; none for a call of our own.
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
-    pub call: Option<Call>,
+    pub call: Option<Arc<Call>>,
     /// What sort of call it is.
     pub kind: Kind,
     /// Where the answer goes.
     pub answer: oneshot::Sender<Answer>,
-    /// How often it has travelled in vain.
-    pub attempts: u32,
-    /// What the first journey whose reply was lost must have come to, if it arrived.
-    pub foretold: Option<Reply>,
     /// Of a call of our own: what it stands on.
-    pub premise: Option<Premise>,
+    pub condition: Option<Condition>,
 }
 
 /// A node and its last deeds, as they were when it was found out that something is to be registered or
 /// unregistered for it. A node that does the contrary itself meanwhile knows better.
 #[derive(Clone, Debug)]
-pub struct Premise {
+pub struct Condition {
     /// The node.
     pub node: String,
     /// Its last deeds then.
     pub deeds: Deeds,
 }
 
-impl Premise {
+impl Condition {
     /// Whether it still holds for a call of this kind, now that these are the node's last deeds.
     pub fn holds(&self, kind: Kind, now: Deeds) -> bool {
         match kind {
@@ -73,55 +66,20 @@ impl Premise {
     }
 }
 
-impl LaneItem {
-    /// A call that has not travelled yet.
-    pub fn new(
-        raw: Option<(Head, Bytes)>,
-        call: Option<Call>,
-        kind: Kind,
-        answer: oneshot::Sender<Answer>,
-    ) -> Self {
-        Self {
-            raw,
-            call,
-            kind,
-            answer,
-            attempts: 0,
-            foretold: None,
-            premise: None,
-        }
+impl Item {
+    /// The method and the caller id, for messages.
+    pub fn describe(&self) -> String {
+        let Some(call) = &self.call else {
+            return "a request that rosrescue cannot decode".to_owned();
+        };
+        let caller_id = call.params.first().and_then(Value::as_str);
+        format!("{:.100} of {:.200}", call.method, caller_id.unwrap_or("?"))
     }
 
-    /// The caller id, for messages.
-    pub fn caller(&self) -> Option<&str> {
-        self.call.as_ref()?.params.first()?.as_str()
-    }
-
-    /// The answer of an earlier journey whose reply was lost, if `reply` shows that it was run then:
-    /// what could be done before can not be done any more.
-    pub fn done_before(&self, reply: &Reply) -> Option<Reply> {
-        let method = &self.call.as_ref()?.method;
-        let first = self
-            .foretold
-            .as_ref()
-            .filter(|first| is_done(method, first))?;
-        let undone = matches!(reply, Reply::Value(Value::Array(_))) && !is_done(method, reply);
-        undone.then(|| first.clone())
-    }
-
-    /// The nodes whose registrations the call may change. What cannot be decoded has none that we
-    /// know of.
-    pub fn registrants(&self) -> BTreeSet<String> {
-        self.call
-            .as_ref()
-            .map(master::registrants)
-            .unwrap_or_default()
-    }
-
-    /// Whether it may travel in a multicall with others. Only calls whose reply holds no parameter
-    /// value: a value that the master cannot return would spoil the replies of all.
+    /// Whether it may share a batch with others. Only calls whose reply holds no parameter value: a
+    /// value that the master cannot return would spoil the replies of all.
     fn may_share(&self) -> bool {
-        let shareable = |call: &Call| {
+        let shareable = |call: &Arc<Call>| {
             matches!(
                 call.method.as_str(),
                 "registerPublisher"
@@ -147,25 +105,15 @@ impl LaneItem {
     }
 }
 
-/// Whether a method has done something by this answer. An unregistration of what is not registered
-/// succeeds too, and says 0.
-fn is_done(method: &str, reply: &Reply) -> bool {
-    let nothing = |reply: &Reply| match reply {
-        Reply::Value(Value::Array(answer)) => answer.get(2) == Some(&Value::Int(0)),
-        _ => false,
-    };
-    master::is_success(reply) && !(method.starts_with("unregister") && nothing(reply))
-}
-
-/// Takes from the front of `queue` what travels next: one call, or several that may share.
-pub fn pack(queue: &mut VecDeque<LaneItem>) -> Vec<LaneItem> {
+/// Takes the next batch from the front of `queue`: one call, or several that may share.
+pub fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
     let mut items: Vec<_> = queue.pop_front().into_iter().collect();
-    let mut bytes = items.first().map_or(0, LaneItem::weight);
-    while items.first().is_some_and(LaneItem::may_share)
-        && items.len() < TOGETHER
+    let mut bytes = items.first().map_or(0, Item::weight);
+    while items.first().is_some_and(Item::may_share)
+        && items.len() < CALLS_MAX
         && let Some(next) = queue.front()
         && next.may_share()
-        && bytes + next.weight() <= TOGETHER_BYTES
+        && bytes + next.weight() <= BYTES_MAX
     {
         bytes += next.weight();
         items.extend(queue.pop_front());
@@ -174,9 +122,9 @@ pub fn pack(queue: &mut VecDeque<LaneItem>) -> Vec<LaneItem> {
 }
 
 /// What goes out for `items`: the client's own bytes if it is one call.
-pub fn outbound(items: &[LaneItem]) -> (Head, Bytes) {
+pub fn outbound(items: &[Item]) -> (Head, Bytes) {
     if let [
-        LaneItem {
+        Item {
             raw: Some((head, body)),
             ..
         },
@@ -184,7 +132,9 @@ pub fn outbound(items: &[LaneItem]) -> (Head, Bytes) {
     {
         return (head.clone(), body.clone());
     }
-    let mut calls = items.iter().filter_map(|item| item.call.clone());
+    let mut calls = items
+        .iter()
+        .filter_map(|item| item.call.as_deref().cloned());
     let call = match (items.len(), calls.next()) {
         (1, Some(call)) => call,
         (_, first) => Call::multicall(first.into_iter().chain(calls)),
@@ -215,21 +165,6 @@ pub fn unpack_one(result: &Value) -> Option<Reply> {
         }
         _ => None,
     }
-}
-
-/// Why a journey failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum TravelError {
-    /// There was no connection to the right incarnation.
-    #[error(transparent)]
-    Connect(#[from] VerifyError),
-    /// The calls got no reply.
-    #[error(transparent)]
-    Call(#[from] CallError),
-    /// The look at the master failed.
-    #[error(transparent)]
-    Look(#[from] LookError),
 }
 
 /// Whether the master writes its own address into the reply: `getUri`, alone or in a multicall.

@@ -1,34 +1,14 @@
 use super::*;
 
-fn item(call: Call) -> LaneItem {
+fn item(call: Call) -> Item {
     let body = Bytes::from(xmlrpc::encode_call(&call));
-    let raw = Some((Head::default(), body));
-    LaneItem::new(raw, Some(call), Kind::Mutate, oneshot::channel().0)
-}
-
-#[test]
-fn what_was_done_by_a_lost_journey_is_answered_as_done() {
-    let answer = |code: i32| Reply::Value(vec![Value::from(code), "".into(), 0.into()].into());
-    let mut item = item(Call::new("deleteParam", vec!["/n".into(), "/a".into()]));
-    assert_eq!(item.done_before(&answer(-1)), None);
-    item.foretold = Some(answer(1));
-    assert_eq!(item.done_before(&answer(-1)), Some(answer(1)));
-    assert_eq!(item.done_before(&answer(1)), None);
-    item.foretold = Some(answer(-1));
-    assert_eq!(item.done_before(&answer(-1)), None);
-}
-
-#[test]
-fn what_was_unregistered_by_a_lost_journey_is_answered_as_done() {
-    let answer = |count: i32| Reply::Value(vec![1.into(), "".into(), Value::from(count)].into());
-    let params = vec!["/n".into(), "/t".into(), "http://n:1/".into()];
-    let mut item = item(Call::new("unregisterPublisher", params));
-    assert_eq!(item.done_before(&answer(0)), None);
-    item.foretold = Some(answer(1));
-    assert_eq!(item.done_before(&answer(0)), Some(answer(1)));
-    assert_eq!(item.done_before(&answer(1)), None);
-    item.foretold = Some(answer(0));
-    assert_eq!(item.done_before(&answer(0)), None);
+    Item {
+        raw: Some((Head::default(), body)),
+        call: Some(Arc::new(call)),
+        kind: Kind::Mutate,
+        answer: oneshot::channel().0,
+        condition: None,
+    }
 }
 
 #[test]
@@ -37,7 +17,7 @@ fn a_node_knows_better_only_by_the_contrary() {
         registered,
         unregistered,
     };
-    let premise = Premise {
+    let condition = Condition {
         node: "/n".to_owned(),
         deeds: deeds(3, 2),
     };
@@ -47,7 +27,7 @@ fn a_node_knows_better_only_by_the_contrary() {
         (Kind::Mutate, deeds(4, 2), true),
         (Kind::Mutate, deeds(3, 4), false),
     ] {
-        assert_eq!(premise.holds(kind, now), holds, "{kind:?} {now:?}");
+        assert_eq!(condition.holds(kind, now), holds, "{kind:?} {now:?}");
     }
 }
 
@@ -65,7 +45,7 @@ fn packed(calls: Vec<Call>) -> Vec<usize> {
 }
 
 #[test]
-fn calls_that_may_share_travel_together_and_keep_their_order() {
+fn calls_that_may_share_are_one_batch_and_keep_their_order() {
     let subscribe = Call::new(
         "subscribeParam",
         vec!["/n".into(), "http://n:1/".into(), "/k".into()],
@@ -76,7 +56,7 @@ fn calls_that_may_share_travel_together_and_keep_their_order() {
         packed((0..250).map(|i| set("/a", i)).collect()),
         [100, 100, 50]
     );
-    let big = "x".repeat(TOGETHER_BYTES / 2 + 1);
+    let big = "x".repeat(BYTES_MAX / 2 + 1);
     assert_eq!(
         packed(vec![set("/a", &*big), set("/b", &*big), set("/c", 1)]),
         [1, 2]

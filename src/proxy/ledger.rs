@@ -1,11 +1,11 @@
-//! The mirror and its checkpoint under one lock: what the master knows, kept twice.
+//! Mirror and journal under one lock: a write is recorded and applied in one step.
 //!
-//! The lock makes "recorded" and "applied" one step, and orders both against the moment at which a
-//! new incarnation takes over: a reply of the old master that arrives after its state was taken for
-//! the injection is not acknowledged, and the call travels again.
+//! The lock also orders both against the moment at which a new incarnation takes over: a reply of
+//! the old master that arrives after its state was taken for the injection is not acknowledged.
 
-mod keeping;
-mod words;
+mod durability;
+mod pending;
+mod summary;
 
 use std::{
     collections::HashSet,
@@ -15,18 +15,18 @@ use std::{
 
 use tokio::sync::{Notify, watch};
 
-use self::keeping::Whole;
+use self::{durability::Whole, pending::PendingWrites};
 use super::activity::{Activity, Noticed};
 use super::stats::Stats;
 use crate::{
-    master::{self, Agreement, Answered, Master},
+    master::{self, Agreement, Answered, Master, Token},
     record::{Checkpoint, Entry, Session},
     store::Store,
     xmlrpc::{Call, Reply},
 };
 
-/// Unregistrations that take nothing away are remembered beside so many others.
-const OWED_IDLY: usize = 1000;
+/// Unregistrations that take nothing away are pending beside so many others.
+const IDLE_PENDING: usize = 1000;
 
 /// Memory that the answers to the reads in one multicall may take, in bytes. A few short reads of a large
 /// state ask for any amount of it, and wait for the master instead.
@@ -46,16 +46,27 @@ pub struct Recorded {
     pub doubtful: bool,
 }
 
+/// What an injection starts from.
+#[derive(Debug)]
+pub struct Basis {
+    /// The mirror's state.
+    pub mirror: Master,
+    /// Its version.
+    pub version: u64,
+    /// Writes that the present incarnation may not have run.
+    pub pending: Vec<Call>,
+}
+
 /// The mirror, the journal and what belongs to them.
-pub struct Shadow {
+pub struct Ledger {
     inner: Mutex<Inner>,
     stats: &'static Stats,
     durable: watch::Sender<u64>,
     /// The mirror's version in the last whole checkpoint that was attempted.
     attempted: watch::Sender<u64>,
-    /// Wakes the keeper of the checkpoint.
+    /// Wakes the checkpointer.
     pub work: Notify,
-    /// Wakes those who tell nodes the news.
+    /// Wakes those who notify nodes.
     pub news: Notify,
 }
 
@@ -66,41 +77,41 @@ struct Inner {
     session: Session,
     /// None if no checkpoint could be opened: unprotected.
     store: Option<Store>,
-    incarnation: u64,
     /// Changes with every change of the mirror.
     version: u64,
     whole: Whole,
-    /// Unregistrations taken while the gate was shut: the same incarnation, should it come back,
-    /// has not heard of them.
-    owed: Vec<Call>,
+    pending: PendingWrites,
     activity: Activity,
     diverged: HashSet<String>,
-    frozen: bool,
+    /// A master is being brought to the mirror's state, which must not change meanwhile.
+    injecting: bool,
     doubted: bool,
 }
 
-impl Shadow {
-    /// A shadow of `mirror`, recorded in `store`.
+impl Ledger {
+    /// A ledger of `mirror`, recorded in `store`. `pending`: writes that the incarnation of `session` may not
+    /// have run.
     pub fn new(
         mirror: Master,
         session: Session,
+        pending: Vec<Call>,
         store: Option<Store>,
         stats: &'static Stats,
     ) -> Self {
-        let inner = Inner {
+        let mut inner = Inner {
             mirror,
             identity: (-1, String::new()),
             session,
             store,
-            incarnation: 0,
             version: 0,
             whole: Whole::default(),
-            owed: Vec::new(),
+            pending: PendingWrites::default(),
             activity: Activity::default(),
             diverged: HashSet::new(),
-            frozen: true,
+            injecting: false,
             doubted: false,
         };
+        inner.add_pending(pending);
         Self {
             inner: Mutex::new(inner),
             stats,
@@ -128,6 +139,17 @@ impl Shadow {
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
+    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it does. Nodes
+    /// that a master would notify of it are notified.
+    pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<Reply> {
+        let mut inner = self.lock();
+        // An unregistration of what is not here may be of what is on its way to the master.
+        let idle = !is_unregistration(write)
+            && !inner.mirror.would_change(write)
+            && inner.mirror.fits(write, ANSWER_MOST);
+        idle.then(|| inner.apply(now, write, Some(false), &self.news))
+    }
+
     /// Tells the mirror what getPid and getUri answer.
     pub fn set_identity(&self, pid: i32, uri: String) {
         let mut inner = self.lock();
@@ -142,12 +164,18 @@ impl Shadow {
 
     /// Changes the session and records it.
     pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
-        let mut inner = self.lock();
-        change(&mut inner.session);
-        let entry = Entry::Session(inner.session.clone());
-        inner.append(&[entry]);
-        drop(inner);
+        self.lock().update_session(change);
         self.work.notify_one();
+    }
+
+    /// The number of the present incarnation: replies must come from it.
+    pub fn incarnation(&self) -> u64 {
+        self.lock().session.incarnation
+    }
+
+    /// The token of the present incarnation.
+    pub fn token(&self) -> Token {
+        self.lock().token()
     }
 
     /// Records and applies calls that the master of `incarnation` has answered, in its order.
@@ -155,15 +183,15 @@ impl Shadow {
         &self,
         now: Instant,
         incarnation: u64,
-        travelled: &[(&Call, &Reply)],
+        batch: &[(&Call, &Reply)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
-        if inner.incarnation != incarnation {
+        if inner.session.incarnation != incarnation || inner.injecting {
             return Err(Superseded);
         }
         let mut recorded = Recorded::default();
-        let mut answered = Vec::with_capacity(travelled.len());
-        for (call, reply) in travelled {
+        let mut answered = Vec::with_capacity(batch.len());
+        for (call, reply) in batch {
             let accepted = master::accepted(&inner.mirror, call, reply);
             recorded.doubtful |= !accepted.certain;
             answered.extend(accepted.calls);
@@ -172,7 +200,7 @@ impl Shadow {
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
         for (index, answered) in answered.into_iter().enumerate() {
-            let outcome = inner.apply(now, &answered.call, &self.news);
+            let outcome = inner.apply(now, &answered.call, None, &self.news);
             let agreement = answered.compare(&outcome, index < last_write);
             if agreement != Agreement::Same {
                 self.stats.divergences.count();
@@ -198,56 +226,112 @@ impl Shadow {
         Ok(recorded)
     }
 
-    /// What the master would answer to these calls, one after the other.
-    pub fn foretell<'a>(&self, calls: impl Iterator<Item = &'a Call>) -> Vec<Reply> {
+    /// What the master would answer to this call.
+    pub fn predict(&self, call: &Call) -> Reply {
         let mut model = self.with_mirror(Clone::clone);
-        let answer = |call| model.apply_telling(call, &mut ());
-        calls.map(answer).collect()
+        model.apply_telling(call, &mut ())
     }
 
     /// Records and applies a call of our own before there is any master.
     pub fn seed(&self, call: &Call) {
         let mut inner = self.lock();
-        inner.apply(Instant::now(), call, &self.news);
+        inner.apply(Instant::now(), call, None, &self.news);
         inner.append(&[Entry::call(call.clone())]);
     }
 
-    /// Takes an unregistration while the gate is shut: records it, applies it, and answers as the
-    /// master would. One that takes nothing away is not recorded, and is remembered within limits: it
-    /// may be said without end. It may mean a registration whose reply was lost with an earlier
-    /// rosrescue, and which the master that comes back has run.
+    /// Answers a call of the Master API as the master would while it is away: records what it changes as
+    /// pending, applies it, and has nodes notified. With the reply comes the journal's last record of
+    /// it, if there is one.
     ///
-    /// With the reply comes the journal's last record of it, if there is one. None while the mirror is
-    /// frozen, or if the call reads too much besides: it has to wait for the master.
-    pub fn unregister(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
+    /// None while a master is being brought to the mirror's state, or if the call reads too much besides:
+    /// it has to wait.
+    pub fn stand_in(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
-        if inner.frozen || !inner.mirror.fits(call, ANSWER_MOST) {
+        if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
-        let before = inner.mirror.counts();
-        let reply = inner.apply(now, call, &self.news);
-        let idle = inner.mirror.counts() == before;
-        if idle && (inner.owed.len() >= OWED_IDLY || inner.owed.contains(call)) {
+        let changes = inner.mirror.would_change(call);
+        let reply = inner.apply(now, call, Some(changes), &self.news);
+        let mut writes = match reply {
+            // Only its answer could not be written. What is refused once is refused again.
+            Reply::Fault { .. } => master::writes(call),
+            Reply::Value(_) => {
+                let accepted = master::accepted(&inner.mirror, call, &reply).calls;
+                let executed = accepted.into_iter().filter(|of| of.executed);
+                executed.map(|of| of.call).collect()
+            }
+        };
+        if !changes {
+            // The master may know what the mirror does not: a registration that it ran for a rosrescue
+            // that died before the reply.
+            let room = inner.pending.calls().len() < IDLE_PENDING;
+            writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
+        }
+        if writes.is_empty() {
             return Some((reply, None));
         }
-        let accepted = master::accepted(&inner.mirror, call, &reply).calls;
-        let accepted = accepted.into_iter().filter(|of| of.executed);
-        let accepted: Vec<_> = accepted.map(|of| of.call).collect();
-        let mut seq = None;
-        if !idle {
-            let entries: Vec<_> = accepted.iter().cloned().map(Entry::call).collect();
-            seq = inner.append(&entries);
-        }
-        inner.owed.extend(accepted);
+        // A look that shows what it takes away would bring it back.
+        inner.version += u64::from(!changes);
+        self.stats.recorded.add(writes.len() as u64);
+        let entries = writes.iter().map(|call| Entry::Call {
+            call: call.clone(),
+            pending: true,
+        });
+        let seq = inner.append(&entries.collect::<Vec<_>>());
+        inner.add_pending(writes);
         drop(inner);
         self.work.notify_one();
         Some((reply, seq))
     }
 
-    /// From now on, or no longer, the mirror takes no unregistration by itself. Frozen at first: it
-    /// is thawed while the gate is shut, until the master that is examined is compared with it.
-    pub fn set_frozen(&self, frozen: bool) {
-        self.lock().frozen = frozen;
+    /// How many writes the present incarnation may not have run.
+    pub fn pending(&self) -> usize {
+        self.lock().pending.calls().len()
+    }
+
+    /// The mirror must not change from now on, until [`Self::end_injection`]. What a master that is about to
+    /// be brought to its state is planned from.
+    pub fn begin_injection(&self) -> Basis {
+        let mut inner = self.lock();
+        inner.injecting = true;
+        Basis {
+            mirror: inner.mirror.clone(),
+            version: inner.version,
+            pending: inner.pending.calls().to_vec(),
+        }
+    }
+
+    /// The mirror's version and state, and the token that the next incarnation will get.
+    pub fn next(&self) -> (u64, Master, Token) {
+        let inner = self.lock();
+        let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
+        (inner.version, inner.mirror.clone(), token)
+    }
+
+    /// The next incarnation takes over, to be brought to the mirror's state: replies of the one before no
+    /// longer count. The new one's token.
+    pub fn succeed(&self) -> Token {
+        let mut inner = self.lock();
+        inner.next_incarnation();
+        // The new one is brought to the mirror's state, or the mirror to its.
+        inner.doubted = false;
+        inner.token()
+    }
+
+    /// The present incarnation holds what the mirror holds.
+    pub fn delivered(&self) {
+        let mut inner = self.lock();
+        if !inner.pending.calls().is_empty() {
+            inner.pending.clear();
+            let seq = inner.seq();
+            inner.update_session(|session| session.delivered = seq);
+            self.work.notify_one();
+        }
+    }
+
+    /// The mirror may change again.
+    pub fn end_injection(&self) {
+        self.lock().injecting = false;
     }
 
     /// The present master may not be what the mirror is: it is to be read again.
@@ -258,34 +342,6 @@ impl Shadow {
     /// Whether there was such a doubt, once.
     pub fn take_doubt(&self) -> bool {
         std::mem::take(&mut self.lock().doubted)
-    }
-
-    /// A new incarnation takes over, to be brought to the mirror's state: replies of the old one no
-    /// longer count.
-    pub fn succeed(&self) {
-        let mut inner = self.lock();
-        inner.incarnation += 1;
-        inner.owed.clear();
-        // The new one is brought to the mirror's state, or the mirror to its.
-        inner.doubted = false;
-        inner.activity.forget_displaced();
-    }
-
-    /// The incarnation that replies must come from.
-    pub fn incarnation(&self) -> u64 {
-        self.lock().incarnation
-    }
-
-    /// Unregistrations that the present incarnation has not heard of.
-    pub fn owed(&self) -> Vec<Call> {
-        self.lock().owed.clone()
-    }
-
-    /// The first `count` of [`Self::owed`] have been sent.
-    pub fn paid(&self, count: usize) {
-        let mut inner = self.lock();
-        let count = count.min(inner.owed.len());
-        inner.owed.drain(..count);
     }
 
     /// The mirror's version: equal versions mean equal states.
@@ -309,7 +365,7 @@ impl Shadow {
         state: Master,
     ) -> Result<Vec<String>, Superseded> {
         let mut inner = self.lock();
-        if (inner.incarnation, inner.version) != (incarnation, version) {
+        if inner.injecting || (inner.session.incarnation, inner.version) != (incarnation, version) {
             return Err(Superseded);
         }
         let difference = inner.adopt(state);
@@ -327,31 +383,30 @@ impl Shadow {
         work(mirror, activity)
     }
 
-    /// Calls are parked: which of them take the name of a node at another address?
-    pub fn note_parked<'a>(&self, calls: impl Iterator<Item = &'a Call>) {
-        let mut inner = self.lock();
-        let mut new = false;
-        for call in calls {
-            if let Some((node, api)) = inner.mirror.displaced_by(call) {
-                new |= inner.activity.displace(node, api);
-            }
-        }
-        if new {
-            self.news.notify_one();
-        }
-    }
-
     /// What a checkpoint written now holds.
     pub fn checkpoint(&self) -> Checkpoint {
         self.lock().checkpoint()
     }
 }
 
+/// Whether a call, if it is no multicall, takes something away that its caller registered.
+fn is_unregistration(call: &Call) -> bool {
+    master::kind(call) == master::Kind::Unregister
+}
+
 impl Inner {
-    fn apply(&mut self, now: Instant, call: &Call, news: &Notify) -> Reply {
-        let mut noticed = Noticed::default();
+    /// Applies `call`. `standing_in`: whether it changes anything, if no master notifies nodes of it.
+    fn apply(
+        &mut self,
+        now: Instant,
+        call: &Call,
+        standing_in: Option<bool>,
+        news: &Notify,
+    ) -> Reply {
+        let mut noticed = Noticed::new(standing_in.is_some());
+        noticed.displaced = self.activity.displaced_by(&self.mirror, call);
         let reply = self.mirror.apply_telling(call, &mut noticed);
-        self.version += 1;
+        self.version += u64::from(standing_in.unwrap_or(true));
         let registered = |node: &str| self.mirror.api_of(node).is_some();
         if self.activity.applied(now, call, noticed, registered) {
             news.notify_one();
@@ -372,9 +427,41 @@ impl Inner {
         difference
     }
 
+    fn add_pending(&mut self, writes: Vec<Call>) {
+        if self.pending.extend(writes).is_err() {
+            // Should the present incarnation come back, it is brought to the mirror's state as one that
+            // was succeeded.
+            self.next_incarnation();
+        }
+    }
+
+    fn next_incarnation(&mut self) {
+        self.pending.clear();
+        let seq = self.seq();
+        self.update_session(|session| {
+            session.incarnation += 1;
+            session.delivered = seq;
+        });
+    }
+
+    fn update_session(&mut self, change: impl FnOnce(&mut Session)) {
+        change(&mut self.session);
+        let entry = Entry::Session(self.session.clone());
+        self.append(&[entry]);
+    }
+
+    fn token(&self) -> Token {
+        Token::new(&self.session.mark, self.session.incarnation)
+    }
+
     /// The mirror has changed otherwise than by journaled calls: a whole checkpoint is due.
     fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
+    }
+
+    /// Number of the journal's last record.
+    fn seq(&self) -> u64 {
+        self.store.as_ref().map_or(0, Store::seq)
     }
 
     /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.
@@ -394,10 +481,10 @@ impl Inner {
 
     fn checkpoint(&self) -> Checkpoint {
         Checkpoint {
-            seq: self.store.as_ref().map_or(0, Store::seq),
+            seq: self.seq(),
             session: self.session.clone(),
+            pending: self.pending.calls().to_vec(),
             snapshot: self.mirror.snapshot(),
-            pending: Vec::new(),
         }
     }
 
@@ -405,7 +492,7 @@ impl Inner {
         let method = answered.call.method.as_str();
         if self.diverged.insert(method.to_owned()) {
             let [master, mirror] =
-                [&answered.reply, mirror].map(|reply| words::in_short(method, reply));
+                [&answered.reply, mirror].map(|reply| summary::summary(method, reply));
             tracing::warn!(
                 method,
                 mirror,

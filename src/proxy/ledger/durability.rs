@@ -1,6 +1,6 @@
-//! What the keeper of the checkpoint does with mirror and journal, and how others wait for it.
+//! What the checkpointer does with mirror and journal, and how others wait for it.
 
-use super::Shadow;
+use super::Ledger;
 use crate::{
     record::Checkpoint,
     store::{Store, StoreError},
@@ -25,7 +25,7 @@ impl Whole {
     }
 }
 
-impl Shadow {
+impl Ledger {
     /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
     pub async fn durable(&self, seq: u64) {
         let mut durable = self.durable.subscribe();

@@ -6,7 +6,7 @@ use crate::xmlrpc::{Reply, Value};
 const LOGGED_REPLY: usize = 300;
 
 /// A reply for the log. Values of parameters are nobody's business there.
-pub(super) fn in_short(method: &str, reply: &Reply) -> String {
+pub(super) fn summary(method: &str, reply: &Reply) -> String {
     let text = match reply {
         Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
             let said = answer.get(..2).unwrap_or_default();

@@ -1,0 +1,120 @@
+//! Whether a call of an earlier connection may still be running in the master, as the kernel's table
+//! of TCP sockets tells.
+//!
+//! A rosmaster runs each connection in a thread of its own, and closes its end only when it has run
+//! what has come. So as long as it may run a call of a connection that we have closed, or that was
+//! closed by the end of an earlier rosrescue,
+//!
+//! * its end of the connection, on this computer, is in the state CLOSE_WAIT, if it has been accepted
+//!   yet or not,
+//! * ours, which belongs to no process any more, is in FIN_WAIT1 or FIN_WAIT2.
+//!
+//! Linux forgets ours a minute after the other side has acknowledged the end, so that a master on
+//! another computer is given no more than that; see `docs/decisions/0003-no-call-in-flight.md`.
+
+use std::{
+    fs,
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
+};
+
+/// States of a socket, as the kernel numbers them.
+const FIN_WAIT1: u8 = 0x04;
+const FIN_WAIT2: u8 = 0x05;
+const CLOSE_WAIT: u8 = 0x08;
+const CLOSING: u8 = 0x0b;
+
+/// Whether the master at `master` may still be running a call of a connection that has been closed on
+/// this side.
+pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
+    ["tcp", "tcp6"].into_iter().any(|table| {
+        // Where there is no such table nobody knows: the same as if nothing ran.
+        let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
+        is_in_table(&table, master)
+    })
+}
+
+fn is_in_table(table: &str, master: SocketAddr) -> bool {
+    let master = SocketAddr::new(master.ip().to_canonical(), master.port());
+    let mut sockets = table.lines().skip(1).filter_map(|line| {
+        let mut columns = line.split_whitespace().skip(1);
+        let (local, remote) = (columns.next()?, columns.next()?);
+        let state = u8::from_str_radix(columns.next()?, 16).ok()?;
+        Some((address(local)?, address(remote)?, state))
+    });
+    sockets.any(|(local, remote, state)| match state {
+        CLOSE_WAIT => local == master,
+        FIN_WAIT1 | FIN_WAIT2 | CLOSING => remote == master,
+        _ => false,
+    })
+}
+
+/// An address as the table has it: words of 32 bits in the computer's own order, and the port.
+fn address(text: &str) -> Option<SocketAddr> {
+    let (ip, port) = text.split_once(':')?;
+    let words: Vec<_> = (0..ip.len() / 8)
+        .map(|index| u32::from_str_radix(ip.get(8 * index..8 * index + 8)?, 16).ok())
+        .map(|word| Some(word?.to_ne_bytes()))
+        .collect::<Option<_>>()?;
+    let ip = match words.as_slice() {
+        [v4] => IpAddr::V4(Ipv4Addr::from(*v4)),
+        [a, b, c, d] => {
+            let bytes: [u8; 16] = [*a, *b, *c, *d].concat().try_into().ok()?;
+            IpAddr::V6(Ipv6Addr::from(bytes)).to_canonical()
+        }
+        _ => return None,
+    };
+    Some(SocketAddr::new(ip, u16::from_str_radix(port, 16).ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        io::Write,
+        net::{TcpListener, TcpStream},
+        time::{Duration, Instant},
+    };
+
+    use super::*;
+
+    fn eventually(what: &str, is_it: impl Fn() -> bool) {
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while !is_it() {
+            assert!(Instant::now() < deadline, "never: {what}");
+            std::thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn a_call_may_run_until_the_master_closes_its_end() {
+        for address in ["127.0.0.1:0", "[::1]:0"] {
+            let Ok(listener) = TcpListener::bind(address) else {
+                // A computer without IPv6.
+                continue;
+            };
+            let master = listener.local_addr().unwrap();
+            assert!(!may_run_a_call(master));
+            let mut client = TcpStream::connect(master).unwrap();
+            client.write_all(b"a call").unwrap();
+            assert!(!may_run_a_call(master), "its sender waits for the answer");
+            drop(client);
+            eventually("it is on its way", || may_run_a_call(master));
+            let (server, _) = listener.accept().unwrap();
+            assert!(may_run_a_call(master), "it has been accepted");
+            drop(server);
+            eventually("it has been run", || !may_run_a_call(master));
+        }
+    }
+
+    #[test]
+    fn addresses_of_both_families_are_read() {
+        let table = "  sl  local_address rem_address   st\n\
+             0: 0100007F:2C2F 0100007F:A001 08 00000000:00000000\n\
+             1: 0000000000000000FFFF00000200000A:A002 0000000000000000FFFF00000100000A:2C2F 05 0\n";
+        if cfg!(target_endian = "little") {
+            assert!(is_in_table(table, "127.0.0.1:11311".parse().unwrap()));
+            assert!(is_in_table(table, "10.0.0.1:11311".parse().unwrap()));
+            assert!(!is_in_table(table, "10.0.0.2:11311".parse().unwrap()));
+            assert!(!is_in_table(table, "127.0.0.1:40961".parse().unwrap()));
+        }
+    }
+}
