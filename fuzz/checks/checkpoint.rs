@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use rosrescue::master::Master;
 use rosrescue::record::{self, Checkpoint, Entry, Record};
 use rosrescue::session::{Rebuilt, rebuild};
-use rosrescue::store::{Loaded, Storage, Store};
+use rosrescue::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::xmlrpc::Call;
 
 /// Parts the present file from its previous generation, which may follow it.
@@ -146,6 +146,11 @@ fn check_record(record: &Record) {
 
 type File = Arc<Mutex<Vec<u8>>>;
 
+fn id(file: &File) -> FileId {
+    let (device, inode) = (0, Arc::as_ptr(file) as usize as u64);
+    FileId { device, inode }
+}
+
 /// A disk that never fails and forgets nothing.
 #[derive(Clone, Default)]
 struct Memory(Arc<Mutex<BTreeMap<PathBuf, File>>>);
@@ -171,8 +176,16 @@ impl Storage for Memory {
         Ok(path.to_owned())
     }
 
-    fn lock(&self, _: &Path) -> io::Result<Result<(), Option<u32>>> {
+    fn lock(&self, _: &Path, _: &Path) -> io::Result<Result<(), Option<u32>>> {
         Ok(Ok(()))
+    }
+
+    fn renew_lock(&self, (): &mut (), _: &Path) -> io::Result<Result<(), Option<u32>>> {
+        Ok(Ok(()))
+    }
+
+    fn lock_id(&self, (): &()) -> io::Result<FileId> {
+        Ok(id(&File::default()))
     }
 
     fn read(&self, path: &Path, _: u64) -> io::Result<Vec<u8>> {
@@ -205,6 +218,30 @@ impl Storage for Memory {
         let file = self.file(from)?;
         self.0.lock().unwrap().insert(to.to_owned(), file);
         Ok(true)
+    }
+
+    fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
+        self.rename(path, aside)?;
+        self.rename(from, path)
+    }
+
+    fn status(&self, file: &File) -> io::Result<FileStatus> {
+        let length = file.lock().unwrap().len();
+        Ok(FileStatus {
+            id: id(file),
+            length: length as u64,
+            modified: 0,
+        })
+    }
+
+    fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {
+        Ok(self.file(path).ok().as_ref().map(id))
+    }
+
+    fn checksum(&self, path: &Path, length: u64) -> io::Result<u32> {
+        let file = self.file(path)?;
+        let bytes = file.lock().unwrap();
+        Ok(crc32c::crc32c(&bytes[..bytes.len().min(length as usize)]))
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {

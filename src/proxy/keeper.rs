@@ -1,9 +1,9 @@
-//! Keeps the checkpoint: forces the journal to the disk, writes new generations, and re-arms after
-//! the disk has failed. Beside traffic; a call waits for it with `--sync always`, and where what it did is
-//! in no journal.
+//! Keeps the checkpoint: forces the journal to the disk, checks that the file is still the one at its
+//! path and as it was left, writes new generations, and re-arms after the disk has failed or somebody has
+//! moved or changed the file. Beside traffic; a call waits for it with `--sync always`, and where what it
+//! did is in no journal.
 
 use std::{
-    path::Path,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -13,11 +13,13 @@ use tokio_util::sync::CancellationToken;
 use super::Proxy;
 use crate::{
     cli::Sync,
-    store::{Compacted, Disk, Store, StoreError, SyncJob},
+    store::{CheckJob, Store, SyncJob},
 };
 
-/// The keeper looks after things at least so often; an unprotected store is re-armed in that time.
-const ROUND: Duration = Duration::from_secs(1);
+/// The file is checked at least so often: what somebody does to it is noticed well within a second.
+const LOOK: Duration = Duration::from_millis(500);
+/// An unprotected store is re-armed so often.
+const AGAIN: Duration = Duration::from_secs(1);
 /// The journal is compacted when nothing was recorded for this time,
 const QUIET: Duration = Duration::from_secs(2);
 /// but not more often than this: a memory card wears out.
@@ -39,7 +41,7 @@ pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
         tokio::select! {
             () = stop.cancelled() => return,
             () = proxy.ledger.work.notified() => {}
-            () = tokio::time::sleep(ROUND) => {}
+            () = tokio::time::sleep(LOOK) => {}
         }
         keeper.round().await;
         if keeper.proxy.config.sync != Sync::Always {
@@ -67,23 +69,34 @@ impl Keeping {
         if self.proxy.ledger.with_store(|_, _| ()).is_none() {
             self.open_again().await;
         }
-        if self.proxy.config.sync != Sync::Never {
-            self.sync().await;
-        }
+        self.sync().await;
+        // Also of what the next lines repair at once.
+        self.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
         }
         self.say_protection();
     }
 
+    /// Checks the file and, with `--sync never` not, brings it to the disk.
     async fn sync(&self) {
         let ledger = &self.proxy.ledger;
-        let job = ledger.with_store(|store, _| store.sync_job()).flatten();
-        if let Some(job) = job
-            && let Ok(done) = tokio::task::spawn_blocking(move || SyncJob::run(job)).await
-        {
-            // Its failure is the store's to remember and `say_protection`'s to tell.
-            let _ = ledger.with_store(|store, _| store.synced(done));
+        let syncs = self.proxy.config.sync != Sync::Never;
+        let jobs = ledger.with_store(|store, _| {
+            let check = store.check_job();
+            (check, syncs.then(|| store.sync_job()).flatten())
+        });
+        let (check, sync) = jobs.unwrap_or_default();
+        let work = move || (check.map(CheckJob::run), sync.map(SyncJob::run));
+        if let Ok((checked, synced)) = tokio::task::spawn_blocking(work).await {
+            // A failure is the store's to remember and `say_protection`'s to tell.
+            ledger.with_store(|store, _| {
+                let _ = checked.map(|done| store.checked(done));
+                let _ = synced.map(|done| store.synced(done));
+            });
+        }
+        if !syncs {
+            return;
         }
         let durable = ledger.with_store(|store, _| match store.unprotected() {
             None => store.synced_seq(),
@@ -121,17 +134,20 @@ impl Keeping {
         // A whole snapshot on a disk that is full is not to be written at every turn.
         let failed = self
             .failed_at
-            .is_some_and(|at| now.duration_since(at) < ROUND);
+            .is_some_and(|at| now.duration_since(at) < AGAIN);
         !failed && (due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested))
     }
 
     async fn compact(&mut self) {
         let ledger = &self.proxy.ledger;
         let begun = ledger.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
-        let Some(Ok(job)) = begun else { return };
-        let finished = match tokio::task::spawn_blocking(move || job.run()).await {
-            Ok(done) => ledger.with_store(|store, _| finish(store, done)),
-            Err(_) => return,
+        let finished = match begun {
+            None => return,
+            Some(Err(error)) => Some(Err(error)),
+            Some(Ok(job)) => match tokio::task::spawn_blocking(move || job.run()).await {
+                Ok(done) => ledger.with_store(|store, _| store.finish_compaction(done)),
+                Err(_) => return,
+            },
         };
         match finished {
             Some(Err(error)) => {
@@ -150,10 +166,11 @@ impl Keeping {
         }
     }
 
-    /// The checkpoint could not be opened at the start: perhaps now.
+    /// The checkpoint could not be opened at the start: perhaps now. Nothing of it is read, what the
+    /// memory holds is newer; but it is kept, since nobody has seen what it holds.
     async fn open_again(&self) {
         let path = self.proxy.config.checkpoint.clone();
-        let opened = tokio::task::spawn_blocking(move || open_fresh(&path)).await;
+        let opened = tokio::task::spawn_blocking(move || Store::open_over(&path)).await;
         if let Ok(Ok(store)) = opened {
             self.proxy.ledger.set_store(store);
         }
@@ -161,11 +178,15 @@ impl Keeping {
 
     /// Says, once, that the state is no longer recorded, and that it is again.
     fn say_protection(&mut self) {
-        let unprotected = self.proxy.ledger.unprotected();
-        if unprotected == self.said {
-            return;
-        }
         let path = self.proxy.config.checkpoint.display();
+        let kept = self.proxy.ledger.with_store(|store, _| store.take_kept());
+        if let Some(kept) = kept.flatten() {
+            tracing::warn!(
+                checkpoint = %path, kept = %kept.display(),
+                "what was at the checkpoint's path is kept under another name"
+            );
+        }
+        let unprotected = self.proxy.ledger.unprotected();
         match (&unprotected, &self.said) {
             (Some(reason), None) => tracing::error!(
                 checkpoint = %path, reason,
@@ -177,13 +198,4 @@ impl Keeping {
         }
         self.said = unprotected;
     }
-}
-
-fn finish(store: &mut Store, done: Compacted<Disk>) -> Result<(), StoreError> {
-    store.finish_compaction(done)
-}
-
-/// Opens a store of which nothing is read: what the memory holds is newer.
-fn open_fresh(path: &Path) -> Result<Store, crate::store::OpenError> {
-    Store::open(path).map(|(store, _)| store)
 }

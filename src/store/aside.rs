@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::generation::{append_all, failed};
-use super::{Loaded, Names, Storage, Store, StoreError};
+use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
     /// Gives the present file another name, `PATH.REASON-NUMBER`, and its previous generation too,
@@ -18,7 +18,7 @@ impl<S: Storage> Store<S> {
         self.active = None;
         self.overtake();
         self.unprotected = Some("its file has been set aside".to_owned());
-        self.usable = false;
+        self.present = None;
         let kind: String = reason
             .chars()
             .map(|letter| {
@@ -55,7 +55,7 @@ pub(super) fn keep_aside(
         sentence.push_str(&format!("; they are kept as `{}`", aside.display()));
     }
     if !loaded.damage.is_empty() {
-        let aside = names.aside(storage, "broken")?;
+        let aside = names.aside(storage, BROKEN)?;
         storage.link(&names.path, &aside)?;
         loaded
             .damage

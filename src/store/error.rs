@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use super::Change;
 use crate::record::EncodeError;
 
 /// Why a checkpoint cannot be opened. Nothing has been changed then.
@@ -55,6 +56,20 @@ pub enum OpenError {
     },
 }
 
+impl OpenError {
+    /// What the operating system said, without what to do about it.
+    pub(super) fn without_advice(&self) -> String {
+        match self {
+            Self::Io {
+                doing,
+                path,
+                source,
+            } => format!("cannot {doing} `{}`: {source}", path.display()),
+            other => other.to_string(),
+        }
+    }
+}
+
 /// Why something was not recorded. Calls go on being forwarded.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -76,6 +91,26 @@ pub enum StoreError {
         path: PathBuf,
         /// What it said.
         source: io::Error,
+    },
+    /// Somebody else changed the file.
+    #[error("`{}` was changed by somebody else: {change}", path.display())]
+    Changed {
+        /// The checkpoint.
+        path: PathBuf,
+        /// How.
+        change: Change,
+    },
+    /// Another rosrescue took the lock after ours had been removed.
+    #[error(
+        "`{}` is in use by another rosrescue{} now; stop one of the two",
+        path.display(),
+        holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
+    )]
+    Taken {
+        /// The checkpoint.
+        path: PathBuf,
+        /// The process that holds the lock, if it left its number.
+        holder: Option<u32>,
     },
     /// The snapshot is older than the journal.
     #[error(

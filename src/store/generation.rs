@@ -5,7 +5,8 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use super::journal::Active;
-use super::{Names, Storage, Store, StoreError, SyncJob, Synced};
+use super::storage::FileId;
+use super::{BROKEN, Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use crate::record::{self, Checkpoint, Stamp};
 
 /// A journal that is smaller than this is not worth a new generation.
@@ -48,8 +49,8 @@ struct Plan<S: Storage> {
     storage: S,
     names: Names,
     generation: u64,
-    /// Whether the present file becomes the previous generation.
-    keep_present: bool,
+    /// The present file, if it becomes the previous generation.
+    keep_present: Option<FileId>,
     /// What comes first then: the generation before may be the only one to have some of the present
     /// file's records on the medium.
     settle: Option<SyncJob<S>>,
@@ -69,6 +70,9 @@ struct Written<S: Storage> {
     file: S::File,
     stamp: Stamp,
     snapshot_bytes: u64,
+    crc: u32,
+    /// The file that is the previous generation now.
+    previous: Option<FileId>,
     /// Whether the previous generation is the present file itself, so that it has what is appended
     /// to that until the new one takes its place.
     linked: bool,
@@ -115,13 +119,13 @@ impl<S: Storage> Plan<S> {
             return Err(names.overtaken());
         }
         let mut linked = true;
-        if self.keep_present {
-            let previous = names.previous();
-            linked = match storage.link(&names.path, &previous) {
-                // Somebody removed it; a new one is the best that can be done.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => true,
-                other => other.map_err(failed("keep", &previous))?,
-            };
+        let mut previous = None;
+        if self.present_is_there() {
+            let path = names.previous();
+            linked = storage
+                .link(&names.path, &path)
+                .map_err(failed("keep", &path))?;
+            previous = self.keep_present;
         }
         // Both names are on the medium before the new generation takes the path: whatever part of
         // the rest a loss of power undoes, the records are in one of the two.
@@ -133,8 +137,16 @@ impl<S: Storage> Plan<S> {
             file,
             stamp: encoded.stamp,
             snapshot_bytes,
+            crc: crc32c::crc32c(&encoded.bytes),
+            previous,
             linked,
         })
+    }
+
+    /// Whether the present file is to be kept and nobody has moved it away.
+    fn present_is_there(&self) -> bool {
+        let there = self.storage.id_at(&self.names.path).ok().flatten();
+        there.is_some() && there == self.keep_present
     }
 
     /// A file at `path` that holds `bytes`, on the medium.
@@ -151,7 +163,7 @@ impl<S: Storage> Plan<S> {
     /// file itself never gives way: it is the only copy until there is a new one.
     fn make_room(&self) -> bool {
         let wanted = self.ticket.lock();
-        *wanted && self.keep_present && self.storage.remove(&self.names.previous()).is_ok()
+        *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
     }
 }
 
@@ -209,6 +221,7 @@ impl<S: Storage> Store<S> {
         if self.is_busy() {
             return Err(StoreError::Busy);
         }
+        self.hold_lock()?;
         self.seq = seq;
         self.generation += 1;
         let generation = self.generation;
@@ -224,7 +237,10 @@ impl<S: Storage> Store<S> {
             storage: self.storage.clone(),
             names: self.names.clone(),
             generation,
-            keep_present: self.usable,
+            keep_present: self
+                .present
+                .filter(|present| present.usable)
+                .map(|present| present.id),
             settle: if unsettled { self.sync_job() } else { None },
             ticket,
         })
@@ -296,7 +312,11 @@ impl<S: Storage> Store<S> {
                 false => self.storage.sync(&written.file),
             })
             .map_err(failed("write", &fresh))?;
-        if let Err(source) = self.storage.rename(&fresh, &self.names.path) {
+        let status = self
+            .storage
+            .status(&written.file)
+            .map_err(failed("check", &fresh))?;
+        if let Err(source) = self.take_path(&fresh, written.previous) {
             // Which file the path names now, nobody knows.
             return Err(self.latch(failed("replace", &self.names.path)(source)));
         }
@@ -306,12 +326,36 @@ impl<S: Storage> Store<S> {
             generation: done.generation,
             snapshot_bytes: written.snapshot_bytes,
             journal_bytes: journal.len() as u64,
+            id: status.id,
+            crc: crc32c::crc32c_append(written.crc, &journal),
+            modified: status.modified,
+            suspect: false,
             clean: journal.is_empty(),
             named: false,
         });
-        self.usable = true;
+        self.present = Some(Present {
+            id: status.id,
+            usable: true,
+        });
         self.unprotected = None;
         self.compact_above = COMPACTION_BYTES_MIN;
+        Ok(())
+    }
+
+    /// Puts the file at `fresh` at the path. What is there is kept under another name, unless it is
+    /// known: kept already as the `previous` generation, or ours and of no use.
+    fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
+        let (storage, path) = (&self.storage, &self.names.path);
+        let there = storage.id_at(path)?;
+        let useless = self.present.filter(|present| !present.usable);
+        let useless = useless.map(|present| present.id);
+        if there.is_none() || there == previous || there == useless {
+            return storage.rename(fresh, path);
+        }
+        let aside = self.names.aside(storage, self.aside_kind)?;
+        storage.replace(fresh, path, &aside)?;
+        self.aside_kind = BROKEN;
+        self.kept = Some(aside);
         Ok(())
     }
 

@@ -4,6 +4,7 @@ use std::io;
 use std::sync::Arc;
 
 use super::generation::failed;
+use super::storage::FileId;
 use super::{Names, Storage, Store, StoreError};
 use crate::record::{self, Entry, Stamp};
 
@@ -17,6 +18,14 @@ pub(super) struct Active<S: Storage> {
     pub(super) generation: u64,
     pub(super) snapshot_bytes: u64,
     pub(super) journal_bytes: u64,
+    /// Which file it is.
+    pub(super) id: FileId,
+    /// The check sum of all that was written.
+    pub(super) crc: u32,
+    /// The time of modification that our last write has left.
+    pub(super) modified: i128,
+    /// Whether somebody else may have written to it, so that the content must be read.
+    pub(super) suspect: bool,
     /// Whether everything appended is on the medium.
     pub(super) clean: bool,
     /// Whether the file's name is.
@@ -63,8 +72,14 @@ impl<S: Storage> Store<S> {
                 });
             }
         };
+        // Nothing is acknowledged that went behind somebody else's bytes, or into a file cut off.
+        if let Ok(status) = self.storage.status(&active.file)
+            && let Err(change) = active.compare(&status)
+        {
+            return Err(self.changed(change));
+        }
         active.clean &= self.buffer.is_empty();
-        let length = active.snapshot_bytes + active.journal_bytes + self.buffer.len() as u64;
+        let length = active.length() + self.buffer.len() as u64;
         let appended = match length > self.file_bytes_max {
             // It would never be read again.
             true => Err(io::ErrorKind::FileTooLarge.into()),
@@ -82,6 +97,13 @@ impl<S: Storage> Store<S> {
         match written {
             Ok(()) => {
                 active.journal_bytes += self.buffer.len() as u64;
+                active.crc = crc32c::crc32c_append(active.crc, &self.buffer);
+                if let Ok(status) = self.storage.status(&active.file) {
+                    active.modified = status.modified;
+                    if let Err(change) = active.compare(&status) {
+                        return Err(self.changed(change));
+                    }
+                }
                 encoded?;
                 Ok(self.seq)
             }
@@ -92,9 +114,11 @@ impl<S: Storage> Store<S> {
     /// Stops recording, for good as far as the present file is concerned.
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());
-        if self.active.take().is_some_and(|active| !active.named) {
+        if self.active.take().is_some_and(|active| !active.named)
+            && let Some(present) = &mut self.present
+        {
             // Nobody knows what of it is on the medium, and the generation before has all of it that was.
-            self.usable = false;
+            present.usable = false;
         }
         error
     }

@@ -4,7 +4,7 @@ use std::io;
 use std::path::Path;
 
 use super::names::Names;
-use super::{OpenError, Storage};
+use super::{BROKEN, OpenError, Present, Storage, UNREADABLE};
 use crate::record::{self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session};
 
 /// No checkpoint is larger; what is, is not read.
@@ -49,36 +49,86 @@ pub(super) struct Found {
     /// The highest generation known.
     pub(super) generation: u64,
     /// Whether the present file can serve as the previous generation of the next.
-    pub(super) usable: bool,
+    usable: bool,
+    /// The present file, if it could be read.
+    pub(super) present: Option<Present>,
+    /// What is at the previous generation's path and can be no fallback: the kind of name under
+    /// which it is to be kept.
+    pub(super) bad_previous: Option<&'static str>,
     /// The bytes of an append that was cut short.
     pub(super) torn: Option<Vec<u8>>,
 }
 
 /// Reads the checkpoint of `names`; `None` if there is none.
 pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
-    let Some(bytes) = read(storage, &names.path)? else {
-        return Ok(None);
+    let path = &names.path;
+    // Before it is read: what takes its place later is another file, and is kept.
+    let id = storage.id_at(path).ok().flatten();
+    let bytes = match read(storage, path) {
+        Ok(None) => return Ok(None),
+        Ok(Some(bytes)) => Ok(bytes),
+        Err(error) => Err(error),
     };
-    // A fallback that cannot be read is none.
-    let previous = read(storage, &names.previous()).ok().flatten();
-    let previous = previous
-        .as_deref()
-        .and_then(|bytes| record::scan(bytes).ok());
-    match (record::scan(&bytes), previous) {
-        (Ok(present), previous) => Ok(Some(join(names, &present, previous.as_ref(), &bytes))),
-        (Err(DecodeError::NewerVersion { version }), _) => Err(OpenError::NewerVersion {
-            path: names.path.clone(),
-            version,
-        }),
-        // Beside a previous generation of ours, this was ours too.
-        (Err(DecodeError::NotACheckpoint), Some(previous)) => {
-            let nothing = Framed::unreadable(&bytes);
-            Ok(Some(join(names, &nothing, Some(&previous), &bytes)))
+    let previous = read(storage, &names.previous());
+    let mut bad_previous = previous.is_err().then_some(UNREADABLE);
+    let previous = previous.ok().flatten();
+    let previous = previous.as_deref().and_then(|bytes| {
+        let scanned = record::scan(bytes);
+        bad_previous = scanned.is_err().then_some(BROKEN);
+        scanned.ok()
+    });
+    let mut found = match bytes {
+        Ok(bytes) => {
+            let mut found = load_present(names, &bytes, previous.as_ref())?;
+            found.present = id.map(|id| Present {
+                id,
+                usable: found.usable,
+            });
+            found
         }
-        (Err(DecodeError::NotACheckpoint), None) => Err(OpenError::NotACheckpoint {
-            path: names.path.clone(),
-        }),
-    }
+        Err(error) => {
+            let whole = previous.filter(|previous| previous.checkpoint().is_ok());
+            let Some(previous) = whole else {
+                return Err(error);
+            };
+            let why = format!(
+                "{}; it will be kept under another name",
+                error.without_advice()
+            );
+            let nothing = Framed::unreadable(&[]);
+            let mut found = join(names, &nothing, Err(why), Some(&previous), &[]);
+            // The next one must not be taken for the one that cannot be read.
+            found.generation += 1;
+            found
+        }
+    };
+    found.bad_previous = bad_previous;
+    Ok(Some(found))
+}
+
+fn load_present(
+    names: &Names,
+    bytes: &[u8],
+    previous: Option<&Framed<'_>>,
+) -> Result<Found, OpenError> {
+    let path = &names.path;
+    let present = match (record::scan(bytes), previous) {
+        (Ok(present), _) => present,
+        (Err(DecodeError::NewerVersion { version }), _) => {
+            let path = path.clone();
+            return Err(OpenError::NewerVersion { path, version });
+        }
+        // Beside a previous generation of ours, this was ours too.
+        (Err(DecodeError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
+        (Err(DecodeError::NotACheckpoint), None) => {
+            return Err(OpenError::NotACheckpoint { path: path.clone() });
+        }
+    };
+    let snapshot = present.checkpoint().map_err(|why| {
+        let path = path.display();
+        format!("the snapshot of `{path}` cannot be used: {why}")
+    });
+    Ok(join(names, &present, snapshot, previous, bytes))
 }
 
 fn read(storage: &impl Storage, path: &Path) -> Result<Option<Vec<u8>>, OpenError> {
@@ -88,28 +138,27 @@ fn read(storage: &impl Storage, path: &Path) -> Result<Option<Vec<u8>>, OpenErro
         source,
     };
     match storage.read(path, FILE_BYTES_MAX) {
-        Ok(bytes) if bytes.len() as u64 > FILE_BYTES_MAX => {
-            Err(failed(io::Error::other("it is larger than any checkpoint")))
-        }
         Ok(bytes) => Ok(Some(bytes)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(failed(error)),
     }
 }
 
-fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, bytes: &[u8]) -> Found {
+fn join(
+    names: &Names,
+    present: &Framed<'_>,
+    snapshot: Result<Checkpoint, String>,
+    previous: Option<&Framed<'_>>,
+    bytes: &[u8],
+) -> Found {
     let path = &names.path;
     let mut damage = Vec::new();
     let mut damaged = present.damaged.clone();
-    let snapshot = present.checkpoint();
     let whole = snapshot.is_ok();
     let checkpoint = match snapshot {
         Ok(checkpoint) => Some(checkpoint),
         Err(why) => {
-            damage.push(format!(
-                "the snapshot of `{}` cannot be used: {why}",
-                path.display()
-            ));
+            damage.push(why);
             fall_back(&names.previous(), previous, &mut damage)
         }
     };
@@ -166,6 +215,8 @@ fn join(names: &Names, present: &Framed<'_>, previous: Option<&Framed<'_>>, byte
             .unwrap_or(0),
         // Not while the previous generation has what it lacks.
         usable: whole && records.len() == own,
+        present: None,
+        bad_previous: None,
         torn: torn
             .clone()
             .and_then(|range| bytes.get(range).map(<[u8]>::to_vec)),

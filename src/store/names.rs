@@ -76,7 +76,8 @@ impl Names {
         let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
         for number in found.iter().take(surplus) {
-            storage.remove(&self.numbered(kind, *number))?;
+            // Whatever it is, it is no reason to keep nothing new.
+            let _ = storage.remove(&self.numbered(kind, *number));
         }
         let number = found.last().copied().unwrap_or(0).saturating_add(1);
         Ok(self.numbered(kind, number))

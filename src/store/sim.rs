@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use super::Storage;
+use super::{FileId, FileStatus, Storage};
 
 /// How an operation fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,6 +27,10 @@ pub(super) enum Fault {
 struct Inode {
     durable: Vec<u8>,
     writes: Vec<Vec<u8>>,
+    /// How often it has been written.
+    modified: i128,
+    /// The medium does not give it back.
+    unreadable: bool,
     /// A sync failed: whoever touches the file again has not understood what that means.
     poisoned: bool,
 }
@@ -43,6 +47,7 @@ enum NameOp {
     Set(PathBuf, usize),
     Move(PathBuf, PathBuf, usize),
     Remove(PathBuf),
+    Swap([(PathBuf, usize); 2]),
 }
 
 impl NameOp {
@@ -60,6 +65,7 @@ impl NameOp {
             Self::Remove(path) => {
                 names.remove(path);
             }
+            Self::Swap(pairs) => names.extend(pairs.clone()),
         }
     }
 }
@@ -83,6 +89,13 @@ pub(super) struct SimFs(Arc<Mutex<World>>);
 
 /// An open file.
 pub(super) struct SimFile(usize);
+
+impl SimFile {
+    fn id(&self) -> FileId {
+        let (device, inode) = (0, self.0 as u64);
+        FileId { device, inode }
+    }
+}
 
 /// What is to be done, and the error to return if it is not.
 enum Step {
@@ -141,6 +154,15 @@ impl World {
             .ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
+    /// A new file that has its name for good.
+    fn add(&mut self, path: &Path) -> usize {
+        let inode = self.inodes.len();
+        self.inodes.push(Inode::default());
+        self.names.insert(path.to_owned(), inode);
+        self.durable_names.insert(path.to_owned(), inode);
+        inode
+    }
+
     fn record(&mut self, op: NameOp) {
         op.apply(&mut self.names);
         self.pending.push(op);
@@ -162,6 +184,42 @@ impl SimFs {
         world.hit
     }
 
+    /// Somebody else puts `bytes` at `path`, as a file of its own or in place.
+    pub(super) fn overwrite(&self, path: &Path, bytes: &[u8], in_place: bool) {
+        let mut world = self.0.lock().unwrap();
+        let inode = match world.find(path) {
+            Ok(inode) if in_place => inode,
+            _ => world.add(path),
+        };
+        let modified = world.inodes[inode].modified + (1 << 60);
+        world.inodes[inode] = Inode {
+            durable: bytes.to_vec(),
+            modified,
+            ..Inode::default()
+        };
+    }
+
+    /// From now on what is at `path` cannot be read.
+    pub(super) fn make_unreadable(&self, path: &Path) {
+        let mut world = self.0.lock().unwrap();
+        let inode = world.find(path).unwrap();
+        world.inodes[inode].unreadable = true;
+    }
+
+    /// Somebody else removes what is at `path`.
+    pub(super) fn take_away(&self, path: &Path) {
+        let mut world = self.0.lock().unwrap();
+        world.names.remove(path);
+        world.durable_names.remove(path);
+    }
+
+    /// Whether any file has this content.
+    pub(super) fn has(&self, bytes: &[u8]) -> bool {
+        let world = self.0.lock().unwrap();
+        let mut inodes = world.names.values();
+        inodes.any(|inode| world.inodes[*inode].content() == bytes)
+    }
+
     /// Operations so far.
     pub(super) fn ops(&self) -> usize {
         self.0.lock().unwrap().ops
@@ -173,6 +231,7 @@ impl SimFs {
         for inode in &mut world.inodes {
             *inode = Inode {
                 durable: inode.content(),
+                unreadable: inode.unreadable,
                 ..Inode::default()
             };
         }
@@ -248,14 +307,25 @@ impl SimFs {
 
 impl Storage for SimFs {
     type File = SimFile;
-    type Lock = ();
+    type Lock = SimFile;
 
     fn locate(&self, path: &Path) -> io::Result<PathBuf> {
         Ok(path.to_owned())
     }
 
-    fn lock(&self, _path: &Path) -> io::Result<Result<(), Option<u32>>> {
-        Ok(Ok(()))
+    fn lock(&self, _: &Path, path: &Path) -> io::Result<Result<SimFile, Option<u32>>> {
+        let mut world = self.0.lock().unwrap();
+        let inode = world.find(path).unwrap_or_else(|_| world.add(path));
+        Ok(Ok(SimFile(inode)))
+    }
+
+    fn renew_lock(&self, lock: &mut SimFile, path: &Path) -> io::Result<Result<(), Option<u32>>> {
+        let renewed = self.lock(path, path)?;
+        Ok(renewed.map(|file| *lock = file))
+    }
+
+    fn lock_id(&self, lock: &SimFile) -> io::Result<FileId> {
+        Ok(lock.id())
     }
 
     fn read(&self, path: &Path, _limit: u64) -> io::Result<Vec<u8>> {
@@ -263,7 +333,11 @@ impl Storage for SimFs {
         if world.dead {
             return Err(io::Error::other("the process is dead"));
         }
-        Ok(world.inodes[world.find(path)?].content())
+        let inode = &world.inodes[world.find(path)?];
+        match inode.unreadable {
+            true => Err(io::Error::from_raw_os_error(5)),
+            false => Ok(inode.content()),
+        }
     }
 
     fn create(&self, path: &Path) -> io::Result<SimFile> {
@@ -285,6 +359,7 @@ impl Storage for SimFs {
         let inode = &mut world.inodes[file.0];
         assert!(!inode.poisoned, "a file whose sync failed was written");
         inode.writes.push(bytes[..taken].to_vec());
+        inode.modified += 1;
         Ok(taken)
     }
 
@@ -318,6 +393,41 @@ impl Storage for SimFs {
         world.whole_step()?;
         world.record(NameOp::Set(to.to_owned(), inode));
         Ok(true)
+    }
+
+    fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
+        let mut world = self.0.lock().unwrap();
+        let (ours, theirs) = (world.find(from)?, world.find(path)?);
+        world.whole_step()?;
+        world.record(NameOp::Move(from.to_owned(), aside.to_owned(), ours));
+        world.whole_step()?;
+        world.record(NameOp::Swap([
+            (path.to_owned(), ours),
+            (aside.to_owned(), theirs),
+        ]));
+        Ok(())
+    }
+
+    fn status(&self, file: &SimFile) -> io::Result<FileStatus> {
+        let world = self.0.lock().unwrap();
+        let inode = &world.inodes[file.0];
+        Ok(FileStatus {
+            id: file.id(),
+            length: inode.content().len() as u64,
+            modified: inode.modified,
+        })
+    }
+
+    fn id_at(&self, path: &Path) -> io::Result<Option<FileId>> {
+        let inode = self.0.lock().unwrap().find(path);
+        Ok(inode.ok().map(|inode| SimFile(inode).id()))
+    }
+
+    fn checksum(&self, path: &Path, length: u64) -> io::Result<u32> {
+        let content = self.read(path, length)?;
+        Ok(crc32c::crc32c(
+            &content[..content.len().min(length as usize)],
+        ))
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {

@@ -1,6 +1,7 @@
 //! Crashes at every operation, losses of power, and disks that fail.
 
 mod faults;
+mod moved;
 
 use std::path::Path;
 

@@ -181,15 +181,15 @@ fn without_any_snapshot_the_records_are_left() {
 }
 
 #[test]
-fn a_file_removed_under_a_running_store_is_noticed_by_the_next_sync() {
+fn a_file_removed_under_a_running_store_is_noticed_by_the_next_check() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("c.yaml");
     let mut store = started(&path, 1);
     fs::remove_file(&path).unwrap();
-    let done = store.sync_job().unwrap().run();
+    let done = store.check_job().unwrap().run();
     assert!(
         store
-            .synced(done)
+            .checked(done)
             .unwrap_err()
             .to_string()
             .contains("removed")

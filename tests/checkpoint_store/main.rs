@@ -4,6 +4,7 @@
 #![allow(clippy::expect_used, clippy::indexing_slicing, clippy::unwrap_used)]
 
 mod damage;
+mod moved;
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};

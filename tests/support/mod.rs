@@ -16,6 +16,7 @@
     reason = "a test"
 )]
 
+mod disk;
 mod fake;
 mod kinds;
 mod name_server;
@@ -34,6 +35,7 @@ mod state;
 mod status;
 mod twins;
 
+pub(crate) use disk::SmallDisk;
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
 pub(crate) use kinds::{kinds, sorted};
 pub(crate) use name_server::NameServer;

@@ -1,0 +1,133 @@
+//! The lock on this machine's disk, which nobody can take away.
+//!
+//! A lock file alone is not enough: it can be deleted, or renamed with its folder, and the next
+//! rosrescue would make a new one. So there are three locks. The lock file serves everybody who
+//! sees the folder, in other containers too. A socket in the abstract namespace, named after the
+//! checkpoint, cannot be removed while we live. And the checkpoint itself is locked, see
+//! [`claim`].
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Write};
+use std::os::fd::AsFd;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::path::Path;
+
+use rustix::fs::FlockOperation;
+
+use super::storage::FileId;
+
+/// Held until dropped.
+#[derive(Debug)]
+pub struct DiskLock {
+    file: File,
+    /// `None` where the kernel has no such sockets.
+    _name: Option<UnixDatagram>,
+}
+
+/// Somebody else has it: the process, if it left its number.
+type Refused = Option<u32>;
+
+impl DiskLock {
+    /// Takes the lock of `checkpoint` with the lock file `path`.
+    pub(super) fn take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
+        let name = match bind(checkpoint) {
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => {
+                return Ok(Err(File::open(path).ok().and_then(holder)));
+            }
+            other => other.ok(),
+        };
+        if is_claimed(checkpoint) {
+            return Ok(Err(File::open(path).ok().and_then(holder)));
+        }
+        Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
+    }
+
+    /// Makes the lock file anew if it is no longer ours that is at `path`, and its folder, too.
+    pub(super) fn renew(&mut self, path: &Path) -> io::Result<Result<(), Refused>> {
+        if FileId::at(path)? == Some(self.id()?) {
+            return Ok(Ok(()));
+        }
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        Ok(lock_file(path)?.map(|file| self.file = file))
+    }
+
+    /// The lock file's.
+    pub(super) fn id(&self) -> io::Result<FileId> {
+        Ok(FileId::of(&self.file.metadata()?))
+    }
+}
+
+/// Locks a checkpoint's own file for as long as it is open, where the file system can.
+pub(super) fn claim(file: &File) {
+    let _ = rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive);
+}
+
+/// Whether another rosrescue has this file open.
+fn is_claimed(checkpoint: &Path) -> bool {
+    // At a pipe, opening would wait.
+    if !fs::metadata(checkpoint).is_ok_and(|metadata| metadata.is_file()) {
+        return false;
+    }
+    let Ok(file) = File::open(checkpoint) else {
+        return false;
+    };
+    let tried = rustix::fs::flock(file, FlockOperation::NonBlockingLockShared);
+    tried == Err(rustix::io::Errno::WOULDBLOCK)
+}
+
+fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
+    let mut options = OpenOptions::new();
+    let mut file = options
+        .mode(0o600)
+        .read(true)
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .open(path)?;
+    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {
+            // For people and for the message of the next one; the lock holds without it.
+            let _ = file
+                .set_len(0)
+                .and_then(|()| writeln!(file, "{}", std::process::id()));
+            Ok(Ok(file))
+        }
+        Err(rustix::io::Errno::WOULDBLOCK) => Ok(Err(holder(file))),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// The process id in a lock file.
+fn holder(file: File) -> Option<u32> {
+    let mut text = String::new();
+    file.take(32).read_to_string(&mut text).ok()?;
+    text.trim().parse().ok()
+}
+
+/// Binds the socket that bears the checkpoint's name. A datagram socket: it has no queue of
+/// connections that somebody could fill.
+fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
+    let root = FileId::of(&fs::metadata("/")?);
+    // A path means the same file only within one tree of mounts: containers that share a network
+    // have one each.
+    let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();
+    let folder = checkpoint.parent().unwrap_or_else(|| Path::new("/"));
+    let path = fs::canonicalize(folder)?.join(checkpoint.file_name().unwrap_or_default());
+    let tree = format!("{}:{}:{}:", mounts.display(), root.device, root.inode);
+    let hash = fnv1a(&[tree.as_bytes(), path.as_os_str().as_bytes()].concat());
+    let name = format!("rosrescue-checkpoint-{hash:016x}");
+    UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(name)?)
+}
+
+/// FNV-1a of 64 bits: a path can be longer than the name of a socket, and every version must come
+/// to the same name.
+fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}

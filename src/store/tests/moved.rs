@@ -1,0 +1,260 @@
+//! What somebody else does to the files while they are in use.
+
+use super::*;
+
+const FOREIGN: &[u8] = b"use_sim_time: true\n";
+
+fn path() -> &'static Path {
+    Path::new(PATH)
+}
+
+/// As the keeper of the checkpoint does every round.
+fn check(store: &mut Store<SimFs>) {
+    if let Some(job) = store.check_job() {
+        let _ = store.checked(job.run());
+    }
+}
+
+/// A store with two records.
+fn started(fs: &SimFs, model: &mut Model) -> Store<SimFs> {
+    let (mut store, _) = open(fs).unwrap();
+    model.begin(&mut store);
+    model.append(&mut store, 2);
+    check(&mut store);
+    assert_eq!(store.unprotected(), None);
+    store
+}
+
+/// The whole file with one byte changed.
+fn changed(fs: &SimFs) -> Vec<u8> {
+    let mut bytes = fs.read(path(), 1 << 20).unwrap();
+    bytes[200] ^= 1;
+    bytes
+}
+
+type Deed = fn(&SimFs);
+
+const DEEDS: [(&str, &str, Deed); 7] = [
+    ("removed", "removed or renamed", |fs| fs.take_away(path())),
+    ("replaced", "another file", |fs| {
+        fs.overwrite(path(), FOREIGN, false);
+    }),
+    ("replaced by its like", "another file", |fs| {
+        let bytes = fs.read(path(), 1 << 20).unwrap();
+        fs.overwrite(path(), &bytes, false);
+    }),
+    ("cut off", "has 0 bytes instead of", |fs| {
+        fs.overwrite(path(), b"", true);
+    }),
+    ("written to", "bytes instead of", |fs| {
+        let more = [fs.read(path(), 1 << 20).unwrap(), b"# note\n".to_vec()].concat();
+        fs.overwrite(path(), &more, true);
+    }),
+    ("overwritten", "overwritten", |fs| {
+        fs.overwrite(path(), &changed(fs), true);
+    }),
+    ("unlocked", "lock file", |fs| {
+        fs.take_away(Path::new("/log/latest-chkpt.yaml.lock"));
+    }),
+];
+
+#[test]
+fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
+    // In a quiet time, and in the middle of traffic.
+    for ((what, word, deed), traffic) in DEEDS.into_iter().flat_map(|it| [(it, 0), (it, 1)]) {
+        let fs = SimFs::default();
+        let mut model = Model::default();
+        let mut store = started(&fs, &mut model);
+        deed(&fs);
+        model.append(&mut store, traffic);
+        check(&mut store);
+        let reason = store.unprotected().expect(what);
+        assert!(reason.contains(word) && reason.contains(PATH), "{reason}");
+
+        store.rearm(&model.checkpoint(store.seq())).unwrap();
+        model.append(&mut store, 1);
+        check(&mut store);
+        assert_eq!(store.unprotected(), None, "{what}");
+        drop(store);
+        let loaded = open(&fs.after_kill()).unwrap().1.unwrap();
+        assert!(loaded.exact && loaded.damage.is_empty(), "{what}");
+        assert_eq!(state(&loaded), model.applied, "{what}");
+    }
+}
+
+#[test]
+fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    fs.overwrite(path(), b"", true);
+    model.append(&mut store, 1);
+    assert_eq!(model.acked, 2);
+    assert_eq!(fs.read(path(), 10).unwrap(), b"");
+}
+
+#[test]
+fn a_file_that_was_merely_touched_goes_on() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    let bytes = fs.read(path(), 1 << 20).unwrap();
+    fs.overwrite(path(), &bytes, true);
+    model.append(&mut store, 1);
+    check(&mut store);
+    assert_eq!((store.unprotected(), store.generation()), (None, 1));
+    assert_eq!(model.acked, 3);
+}
+
+#[test]
+fn a_check_of_an_earlier_generation_says_nothing_of_this_one() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    let late = store.check_job().unwrap();
+    model.begin(&mut store);
+    store.checked(late.run()).unwrap();
+    assert_eq!(store.unprotected(), None);
+}
+
+/// Whatever is found at the path is kept, even by a process that is killed in between or when the power
+/// fails, and the state is in a file at any moment from the first new generation on.
+#[test]
+fn what_is_found_at_the_path_is_kept_at_every_crash() {
+    for at in 0.. {
+        let fs = SimFs::default();
+        let mut model = Model::default();
+        let mut store = started(&fs, &mut model);
+        model.begin(&mut store);
+        fs.overwrite(path(), FOREIGN, false);
+        fs.arm(at, Fault::Kill(4));
+        check(&mut store);
+        let done = model.begin(&mut store);
+        model.sync(&mut store);
+        drop(store);
+        let reached = fs.disarm();
+        let mut images = fs.after_power_loss(4_096);
+        images.push(fs.after_kill());
+        for (nth, image) in images.iter().enumerate() {
+            let context = format!("operation {at}, image {nth}");
+            assert!(image.has(FOREIGN), "{context}");
+            let loaded = open(image).unwrap().1;
+            assert!(
+                !done || loaded.is_some_and(|loaded| loaded.exact),
+                "{context}"
+            );
+            // And the next start keeps it, too.
+            go_on(image, &context);
+            assert!(image.has(FOREIGN), "{context}");
+        }
+        if !reached {
+            assert!(done && at > 5);
+            break;
+        }
+    }
+}
+
+#[test]
+fn a_state_that_comes_from_elsewhere_replaces_no_file() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    model.begin(&mut store);
+    drop(store);
+    let names = Names { path: PATH.into() };
+    let good = [names.path.clone(), names.previous()].map(|path| fs.read(&path, 1 << 20).unwrap());
+    for at in 0.. {
+        let fs = fs.after_kill();
+        fs.arm(at, Fault::Kill(4));
+        let mut model = Model::default();
+        if let Ok(mut store) = Store::open_over_on(fs.clone(), path()) {
+            assert_eq!(store.seq(), 2);
+            model.begin(&mut store);
+            model.append(&mut store, 1);
+            model.begin(&mut store);
+            model.begin(&mut store);
+        }
+        let reached = fs.disarm();
+        let after = fs.after_kill();
+        assert!(good.iter().all(|bytes| after.has(bytes)), "operation {at}");
+        if !reached {
+            let names = fs.list(Path::new("/log")).unwrap();
+            let kept = names.iter().filter(|name| name.contains(".unreadable-"));
+            assert_eq!(kept.count(), 2);
+            let loaded = open(&after).unwrap().1.unwrap();
+            assert_eq!(state(&loaded), model.applied);
+            break;
+        }
+    }
+}
+
+#[test]
+fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
+    let disk = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&disk, &mut model);
+    model.sync(&mut store);
+    model.begin(&mut store);
+    drop(store);
+    let unread = disk.read(path(), 1 << 20).unwrap();
+    disk.make_unreadable(path());
+    for at in 0.. {
+        let fs = disk.after_kill();
+        fs.arm(at, Fault::Kill(4));
+        if let Ok((mut store, loaded)) = open(&fs) {
+            let loaded = loaded.unwrap();
+            assert_eq!(state(&loaded), model.applied);
+            assert!(!loaded.exact && loaded.damage[0].contains("cannot read"));
+            model.begin(&mut store);
+            model.begin(&mut store);
+        }
+        let reached = fs.disarm();
+        let mut images = fs.after_power_loss(4_096);
+        images.push(fs.after_kill());
+        for (nth, image) in images.iter().enumerate() {
+            let context = format!("operation {at}, image {nth}");
+            let loaded = open(image).unwrap().1.unwrap();
+            assert_eq!(state(&loaded), model.applied, "{context}");
+            go_on(image, &context);
+            assert!(image.has(&unread), "{context}");
+        }
+        if !reached {
+            let names = fs.list(Path::new("/log")).unwrap();
+            assert!(names.contains(&"latest-chkpt.yaml.unreadable-1".to_owned()));
+            break;
+        }
+    }
+}
+
+/// Without a fallback nothing is known, and nothing is touched.
+#[test]
+fn what_cannot_be_read_stays_if_there_is_no_other() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    model.begin(&mut store);
+    drop(store);
+    let names = Names { path: PATH.into() };
+    fs.make_unreadable(&names.path);
+    fs.make_unreadable(&names.previous());
+    let before = fs.ops();
+    assert!(matches!(open(&fs), Err(OpenError::Io { .. })));
+    assert_eq!(fs.ops(), before);
+}
+
+#[test]
+fn a_previous_generation_that_cannot_be_read_is_kept() {
+    let fs = SimFs::default();
+    let mut model = Model::default();
+    let mut store = started(&fs, &mut model);
+    model.begin(&mut store);
+    drop(store);
+    let names = Names { path: PATH.into() };
+    let unread = fs.read(&names.previous(), 1 << 20).unwrap();
+    fs.make_unreadable(&names.previous());
+    let (mut store, loaded) = open(&fs).unwrap();
+    assert!(loaded.unwrap().exact);
+    model.begin(&mut store);
+    model.begin(&mut store);
+    assert!(fs.has(&unread));
+}
