@@ -25,7 +25,11 @@ fn a_checkpoint_that_cannot_be_written() {
     fs::write(&file, "a file").unwrap();
     let folder = scratch.path("folder");
     fs::create_dir(&folder).unwrap();
-    for checkpoint in [file.join("chkpt.yaml"), folder, "/proc/chkpt.yaml".into()] {
+    for checkpoint in [
+        file.join("chkpt.yaml"),
+        folder.clone(),
+        "/proc/chkpt.yaml".into(),
+    ] {
         let mut rescue = Setup::core(&scratch, free_port())
             .at_checkpoint(checkpoint.clone())
             .start();
@@ -45,6 +49,8 @@ fn a_checkpoint_that_cannot_be_written() {
         assert_eq!(scratch.survivors(), vec![]);
     }
     assert_eq!(fs::read_to_string(&file).unwrap(), "a file");
+    // A person's folder is not renamed, either.
+    assert!(folder.is_dir() && !scratch.path("folder.unreadable-1").exists());
 }
 
 /// What somebody else wrote is never lost: it stays where it is, or is kept under another name.

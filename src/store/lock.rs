@@ -14,10 +14,15 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use rustix::fs::FlockOperation;
 
 use super::storage::FileId;
+
+/// Locks outlive a process that is killed while it starts another one, until that one has closed what
+/// it inherited. Who starts at that moment is not to be refused.
+const LINGER: Duration = Duration::from_millis(500);
 
 /// Held until dropped.
 #[derive(Debug)]
@@ -33,6 +38,16 @@ type Refused = Option<u32>;
 impl DiskLock {
     /// Takes the lock of `checkpoint` with the lock file `path`.
     pub(super) fn take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
+        let start = Instant::now();
+        loop {
+            match Self::try_take(checkpoint, path)? {
+                Err(_) if start.elapsed() < LINGER => std::thread::sleep(LINGER / 20),
+                taken => return Ok(taken),
+            }
+        }
+    }
+
+    fn try_take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
         let name = match bind(checkpoint) {
             Err(error) if error.kind() == io::ErrorKind::AddrInUse => {
                 return Ok(Err(File::open(path).ok().and_then(holder)));

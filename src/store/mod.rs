@@ -174,15 +174,13 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the folder cannot be used or another rosrescue has it.
+    /// As [`open_on`](Self::open_on): what is no checkpoint, and might be a folder of somebody's, is not
+    /// renamed either.
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
         // Its numbers must not be used again.
-        let found = load::load(storage, names)
-            .ok()
-            .flatten()
-            .unwrap_or_default();
+        let found = load::load(storage, names)?.unwrap_or_default();
         let _ = names.remove_unfinished(storage);
         set_aside_previous(storage, names, UNREADABLE)
             .map_err(open_failed("clear the folder of", &names.path))?;
