@@ -26,7 +26,9 @@ const SAID: Duration = Duration::from_secs(2);
 fn robot(scratch: &Scratch) -> Rescue {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();
+    // However seldom it forces the disk, it looks.
     Setup::core(scratch, free_port())
+        .args(["--sync-interval", "30000"])
         .at_checkpoint(folder.join("chkpt.yaml"))
         .start()
 }

@@ -43,11 +43,11 @@ pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
             () = proxy.ledger.work.notified() => {}
             () = tokio::time::sleep(LOOK) => {}
         }
-        keeper.round().await;
+        keeper.round(true).await;
         if keeper.proxy.config.sync != Sync::Always {
             tokio::select! {
                 () = stop.cancelled() => return,
-                () = tokio::time::sleep(keeper.proxy.config.sync_interval) => {}
+                () = keeper.pause() => {}
             }
         }
     }
@@ -65,11 +65,25 @@ struct Keeping {
 }
 
 impl Keeping {
-    async fn round(&mut self) {
+    /// Until the next sync, however long that is: the file is looked at all the same.
+    async fn pause(&mut self) {
+        let end = Instant::now() + self.proxy.config.sync_interval;
+        loop {
+            let rest = end.saturating_duration_since(Instant::now());
+            tokio::time::sleep(rest.min(LOOK)).await;
+            if rest <= LOOK {
+                return;
+            }
+            self.round(false).await;
+        }
+    }
+
+    async fn round(&mut self, sync: bool) {
         if self.proxy.ledger.with_store(|_, _| ()).is_none() {
             self.open_again().await;
         }
-        self.sync().await;
+        self.sync(sync && self.proxy.config.sync != Sync::Never)
+            .await;
         // Also of what the next lines repair at once.
         self.say_protection();
         if self.compaction_is_due() {
@@ -78,10 +92,9 @@ impl Keeping {
         self.say_protection();
     }
 
-    /// Checks the file and, with `--sync never` not, brings it to the disk.
-    async fn sync(&self) {
+    /// Checks the file and, if it `syncs`, brings it to the disk.
+    async fn sync(&self, syncs: bool) {
         let ledger = &self.proxy.ledger;
-        let syncs = self.proxy.config.sync != Sync::Never;
         let jobs = ledger.with_store(|store, _| {
             let check = store.check_job();
             (check, syncs.then(|| store.sync_job()).flatten())
@@ -159,7 +172,7 @@ impl Keeping {
                 self.compacted_at = Some(Instant::now());
                 if self.proxy.config.sync == Sync::Always {
                     // The new file's name is not on the disk yet.
-                    self.sync().await;
+                    self.sync(true).await;
                 }
                 self.proxy.ledger.set_attempted(Ok(()));
             }
