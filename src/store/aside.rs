@@ -1,9 +1,11 @@
-//! Keeping files under other names: what was damaged, and sessions that have ended.
+//! Keeping files under other names: what was damaged, what was found at the path, and sessions that have
+//! ended.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::generation::{append_all, failed};
+use super::storage::FileId;
 use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
@@ -38,6 +40,25 @@ impl<S: Storage> Store<S> {
             Ok(moved.then_some(aside))
         });
         moved.map_err(failed("set aside", path))
+    }
+}
+
+impl<S: Storage> Store<S> {
+    /// Puts the file at `fresh` at the path. What is there is kept under another name, unless it is
+    /// known: kept already as the `previous` generation, or ours and of no use.
+    pub(super) fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
+        let (storage, path) = (&self.storage, &self.names.path);
+        let there = storage.id_at(path)?;
+        let useless = self.present.filter(|present| !present.usable);
+        let useless = useless.map(|present| present.id);
+        if there.is_none() || there == previous || there == useless {
+            return storage.rename(fresh, path);
+        }
+        let aside = self.names.aside(storage, self.aside_kind)?;
+        storage.replace(fresh, path, &aside)?;
+        self.aside_kind = BROKEN;
+        self.kept = Some(aside);
+        Ok(())
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use super::journal::Active;
 use super::storage::FileId;
-use super::{BROKEN, Names, Present, Storage, Store, StoreError, SyncJob, Synced};
+use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use crate::record::{self, Checkpoint, Stamp};
 
 /// A journal that is smaller than this is not worth a new generation.
@@ -339,23 +339,6 @@ impl<S: Storage> Store<S> {
         });
         self.unprotected = None;
         self.compact_above = COMPACTION_BYTES_MIN;
-        Ok(())
-    }
-
-    /// Puts the file at `fresh` at the path. What is there is kept under another name, unless it is
-    /// known: kept already as the `previous` generation, or ours and of no use.
-    fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
-        let (storage, path) = (&self.storage, &self.names.path);
-        let there = storage.id_at(path)?;
-        let useless = self.present.filter(|present| !present.usable);
-        let useless = useless.map(|present| present.id);
-        if there.is_none() || there == previous || there == useless {
-            return storage.rename(fresh, path);
-        }
-        let aside = self.names.aside(storage, self.aside_kind)?;
-        storage.replace(fresh, path, &aside)?;
-        self.aside_kind = BROKEN;
-        self.kept = Some(aside);
         Ok(())
     }
 

@@ -9,7 +9,8 @@
 //!
 //! A failed write or sync *latches*: the file is never written again, because what a failed
 //! `fsync` has dropped is reported once and then forgotten. The store is then
-//! [unprotected](Store::unprotected) until [`Store::rearm`] has written a new file.
+//! [unprotected](Store::unprotected) until [`Store::rearm`] has written a new file. What somebody else does
+//! to the file, its folder or its lock makes no write fail; a [`CheckJob`] finds it, and it latches too.
 
 mod aside;
 mod error;

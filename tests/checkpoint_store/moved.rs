@@ -5,7 +5,7 @@ use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::process::Command;
 
-use rosrescue::store::{CheckJob, OpenError, Store};
+use rosrescue::store::{CheckJob, OpenError, Store, StoreError};
 
 use super::{checkpoint, entry, names, started};
 
@@ -59,6 +59,34 @@ fn a_lock_file_that_is_deleted_or_replaced() {
     check(&mut store);
     assert!(store.unprotected().unwrap().contains("lock file"));
     fs::write(&lock, "").unwrap();
+    assert_whole(&path, store);
+}
+
+/// In another container, say, where the socket is not seen.
+#[test]
+fn a_lock_that_another_one_took_is_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 3);
+    let lock = folder.path().join("c.yaml.lock");
+    fs::remove_file(&lock).unwrap();
+    fs::write(&lock, "4711\n").unwrap();
+    let other = File::open(&lock).unwrap();
+    other.lock().unwrap();
+    check(&mut store);
+    for _ in 0..2 {
+        let error = store.rearm(&checkpoint(store.seq())).unwrap_err();
+        assert!(matches!(
+            error,
+            StoreError::Taken {
+                holder: Some(4711),
+                ..
+            }
+        ));
+        assert!(store.append(&[entry(4)]).is_err());
+    }
+    assert_eq!(names(folder.path()), ["c.yaml", "c.yaml.lock"]);
+    drop(other);
     assert_whole(&path, store);
 }
 
