@@ -1,6 +1,7 @@
 //! Puts the parts together, from the first look at the checkpoint to the orderly stop.
 
 use std::{
+    io,
     path::Path,
     sync::{
         Arc,
@@ -22,6 +23,7 @@ use crate::{
     admin::Board,
     clock,
     config::{Config, MasterConfig},
+    guardian::handover::Sockets,
     master::Master,
     proxy::{
         Proxy,
@@ -30,7 +32,7 @@ use crate::{
         idle::Idle,
         keeper,
         ledger::Ledger,
-        listener::{self, ListenError},
+        listener,
         pool::Pool,
         stats::Stats,
         upstream::Upstream,
@@ -39,13 +41,14 @@ use crate::{
     record::Session,
     recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
     ros_env::MasterUri,
-    session::{self, Decision, Evidence, Rebuilt, Restore},
+    session::{self, Decision, Evidence, Rebuilt},
     store::{self, OpenError, Store},
     supervisor::{Rosmaster, SupervisorError},
     xmlrpc::Call,
 };
 
 mod life;
+mod superiors;
 
 /// So many bodies of the largest size may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
@@ -56,9 +59,9 @@ const DRAIN: Duration = Duration::from_millis(500);
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
-    /// The port cannot be served.
-    #[error(transparent)]
-    Listen(#[from] ListenError),
+    /// A socket cannot be served.
+    #[error("cannot serve a socket: {0}")]
+    Listen(#[from] io::Error),
     /// The checkpoint belongs to somebody else.
     #[error(transparent)]
     Checkpoint(OpenError),
@@ -91,24 +94,20 @@ struct Beginning {
     story: String,
 }
 
-/// Runs until `stop`. `say` prints a line for the person who started us.
+/// Serves `sockets` until `stop`. `say` prints a line for the person who started us.
 pub async fn run(
     mut config: Config,
+    sockets: Sockets,
     names: Vec<String>,
     stop: CancellationToken,
     say: impl Fn(&str),
 ) -> Result<(), RunError> {
-    let option = match &config.master {
-        MasterConfig::Supervised(_) => "-p",
-        MasterConfig::External(_) => "--listen",
-    };
-    let listeners = listener::bind(&config.listen, option)?;
-    if let Some(bound) = listeners
-        .first()
-        .and_then(|listener| listener.local_addr().ok())
-    {
+    if let Some(bound) = sockets.addresses().first() {
         config.advertised.port = bound.port();
     }
+    let Sockets { listeners, guard } = sockets;
+    let listeners = listeners.into_iter().map(TcpListener::from_std);
+    let listeners = listeners.collect::<io::Result<_>>()?;
     let supervised = match &config.master {
         MasterConfig::Supervised(supervised) => Some((
             supervised.clone(),
@@ -177,6 +176,7 @@ pub async fn run(
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     proxy.ledger.set_identity(pid, proxy.uri.clone());
+    superiors::attend(guard, &proxy, stop.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
         if !left {
@@ -321,12 +321,14 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
         let session = session.unwrap_or_default();
         let same_boot = session.boot_id == boot_id;
-        let evidence = Evidence {
+        let mut evidence = Evidence {
             same_boot,
             closed: session.closed,
-            node_alive: config.restore == Restore::Auto
-                && life::any_alive(&mirror, same_boot).await,
+            node_alive: false,
         };
+        if session::depends_on_nodes(config.restore, evidence) {
+            evidence.node_alive = life::any_alive(&mirror, same_boot).await;
+        }
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
                 story = format!("restored ({why})");

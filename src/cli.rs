@@ -224,6 +224,12 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub max_body: u64,
+    /// Run as a single process, without a guardian that keeps the port and starts rosrescue again
+    /// when it dies: for a debugger, or under a supervisor that does so. A socket unit of systemd
+    /// takes the guardian's place by itself
+    #[arg(long, env = "ROSRESCUE_NO_GUARDIAN")]
+    #[arg(value_parser = FalseyValueParser::new())]
+    pub no_guardian: bool,
     /// Form of the log on stderr
     #[arg(long, env = "ROSRESCUE_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     pub log_format: LogFormat,

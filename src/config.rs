@@ -204,6 +204,28 @@ impl Config {
         )
     }
 
+    /// The option that chooses the port.
+    pub fn port_option(&self) -> &'static str {
+        match self.master {
+            MasterConfig::Supervised(_) => "-p",
+            MasterConfig::External(_) => "--listen",
+        }
+    }
+
+    /// Serves `addresses` instead, which somebody else has bound.
+    pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
+        let single = addresses.first().filter(|address| {
+            !address.ip().is_unspecified() && ros_env::address_override(env).is_none()
+        });
+        if let Some(served) = single {
+            self.advertised.host = served.ip().to_string();
+        }
+        if let Some(first) = addresses.first() {
+            self.advertised.port = first.port();
+        }
+        self.listen = addresses;
+    }
+
     fn common(
         args: &CommonArgs,
         env: Lookup<'_>,
@@ -389,6 +411,21 @@ mod tests {
         let env = |name: &str| (name == "ROS_IP").then(|| "10.0.0.7".to_owned());
         let config = Config::core(&cli.core, &env, "robot", None).unwrap();
         assert_eq!(config.advertised.to_string(), "http://10.0.0.7:1/");
+    }
+
+    #[test]
+    fn sockets_of_others_are_advertised_as_they_are_bound() {
+        let served = |address: &str, ip: Option<&str>| {
+            let cli = Cli::parse_from(["rosrescue", "-p", "12000"]);
+            let env = |name: &str| ip.filter(|_| name == "ROS_IP").map(str::to_owned);
+            let mut config = Config::core(&cli.core, &env, "robot", None).unwrap();
+            config.serve_at(vec![address.parse().unwrap()], &env);
+            config.advertised.to_string()
+        };
+        assert_eq!(served("[::]:4000", None), "http://robot:4000/");
+        assert_eq!(served("10.0.0.7:4000", None), "http://10.0.0.7:4000/");
+        let behind_nat = served("10.0.0.7:4000", Some("192.0.2.1"));
+        assert_eq!(behind_nat, "http://192.0.2.1:4000/");
     }
 
     #[test]

@@ -17,6 +17,7 @@
 //!
 //! * [`cli`], [`config`], [`ros_env`]: what is to be run, and what ROS's environment means.
 //! * [`store`]: the checkpoint on the disk.
+//! * [`guardian`]: the parent process that keeps the sockets and starts the worker again.
 //! * [`proxy`]: listener, door, gate, lane, pool, mirror.
 //! * [`recovery`]: watching the master, examining and injecting, census and healing.
 //! * [`supervisor`]: the processes of rosmaster and rosout.
@@ -31,6 +32,7 @@ pub mod census;
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod guardian;
 pub mod lifecycle;
 pub mod master;
 pub mod proxy;

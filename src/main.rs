@@ -1,9 +1,10 @@
 //! The command line of rosrescue: arguments, logging, signals, exit codes.
 
 use std::{
+    error::Error,
     io::{IsTerminal, Write},
     process::ExitCode,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use clap::{CommandFactory, error::ErrorKind};
@@ -11,6 +12,10 @@ use rosrescue::{
     app,
     cli::{Cli, Command, CommonArgs, LogFormat},
     config::Config,
+    guardian::{
+        self,
+        handover::{Guard, Sockets},
+    },
     proxy::listener,
 };
 use tokio::signal::unix::{SignalKind, signal};
@@ -19,11 +24,26 @@ use tracing_subscriber::EnvFilter;
 
 /// How long work beside the main one may go on when all is done.
 const LAST_JOBS: Duration = Duration::from_millis(500);
+/// A signal to all processes called rosrescue, as by killall, comes to a worker twice: by itself and
+/// through its guardian. A second signal within this time is taken for the first.
+const SAME_SIGNAL: Duration = Duration::from_millis(250);
 /// More threads than these do not make a master faster that is Python; each keeps a heap of its own,
 /// as large as its largest task was.
 const THREADS_MAX: usize = 4;
 
 fn main() -> ExitCode {
+    // Before anything else: it takes them out of the environment, and there is one thread.
+    let sockets = match Sockets::inherited() {
+        Ok(sockets) => sockets,
+        Err(error) => {
+            eprintln!("rosrescue: {error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    if sockets.is_some() {
+        // A worker was started as /proc/self/exe, and would be called `exe` in lists of processes.
+        let _ = rustix::thread::set_name(c"rosrescue");
+    }
     let cli = Cli::read();
     let env = |name: &str| std::env::var(name).ok();
     let hostname = rustix::system::uname()
@@ -63,9 +83,13 @@ fn main() -> ExitCode {
             .error(ErrorKind::ValueValidation, error)
             .exit();
     }
-    config.fit_into(raise_file_limit());
-    match run(config, hostname) {
-        Ok(()) => ExitCode::SUCCESS,
+    if let Some(sockets) = &sockets
+        && matches!(sockets.guard, Guard::Systemd)
+    {
+        config.serve_at(sockets.addresses(), &env);
+    }
+    match start(config, sockets, common.no_guardian, hostname) {
+        Ok(status) => ExitCode::from(u8::try_from(status).unwrap_or(1)),
         Err(error) => {
             eprintln!("rosrescue: {error}");
             ExitCode::FAILURE
@@ -73,13 +97,35 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
+/// Serves `sockets`, or guards a worker that does.
+fn start(
+    mut config: Config,
+    sockets: Option<Sockets>,
+    no_guardian: bool,
+    hostname: String,
+) -> Result<i32, Box<dyn Error>> {
+    let sockets = match sockets {
+        Some(sockets) => sockets,
+        None => {
+            let listeners = listener::bind(&config.listen, config.port_option())?;
+            if !no_guardian {
+                return Ok(guardian::run(&listeners)?);
+            }
+            Sockets::own(listeners)
+        }
+    };
+    config.fit_into(raise_file_limit());
+    run(config, sockets, hostname)?;
+    Ok(0)
+}
+
+fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(cores.min(THREADS_MAX))
         .enable_all()
         .build()?;
-    let ended = runtime.block_on(serve(config, hostname));
+    let ended = runtime.block_on(serve(config, sockets, hostname));
     // The closing checkpoint is on the disk, and has overtaken whatever was being written. What still
     // runs in a thread may be a question to a name server that never answers: the end of a process
     // does not wait for that, but the drop of a runtime would.
@@ -87,45 +133,38 @@ fn run(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error
     ended
 }
 
-async fn serve(config: Config, hostname: String) -> Result<(), Box<dyn std::error::Error>> {
+async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
     let stop = CancellationToken::new();
     let (mut interrupt, mut terminate) = (
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
     // The terminal was closed. Whoever started us with nohup does not want to know.
-    let mut hangup = match is_hangup_ignored() {
+    let mut hangup = match guardian::is_hangup_ignored() {
         true => None,
         false => Some(signal(SignalKind::hangup())?),
     };
     let stopper = stop.clone();
+    let guarded = matches!(sockets.guard, Guard::Guardian { .. });
     tokio::spawn(async move {
-        for first in [true, false] {
+        let mut first = None;
+        loop {
             let status = tokio::select! {
                 _ = interrupt.recv() => 130,
                 _ = terminate.recv() => 143,
                 _ = async { hangup.as_mut()?.recv().await }, if hangup.is_some() => 129,
             };
-            if first {
-                stopper.cancel();
-            } else {
+            let first = *first.get_or_insert_with(Instant::now);
+            if stopper.is_cancelled() && !(guarded && first.elapsed() < SAME_SIGNAL) {
                 std::process::exit(status);
             }
+            stopper.cancel();
         }
     });
     let mut names = vec![hostname, config.advertised.host.clone()];
     names.extend(std::env::var("ROS_HOSTNAME").ok());
-    app::run(config, names, stop, say).await?;
+    app::run(config, sockets, names, stop, say).await?;
     Ok(())
-}
-
-/// Whether we were started with SIGHUP ignored, as the kernel tells.
-fn is_hangup_ignored() -> bool {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    // The lowest bit is that of signal 1.
-    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
-        .is_some_and(|mask| mask & 1 == 1)
 }
 
 /// Prints a line; a reader that has gone away is no reason to stop.

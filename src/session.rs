@@ -39,7 +39,21 @@ pub enum Decision {
     Fresh(&'static str),
 }
 
-/// Decides. `evidence` is asked for only if it matters.
+/// Whether the decision hangs on [`Evidence::node_alive`], which takes time to find out.
+pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
+    let with = |node_alive| {
+        decide(
+            policy,
+            Evidence {
+                node_alive,
+                ..evidence
+            },
+        )
+    };
+    with(true) != with(false)
+}
+
+/// Decides.
 pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     let Evidence {
         same_boot,
@@ -192,6 +206,28 @@ mod tests {
             restores(Restore::Auto, false, false, true),
             "reboot, nodes on another computer"
         );
+    }
+
+    #[test]
+    fn nodes_are_asked_only_if_it_matters() {
+        for (policy, same_boot, closed, matters) in [
+            (Restore::Auto, true, false, false),
+            (Restore::Auto, true, true, true),
+            (Restore::Auto, false, false, true),
+            (Restore::Auto, false, true, true),
+            (Restore::Always, false, true, false),
+            (Restore::Never, false, true, false),
+        ] {
+            for node_alive in [false, true] {
+                let evidence = Evidence {
+                    same_boot,
+                    closed,
+                    node_alive,
+                };
+                let depends = depends_on_nodes(policy, evidence);
+                assert_eq!(depends, matters, "{policy:?} {evidence:?}");
+            }
+        }
     }
 
     #[test]

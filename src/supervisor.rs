@@ -15,7 +15,7 @@ use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::process::{Child, Command};
 
-use crate::config::SupervisedConfig;
+use crate::{config::SupervisedConfig, guardian::handover};
 
 mod left;
 pub mod pidfd;
@@ -150,7 +150,7 @@ impl Rosmaster {
 
     /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
     pub fn spawn(&self, port: u16) -> Result<Child, SupervisorError> {
-        let mut command = Command::new(&self.program);
+        let mut command = command(&self.program);
         command.arg("--core").arg("-p").arg(port.to_string());
         command.arg("-w").arg(self.config.numworkers.to_string());
         if self.config.timeout > 0.0 {
@@ -196,6 +196,13 @@ impl Rosmaster {
     pub fn last_words(&self) -> String {
         tail_of(&self.output)
     }
+}
+
+/// Runs `program`, without what our own superiors told us.
+fn command(program: &Path) -> Command {
+    let mut command = Command::new(program);
+    handover::keep_from(command.as_std_mut());
+    command
 }
 
 /// A file that belongs to `checkpoint`.
@@ -313,7 +320,7 @@ pub fn describe(status: ExitStatus) -> String {
 
 /// What `program` prints within `limit`, as roslaunch's `command=` would take it.
 pub async fn output_of(program: &str, arguments: &[&str], limit: Duration) -> Option<String> {
-    let mut command = Command::new(find_program(program, &["bin"])?);
+    let mut command = command(&find_program(program, &["bin"])?);
     command
         .args(arguments)
         .stdin(Stdio::null())

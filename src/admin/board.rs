@@ -22,11 +22,47 @@ pub struct Board {
     opened: watch::Sender<bool>,
 }
 
+/// Who keeps the port and starts rosrescue again when it dies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Guarded {
+    /// Nobody that we know of.
+    #[default]
+    Nobody,
+    /// systemd, by a socket unit.
+    Systemd,
+    /// The guardian, which is this process.
+    Guardian(u32),
+    /// Nobody since the guardian, which was this process, has ended.
+    NoLonger(u32),
+}
+
+impl Guarded {
+    fn is_guarded(self) -> bool {
+        matches!(self, Self::Systemd | Self::Guardian(_))
+    }
+}
+
+impl fmt::Display for Guarded {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Nobody => f.write_str("nobody (--no-guardian)"),
+            Self::Systemd => f.write_str("systemd"),
+            Self::Guardian(pid) => write!(f, "process {pid}"),
+            Self::NoLonger(pid) => write!(
+                f,
+                "NOBODY: the guardian, process {pid}, has ended; start rosrescue anew when the robot \
+                 is at rest"
+            ),
+        }
+    }
+}
+
 #[derive(Debug, Default)]
 struct Inner {
     open: bool,
     /// When the gate was shut, by the wall clock.
     shut_at: Option<f64>,
+    guarded: Guarded,
     crash_loop: bool,
     deaths: u64,
     recoveries: u64,
@@ -58,6 +94,27 @@ impl Board {
     /// The master dies again and again, or no longer.
     pub fn set_crash_loop(&self, crash_loop: bool) {
         self.lock().crash_loop = crash_loop;
+    }
+
+    /// Who guards this process.
+    pub fn set_guarded(&self, guarded: Guarded) {
+        self.lock().guarded = guarded;
+    }
+
+    /// The state in a line; `unprotected` is why it is not recorded.
+    pub fn line(&self, unprotected: Option<String>) -> String {
+        let inner = self.lock();
+        let mut line = match (inner.open, unprotected) {
+            (false, _) if inner.crash_loop => "the master dies again and again".to_owned(),
+            (false, _) => "the master is away".to_owned(),
+            (true, Some(reason)) => format!("unprotected: {reason}"),
+            (true, None) => "protected".to_owned(),
+        };
+        if let Guarded::NoLonger(pid) = inner.guarded {
+            line += &format!("; unguarded: the guardian, process {pid}, has ended");
+        }
+        // A newline would begin another assignment.
+        line.replace('\n', " ")
     }
 
     /// So many masters have died.
@@ -126,6 +183,10 @@ pub struct Status {
     pub checkpoint: String,
     /// Why the state is not recorded; none if all is well.
     pub unprotected: Option<String>,
+    /// Whether another process keeps the port, and starts rosrescue again, when it dies.
+    pub guarded: bool,
+    /// In words, which one.
+    pub guarded_by: String,
     /// What the mirror holds.
     pub state: Counts,
     /// Nodes that do not answer now and are not known to be dead.
@@ -166,6 +227,8 @@ impl Status {
             deaths: inner.deaths,
             checkpoint: proxy.config.checkpoint.display().to_string(),
             unprotected,
+            guarded: inner.guarded.is_guarded(),
+            guarded_by: inner.guarded.to_string(),
             state,
             suspects,
             recoveries: inner.recoveries,
@@ -201,6 +264,7 @@ impl fmt::Display for Status {
             |reason| format!("UNPROTECTED: {reason}"),
         );
         writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
+        writeln!(f, "guarded by      {}", self.guarded_by)?;
         writeln!(f, "state           {}", self.state)?;
         if !self.suspects.is_empty() {
             writeln!(f, "suspect         {}", self.suspects.join(", "))?;
@@ -229,5 +293,24 @@ impl fmt::Display for Status {
             writeln!(f, "{name:<16}{value}")?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_line_says_the_worst() {
+        let board = Board::default();
+        assert_eq!(board.line(None), "the master is away");
+        board.set_crash_loop(true);
+        assert_eq!(board.line(None), "the master dies again and again");
+        board.set_open(true);
+        assert_eq!(board.line(None), "protected");
+        let line = board.line(Some("the disk\nis full".to_owned()));
+        assert_eq!(line, "unprotected: the disk is full");
+        board.set_guarded(Guarded::NoLonger(7));
+        assert!(board.line(None).contains("unguarded"));
     }
 }

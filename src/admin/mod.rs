@@ -10,7 +10,7 @@
 
 mod board;
 
-pub use board::{Board, Status};
+pub use board::{Board, Guarded, Status};
 
 use bytes::Bytes;
 use http_body_util::Full;
@@ -105,6 +105,12 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
         "gauge",
         "whether the master dies again and again",
         flag(status.crash_loop),
+    );
+    add(
+        "guarded",
+        "gauge",
+        "whether another process keeps the port when rosrescue dies",
+        flag(status.guarded),
     );
     add(
         "recoveries_total",

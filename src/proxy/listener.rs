@@ -2,7 +2,7 @@
 
 use std::{
     io,
-    net::{IpAddr, Ipv6Addr, SocketAddr},
+    net::{self, IpAddr, Ipv6Addr, SocketAddr},
     sync::Arc,
     time::Duration,
 };
@@ -62,14 +62,14 @@ pub enum ListenError {
     },
 }
 
-/// Listens at all of `addresses`. All but the first are left out if the computer lacks their address
+/// Listens at all of `addresses`, without blocking. All but the first are left out if the computer lacks their address
 /// family. With port 0 they share one free port. `option`, which
 /// chooses the port, is named in errors.
 pub fn bind(
     addresses: &[SocketAddr],
     option: &'static str,
-) -> Result<Vec<TcpListener>, ListenError> {
-    let mut listeners: Vec<TcpListener> = Vec::new();
+) -> Result<Vec<net::TcpListener>, ListenError> {
+    let mut listeners: Vec<net::TcpListener> = Vec::new();
     let mut port = None;
     for address in addresses {
         let address = SocketAddr::new(address.ip(), port.unwrap_or_else(|| address.port()));
@@ -101,7 +101,7 @@ pub fn bind(
     Ok(listeners)
 }
 
-fn bind_one(address: SocketAddr) -> io::Result<TcpListener> {
+fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
     let socket = Socket::new(
         Domain::for_address(address),
         Type::STREAM,
@@ -114,7 +114,7 @@ fn bind_one(address: SocketAddr) -> io::Result<TcpListener> {
     socket.set_nonblocking(true)?;
     socket.bind(&address.into())?;
     socket.listen(BACKLOG)?;
-    TcpListener::from_std(socket.into())
+    Ok(socket.into())
 }
 
 /// Serves `listener` until `stop`; connections that are under way may end in order.
@@ -205,7 +205,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
 /// packet is sent for it.
 pub fn local_address() -> Option<IpAddr> {
     let routed = |from: SocketAddr, to: SocketAddr| {
-        let socket = std::net::UdpSocket::bind(from).ok()?;
+        let socket = net::UdpSocket::bind(from).ok()?;
         socket.connect(to).ok()?;
         Some(socket.local_addr().ok()?.ip())
     };

@@ -7,7 +7,7 @@
 use std::{
     ffi::{OsStr, OsString},
     fs, io,
-    os::unix::ffi::OsStrExt,
+    os::unix::{ffi::OsStrExt, process::parent_id},
     path::{Path, PathBuf},
 };
 
@@ -49,12 +49,17 @@ fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
     fs::read_link(format!("/proc/{process}/ns/net")).ok()
 }
 
-/// Whether the parent of `pid` is a rosrescue, so that nobody has left it behind.
+/// Whether the parent of `pid` is a rosrescue, so that nobody has left it behind. Our own parent is
+/// not meant: a guardian starts no masters, but gets those of dead workers as the first process of a
+/// container.
 fn has_rosrescue(pid: u32) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     // The command's name comes before, in parentheses, with whatever it likes in it.
     let after = stat.rsplit(')').next().unwrap_or_default();
     let parent = after.split_whitespace().nth(1).unwrap_or_default();
+    if parent == parent_id().to_string() {
+        return false;
+    }
     let program = fs::read_link(format!("/proc/{parent}/exe")).unwrap_or_default();
     let name = program.file_name().unwrap_or_default();
     name.as_bytes().starts_with(b"rosrescue")

@@ -8,7 +8,7 @@ use std::{
 
 use tokio::process::{Child, Command};
 
-use super::{add_ros_paths, beside, create, find_program, is_program, tail_of};
+use super::{add_ros_paths, beside, command, create, find_program, is_program, tail_of};
 
 /// Starts rosouts.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ impl Rosout {
     }
 
     fn command(&self, uri: &str) -> Command {
-        let mut command = Command::new(&self.program);
+        let mut command = command(&self.program);
         command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
         add_ros_paths(&mut command, &self.program, 3);
         command

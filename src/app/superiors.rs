@@ -1,0 +1,105 @@
+//! Tells whoever watches over this process how it is: its guardian, and systemd (`sd_notify(3)`).
+
+use std::{os::unix::net::UnixStream as StdLink, sync::Arc, time::Duration};
+
+use sd_notify::NotifyState;
+use tokio::{
+    io::{AsyncReadExt, AsyncWriteExt},
+    net::UnixStream,
+    time::{Instant, MissedTickBehavior, interval},
+};
+use tokio_util::sync::CancellationToken;
+
+use crate::{admin::Guarded, guardian::handover::Guard, proxy::Proxy};
+
+/// How often systemd may be told another status.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Keeps in touch with them until `stop`.
+pub(super) fn attend(guard: Guard, proxy: &Arc<Proxy>, stop: CancellationToken) {
+    match guard {
+        Guard::Nobody => proxy.board.set_guarded(Guarded::Nobody),
+        Guard::Systemd => proxy.board.set_guarded(Guarded::Systemd),
+        Guard::Guardian { pid, link } => {
+            proxy.board.set_guarded(Guarded::Guardian(pid));
+            tokio::spawn(follow_guardian(pid, link, proxy.clone()));
+        }
+    }
+    if std::env::var_os("NOTIFY_SOCKET").is_some() {
+        tokio::spawn(report_ready(proxy.clone()));
+        tokio::spawn(report_status(proxy.clone(), stop));
+    }
+}
+
+/// Tells the guardian when calls are answered, and people when the guardian is gone.
+async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
+    let link = link
+        .set_nonblocking(true)
+        .and_then(|()| UnixStream::from_std(link));
+    let Ok(mut link) = link else { return };
+    let (mut from, mut to) = link.split();
+    let served = async {
+        proxy.board.first_opening().await;
+        // If nobody takes it the other half tells.
+        let _ = to.write_all(&[1]).await;
+    };
+    // The guardian never writes: an answer is its end.
+    let mut byte = [0];
+    let ended = from.read(&mut byte);
+    tokio::pin!(ended);
+    tokio::select! {
+        _ = &mut ended => {}
+        () = served => drop(ended.await),
+    }
+    proxy.board.set_guarded(Guarded::NoLonger(pid));
+    tracing::warn!(
+        pid,
+        "unguarded: the guardian process has ended; all goes on, but if rosrescue dies now, \
+         connections are refused and nobody starts it again. Stop it and start it anew when the robot \
+         is at rest"
+    );
+}
+
+async fn report_ready(proxy: Arc<Proxy>) {
+    proxy.board.first_opening().await;
+    send(&[NotifyState::Ready]);
+}
+
+/// Tells systemd the state in a line, and feeds its watchdog. That takes a timer and a thread of the
+/// runtime, and the locks of the board and of the mirror: what calls need, too.
+async fn report_status(proxy: Arc<Proxy>, stop: CancellationToken) {
+    // Twice as often as necessary, as systemd asks for.
+    let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
+    let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));
+    let mut ticks = interval(tick.max(Duration::from_millis(1)));
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut last = String::new();
+    let mut fed = None;
+    let mut stopping = false;
+    loop {
+        let now = tokio::select! {
+            now = ticks.tick() => now,
+            () = stop.cancelled(), if !stopping => {
+                stopping = true;
+                send(&[NotifyState::Stopping, NotifyState::Status("stopping")]);
+                Instant::now()
+            }
+        };
+        let line = proxy.board.line(proxy.ledger.unprotected());
+        if !stopping && line != last {
+            send(&[NotifyState::Status(&line)]);
+            last = line;
+        }
+        let due = |pause| fed.is_none_or(|fed| now.saturating_duration_since(fed) + tick > pause);
+        if watchdog.is_some_and(due) {
+            send(&[NotifyState::Watchdog]);
+            fed = Some(now);
+        }
+    }
+}
+
+fn send(state: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(state) {
+        tracing::debug!(%error, "systemd is not told");
+    }
+}

@@ -1,0 +1,240 @@
+//! The guardian: the parent process that keeps the listening sockets and keeps a worker alive.
+//!
+//! A person's `rosrescue` is two processes. The guardian binds the sockets, starts the worker, which
+//! is the same program with the sockets passed on ([`handover`]), and starts it again when it dies
+//! ([`restart`]). Connections that come meanwhile wait in the kernel's queue; none is refused. The
+//! guardian does nothing else, so that there is little it could die of: it has no runtime and reads
+//! nothing from the network.
+//!
+//! Under systemd a socket unit takes its place.
+
+use std::{
+    io::{self, Read},
+    net::TcpListener,
+    os::{
+        fd::OwnedFd,
+        unix::{net::UnixStream, process::CommandExt},
+    },
+    process::Command,
+    sync::mpsc::{Receiver, RecvTimeoutError, sync_channel},
+    thread,
+    time::{Duration, Instant},
+};
+
+use command_fds::{CommandFdExt, FdMapping, FdMappingCollision};
+use rustix::process::{Signal, WaitOptions};
+use signal_hook::{
+    consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
+    iterator::Signals,
+};
+use thiserror::Error;
+
+use crate::supervisor::signal_process;
+
+pub mod handover;
+pub mod restart;
+
+use restart::{End, Next, Restarts};
+
+/// The program that runs, also after its file has been replaced by another version.
+const PROGRAM: &str = "/proc/self/exe";
+
+/// Why there is no worker. Exit status 1.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum GuardianError {
+    /// The system would not start it.
+    #[error("cannot start the worker process: {0}; --no-guardian runs rosrescue without one")]
+    Spawn(#[from] io::Error),
+    /// Cannot happen: every descriptor is given its own number.
+    #[error("cannot pass the sockets on: {0}")]
+    Handover(#[from] FdMappingCollision),
+}
+
+/// Runs workers that serve `listeners` until one ends in order. Answers with the exit status.
+///
+/// # Errors
+///
+/// If the first worker cannot be started, or signals cannot be received. Later the guardian never
+/// gives up.
+pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
+    let signals = receive_signals()?;
+    let mut restarts = Restarts::default();
+    let mut worker = Worker::start(listeners)?;
+    loop {
+        let end = worker.attend(&signals, || restarts.stop());
+        let pause = match restarts.ended(end, worker.has_served(), Instant::now()) {
+            Next::Exit(status) => return Ok(status),
+            Next::Restart { pause } => pause,
+        };
+        let pid = worker.pid;
+        if pause.is_zero() {
+            tracing::warn!(pid, how = %end, "the worker has ended; starting it again");
+        } else {
+            tracing::error!(
+                pid, how = %end, ?pause,
+                "the worker dies again and again; the port stays open, and it is started again after a pause"
+            );
+        }
+        worker = match start_again(listeners, &signals, pause)? {
+            Ok(worker) => worker,
+            Err(signal) => {
+                tracing::warn!(
+                    "stopped while no worker runs; a rosmaster that it had started goes on, and the \
+                     next rosrescue takes it over"
+                );
+                return Ok(128 + signal);
+            }
+        };
+    }
+}
+
+/// Starts a worker after `pause`, and tries until the system lets it. Answers with the signal that
+/// came meanwhile, if one did.
+fn start_again(
+    listeners: &[TcpListener],
+    signals: &Receiver<i32>,
+    mut pause: Duration,
+) -> Result<Result<Worker, i32>, GuardianError> {
+    loop {
+        let until = Instant::now() + pause;
+        loop {
+            match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                // An orphan has ended, which is now our child.
+                Ok(SIGCHLD) => drop(reap(None)),
+                Ok(signal) => return Ok(Err(signal)),
+                Err(RecvTimeoutError::Timeout) => break,
+                Err(RecvTimeoutError::Disconnected) => return Err(signals_lost().into()),
+            }
+        }
+        match Worker::start(listeners) {
+            Ok(worker) => return Ok(Ok(worker)),
+            Err(error) => tracing::error!(%error, "retrying"),
+        }
+        pause = restart::PAUSE_MOST;
+    }
+}
+
+/// The process that does the work.
+struct Worker {
+    pid: u32,
+    /// The worker writes a byte to it when it first serves, and sees by its end that we have ended.
+    link: UnixStream,
+}
+
+impl Worker {
+    fn start(listeners: &[TcpListener]) -> Result<Self, GuardianError> {
+        let (link, of_worker) = UnixStream::pair()?;
+        link.set_nonblocking(true)?;
+        let mut passed = Vec::new();
+        for listener in listeners {
+            passed.push(OwnedFd::from(listener.try_clone()?));
+        }
+        passed.push(of_worker.into());
+        let count = passed.len().to_string();
+        let mappings = (handover::FIRST..).zip(passed);
+        let mappings = mappings.map(|(child_fd, parent_fd)| FdMapping {
+            parent_fd,
+            child_fd,
+        });
+        let mut arguments = std::env::args_os();
+        let mut command = Command::new(PROGRAM);
+        command
+            .arg0(arguments.next().unwrap_or_else(|| "rosrescue".into()))
+            .args(arguments)
+            .env(handover::LISTEN_FDS, count)
+            .env(handover::GUARDIAN, std::process::id().to_string())
+            .env_remove(handover::LISTEN_PID)
+            .env_remove(handover::LISTEN_FDNAMES)
+            // A group of its own: what is typed in the terminal comes to us, and once through us.
+            .process_group(0);
+        if sd_notify::watchdog_enabled().is_none() {
+            // It is for another process.
+            command.env_remove("WATCHDOG_USEC");
+        }
+        // The worker feeds systemd's watchdog in our place.
+        command.env_remove("WATCHDOG_PID");
+        command.fd_mappings(mappings.collect())?;
+        let pid = command.spawn()?.id();
+        Ok(Self { pid, link })
+    }
+
+    /// Waits for its end, and passes signals on until then; `stopping` is told of them.
+    fn attend(&self, signals: &Receiver<i32>, mut stopping: impl FnMut()) -> End {
+        loop {
+            match signals.recv() {
+                Ok(SIGCHLD) => {
+                    if let Some(end) = reap(Some(self.pid)) {
+                        return end;
+                    }
+                }
+                Ok(signal) => {
+                    stopping();
+                    let signal = match signal {
+                        SIGINT => Signal::INT,
+                        SIGHUP => Signal::HUP,
+                        _ => Signal::TERM,
+                    };
+                    signal_process(self.pid, signal);
+                }
+                // The thread that sends them has panicked.
+                Err(_) => return End::Code(1),
+            }
+        }
+    }
+
+    /// Whether it has ever answered calls.
+    fn has_served(&self) -> bool {
+        (&self.link).read(&mut [0]).is_ok_and(|read| read == 1)
+    }
+}
+
+/// Takes note of all children that have ended: as the first process of a container we are given those
+/// of others, too. Answers with the end of `worker` if it is among them.
+fn reap(worker: Option<u32>) -> Option<End> {
+    let mut end = None;
+    while let Ok(Some((pid, status))) = rustix::process::wait(WaitOptions::NOHANG) {
+        if u32::try_from(pid.as_raw_nonzero().get()).ok() == worker {
+            end = match (status.exit_status(), status.terminating_signal()) {
+                (Some(code), _) => Some(End::Code(code)),
+                (None, Some(signal)) => Some(End::Signal(signal)),
+                (None, None) => None,
+            };
+        }
+    }
+    end
+}
+
+/// The signals that come, one by one.
+fn receive_signals() -> io::Result<Receiver<i32>> {
+    let mut wanted = vec![SIGCHLD, SIGINT, SIGTERM];
+    if !is_hangup_ignored() {
+        wanted.push(SIGHUP);
+    }
+    let mut signals = Signals::new(wanted)?;
+    let (sender, receiver) = sync_channel(8);
+    thread::Builder::new()
+        .name("signals".to_owned())
+        .spawn(move || {
+            for signal in signals.forever() {
+                if sender.send(signal).is_err() {
+                    return;
+                }
+            }
+        })?;
+    Ok(receiver)
+}
+
+fn signals_lost() -> io::Error {
+    io::Error::other("signals are not received any more")
+}
+
+/// Whether we were started with SIGHUP ignored, as by nohup: whoever did so wants us to outlive the
+/// terminal.
+pub fn is_hangup_ignored() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    // The lowest bit is that of signal 1.
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .is_some_and(|mask| mask & 1 == 1)
+}

@@ -1,0 +1,199 @@
+//! Listening sockets that a process is given at its start, by the LISTEN_FDS protocol of systemd
+//! (`sd_listen_fds(3)`), and who gave them.
+//!
+//! In the protocol LISTEN_PID names the process that the sockets are for. A guardian cannot know that
+//! of its worker before the fork, so it names itself in [`GUARDIAN`] instead. The last of its sockets
+//! is no listener but one end of a pair: its other end closes when the guardian ends.
+
+use std::{
+    io,
+    net::{SocketAddr, TcpListener},
+    os::{
+        fd::{OwnedFd, RawFd},
+        unix::{net::UnixStream, process::parent_id},
+    },
+    process::Command,
+};
+
+use listenfd::ListenFd;
+use socket2::SockRef;
+use thiserror::Error;
+
+use crate::ros_env::Lookup;
+
+/// The number of the first socket.
+pub(super) const FIRST: RawFd = 3;
+/// How many there are.
+pub(super) const LISTEN_FDS: &str = "LISTEN_FDS";
+/// The process that they are for.
+pub(super) const LISTEN_PID: &str = "LISTEN_PID";
+pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
+/// The process id of the guardian whose worker this is.
+pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
+
+/// Sockets that cannot be served. Exit status 1.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum HandoverError {
+    /// One is something else.
+    #[error(
+        "socket {number} that was passed to rosrescue is no TCP socket that listens: {source}; a \
+         socket unit needs ListenStream= with a port, and Accept=no"
+    )]
+    NotAListener {
+        /// Its number.
+        number: RawFd,
+        /// What is wrong with it.
+        source: io::Error,
+    },
+    /// The link to the guardian is missing.
+    #[error("the guardian's link cannot be used: {0}")]
+    Link(io::Error),
+}
+
+/// Sockets to serve.
+#[derive(Debug)]
+pub struct Sockets {
+    /// They do not block.
+    pub listeners: Vec<TcpListener>,
+    /// Who else keeps them.
+    pub guard: Guard,
+}
+
+/// Who keeps the sockets, and starts rosrescue again, when it dies.
+#[derive(Debug)]
+pub enum Guard {
+    /// Nobody that we know of.
+    Nobody,
+    /// systemd, or whoever else speaks its protocol.
+    Systemd,
+    /// The guardian.
+    Guardian {
+        /// Its process.
+        pid: u32,
+        /// Closes when it ends.
+        link: UnixStream,
+    },
+}
+
+impl Sockets {
+    /// Those that this process was given, if it was. To be called first of all, once.
+    ///
+    /// # Errors
+    ///
+    /// If they cannot be served.
+    pub fn inherited() -> Result<Option<Self>, HandoverError> {
+        let env = |name: &str| std::env::var(name).ok();
+        let Some(giver) = giver(&env, std::process::id(), parent_id()) else {
+            return Ok(None);
+        };
+        // It takes the variables out of the environment.
+        let mut given = ListenFd::from_env();
+        let guard = match giver {
+            Giver::Systemd => Guard::Systemd,
+            Giver::Guardian(pid) => {
+                let link = given.take_unix_listener(given.len().saturating_sub(1));
+                let link = link.map_err(HandoverError::Link)?;
+                let link =
+                    link.ok_or_else(|| HandoverError::Link(io::ErrorKind::NotFound.into()))?;
+                Guard::Guardian {
+                    pid,
+                    link: OwnedFd::from(link).into(),
+                }
+            }
+        };
+        let mut listeners = Vec::new();
+        for (index, number) in (0..given.len()).zip(FIRST..) {
+            let listener = given.take_tcp_listener(index).and_then(|listener| {
+                let Some(listener) = listener else {
+                    return Ok(None);
+                };
+                if !SockRef::from(&listener).is_listener()? {
+                    return Err(io::Error::other("it does not listen"));
+                }
+                listener.set_nonblocking(true)?;
+                Ok(Some(listener))
+            });
+            let listener =
+                listener.map_err(|source| HandoverError::NotAListener { number, source });
+            listeners.extend(listener?);
+        }
+        Ok(Some(Self { listeners, guard }))
+    }
+
+    /// Those that this process has bound itself.
+    pub fn own(listeners: Vec<TcpListener>) -> Self {
+        Self {
+            listeners,
+            guard: Guard::Nobody,
+        }
+    }
+
+    /// Where they listen.
+    pub fn addresses(&self) -> Vec<SocketAddr> {
+        let addresses = self.listeners.iter().map(TcpListener::local_addr);
+        addresses.filter_map(Result::ok).collect()
+    }
+}
+
+/// Who gives sockets to a process.
+#[derive(Debug, PartialEq, Eq)]
+enum Giver {
+    Systemd,
+    Guardian(u32),
+}
+
+/// Whose sockets those of the environment `env` are; none if they are not for the process `own`,
+/// whose parent is `parent`.
+fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
+    let number = |name: &str| env(name)?.parse::<u32>().ok();
+    number(LISTEN_FDS).filter(|count| *count > 0)?;
+    match env(LISTEN_PID) {
+        Some(_) => (number(LISTEN_PID) == Some(own)).then_some(Giver::Systemd),
+        None => (number(GUARDIAN) == Some(parent)).then_some(Giver::Guardian(parent)),
+    }
+}
+
+/// Keeps from a child process what its parent was told by the guardian and by systemd: it is not meant
+/// for it.
+pub fn keep_from(command: &mut Command) {
+    for name in [
+        LISTEN_FDS,
+        LISTEN_PID,
+        LISTEN_FDNAMES,
+        GUARDIAN,
+        "NOTIFY_SOCKET",
+        "WATCHDOG_PID",
+        "WATCHDOG_USEC",
+    ] {
+        command.env_remove(name);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn giver_of(variables: &[(&str, &str)]) -> Option<Giver> {
+        let env = |name: &str| {
+            let found = variables.iter().find(|(of, _)| *of == name)?;
+            Some(found.1.to_owned())
+        };
+        giver(&env, 20, 10)
+    }
+
+    #[test]
+    fn sockets_are_taken_by_the_process_that_they_are_for() {
+        assert_eq!(giver_of(&[]), None);
+        let fds = (LISTEN_FDS, "2");
+        assert_eq!(giver_of(&[fds]), None);
+        assert_eq!(giver_of(&[fds, (LISTEN_PID, "20")]), Some(Giver::Systemd));
+        assert_eq!(giver_of(&[fds, (LISTEN_PID, "21")]), None);
+        assert_eq!(giver_of(&[(LISTEN_FDS, "0"), (LISTEN_PID, "20")]), None);
+        let ours = (GUARDIAN, "10");
+        assert_eq!(giver_of(&[fds, ours]), Some(Giver::Guardian(10)));
+        assert_eq!(giver_of(&[fds, (GUARDIAN, "11")]), None);
+        assert_eq!(giver_of(&[ours]), None);
+        assert_eq!(giver_of(&[fds, ours, (LISTEN_PID, "21")]), None);
+    }
+}

@@ -1,0 +1,167 @@
+//! What follows on the end of a worker. Pure: the time comes in as an argument.
+
+use std::{
+    collections::VecDeque,
+    fmt,
+    time::{Duration, Instant},
+};
+
+/// Deaths within [`SPAN`] after which the worker is started again at once.
+const AT_ONCE: usize = 5;
+const SPAN: Duration = Duration::from_secs(60);
+/// The first pause; each further one is twice as long.
+const PAUSE_LEAST: Duration = Duration::from_millis(500);
+/// The longest pause. More than [`AT_ONCE`] of it fit into [`SPAN`], so that a worker that never lives
+/// for long stays at it.
+pub const PAUSE_MOST: Duration = Duration::from_secs(10);
+
+/// The exit status of a Rust program that panicked.
+const PANIC: i32 = 101;
+
+/// How a worker ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum End {
+    /// By itself, with this exit status.
+    Code(i32),
+    /// By a signal.
+    Signal(i32),
+}
+
+impl End {
+    /// The exit status by which a shell would tell of it.
+    fn status(self) -> i32 {
+        match self {
+            Self::Code(code) => code,
+            Self::Signal(signal) => 128 + signal,
+        }
+    }
+}
+
+impl fmt::Display for End {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Code(code) => write!(f, "exit status {code}"),
+            Self::Signal(signal) => write!(f, "signal {signal}"),
+        }
+    }
+}
+
+/// What to do next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Next {
+    /// End with this status.
+    Exit(i32),
+    /// Start another worker.
+    Restart {
+        /// How long to wait before.
+        pause: Duration,
+    },
+}
+
+/// Decides whether and when a worker is started again.
+#[derive(Debug, Default)]
+pub struct Restarts {
+    /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
+    deaths: VecDeque<Instant>,
+    /// The last pause.
+    pause: Duration,
+    /// Whether any worker has served.
+    served: bool,
+    stopping: bool,
+}
+
+impl Restarts {
+    /// A signal asks for the end: no worker is started again.
+    pub fn stop(&mut self) {
+        self.stopping = true;
+    }
+
+    /// A worker has ended at `now`; `served` says whether it answered calls before.
+    ///
+    /// An end with a status is an error of the start, such as a missing rosmaster, until a worker has
+    /// served; afterwards the same error may go away by itself.
+    pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
+        self.served |= served;
+        match end {
+            _ if self.stopping => Next::Exit(end.status()),
+            End::Code(0) => Next::Exit(0),
+            End::Code(code) if code != PANIC && !self.served => Next::Exit(code),
+            _ => Next::Restart {
+                pause: self.pause_after(now),
+            },
+        }
+    }
+
+    fn pause_after(&mut self, now: Instant) -> Duration {
+        self.deaths
+            .retain(|death| now.saturating_duration_since(*death) < SPAN);
+        self.deaths.push_back(now);
+        self.pause = if self.deaths.len() > AT_ONCE {
+            self.deaths.pop_front();
+            (self.pause * 2).clamp(PAUSE_LEAST, PAUSE_MOST)
+        } else {
+            Duration::ZERO
+        };
+        self.pause
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KILLED: End = End::Signal(9);
+
+    #[test]
+    fn pauses_grow_while_workers_die_and_end_when_one_lives() {
+        let mut restarts = Restarts::default();
+        let mut now = Instant::now();
+        let mut die = |lived: Duration| match restarts.ended(KILLED, true, now + lived) {
+            Next::Restart { pause } => {
+                now += lived + pause;
+                pause.as_millis()
+            }
+            Next::Exit(status) => panic!("exit {status}"),
+        };
+        let second = Duration::from_secs(1);
+        let pauses: Vec<_> = (0..14).map(|_| die(second / 10)).collect();
+        let expected = [
+            0, 0, 0, 0, 0, 500, 1000, 2000, 4000, 8000, 10_000, 10_000, 10_000, 10_000,
+        ];
+        assert_eq!(pauses, expected);
+        assert_eq!(die(61 * second), 0);
+        assert_eq!(die(second), 0);
+    }
+
+    #[test]
+    fn errors_of_the_start_end_it_and_later_ones_do_not() {
+        let now = Instant::now();
+        let mut restarts = Restarts::default();
+        assert_eq!(restarts.ended(End::Code(1), false, now), Next::Exit(1));
+        let at_once = Next::Restart {
+            pause: Duration::ZERO,
+        };
+        assert_eq!(restarts.ended(KILLED, false, now), at_once);
+        assert_eq!(restarts.ended(End::Code(PANIC), false, now), at_once);
+        // Still none has served.
+        assert_eq!(restarts.ended(End::Code(2), false, now), Next::Exit(2));
+        assert_eq!(restarts.ended(KILLED, true, now), at_once);
+        assert_eq!(restarts.ended(End::Code(1), false, now), at_once);
+    }
+
+    #[test]
+    fn a_stop_ends_it_with_the_status_of_the_worker() {
+        let now = Instant::now();
+        let mut restarts = Restarts::default();
+        assert_eq!(restarts.ended(End::Code(0), true, now), Next::Exit(0));
+        restarts.stop();
+        for (end, status) in [
+            (End::Code(0), 0),
+            (End::Code(130), 130),
+            (End::Code(PANIC), PANIC),
+            (End::Signal(15), 143),
+        ] {
+            assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
+        }
+    }
+}
