@@ -10,6 +10,9 @@ use super::process::{Process, behind};
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 
+/// Set, rosrescue is a single process.
+const NO_GUARDIAN: &str = "ROSRESCUE_NO_GUARDIAN";
+
 /// How to start rosrescue; the same again after a crash.
 #[derive(Debug)]
 pub(crate) struct Setup {
@@ -27,6 +30,8 @@ impl Setup {
         let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
         scratch.prepare(&mut command);
         command.args(arguments).current_dir(scratch.path(""));
+        // Most tests are about the process that serves: it is the one that they signal and measure.
+        command.env(NO_GUARDIAN, "1");
         Self {
             command,
             port: 0,
@@ -70,6 +75,12 @@ impl Setup {
     /// Runs it by another command, which `wrap` makes of its own.
     pub(crate) fn wrapped(mut self, wrap: impl FnOnce(&Command) -> Command) -> Self {
         self.command = wrap(&self.command);
+        self
+    }
+
+    /// With its guardian, as a person runs it: the process that is started is the guardian then.
+    pub(crate) fn guarded(mut self) -> Self {
+        self.command.env_remove(NO_GUARDIAN);
         self
     }
 
