@@ -133,7 +133,8 @@ impl Rosmaster {
     /// The rosmaster that an earlier rosrescue with this checkpoint left behind at `port`. Any that
     /// does not listen there has never served, or never will: it is ended.
     pub fn left_behind(&self, port: Option<u16>) -> Option<u32> {
-        let all = left::find(&left::owner(&self.checkpoint));
+        let mut all = left::find(&left::owner(&self.checkpoint));
+        all.retain(|pid| !runs(*pid, "rosout"));
         let serves = |pid: &u32| port.is_some_and(|port| left::listens(*pid, port));
         let found = all.iter().copied().find(serves);
         if found.is_none() {

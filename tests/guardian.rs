@@ -144,6 +144,27 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
     assert_eq!(said.matches("the worker has ended").count(), 5, "{said}");
 }
 
+/// It takes rosout some time to register: until then the next worker knows it by its process.
+#[test]
+fn a_rosout_that_has_just_been_started_is_adopted() {
+    let scratch = Scratch::new();
+    let mut rescue = Setup::core(&scratch, free_port()).guarded().start();
+    rescue.wait_line("that it starts rosout", |line| {
+        line.contains("started rosout")
+    });
+    let dead = worker(&scratch);
+    signal(dead, Signal::KILL);
+    worker_after(&scratch, dead);
+    let client = rescue.client();
+    eventually("rosout is at work", || {
+        State::try_read(&client).is_ok_and(|state| state.knows("/rosout"))
+    });
+    let said = rescue.stderr().join("\n");
+    assert_eq!(said.matches("started rosout").count(), 1, "{said}");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
 #[test]
 fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
     let scratch = Scratch::new();

@@ -106,7 +106,7 @@ async fn keep_rosout(proxy: &Proxy) {
     let mut pause = RESPAWN;
     loop {
         let start = Instant::now();
-        match living_rosout(proxy).await {
+        match living_rosout(proxy).await.or_else(|| rosout.left_behind()) {
             Some(pid) => {
                 proxy.rosout.store(pid, Ordering::Relaxed);
                 while supervisor::is_alive(pid) {

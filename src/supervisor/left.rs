@@ -1,7 +1,7 @@
-//! A rosmaster that an earlier rosrescue left behind when it was killed.
+//! A rosmaster, or a rosout, that an earlier rosrescue left behind when it was killed.
 //!
 //! It is known by its process and not by its port: since rosrescue died, anybody may have taken the
-//! port, another rosmaster too. Each rosmaster that is started bears the checkpoint's path in its
+//! port, another rosmaster too. Each process that is started bears the checkpoint's path in its
 //! environment, which nobody else writes and which the kernel shows for as long as the process lives.
 
 use std::{
@@ -15,10 +15,10 @@ use rustix::process::PidfdFlags;
 
 use super::pidfd;
 
-/// The environment variable that says whose master a process is.
+/// The environment variable that says whose a process is.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
 
-/// What the masters of `checkpoint` bear in [`OWNER`].
+/// What the processes of `checkpoint` bear in [`OWNER`].
 pub(super) fn owner(checkpoint: &Path) -> OsString {
     let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
     // The file itself may not be there yet.

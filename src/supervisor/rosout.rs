@@ -1,6 +1,7 @@
 //! rosout, the node that collects the log.
 
 use std::{
+    ffi::OsString,
     io,
     path::{Path, PathBuf},
     process::Stdio,
@@ -8,7 +9,9 @@ use std::{
 
 use tokio::process::{Child, Command};
 
-use super::{add_ros_paths, beside, command, create, find_program, is_program, tail_of};
+use super::{
+    add_ros_paths, beside, command, create, find_program, is_program, left, runs, tail_of,
+};
 
 /// Starts rosouts.
 #[derive(Debug)]
@@ -16,6 +19,8 @@ pub struct Rosout {
     program: PathBuf,
     /// What the last one wrote to stderr.
     output: PathBuf,
+    /// Whose they are.
+    owner: OsString,
 }
 
 impl Rosout {
@@ -27,7 +32,15 @@ impl Rosout {
         Some(Self {
             program,
             output: beside(checkpoint, ".rosout-output.log"),
+            owner: left::owner(checkpoint),
         })
+    }
+
+    /// The rosout that an earlier rosrescue with this checkpoint left behind. It may not have
+    /// registered yet.
+    pub fn left_behind(&self) -> Option<u32> {
+        let mut all = left::find(&self.owner).into_iter();
+        all.find(|pid| runs(*pid, "rosout"))
     }
 
     /// Starts one as a node of the master at `uri`. It outlives us: dropping the child does not end
@@ -40,6 +53,7 @@ impl Rosout {
     fn command(&self, uri: &str) -> Command {
         let mut command = command(&self.program);
         command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
+        command.env(left::OWNER, &self.owner);
         add_ros_paths(&mut command, &self.program, 3);
         command
             .stdin(Stdio::null())
@@ -65,6 +79,7 @@ mod tests {
         let rosout = Rosout {
             program: PathBuf::from("/opt/ros/noetic/lib/rosout/rosout"),
             output: PathBuf::new(),
+            owner: OsString::new(),
         };
         let command = rosout.command("http://localhost:1/");
         let mut set = command.as_std().get_envs();
