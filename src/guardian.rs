@@ -24,7 +24,7 @@ use std::{
 use command_fds::{CommandFdExt, FdMapping, FdMappingCollision};
 use rustix::process::{Signal, WaitOptions};
 use signal_hook::{
-    consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
+    consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM},
     iterator::Signals,
 };
 use thiserror::Error;
@@ -77,8 +77,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
             );
         }
         worker = match start_again(listeners, &signals, pause)? {
-            Ok(worker) => worker,
-            Err(signal) => {
+            Again::Started(worker) => worker,
+            Again::Stopped(signal) => {
                 tracing::warn!(
                     "stopped while no worker runs; a rosmaster that it had started goes on, and the \
                      next rosrescue takes it over"
@@ -89,26 +89,32 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     }
 }
 
-/// Starts a worker after `pause`, and tries until the system lets it. Answers with the signal that
-/// came meanwhile, if one did.
+/// What came of starting another worker.
+enum Again {
+    Started(Worker),
+    /// This signal came before.
+    Stopped(i32),
+}
+
+/// Starts a worker after `pause`, and tries until the system lets it.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
     mut pause: Duration,
-) -> Result<Result<Worker, i32>, GuardianError> {
+) -> Result<Again, GuardianError> {
     loop {
         let until = Instant::now() + pause;
         loop {
             match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
                 // An orphan has ended, which is now our child.
                 Ok(SIGCHLD) => drop(reap(None)),
-                Ok(signal) => return Ok(Err(signal)),
+                Ok(signal) => return Ok(Again::Stopped(signal)),
                 Err(RecvTimeoutError::Timeout) => break,
                 Err(RecvTimeoutError::Disconnected) => return Err(signals_lost().into()),
             }
         }
         match Worker::start(listeners) {
-            Ok(worker) => return Ok(Ok(worker)),
+            Ok(worker) => return Ok(Again::Started(worker)),
             Err(error) => tracing::error!(%error, "retrying"),
         }
         pause = restart::PAUSE_MOST;
@@ -173,6 +179,7 @@ impl Worker {
                     let signal = match signal {
                         SIGINT => Signal::INT,
                         SIGHUP => Signal::HUP,
+                        SIGQUIT => Signal::QUIT,
                         _ => Signal::TERM,
                     };
                     signal_process(self.pid, signal);
@@ -207,7 +214,7 @@ fn reap(worker: Option<u32>) -> Option<End> {
 
 /// The signals that come, one by one.
 fn receive_signals() -> io::Result<Receiver<i32>> {
-    let mut wanted = vec![SIGCHLD, SIGINT, SIGTERM];
+    let mut wanted = vec![SIGCHLD, SIGINT, SIGQUIT, SIGTERM];
     if !is_hangup_ignored() {
         wanted.push(SIGHUP);
     }

@@ -269,6 +269,16 @@ fn a_second_signal_ends_both_at_once() {
     assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
 }
 
+/// Ctrl-\ in a terminal: the worker does not go on in secret.
+#[test]
+fn a_quit_ends_both() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.signal(Signal::QUIT);
+    assert_eq!(rescue.wait().code(), Some(131));
+    assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
+}
+
 #[test]
 fn errors_of_the_start_are_said_once_and_end_it() {
     let scratch = Scratch::new();
@@ -318,6 +328,26 @@ fn a_worker_outlives_its_guardian_and_says_so() {
     eventually("it ends", || !alive(worker));
     let said = rescue.stderr().join("\n");
     assert!(said.contains("closed in order"), "{said}");
+}
+
+#[test]
+fn both_killed_at_once_are_started_again_by_a_person() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    let client = rescue.client();
+    client.set_param("/kept", "yes");
+    let before = State::read(&client);
+    let (master, worker) = (client.master_pid(), worker(&scratch));
+    rescue.signal(Signal::KILL);
+    signal(worker, Signal::KILL);
+    rescue.wait();
+    eventually("the worker is dead", || !alive(worker));
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(client.master_pid(), master, "it is adopted");
+    before.assert_same(&State::read(&client), "after the death of both");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
 }
 
 /// As the first process of a container the guardian becomes the parent of the master that a dead

@@ -62,7 +62,8 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
 
 async fn report_ready(proxy: Arc<Proxy>) {
     proxy.board.first_opening().await;
-    send(&[NotifyState::Ready]);
+    let line = proxy.board.line(proxy.shadow.unprotected());
+    send(&[NotifyState::Ready, NotifyState::Status(&line)]);
 }
 
 /// Tells systemd the state in a line, and feeds its watchdog. That takes a timer and a thread of the

@@ -2,7 +2,7 @@
 //! (`sd_listen_fds(3)`), and who gave them.
 //!
 //! In the protocol LISTEN_PID names the process that the sockets are for. A guardian cannot know that
-//! of its worker before the fork, so it names itself in [`GUARDIAN`] instead. The last of its sockets
+//! of its worker before the fork, so it names itself in `ROSRESCUE_GUARDIAN` instead. The last of its sockets
 //! is no listener but one end of a pair: its other end closes when the guardian ends.
 
 use std::{

@@ -11,8 +11,8 @@ const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
 /// The first pause; each further one is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
-/// The longest pause. More than [`AT_ONCE`] of it fit into [`SPAN`], so that a worker that never lives
-/// for long stays at it.
+/// The longest pause. Six of it fit into a minute, so that workers that never live for long stay at
+/// it.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
 /// The exit status of a Rust program that panicked.
