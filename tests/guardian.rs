@@ -68,13 +68,17 @@ fn sockets(pid: u32) -> BTreeSet<PathBuf> {
         .collect()
 }
 
-/// `rosrescue core` with its guardian, once rosout is at work.
+/// `rosrescue core` with its guardian, once all is there that roscore has, too.
 #[track_caller]
 fn core(scratch: &Scratch) -> Rescue {
     let rescue = Setup::core(scratch, free_port()).guarded().start();
     let client = rescue.client();
+    eventually("roscore's parameters are set", || {
+        client.param("/rosdistro").is_some() && client.param("/rosversion").is_some()
+    });
+    // It subscribes last, and does nothing more in the master.
     eventually("rosout is at work", || {
-        State::try_read(&client).is_ok_and(|state| state.knows("/rosout"))
+        State::try_read(&client).is_ok_and(|state| !state.subscribers_of("/rosout").is_empty())
     });
     rescue
 }
