@@ -39,6 +39,9 @@ use restart::{End, Next, Restarts};
 /// The program that runs, also after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
 
+/// How long a worker may take until it handles signals, before it is sent one all the same.
+const START_TIME: Duration = Duration::from_secs(1);
+
 /// Why there is no worker. Exit status 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -63,7 +66,7 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     let mut worker = Worker::start(listeners)?;
     loop {
         let end = worker.attend(&signals, || restarts.stop());
-        let pause = match restarts.ended(end, worker.has_served(), Instant::now()) {
+        let pause = match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
             Next::Exit(status) => return Ok(status),
             Next::Restart { pause } => pause,
         };
@@ -76,62 +79,61 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
                 "the worker dies again and again; the port stays open, and it is started again after a pause"
             );
         }
-        worker = match start_again(listeners, &signals, pause)? {
-            Again::Started(worker) => worker,
-            Again::Stopped(signal) => {
-                tracing::warn!(
-                    "stopped while no worker runs; a rosmaster that it had started goes on, and the \
-                     next rosrescue takes it over"
-                );
-                return Ok(128 + signal);
-            }
-        };
+        let stop;
+        (worker, stop) = start_again(listeners, &signals, pause)?;
+        if let Some(signal) = stop {
+            restarts.stop();
+            worker.pass_on(signal);
+        }
     }
 }
 
-/// What came of starting another worker.
-enum Again {
-    Started(Worker),
-    /// This signal came before.
-    Stopped(i32),
-}
-
-/// Starts a worker after `pause`, and tries until the system lets it.
+/// Starts a worker after `pause`, and tries until the system lets it. A signal ends the pause, and is
+/// answered with the worker: it is for it to end what the dead one has left.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
     mut pause: Duration,
-) -> Result<Again, GuardianError> {
+) -> Result<(Worker, Option<i32>), GuardianError> {
     loop {
-        let until = Instant::now() + pause;
-        loop {
-            match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
-                // An orphan has ended, which is now our child.
-                Ok(SIGCHLD) => drop(reap(None)),
-                Ok(signal) => return Ok(Again::Stopped(signal)),
-                Err(RecvTimeoutError::Timeout) => break,
-                Err(RecvTimeoutError::Disconnected) => return Err(signals_lost().into()),
-            }
-        }
+        let stop = wait(signals, pause)?;
         match Worker::start(listeners) {
-            Ok(worker) => return Ok(Again::Started(worker)),
+            Ok(worker) => return Ok((worker, stop)),
+            Err(error) if stop.is_some() => return Err(error),
             Err(error) => tracing::error!(%error, "retrying"),
         }
         pause = restart::PAUSE_MOST;
     }
 }
 
+/// Waits for `pause`, or until a signal comes that asks for the end.
+fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
+    let until = Instant::now() + pause;
+    loop {
+        match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
+            // An orphan has ended, which is now our child.
+            Ok(SIGCHLD) => drop(reap(None)),
+            Ok(signal) => return Ok(Some(signal)),
+            Err(RecvTimeoutError::Timeout) => return Ok(None),
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(io::Error::other("signals are not received any more"));
+            }
+        }
+    }
+}
+
 /// The process that does the work.
 struct Worker {
     pid: u32,
-    /// The worker writes a byte to it when it first serves, and sees by its end that we have ended.
+    /// By it the worker tells how far it is, and sees that we have ended.
     link: UnixStream,
+    handles_signals: bool,
 }
 
 impl Worker {
     fn start(listeners: &[TcpListener]) -> Result<Self, GuardianError> {
         let (link, of_worker) = UnixStream::pair()?;
-        link.set_nonblocking(true)?;
+        link.set_read_timeout(Some(START_TIME))?;
         let mut passed = Vec::new();
         for listener in listeners {
             passed.push(OwnedFd::from(listener.try_clone()?));
@@ -162,11 +164,15 @@ impl Worker {
         command.env_remove("WATCHDOG_PID");
         command.fd_mappings(mappings.collect())?;
         let pid = command.spawn()?.id();
-        Ok(Self { pid, link })
+        Ok(Self {
+            pid,
+            link,
+            handles_signals: false,
+        })
     }
 
     /// Waits for its end, and passes signals on until then; `stopping` is told of them.
-    fn attend(&self, signals: &Receiver<i32>, mut stopping: impl FnMut()) -> End {
+    fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut()) -> End {
         loop {
             match signals.recv() {
                 Ok(SIGCHLD) => {
@@ -176,13 +182,7 @@ impl Worker {
                 }
                 Ok(signal) => {
                     stopping();
-                    let signal = match signal {
-                        SIGINT => Signal::INT,
-                        SIGHUP => Signal::HUP,
-                        SIGQUIT => Signal::QUIT,
-                        _ => Signal::TERM,
-                    };
-                    signal_process(self.pid, signal);
+                    self.pass_on(signal);
                 }
                 // The thread that sends them has panicked.
                 Err(_) => return End::Code(1),
@@ -190,9 +190,30 @@ impl Worker {
         }
     }
 
-    /// Whether it has ever answered calls.
-    fn has_served(&self) -> bool {
-        (&self.link).read(&mut [0]).is_ok_and(|read| read == 1)
+    /// Sends it `signal`, once it handles signals: before, an orderly stop would be none.
+    fn pass_on(&mut self, signal: i32) {
+        if !std::mem::replace(&mut self.handles_signals, true) {
+            self.has_said(handover::HANDLES_SIGNALS);
+        }
+        let signal = match signal {
+            SIGINT => Signal::INT,
+            SIGHUP => Signal::HUP,
+            SIGQUIT => Signal::QUIT,
+            _ => Signal::TERM,
+        };
+        signal_process(self.pid, signal);
+    }
+
+    /// Whether it says `word` before its end, or within [`START_TIME`]. What it said before `word` is
+    /// passed over.
+    fn has_said(&self, word: u8) -> bool {
+        let mut said = [0];
+        while (&self.link).read(&mut said).is_ok_and(|length| length > 0) {
+            if said == [word] {
+                return true;
+            }
+        }
+        false
     }
 }
 
@@ -230,10 +251,6 @@ fn receive_signals() -> io::Result<Receiver<i32>> {
             }
         })?;
     Ok(receiver)
-}
-
-fn signals_lost() -> io::Error {
-    io::Error::other("signals are not received any more")
 }
 
 /// Whether we were started with SIGHUP ignored, as by nohup: whoever did so wants us to outlive the

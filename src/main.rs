@@ -144,6 +144,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
         true => None,
         false => Some(signal(SignalKind::hangup())?),
     };
+    sockets.guard.handles_signals();
     let stopper = stop.clone();
     let guarded = matches!(sockets.guard, Guard::Guardian { .. });
     tokio::spawn(async move {

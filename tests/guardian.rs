@@ -206,34 +206,49 @@ fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
     assert!(kib < 2048, "{kib} KiB");
 }
 
-#[test]
-fn workers_that_die_again_and_again_are_started_after_a_pause() {
-    let scratch = Scratch::new();
-    let rescue = core(&scratch);
-    let client = rescue.client();
+/// Kills one worker after the other until the guardian pauses.
+#[track_caller]
+fn kill_until_paused(scratch: &Scratch, rescue: &Rescue) {
     let paused = || {
         let lines = rescue.stderr().into_iter();
         lines
             .filter(|line| line.contains("again and again"))
             .count()
+            > 0
     };
     let mut dead = 0;
     eventually("it is said", || {
-        dead = worker_after(&scratch, dead);
+        dead = worker_after(scratch, dead);
         signal(dead, Signal::KILL);
-        let gone = || process_with(&scratch, "ROSRESCUE_GUARDIAN=") != Some(dead);
-        eventually("it is dead", gone);
         // Those before the sixth are followed by another worker at once.
         eventually("it is followed by another, or by a pause", || {
-            paused() > 0 || process_with(&scratch, "ROSRESCUE_GUARDIAN=").is_some()
+            let next = process_with(scratch, "ROSRESCUE_GUARDIAN=");
+            paused() || next.is_some_and(|next| next != dead)
         });
-        paused() > 0
+        paused()
     });
+}
+
+#[test]
+fn workers_that_die_again_and_again_are_started_after_a_pause() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    kill_until_paused(&scratch, &rescue);
     let said = rescue.stderr().join("\n");
     assert!(said.contains("500ms"), "{said}");
     assert_eq!(said.matches("starting it again").count(), 5, "{said}");
     // Whoever calls in the pause waits for its end.
-    assert!(client.master_pid().is_some());
+    assert!(rescue.client().master_pid().is_some());
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+#[test]
+fn a_stop_in_a_pause_ends_everything() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    kill_until_paused(&scratch, &rescue);
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
 }
 
 #[test]
@@ -256,6 +271,26 @@ fn an_orderly_stop_ends_everything() {
         let said = rescue.stderr().join("\n");
         assert!(said.contains("closed in order"), "{said}");
         assert!(!said.contains("unguarded"), "{said}");
+    }
+}
+
+/// However far the next worker has come: it ends what the dead one has left.
+#[test]
+fn a_stop_right_after_a_death_ends_everything() {
+    for lines in [1, 2] {
+        let scratch = Scratch::new();
+        let mut rescue = core(&scratch);
+        let dead = worker(&scratch);
+        signal(dead, Signal::KILL);
+        worker_after(&scratch, dead);
+        let said = || {
+            let lines = rescue.stdout().into_iter();
+            let lines = lines.filter(|line| line.starts_with("ROS_MASTER_URI="));
+            lines.count()
+        };
+        eventually("it has come so far", || said() >= lines);
+        assert_eq!(rescue.terminate().code(), Some(0));
+        assert_eq!(scratch.survivors(), vec![]);
     }
 }
 

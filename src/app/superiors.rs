@@ -10,7 +10,11 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::{admin::Guarded, guardian::handover::Guard, proxy::Proxy};
+use crate::{
+    admin::Guarded,
+    guardian::handover::{self, Guard},
+    proxy::Proxy,
+};
 
 /// How often systemd may be told another status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -41,7 +45,7 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
     let served = async {
         proxy.board.first_opening().await;
         // If nobody takes it the other half tells.
-        let _ = to.write_all(&[1]).await;
+        let _ = to.write_all(&[handover::SERVES]).await;
     };
     // The guardian never writes: an answer is its end.
     let mut byte = [0];

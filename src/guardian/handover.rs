@@ -3,10 +3,11 @@
 //!
 //! In the protocol LISTEN_PID names the process that the sockets are for. A guardian cannot know that
 //! of its worker before the fork, so it names itself in `ROSRESCUE_GUARDIAN` instead. The last of its sockets
-//! is no listener but one end of a pair: its other end closes when the guardian ends.
+//! is no listener but one end of a pair, the *link*: by it the worker tells how far it is, and sees the end
+//! of the guardian.
 
 use std::{
-    io,
+    io::{self, Write},
     net::{SocketAddr, TcpListener},
     os::{
         fd::{OwnedFd, RawFd},
@@ -30,6 +31,11 @@ pub(super) const LISTEN_PID: &str = "LISTEN_PID";
 pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
 /// The process id of the guardian whose worker this is.
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
+
+/// What a worker writes to its guardian once it handles signals: before, one would kill it at once.
+pub(super) const HANDLES_SIGNALS: u8 = b'h';
+/// What it writes once it answers calls.
+pub const SERVES: u8 = b's';
 
 /// Sockets that cannot be served. Exit status 1.
 #[derive(Debug, Error)]
@@ -133,6 +139,17 @@ impl Sockets {
     pub fn addresses(&self) -> Vec<SocketAddr> {
         let addresses = self.listeners.iter().map(TcpListener::local_addr);
         addresses.filter_map(Result::ok).collect()
+    }
+}
+
+impl Guard {
+    /// Signals may come from now on.
+    pub fn handles_signals(&self) {
+        if let Self::Guardian { link, .. } = self {
+            let mut link = link;
+            // A guardian that has ended sends none.
+            let _ = link.write_all(&[HANDLES_SIGNALS]);
+        }
     }
 }
 

@@ -151,10 +151,12 @@ const STARTED: Duration = Duration::from_millis(500);
 
 /// Ends rosout in order.
 async fn end_rosout(proxy: &Proxy) {
-    let pid = proxy.rosout.load(Ordering::Relaxed);
-    if pid == 0 {
-        return;
-    }
+    let pid = match proxy.rosout.load(Ordering::Relaxed) {
+        // One may have been left to us, and not have been found yet.
+        0 => Rosout::find(&proxy.config.checkpoint).and_then(|rosout| rosout.left_behind()),
+        pid => Some(pid),
+    };
+    let Some(pid) = pid else { return };
     // A process that has just been started has no command line for a moment.
     let named = async {
         while supervisor::is_alive(pid) && !supervisor::runs(pid, "rosout") {
