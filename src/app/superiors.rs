@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use crate::{
     admin::Guarded,
     guardian::handover::{self, Guard},
-    proxy::Proxy,
+    proxy::{Proxy, gate::State},
 };
 
 /// How often systemd may be told another status.
@@ -43,7 +43,7 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
     let Ok(mut link) = link else { return };
     let (mut from, mut to) = link.split();
     let served = async {
-        proxy.board.first_opening().await;
+        answers(&proxy).await;
         // If nobody takes it the other half tells.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
@@ -64,9 +64,15 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
     );
 }
 
+/// Returns when calls are answered, by a master or by the mirror.
+async fn answers(proxy: &Proxy) {
+    let mut gate = proxy.gate.clone();
+    gate.wait_for(|state| state != State::Unknown).await;
+}
+
 async fn report_ready(proxy: Arc<Proxy>) {
-    proxy.board.first_opening().await;
-    let line = proxy.board.line(proxy.shadow.unprotected());
+    answers(&proxy).await;
+    let line = proxy.board.line(proxy.ledger.unprotected());
     send(&[NotifyState::Ready, NotifyState::Status(&line)]);
 }
 
