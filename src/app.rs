@@ -48,7 +48,7 @@ use crate::{
 };
 
 mod life;
-mod superiors;
+mod notify;
 
 /// So many bodies of the largest size may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
@@ -176,7 +176,7 @@ pub async fn run(
     });
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     proxy.ledger.set_identity(pid, proxy.uri.clone());
-    superiors::attend(guard, &proxy, stop.clone());
+    notify::start(guard, &proxy, stop.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
         if !left {

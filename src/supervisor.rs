@@ -199,7 +199,7 @@ impl Rosmaster {
     }
 }
 
-/// Runs `program`, without what our own superiors told us.
+/// Runs `program`, without the variables that are for us alone.
 fn command(program: &Path) -> Command {
     let mut command = Command::new(program);
     handover::keep_from(command.as_std_mut());

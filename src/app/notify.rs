@@ -19,8 +19,8 @@ use crate::{
 /// How often systemd may be told another status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Keeps in touch with them until `stop`.
-pub(super) fn attend(guard: Guard, proxy: &Arc<Proxy>, stop: CancellationToken) {
+/// Begins to tell them. `stop` is told as the begin of the end.
+pub(super) fn start(guard: Guard, proxy: &Arc<Proxy>, stop: CancellationToken) {
     match guard {
         Guard::Nobody => proxy.board.set_guarded(Guarded::Nobody),
         Guard::Systemd => proxy.board.set_guarded(Guarded::Systemd),
