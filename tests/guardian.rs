@@ -135,7 +135,6 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
         longest.max().unwrap()
     });
     println!("the longest wait of a call: {longest:?}");
-    client.ok("deleteParam", params!["/test", "/barrier"]);
     assert_eq!(client.master_pid(), Some(master), "it is adopted");
     assert_eq!(process_of(&scratch, "rosout/rosout"), rosout);
     before.assert_same(&State::read(&client), "after five deaths");
