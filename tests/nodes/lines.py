@@ -11,6 +11,7 @@
     reply NAME              service client: the server that calls itself NAME answered
     value JSON              parameter user: what the cached parameter is now (null if unset)
     reads N                 parameter reader: N times it was read
+    pass MS                 driver: the longest pass of its loop since the last such line
     done WHAT               late node: it has got through
     again TEXT              late node: its user has to make the call again
     failed TEXT             something that should have worked did not
