@@ -1,6 +1,7 @@
 //! Brings a connected master to the mirror's state, or the mirror to the master's.
 
 use std::{
+    net::SocketAddr,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -193,7 +194,7 @@ pub async fn examine(
 async fn settle(proxy: &Proxy, connection: &Connection) -> Result<(), ExamineError> {
     let settled = async {
         proxy.upstream.no_writers().await;
-        while sockets::may_run_a_call(connection.peer()) {
+        while may_run_a_call(connection.peer()).await {
             tokio::time::sleep(SETTLE_PAUSE).await;
         }
     };
@@ -213,6 +214,12 @@ async fn settle(proxy: &Proxy, connection: &Connection) -> Result<(), ExamineErr
             Ok(())
         }
     }
+}
+
+/// As [`sockets::may_run_a_call`]. Calls go on meanwhile: with 15,000 sockets that takes 100 ms.
+async fn may_run_a_call(master: SocketAddr) -> bool {
+    let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
+    looked.await.unwrap_or(false)
 }
 
 /// What is to be brought to a master, and how.
