@@ -274,7 +274,10 @@ async fn write(
     let call = call.as_deref();
     let mut gate = proxy.gate.clone();
     let mut held = std::pin::pin!(gate.shut_for(proxy.config.hold));
-    let mut patience = std::pin::pin!(tokio::time::sleep(PATIENCE));
+    // Whoever finds others waiting need not wait as long again.
+    let now = tokio::time::Instant::now();
+    let since = proxy.write_queue.unanswered_since().unwrap_or(now);
+    let mut patience = std::pin::pin!(tokio::time::sleep_until(since + PATIENCE));
     let mut patient = true;
     loop {
         tokio::select! {

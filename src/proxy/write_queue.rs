@@ -8,7 +8,10 @@ mod worker;
 
 use std::sync::Arc;
 
-use tokio::sync::{Notify, mpsc, oneshot};
+use tokio::{
+    sync::{Notify, mpsc, oneshot, watch},
+    time::Instant,
+};
 
 pub use self::worker::Worker;
 use super::batch::{Answer, Condition, Item};
@@ -25,6 +28,7 @@ const CHANNEL: usize = 64;
 pub struct WriteQueue {
     items: mpsc::Sender<Item>,
     lost: Arc<Notify>,
+    sent: watch::Receiver<Option<Instant>>,
 }
 
 impl WriteQueue {
@@ -32,6 +36,11 @@ impl WriteQueue {
     pub(super) async fn submit(&self, item: Item) {
         // The worker is gone only when rosrescue stops; the answer's sender is dropped then.
         let _ = self.items.send(item).await;
+    }
+
+    /// When the batch was sent that the master has not answered yet, if there is one.
+    pub(super) fn unanswered_since(&self) -> Option<Instant> {
+        *self.sent.borrow()
     }
 
     /// Makes a call of rosrescue's own, recorded as any other. None if nobody answers.
@@ -75,8 +84,9 @@ impl WriteQueue {
 
 /// Makes a write queue; the second part is to be run.
 pub fn write_queue() -> (WriteQueue, Worker) {
-    let (tx, rx) = mpsc::channel(CHANNEL);
+    let (items, rx) = mpsc::channel(CHANNEL);
     let lost = Arc::new(Notify::new());
-    let worker = Worker::new(rx, lost.clone());
-    (WriteQueue { items: tx, lost }, worker)
+    let (tell_sent, sent) = watch::channel(None);
+    let worker = Worker::new(rx, lost.clone(), tell_sent);
+    (WriteQueue { items, lost, sent }, worker)
 }

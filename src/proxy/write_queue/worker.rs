@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::{Notify, mpsc, watch};
 
 use super::{
     outdated::is_outdated,
@@ -41,6 +41,7 @@ struct InFlight {
     /// Of the mirror, when it was sent.
     version: u64,
     items: Vec<Item>,
+    sent: tokio::time::Instant,
     done: Pin<Box<dyn Future<Output = Done> + Send>>,
 }
 
@@ -55,6 +56,7 @@ pub struct Worker {
     /// A batch was lost, and the gate has not changed since.
     lost: bool,
     tell_lost: Arc<Notify>,
+    tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     /// The one that was open last.
     incarnation: u64,
     resync_due: bool,
@@ -75,7 +77,11 @@ struct Opaque {
 }
 
 impl Worker {
-    pub(super) fn new(items: mpsc::Receiver<Item>, tell_lost: Arc<Notify>) -> Self {
+    pub(super) fn new(
+        items: mpsc::Receiver<Item>,
+        tell_lost: Arc<Notify>,
+        tell_sent: watch::Sender<Option<tokio::time::Instant>>,
+    ) -> Self {
         Self {
             items,
             queue: VecDeque::new(),
@@ -84,6 +90,7 @@ impl Worker {
             grace: None,
             lost: false,
             tell_lost,
+            tell_sent,
             incarnation: 0,
             resync_due: false,
             resync_at: None,
@@ -130,6 +137,8 @@ impl Worker {
                 State::StandingIn => self.stand_in(&proxy),
                 State::Injecting | State::Unknown => self.grace = None,
             }
+            self.tell_sent
+                .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));
         }
     }
 
@@ -181,6 +190,7 @@ impl Worker {
             incarnation,
             version: proxy.ledger.version(),
             items,
+            sent: tokio::time::Instant::now(),
             done: Box::pin(done),
         });
     }
