@@ -3,10 +3,7 @@
 use std::{
     io,
     path::Path,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, AtomicU32},
-    },
+    sync::{Arc, atomic::AtomicU32},
     time::Duration,
 };
 
@@ -152,7 +149,7 @@ pub async fn run(
     let proxy = Arc::new(Proxy {
         uri,
         names,
-        looped: AtomicBool::new(false),
+        looped: Notify::new(),
         gate,
         slow: Notify::new(),
         write_queue,
@@ -244,13 +241,9 @@ async fn serve(
         std::future::pending().await
     };
     let looped = async {
-        loop {
-            if proxy.looped.load(std::sync::atomic::Ordering::Relaxed) {
-                return RunError::Loop {
-                    master: proxy.upstream.address(),
-                };
-            }
-            tokio::time::sleep(Duration::from_millis(50)).await;
+        proxy.looped.notified().await;
+        RunError::Loop {
+            master: proxy.upstream.address(),
         }
     };
     let process = tokio::select! {

@@ -19,7 +19,7 @@ pub mod stats;
 pub mod upstream;
 pub mod write_queue;
 
-use std::sync::atomic::{AtomicBool, AtomicU32};
+use std::sync::atomic::AtomicU32;
 
 use tokio::sync::{Notify, Semaphore};
 
@@ -35,8 +35,8 @@ pub struct Proxy {
     pub names: Vec<String>,
     /// Tells this process from every other; see [`upstream::INSTANCE_HEADER`].
     pub instance: String,
-    /// Set when a request of our own came back to us: the master's address is our own.
-    pub looped: AtomicBool,
+    /// Notified when a request of our own came back to us: the master's address is our own.
+    pub looped: Notify,
     /// Whether calls pass to the master.
     pub gate: gate::Rx,
     /// Notified when the master has not answered a call for longer than it should take.

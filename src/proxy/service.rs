@@ -92,9 +92,7 @@ async fn post(
         .get(INSTANCE_HEADER)
         .is_some_and(|of| of == proxy.instance.as_str())
     {
-        proxy
-            .looped
-            .store(true, std::sync::atomic::Ordering::Relaxed);
+        proxy.looped.notify_one();
         return Ok(text(
             StatusCode::LOOP_DETECTED,
             "this is rosrescue itself\n".to_owned(),
