@@ -11,17 +11,15 @@
 mod support;
 
 use std::fs;
-use std::io::Write;
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use flate2::{Compression, write::GzEncoder};
 use rustix::process::{Pid, Resource, Rlimit, Signal, prlimit};
 use support::{
     Client, Mode, PATIENCE, Process, Rescue, Robot, Scratch, Setup, Wire, behind, encode_call,
-    eventually, free_port, http_request, params, request, ros_command, signal,
+    eventually, free_port, gzip, http_request, params, request, ros_command, signal,
 };
 
 /// Open file descriptors.
@@ -77,10 +75,8 @@ fn idle(client: &Client, count: usize) -> Vec<Wire> {
 }
 
 fn packed(body: &[u8]) -> Vec<u8> {
-    let mut packer = GzEncoder::new(Vec::new(), Compression::default());
-    packer.write_all(body).unwrap();
     let header = ["Content-Encoding: gzip"];
-    request("POST /RPC2 HTTP/1.1", &header, &packer.finish().unwrap())
+    request("POST /RPC2 HTTP/1.1", &header, &gzip(body))
 }
 
 /// Sends `request` `times` at once while others are served; tells the most memory that it took, in MB.

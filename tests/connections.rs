@@ -10,16 +10,13 @@
 
 mod support;
 
-use std::io::Write;
 use std::thread;
 use std::time::Duration;
 
-use flate2::Compression;
-use flate2::write::GzEncoder;
 use rosrescue::xmlrpc::{Reply, Value};
 use support::{
-    Client, FakeNode, Rosmaster, Scratch, Setup, Twins, assert_form, encode_call, free_port, holds,
-    http_request, params, request,
+    Client, FakeNode, Rosmaster, Scratch, Setup, Twins, assert_form, encode_call, free_port, gzip,
+    holds, http_request, params, request,
 };
 
 #[test]
@@ -158,9 +155,7 @@ fn large_bodies_pass_and_too_large_ones_do_no_harm() {
 fn gzip_passes_both_ways() {
     let twins = Twins::start();
     let body = encode_call("setParam", params!["/c", "/zipped", "z".repeat(5000)]);
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
-    encoder.write_all(&body).unwrap();
-    let zipped = encoder.finish().unwrap();
+    let zipped = gzip(&body);
     twins.same(&request(
         "POST /RPC2 HTTP/1.1",
         &["Content-Encoding: gzip"],

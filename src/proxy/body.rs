@@ -1,12 +1,8 @@
-//! Request bodies: so large, so slow, and so many at once.
+//! Request bodies: limits on size, arrival rate and memory.
 
-use std::{
-    io::{self, Read},
-    time::Duration,
-};
+use std::{io, time::Duration};
 
 use bytes::Bytes;
-use flate2::read::MultiGzDecoder;
 use http_body_util::BodyExt;
 use hyper::body::{Body, Incoming};
 use tokio::{
@@ -24,11 +20,8 @@ pub const SMALL: usize = 64 << 10;
 const TIME: Duration = Duration::from_secs(10);
 /// The slowest link that a body is taken from, in bytes a second.
 const RATE: u64 = 64 << 10;
-/// rosmaster refuses what unpacks to more bytes: so many are the default of `gzip_decode` in Python's
-/// xmlrpc.
-const UNPACKED: usize = 20 << 20;
-/// Whoever holds this needs no room: one body can always be read to its end, so that bodies that each
-/// have a part of the room do not wait for each other.
+/// Deadlock breaker: its holder may exceed the budget, so that one body can always be read to its end
+/// where several have a part of the room each.
 static LAST: Semaphore = Semaphore::const_new(1);
 
 /// Why there is no body.
@@ -140,38 +133,6 @@ pub async fn read(
     }
 }
 
-/// What gzip has packed into `packed`, in `room` for twice that, as for a body that comes unpacked.
-/// Nothing if it is broken, or more than `limit` bytes, or more than rosmaster takes.
-pub async fn unpack(
-    packed: Bytes,
-    limit: usize,
-    room: &mut Room<'_>,
-) -> Result<Option<Bytes>, BodyError> {
-    let most = limit.min(UNPACKED);
-    let unpacker = {
-        let packed = packed.clone();
-        move || MultiGzDecoder::new(io::Cursor::new(packed.clone())).take(most as u64 + 1)
-    };
-    // How much it is shows only now, and must be known before it takes memory.
-    let counter = unpacker.clone();
-    let counted = in_a_thread(move || io::copy(&mut counter(), &mut io::sink())).await;
-    let Some(size) = counted
-        .and_then(|size| usize::try_from(size).ok())
-        .filter(|size| *size <= most)
-    else {
-        return Ok(None);
-    };
-    if size > SMALL {
-        room.grow_in_time(2 * (packed.len() + size), most).await?;
-    }
-    let unpacked = in_a_thread(move || {
-        let mut unpacked = Vec::with_capacity(size);
-        unpacker().read_to_end(&mut unpacked)?;
-        Ok(unpacked)
-    });
-    Ok(unpacked.await.map(Bytes::from))
-}
-
 /// Takes room for what a large body says when it is taken apart: of short values that is many times
 /// their text.
 pub async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
@@ -198,38 +159,7 @@ async fn in_a_thread<T: Send + 'static>(
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write;
-
-    use flate2::{Compression, write::GzEncoder};
-
     use super::*;
-
-    fn packed(bytes: &[u8]) -> Bytes {
-        let mut packer = GzEncoder::new(Vec::new(), Compression::default());
-        packer.write_all(bytes).unwrap();
-        packer.finish().unwrap().into()
-    }
-
-    #[tokio::test]
-    async fn what_unpacks_to_too_much_is_not_unpacked_and_the_rest_takes_room() {
-        let pool = Semaphore::new(80 << 10);
-        let most = vec![b'z'; UNPACKED];
-        let mut room = Room::of(&pool);
-        let whole = unpack(packed(&most), UNPACKED, &mut room).await;
-        assert_eq!(whole, Ok(Some(Bytes::from(most.clone()))));
-        assert!(pool.available_permits() <= 40 << 10);
-        drop(room);
-        let more = [packed(&most), packed(b"z")].concat();
-        for (bytes, limit) in [
-            (Bytes::from(more), usize::MAX),
-            (packed(&most), UNPACKED - 1),
-            (Bytes::from_static(b"no gzip"), UNPACKED),
-        ] {
-            let mut room = Room::of(&pool);
-            assert_eq!(unpack(bytes, limit, &mut room).await, Ok(None));
-            assert_eq!(pool.available_permits(), 80 << 10);
-        }
-    }
 
     #[tokio::test]
     async fn short_values_take_more_room_than_their_text() {

@@ -103,15 +103,22 @@ async fn post(
     }
     let head = Head {
         path: request.uri().to_string(),
-        encoding: request.headers().get(CONTENT_ENCODING).cloned(),
+        encoding: request
+            .headers()
+            .get(CONTENT_ENCODING)
+            .filter(|name| !name.as_bytes().eq_ignore_ascii_case(b"identity"))
+            .cloned(),
     };
     // Held until the call is answered.
     let mut room = Room::of(&proxy.bodies);
-    let packing = Packing::of(head.encoding.as_ref());
     let read = async {
         let limit = proxy.config.max_body;
         let body = body::read(request.into_body(), limit, &mut room).await?;
-        let call = decode(packing, body.clone(), limit, &mut room).await?;
+        // What is packed is the master's to unpack: no ROS client packs.
+        let call = match &head.encoding {
+            None => decode(body.clone(), &mut room).await?,
+            Some(_) => None,
+        };
         Ok((body, call))
     };
     let (body, call) = match read.await {
@@ -137,7 +144,7 @@ async fn post(
         tracing::debug!(%peer, method = call.method, caller_id, "call");
     } else {
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
-        if packing != Packing::Unknown && !door::may_shut_down(peer.ip()) {
+        if !door::may_shut_down(peer.ip()) {
             proxy.stats.refused.count();
             tracing::warn!(%peer, "refused a request of another computer that cannot be decoded");
             return Ok(xml(&Reply::Fault {
@@ -361,42 +368,8 @@ fn refuse(proxy: &Proxy, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// How a body is packed, as rosmaster reads the header.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Packing {
-    Plain,
-    Gzip,
-    /// rosmaster refuses it without a look at the body.
-    Unknown,
-}
-
-impl Packing {
-    fn of(encoding: Option<&HeaderValue>) -> Self {
-        match encoding.map(HeaderValue::as_bytes) {
-            None => Self::Plain,
-            Some(name) if name.eq_ignore_ascii_case(b"identity") => Self::Plain,
-            Some(name) if name.eq_ignore_ascii_case(b"gzip") => Self::Gzip,
-            Some(_) => Self::Unknown,
-        }
-    }
-}
-
 /// What a body says, if it says it in a way that we know.
-async fn decode(
-    packing: Packing,
-    body: Bytes,
-    limit: usize,
-    room: &mut Room<'_>,
-) -> Result<Option<Call>, BodyError> {
-    let body = match packing {
-        Packing::Plain => Some(body),
-        // What unpacks to more than the limit is not looked into; rosmaster will do as it likes.
-        Packing::Gzip => body::unpack(body, limit, room).await?,
-        Packing::Unknown => None,
-    };
-    let Some(body) = body else {
-        return Ok(None);
-    };
+async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<Call>, BodyError> {
     if body.len() <= body::SMALL {
         return Ok(xmlrpc::decode_call(&body).ok());
     }

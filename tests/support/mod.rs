@@ -18,6 +18,7 @@
 
 mod disk;
 mod fake;
+mod gzip;
 mod kinds;
 mod name_server;
 mod netns;
@@ -37,6 +38,7 @@ mod twins;
 
 pub(crate) use disk::SmallDisk;
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
+pub(crate) use gzip::gzip;
 pub(crate) use kinds::{kinds, sorted};
 pub(crate) use name_server::NameServer;
 pub(crate) use netns::Netns;
