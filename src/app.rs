@@ -192,10 +192,8 @@ pub async fn run(
             halt.cancel();
         }
     });
-    // A master of ours begins with nothing but what we give it; what an earlier one holds must be seen.
-    let known = restored || (process.is_some() && !left);
     proxy.board.set_open(false);
-    let guard = Guard::new(proxy.clone(), gate_tx, process, known);
+    let guard = Guard::new(proxy.clone(), gate_tx, process, restored);
     let process = serve(&proxy, listeners, worker, guard, &halt, || {
         let counts = proxy.ledger.with_mirror(Master::counts);
         say(&format!("{story}: {counts}"));

@@ -1,5 +1,5 @@
-//! Many clients at once, at the moment at which an outage begins: each gets the answer that is due to it,
-//! in its order, and no more of them are parked than there are places.
+//! Many clients at once, at the moment at which an outage begins: each gets the answer that is due to it, at
+//! once and in its order.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,8 +17,8 @@ use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
-    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, holds, http_request,
-    params, tree,
+    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, http_request, params,
+    tree,
 };
 
 /// Clients of the crowd; a multiple of four.
@@ -133,40 +133,33 @@ fn when_the_outage_begins(mode: Mode) {
     barrier.wait();
     robot.kill_master_at_once(dead);
 
-    // Nobody who reads or leaves waits for a master.
-    let (quick, patient): (Vec<_>, Vec<_>) = crowd
-        .into_iter()
-        .zip(0..CROWD)
-        .partition(|(_, number)| number % 4 < 2);
-    for (thread, number) in quick {
+    // Nobody waits for a master.
+    for (thread, number) in crowd.into_iter().zip(0..CROWD) {
         let (answers, took) = thread.join().unwrap();
         let answers = answers.unwrap_or_else(|error| panic!("client {number}: {error}"));
         assert!(took < Duration::from_secs(20), "client {number}: {took:?}");
-        if number % 4 == 1 {
-            assert_eq!(answers, [(1, Value::Int(1))], "client {number}");
-            continue;
-        }
         let expected = [
             (1, Value::Int(number)),
             (1, Value::Bool(false)),
             (1, Value::from(present.api.as_str())),
             (1, Value::from(client.uri())),
         ];
-        assert_eq!(answers[..4], expected, "client {number}");
-        assert_eq!(answers[4].0, 1);
+        match number % 4 {
+            0 => {
+                assert_eq!(answers[..4], expected, "client {number}");
+                assert_eq!(answers[4].0, 1);
+            }
+            1 => assert_eq!(answers, [(1, Value::Int(1))], "client {number}"),
+            _ => assert!(
+                answers.iter().all(|(code, _)| *code == 1),
+                "client {number}: {answers:?}"
+            ),
+        }
     }
     let state = State::read(&client);
     assert!(!(0..CROWD).any(|number| number % 4 == 1 && state.knows(&format!("/client{number}"))));
     robot.revive_master();
     robot.await_recovery(dead);
-    for (thread, number) in patient {
-        let (answers, _) = thread.join().unwrap();
-        let answers = answers.unwrap_or_else(|error| panic!("client {number}: {error}"));
-        assert!(
-            answers.iter().all(|(code, _)| *code == 1),
-            "client {number}: {answers:?}"
-        );
-    }
     // No call was closed without an answer.
     assert_eq!(robot.counter("hold_expired"), 0);
     let (bare, state) = (robot.bare(), robot.state());
@@ -190,145 +183,67 @@ fn when_the_outage_begins(mode: Mode) {
     }
 }
 
+/// What rospy sends when a node ends is one multicall, and so is what roslaunch sends when it begins.
 #[test]
-fn no_more_calls_are_parked_than_there_are_places() {
-    const PLACES: usize = 50;
-    let mut robot = Robot::start_with(Mode::Proxy, &["--max-parked", "50", "--hold", "4"]);
-    let client = robot.client();
-    client.set_param("/kept", "yes");
-    let leaving: Vec<_> = (0..20)
-        .map(|number| {
-            let node = FakeNode::start(&format!("/leaving{number}"));
-            node.publish(&client, "/topic", "std_msgs/String");
-            node
-        })
-        .collect();
-    let dead = robot.master_pid();
-    robot.kill_master();
-    eventually("the gate is shut", || !robot.is_open());
-    let crowd = |round: i32| -> Vec<_> {
-        let setter = |number: i32| {
-            let client = client.clone();
-            thread::spawn(move || {
-                let key = format!("/crowd{round}/of{number}");
-                client.status("setParam", params!["/crowd", key, number])
-            })
-        };
-        (0..CROWD).map(setter).collect()
-    };
-    let waiting = |crowd: &[JoinHandle<_>]| crowd.iter().filter(|one| !one.is_finished()).count();
-
-    let first = crowd(1);
-    eventually("those for whom there is no place are sent away", || {
-        waiting(&first) <= PLACES
-    });
-    assert_eq!(waiting(&first), PLACES);
-    // Those who leave have places of their own, and those who read need none.
-    for node in &leaving[..10] {
-        node.unpublish(&client, "/topic");
-    }
-    assert_eq!(client.param("/kept"), Some("yes".into()));
-    assert_eq!(waiting(&first), PLACES);
-    for one in first {
-        let error = one.join().unwrap().expect_err("nobody did it");
-        assert!(error.to_string().contains("closed after []"), "{error}");
-    }
-    // The places are free again, though nothing else has happened.
-    let second = crowd(2);
-    eventually("those for whom there is no place are sent away", || {
-        waiting(&second) <= PLACES
-    });
-    assert!(holds(Duration::from_millis(300), || waiting(&second) == PLACES));
-    for node in &leaving[10..] {
-        node.unpublish(&client, "/topic");
-    }
-    robot.revive_master();
-    robot.await_recovery(dead);
-    let mut done: Vec<_> = second
-        .into_iter()
-        .zip(0..CROWD)
-        .filter_map(|(one, number)| match one.join().unwrap() {
-            Ok((1, ..)) => Some(number),
-            Ok(other) => panic!("{other:?}"),
-            Err(_) => None,
-        })
-        .collect();
-    done.sort_unstable();
-    assert!(!done.is_empty());
-    assert_eq!(robot.bare().param("/crowd1"), None);
-    let expected = done
-        .iter()
-        .map(|number| (format!("of{number}"), Value::Int(*number)));
-    let found = robot.bare().param("/crowd2").unwrap();
-    let mut found: Vec<_> = found.as_struct().unwrap().clone().into_iter().collect();
-    found.sort_by_key(|(_, value)| value.as_int());
-    assert_eq!(found, expected.collect::<Vec<_>>());
-    assert!(robot.state().publishers_of("/topic").is_empty());
-}
-
-/// What rospy sends when a node ends is one multicall. It says nothing that a roslaunch, or anybody else, has
-/// to do first.
-#[test]
-fn a_parked_multicall_keeps_nobody_from_leaving() {
+fn multicalls_in_an_outage_are_answered_at_once_and_in_order() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
-    let nodes = ["/parked", "/leaving"].map(FakeNode::start);
+    let nodes = ["/staying", "/leaving"].map(FakeNode::start);
     for node in &nodes {
         node.publish(&client, "/topic", "std_msgs/String");
     }
+    let subscriber = FakeNode::start("/subscriber");
+    subscriber.subscribe(&client, "/topic", "std_msgs/String");
+    let told = subscriber.updates("/topic").len();
     let dead = robot.master_pid();
     robot.kill_master();
     eventually("the gate is shut", || !robot.is_open());
-    let park = |calls: Vec<Call>| {
-        let client = client.clone();
-        let before = robot.counter("parked");
-        let call =
-            thread::spawn(move || client.call("system.multicall", Call::multicall(calls).params));
-        eventually("a call is parked", || robot.counter("parked") > before);
-        call
+    let call = |calls: Vec<Call>| {
+        let answer = client
+            .call("system.multicall", Call::multicall(calls).params)
+            .unwrap();
+        let Reply::Value(Value::Array(answers)) = answer else {
+            panic!("{answer:?}");
+        };
+        let value = |answer: &Value| answer.as_array().unwrap()[0].as_array().unwrap()[2].clone();
+        answers.iter().map(value).collect::<Vec<_>>()
     };
     let unregister = |node: &FakeNode, topic: &str| {
         let params = params![node.name.as_str(), topic, node.api.as_str()];
         Call::new("unregisterPublisher", params)
     };
-    let launch = park(vec![
+    let start = Instant::now();
+    let launch = call(vec![
         Call::new(
             "setParam",
             params!["/roslaunch", "/launched", tree! { "a" => 1 }],
         ),
         Call::new("setParam", params!["/leaving", "/leaving/private", 1]),
+        Call::new("getParam", params!["/roslaunch", "/launched/a"]),
     ]);
-    let params = params!["/parked", "/late", "std_msgs/String", nodes[0].api.as_str()];
-    let late = park(vec![Call::new("registerPublisher", params)]);
-
-    // At once, although multicalls are parked.
+    assert_eq!(launch, [0.into(), 0.into(), Value::Int(1)]);
+    let params = params!["/staying", "/late", "std_msgs/String", nodes[0].api.as_str()];
+    call(vec![Call::new("registerPublisher", params)]);
     nodes[1].claim_publication("/topic", None);
-    let leave = Call::multicall([unregister(&nodes[1], "/topic")]).params;
-    let answer = client.call("system.multicall", leave).unwrap();
-    let Reply::Value(Value::Array(answers)) = answer else {
-        panic!("{answer:?}");
-    };
-    assert_eq!(
-        answers[0].as_array().unwrap()[0].as_array().unwrap()[2],
-        Value::Int(1)
-    );
-    assert_eq!(State::read(&client).publishers_of("/topic"), ["/parked"]);
-    assert!(!launch.is_finished() && !late.is_finished());
-
-    // Behind the same node's own registration: else that would come after it.
-    let behind = park(vec![unregister(&nodes[0], "/late")]);
-    assert!(holds(Duration::from_millis(500), || !behind.is_finished()));
+    assert_eq!(call(vec![unregister(&nodes[1], "/topic")]), [Value::Int(1)]);
+    assert_eq!(State::read(&client).publishers_of("/topic"), ["/staying"]);
+    assert_eq!(call(vec![unregister(&nodes[0], "/late")]), [Value::Int(1)]);
+    assert!(start.elapsed() < Duration::from_secs(10));
+    assert!(!robot.is_open(), "there was a master");
+    eventually("the subscriber is told", || {
+        subscriber.updates("/topic").last() == Some(&vec![nodes[0].api.clone()])
+    });
+    let before = State::read(&client);
     robot.revive_master();
     robot.await_recovery(dead);
-    for call in [launch, late, behind] {
-        let answer = call.join().unwrap().unwrap();
-        assert!(
-            matches!(answer, Reply::Value(Value::Array(_))),
-            "{answer:?}"
-        );
-    }
     let state = robot.state();
-    assert_eq!(state.publishers_of("/topic"), ["/parked"]);
+    before.assert_same(&state, "in the next master");
+    assert_eq!(state.publishers_of("/topic"), ["/staying"]);
     assert!(state.publishers_of("/late").is_empty(), "{state}");
     assert_eq!(robot.bare().param("/launched/a"), Some(Value::Int(1)));
+    let updates = &subscriber.updates("/topic")[told..];
+    assert!(
+        updates.iter().all(|list| list.contains(&nodes[0].api)),
+        "{updates:?}"
+    );
 }

@@ -11,7 +11,6 @@
 mod support;
 
 use std::sync::atomic::{AtomicI32, Ordering};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::Value;
@@ -99,29 +98,6 @@ fn outage<T>(robot: &mut Robot, meanwhile: impl FnOnce(&Client) -> T) -> T {
     result
 }
 
-/// Whatever a thread calls is parked; it is answered after the outage.
-type Parked = thread::JoinHandle<FakeNode>;
-
-fn parked(client: &Client, node: FakeNode) -> Parked {
-    let client = client.clone();
-    thread::spawn(move || {
-        claim(&node, &client);
-        node
-    })
-}
-
-/// Waits until rosrescue has parked `count` calls more than before.
-#[track_caller]
-fn await_parked(client: &Client, before: u64, count: u64) {
-    eventually("the calls are parked", || counter(client) >= before + count);
-}
-
-fn counter(client: &Client) -> u64 {
-    support::status(client)["counters"]["parked"]
-        .as_u64()
-        .unwrap()
-}
-
 #[test]
 fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
     for mode in [Mode::Core, Mode::Proxy] {
@@ -136,21 +112,23 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
         for round in 0..rounds(mode, 50) {
             // What came late of the round before.
             assert_innocent(&node, round);
+            // The old one is dead, or still there: then it is told to make way, as ever.
+            let old = (round % 2 == 1).then_some(node);
             node = outage(&mut robot, |client| {
-                // The old one is dead, or still there: then it is told to make way, as ever.
-                let old = node;
-                let before = counter(client);
                 let new = FakeNode::start("/phoenix");
-                let old = (round % 2 == 1).then_some(old);
-                let api = new.api.clone();
-                let parked = parked(client, new);
-                // Core's master may be back before we look.
-                if mode == Mode::Proxy {
-                    await_parked(client, before, 1);
-                }
-                (parked, old, api)
-            })
-            .finish(&robot, round);
+                claim(&new, client);
+                new
+            });
+            assert_innocent(&node, round);
+            let api = node.api.clone();
+            assert_eq!(api_of(&robot, &node.name), Some(api), "round {round}");
+            if let Some(old) = old {
+                eventually("the old one is told to make way", || {
+                    old.heard("shutdown").len() == 1
+                });
+            }
+            let state = robot.state();
+            assert_eq!(state.publishers_of("/phoenix/topic"), ["/phoenix"]);
             witness.hear(&client);
         }
         eventually("the witness knows the last one", || {
@@ -160,35 +138,13 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays() {
     }
 }
 
-trait Finish {
-    fn finish(self, robot: &Robot, round: usize) -> FakeNode;
-}
-
-impl Finish for (Parked, Option<FakeNode>, String) {
-    fn finish(self, robot: &Robot, round: usize) -> FakeNode {
-        let (parked, old, api) = self;
-        let node = parked.join().unwrap();
-        assert_innocent(&node, round);
-        assert_eq!(api_of(robot, &node.name), Some(api), "round {round}");
-        if let Some(old) = old {
-            eventually("the old one is told to make way", || {
-                old.heard("shutdown").len() == 1
-            });
-        }
-        let state = robot.state();
-        assert_eq!(state.publishers_of("/phoenix/topic"), ["/phoenix"]);
-        node
-    }
-}
-
 fn api_of(robot: &Robot, node: &str) -> Option<String> {
     let api = robot.bare().ask("lookupNode", params!["/test", node])?;
     api.as_str().map(str::to_owned)
 }
 
 /// A node dies, comes back at another port, and then its old port goes to somebody else: all in one
-/// outage. When the parked registration reaches the new master it would shut down whoever is at the
-/// old port; a master that never died would have done so while nobody was there.
+/// outage. Whoever tells the node at the old port to shut down must see that it is another one.
 #[test]
 fn who_has_the_port_of_a_node_that_moved_on_stays() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -201,16 +157,12 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
         let port = old.port();
         let (moved, heir) = outage(&mut robot, |client| {
             drop(old);
-            let before = counter(client);
-            let moved = parked(client, FakeNode::start("/moving"));
-            await_parked(client, before, 1);
-            eventually("rosrescue has seen that nobody is at the old port", || {
-                State::try_read(client).is_ok_and(|state| !state.knows("/moving"))
-            });
+            let moved = FakeNode::start("/moving");
+            claim(&moved, client);
             let heir = FakeNode::start_at(&format!("/heir{round}"), port);
-            (moved, parked(client, heir))
+            claim(&heir, client);
+            (moved, heir)
         });
-        let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
         witness.hear(&client);
         assert_innocent(&moved, round);
         assert_innocent(&heir, round);
@@ -239,20 +191,12 @@ fn who_had_the_port_before_the_node_moved_on_stays_too() {
         let port = old.port();
         let (moved, heir) = outage(&mut robot, |client| {
             drop(old);
-            let before = counter(client);
             let heir = FakeNode::start_at(&format!("/heir{round}"), port);
-            heir.claim_publication(&format!("{}/topic", heir.name), Some("std_msgs/String"));
-            let heir = parked(client, heir);
-            await_parked(client, before, 1);
-            let moved = parked(client, FakeNode::start("/moving"));
-            await_parked(client, before, 2);
-            eventually(
-                "rosrescue has seen that another node is at the port",
-                || State::try_read(client).is_ok_and(|state| !state.knows("/moving")),
-            );
+            claim(&heir, client);
+            let moved = FakeNode::start("/moving");
+            claim(&moved, client);
             (moved, heir)
         });
-        let (moved, heir) = (moved.join().unwrap(), heir.join().unwrap());
         witness.hear(&client);
         assert_innocent(&moved, round);
         assert_innocent(&heir, round);
@@ -278,11 +222,12 @@ fn who_has_the_port_of_a_dead_node_stays() {
             let port = node.port();
             let name = node.name.clone();
             assert_innocent(&node, round);
-            let parked = outage(&mut robot, |client| {
+            node = outage(&mut robot, |client| {
                 drop(node);
-                parked(client, FakeNode::start_at(&heir, port))
+                let node = FakeNode::start_at(&heir, port);
+                claim(&node, client);
+                node
             });
-            node = parked.join().unwrap();
             eventually("the dead one is taken out", || {
                 State::try_read(&robot.bare()).is_ok_and(|state| !state.knows(&name))
             });

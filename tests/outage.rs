@@ -17,7 +17,7 @@ use rosrescue::xmlrpc::{Call, Reply, Value};
 use rustix::process::Signal;
 use support::{
     FakeNode, Library, Mode, Robot, State, encode_call, eventually, holds, http_request, kinds,
-    params, tree,
+    params, tree, unreadable,
 };
 
 #[test]
@@ -182,25 +182,32 @@ fn calls_in_the_gap_get_what_their_senders_need() {
         start.elapsed()
     );
 
-    // The rest waits, in order, and is done when the master is there.
-    let setters: Vec<_> = (0..5)
-        .map(|i| {
-            let client = client.clone();
-            let before = robot.counter("parked");
-            let waiting =
-                thread::spawn(move || client.status("setParam", params!["/test", "/last", i]));
-            // Sent one after the other, so that there is an order.
-            eventually("the call is parked", || robot.counter("parked") > before);
-            waiting
-        })
-        .collect();
-    assert!(holds(Duration::from_secs(1), || setters
-        .iter()
-        .all(|setter| !setter.is_finished())));
-    robot.revive_master();
-    for setter in setters {
-        assert_eq!(setter.join().unwrap().expect("the call is answered").0, 1);
+    // Nor does anybody wait who changes something.
+    let watcher = FakeNode::start("/watcher");
+    watcher.subscribe(&client, "/topic", "std_msgs/String");
+    watcher.watch_param(&client, "/last");
+    let setting = Instant::now();
+    for number in 0..5 {
+        client.set_param("/last", number);
+        assert_eq!(client.param("/last"), Some(Value::Int(number)));
     }
+    assert!(
+        setting.elapsed() < Duration::from_secs(4),
+        "{:?}",
+        setting.elapsed()
+    );
+    eventually("the subscriber is told every value", || {
+        told(&watcher, "/last") == [0, 1, 2, 3, 4]
+    });
+    let coming = FakeNode::start("/coming");
+    coming.publish(&client, "/topic", "std_msgs/String");
+    eventually("the subscriber is told of the publisher", || {
+        watcher.updates("/topic") == [[coming.api.as_str()]]
+    });
+    assert!(!robot.is_open(), "there was a master");
+    let before = State::read(&client);
+
+    robot.revive_master();
     robot.await_recovery(dead);
     let state = robot.state();
     assert_eq!(robot.bare().param("/last"), Some(Value::Int(4)));
@@ -208,29 +215,71 @@ fn calls_in_the_gap_get_what_their_senders_need() {
         !state.knows("/fake"),
         "what was unregistered in the gap is back:\n{state}"
     );
+    before.assert_same(&state, "in the next master");
+}
+
+/// The values that a node was told of a parameter, as they came.
+fn told(node: &FakeNode, key: &str) -> Vec<i32> {
+    let updates = node.heard("paramUpdate").into_iter();
+    let of_key = updates.filter(|update| update[1].as_str() == Some(&format!("{key}/")));
+    of_key.map(|update| update[2].as_int().unwrap()).collect()
+}
+
+/// Only a master knows what it would answer.
+#[test]
+fn a_call_outside_the_master_api_is_not_held_for_ever_and_never_answered_falsely() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);
+    robot.kill_master();
+    for request in [
+        http_request(&encode_call("setLocation", params!["/test", "here"])),
+        unreadable("/late", 1),
+    ] {
+        let start = Instant::now();
+        let error = robot
+            .client()
+            .exchange(&request)
+            .expect_err("no answer is right here");
+        let waited = start.elapsed();
+        // Closed without a byte: that is what nodes take for a lost connection and try again.
+        assert!(error.to_string().contains("closed after []"), "{error}");
+        assert!(
+            waited >= Duration::from_millis(1400),
+            "it was held only {waited:?}"
+        );
+    }
+    robot.revive_master();
+    robot.await_gate();
+    assert_eq!(robot.bare().param("/late"), None);
+    robot.client().set_param("/late", 2);
+    assert_eq!(robot.bare().param("/late"), Some(Value::Int(2)));
 }
 
 #[test]
-fn a_call_is_not_held_for_ever_and_never_answered_falsely() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);
+fn a_call_outside_the_master_api_waits_for_the_next_master_and_gets_its_answer() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "60"]);
+    let client = robot.client();
     robot.kill_master();
-    let body = encode_call("setParam", params!["/test", "/late", 1]);
-    let start = Instant::now();
-    let error = robot
-        .client()
-        .exchange(&http_request(&body))
-        .expect_err("no answer is right here");
-    let waited = start.elapsed();
-    // Closed without a byte: that is what nodes take for a lost connection and try again.
-    assert!(error.to_string().contains("closed after []"), "{error}");
-    assert!(
-        waited >= Duration::from_millis(1400),
-        "it was held only {waited:?}"
-    );
+    let requests = [
+        http_request(&encode_call("setLocation", params!["/test", "here"])),
+        unreadable("/waited", 1),
+    ];
+    let waiting: Vec<_> = requests
+        .clone()
+        .into_iter()
+        .map(|request| {
+            let client = client.clone();
+            thread::spawn(move || client.exchange(&request).expect("an answer").reply())
+        })
+        .collect();
+    assert!(holds(Duration::from_secs(1), || {
+        waiting.iter().all(|call| !call.is_finished())
+    }));
     robot.revive_master();
-    robot.await_gate();
-    robot.client().set_param("/late", 2);
-    assert_eq!(robot.bare().param("/late"), Some(Value::Int(2)));
+    for (waiting, request) in waiting.into_iter().zip(requests) {
+        let of_a_master = robot.bare().exchange(&request).unwrap().reply();
+        assert_eq!(waiting.join().unwrap(), of_a_master);
+    }
+    assert_eq!(robot.bare().param("/waited"), Some(Value::Int(1)));
 }
 
 #[test]

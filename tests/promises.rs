@@ -19,8 +19,8 @@ use std::time::Duration;
 use rosrescue::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 use support::{
-    Client, FakeNode, Mode, Relay, Rescue, Robot, Rosmaster, Scratch, Setup, encode_call,
-    eventually, holds, http_request, params, signal, status, stop,
+    Client, FakeNode, Mode, Relay, Rescue, Robot, Rosmaster, Scratch, Setup, eventually,
+    holds, params, signal, status, stop, unreadable,
 };
 
 /// A disk on which nothing is forced while it is held.
@@ -57,15 +57,6 @@ impl Disk {
         assert!(waits, "it did not wait for the disk");
         work.join().unwrap()
     }
-}
-
-/// A `setParam` in UTF-16, which rosmaster understands and rosrescue does not.
-fn unreadable(key: &str) -> Vec<u8> {
-    let call = String::from_utf8(encode_call("setParam", params!["/n", key, 1])).unwrap();
-    let (_, call) = call.split_once("?>").unwrap();
-    let call = format!("\u{feff}<?xml version='1.0' encoding='utf-16'?>{call}");
-    let body: Vec<_> = call.encode_utf16().flat_map(u16::to_le_bytes).collect();
-    http_request(&body)
 }
 
 #[track_caller]
@@ -121,7 +112,7 @@ fn what_a_call_did_that_cannot_be_read_is_in_the_file_before_its_answer() {
     let mut rescue = disk.under(Setup::proxy(&scratch, master.port)).start();
     for key in ["/a", "/b"] {
         let client = rescue.client();
-        let reply = disk.holds_up(move || client.exchange(&unreadable(key)).unwrap().reply());
+        let reply = disk.holds_up(move || client.exchange(&unreadable(key, 1)).unwrap().reply());
         assert_done(&reply);
         signal(rescue.pid(), Signal::KILL);
         master.kill();
@@ -142,7 +133,7 @@ fn a_call_that_cannot_be_read_is_answered_without_a_checkpoint() {
     fs::write(&obstacle, "").unwrap();
     let setup = Setup::proxy(&scratch, master.port).at_checkpoint(obstacle.join("checkpoint"));
     let rescue = setup.start();
-    assert_done(&rescue.client().exchange(&unreadable("/a")).unwrap().reply());
+    assert_done(&rescue.client().exchange(&unreadable("/a", 1)).unwrap().reply());
 }
 
 /// A rosmaster behind a relay, and rosrescue before it.
@@ -155,7 +146,7 @@ fn relayed(scratch: &Scratch) -> (Rosmaster, Relay, Rescue) {
 
 fn send_unreadable(client: &Client, key: &'static str) -> JoinHandle<Reply> {
     let client = client.clone();
-    thread::spawn(move || client.exchange(&unreadable(key)).unwrap().reply())
+    thread::spawn(move || client.exchange(&unreadable(key, 1)).unwrap().reply())
 }
 
 /// Both wait for a look, and the first two looks do not come back.
@@ -178,7 +169,7 @@ fn calls_that_cannot_be_read_wait_together_for_a_look_that_shows_what_they_did()
 #[test]
 fn an_unregistration_whose_reply_was_lost_is_answered_as_done() {
     let scratch = Scratch::new();
-    let (_master, relay, rescue) = relayed(&scratch);
+    let (master, relay, rescue) = relayed(&scratch);
     let client = rescue.client();
     let node = FakeNode::start("/node");
     let (name, api, service_api) = ("/node", node.api.as_str(), node.service_api());
@@ -202,12 +193,17 @@ fn an_unregistration_whose_reply_was_lost_is_answered_as_done() {
             "/service",
         ),
     ] {
+        eventually("calls pass", || status(&client)["open"] == true);
         relay.swallow(method, 1);
         let answer = client.status(method, params).unwrap();
         assert_eq!(relay.hunger(), 0);
         let text = format!("Unregistered [/node] as provider of [{key}]");
         assert_eq!(answer, (1, text, Value::Int(1)), "{method}");
     }
+    eventually("calls pass", || status(&client)["open"] == true);
+    let of = params!["/test", "/node"];
+    assert_eq!(master.client().ask("lookupNode", of.clone()), None);
+    assert_eq!(client.ask("lookupNode", of), None);
 }
 
 /// Not even a topic or a parameter is left in it by which it could be told from an empty one.
@@ -230,7 +226,7 @@ fn what_was_unregistered_in_a_hang_is_told_to_a_master_that_holds_nothing_else()
 }
 
 /// The node is asked what it publishes while it does not, and before anything follows from that it does
-/// again: its registration waits in the outage that has begun meanwhile, and is the last word.
+/// again: its registration, in the outage that has begun meanwhile, is the last word.
 #[test]
 fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -252,26 +248,16 @@ fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
     let dead = robot.master_pid();
     robot.kill_master_at_once(dead);
     eventually("the gate is shut", || !robot.is_open());
-    let parked = robot.counter("parked");
-    let registering = thread::spawn({
-        let (client, api) = (client.clone(), node.api.clone());
-        move || {
-            let params = params!["/node", "/topic", "std_msgs/String", api.as_str()];
-            client.ok("registerPublisher", params)
-        }
-    });
-    eventually("it is parked", || robot.counter("parked") > parked);
     let updates = subscriber.updates("/topic").len();
+    let params = params!["/node", "/topic", "std_msgs/String", node.api.as_str()];
+    client.ok("registerPublisher", params);
     node.release();
     eventually("it has answered", || {
         asked("getSubscriptions") == 2 && asked("getPublications") == 2
     });
-    let waiting = holds(Duration::from_millis(100), || !registering.is_finished());
-    assert!(waiting, "there is no master");
     node.claim_publication("/topic", Some("std_msgs/String"));
     robot.revive_master();
     robot.await_recovery(dead);
-    registering.join().unwrap();
     eventually("the census is over", || {
         let report = status(&client)["last_recovery"].clone();
         !report["census_ms"].is_null()
@@ -281,4 +267,5 @@ fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
         told.iter().all(|list| *list == [node.api.as_str()]),
         "{told:?}"
     );
+    assert_eq!(robot.state().publishers_of("/topic"), ["/node"]);
 }

@@ -44,7 +44,7 @@ pub use look::{FirstLook, NotAMaster};
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
 pub use plan::{Mismatch, Plan, Skipped};
-pub use reconcile::{Authority, reconcile};
+pub use reconcile::{Authority, may_hold, reconcile};
 pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};

@@ -31,6 +31,22 @@ pub fn reconcile(mirror: &Master, held: &Master, pending: &[Call], authority: Au
     target
 }
 
+/// What a master of the present incarnation may hold beside what can be read of it: the subscriptions of
+/// parameters that `mirror` has, and those that a pending write takes away.
+pub fn may_hold(mirror: &Master, pending: &[Call]) -> Master {
+    let mut master = mirror.clone();
+    for call in pending {
+        let text = |index: usize| call.params.get(index).and_then(Value::as_str);
+        // One that has moved on has taken nothing along.
+        let known = text(0).and_then(|caller_id| mirror.api_of(caller_id));
+        if call.method == "unsubscribeParam" && known.is_none_or(|known| text(1) == Some(known)) {
+            let call = Call::new("subscribeParam", call.params.clone());
+            master.apply_telling(&call, &mut ());
+        }
+    }
+    master
+}
+
 /// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another
 /// address adds nothing.
 fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
@@ -222,6 +238,24 @@ mod tests {
         let mirror = after(&[offer, gone.clone()]);
         let target = reconcile(&mirror, &held, &[gone], Authority::Mirror);
         assert_eq!(target, mirror);
+    }
+
+    #[test]
+    fn what_no_look_shows_and_a_pending_write_takes_away_may_be_there() {
+        let watch = |api: &str| call("subscribeParam", &["/n", api, "/k"]);
+        let gone = |api: &str| call("unsubscribeParam", &["/n", api, "/k"]);
+        let mirror = after(&[watch("http://n:1/"), gone("http://n:1/")]);
+        let held = may_hold(&mirror, &[gone("http://n:1/")]);
+        assert_eq!(held, after(&[watch("http://n:1/")]));
+        let target = reconcile(
+            &mirror,
+            &held,
+            &[gone("http://n:1/")],
+            Authority::PendingWrites,
+        );
+        assert_eq!(target, mirror);
+        let moved = after(&[watch("http://n:2/")]);
+        assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
     }
 
     /// Whatever is said to change nothing leaves an equal state.

@@ -140,14 +140,18 @@ impl Ledger {
     }
 
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it does. Nodes
-    /// that a master would notify of it are notified.
-    pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<Reply> {
+    /// that a master would notify of it are notified. With the reply comes the journal's last record:
+    /// what has changed nothing may be as new as that.
+    pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         // An unregistration of what is not here may be of what is on its way to the master.
         let idle = !is_unregistration(write)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
-        idle.then(|| inner.apply(now, write, Some(false), &self.news))
+        idle.then(|| {
+            let reply = inner.apply(now, write, Some(false), &self.news);
+            (reply, inner.last_seq())
+        })
     }
 
     /// Tells the mirror what getPid and getUri answer.
@@ -240,8 +244,8 @@ impl Ledger {
     }
 
     /// Answers a call of the Master API as the master would while it is away: records what it changes as
-    /// pending, applies it, and has nodes notified. With the reply comes the journal's last record of
-    /// it, if there is one.
+    /// pending, applies it, and has nodes notified. With the reply comes the journal's last record, of it
+    /// or, if it changes nothing, of what made it so.
     ///
     /// None while a master is being brought to the mirror's state, or if the call reads too much besides:
     /// it has to wait.
@@ -268,7 +272,7 @@ impl Ledger {
             writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
         }
         if writes.is_empty() {
-            return Some((reply, None));
+            return Some((reply, inner.last_seq()));
         }
         // A look that shows what it takes away would bring it back.
         inner.version += u64::from(!changes);
@@ -287,6 +291,12 @@ impl Ledger {
     /// How many writes the present incarnation may not have run.
     pub fn pending(&self) -> usize {
         self.lock().pending.calls().len()
+    }
+
+    /// What the present incarnation may hold beside what can be read of it.
+    pub fn may_hold(&self) -> Master {
+        let inner = self.lock();
+        master::may_hold(&inner.mirror, inner.pending.calls())
     }
 
     /// The mirror must not change from now on, until [`Self::end_injection`]. What a master that is about to
@@ -461,7 +471,12 @@ impl Inner {
 
     /// Number of the journal's last record.
     fn seq(&self) -> u64 {
-        self.store.as_ref().map_or(0, Store::seq)
+        self.last_seq().unwrap_or_default()
+    }
+
+    /// The same; none without a journal.
+    fn last_seq(&self) -> Option<u64> {
+        self.store.as_ref().map(Store::seq)
     }
 
     /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.

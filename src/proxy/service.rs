@@ -28,6 +28,7 @@ use super::{
 };
 use crate::{
     admin,
+    cli::Sync,
     master::{self, Kind},
     xmlrpc::{self, Call, Reply, Value},
 };
@@ -302,7 +303,12 @@ async fn write(
                 }
                 proxy.slow.notify_one();
                 let idle = call.filter(|call| master::is_answerable(call));
-                if let Some(reply) = idle.and_then(|call| proxy.ledger.answer_idle(Instant::now(), call)) {
+                let answer = idle.and_then(|call| proxy.ledger.answer_idle(Instant::now(), call));
+                if let Some((reply, seq)) = answer {
+                    // It may be the disk that takes so long, and not the master.
+                    if let Some(seq) = seq.filter(|_| proxy.config.sync == Sync::Always) {
+                        proxy.ledger.durable(seq).await;
+                    }
                     proxy.stats.stood_in.count();
                     return Ok(xml(&reply));
                 }

@@ -251,7 +251,7 @@ async fn inject(
             // What cannot be read back is taken from the mirror, of a master that was given it.
             let previous = match bears {
                 Bears::Nothing => Master::default(),
-                _ => proxy.ledger.with_mirror(Clone::clone),
+                _ => proxy.ledger.may_hold(),
             };
             while_alive(proxy, look::second(first, connection, &previous)).await?
         }

@@ -75,17 +75,27 @@ pub struct Guard {
     served: Option<u64>,
     /// The mirror is known to be a master's state, so that it may stand in.
     known: bool,
+    /// The mirror comes from a checkpoint whose session goes on.
+    restored: bool,
     said: Option<(String, Instant)>,
 }
 
 impl Guard {
-    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `known`: the mirror is
-    /// what a master would hold.
-    pub fn new(proxy: Arc<Proxy>, gate: Tx, process: Option<MasterProcess>, known: bool) -> Self {
+    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
+    /// mirror comes from a checkpoint whose session goes on.
+    pub fn new(
+        proxy: Arc<Proxy>,
+        gate: Tx,
+        process: Option<MasterProcess>,
+        restored: bool,
+    ) -> Self {
         let supervision = match process {
             Some(_) => Supervision::Ours,
             None => Supervision::Theirs,
         };
+        // A master of ours begins with nothing but what we give it; what an earlier one holds must be
+        // seen.
+        let begins = process.as_ref().is_some_and(|process| !process.is_left());
         Self {
             lifecycle: Lifecycle::new(supervision, proxy.config.probing),
             proxy,
@@ -100,7 +110,8 @@ impl Guard {
             injecting: Arc::default(),
             outage: Outage::begin(Instant::now(), "start"),
             served: None,
-            known,
+            known: restored || begins,
+            restored,
             said: None,
         }
     }
@@ -382,14 +393,20 @@ impl Guard {
         self.proxy.board.set_open(true);
     }
 
+    /// Whether a session begins that no master has served yet.
+    fn begins(&self) -> bool {
+        self.served.is_none() && !self.restored
+    }
+
     fn spawn(&mut self) -> Result<(), SupervisorError> {
+        // There is nothing to protect yet: better to say what is wrong than to try for ever.
+        let is_fatal = self.begins() && self.proxy.ledger.pending() == 0;
         let Some(process) = &mut self.process else {
             return Ok(());
         };
         match process.spawn(&self.proxy) {
             Ok(()) => Ok(()),
-            // At the start there is nothing to protect yet: better to say so than to try for ever.
-            Err(error) if self.served.is_none() && !self.known => Err(error),
+            Err(error) if is_fatal => Err(error),
             Err(error) => {
                 process.report_failure();
                 self.say(format!("cannot start a master: {error}"));

@@ -37,7 +37,7 @@ impl Outcome {
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Begun => "an empty master is served",
+            Self::Begun => "a new master is served",
             Self::Injected => "the master has been restored",
             Self::Adopted => "a running master has been taken over",
             Self::Reconciled => "the same master goes on, and knows what was written meanwhile",

@@ -15,8 +15,8 @@ const REPEAT: Duration = Duration::from_secs(10);
 impl Guard {
     /// Reports what an examination came to; census and healing add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
-        if !self.known && examination.outcome == Outcome::Injected {
-            // Nothing but what a session begins with.
+        if self.begins() && examination.outcome == Outcome::Injected {
+            // Nothing but what the session begins with.
             examination.outcome = Outcome::Begun;
         }
         let Outage { cause, since, .. } = self.outage;

@@ -49,7 +49,7 @@ pub(crate) use relay::Relay;
 pub(crate) use rescue::{Rescue, Setup};
 pub(crate) use robot::{Mode, Robot};
 pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, find_program, ros_command};
-pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request};
+pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request, unreadable};
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use sick::{SICK_ROSMASTER, Sickness, Zygote, page};
 pub(crate) use state::State;

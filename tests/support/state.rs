@@ -106,6 +106,16 @@ impl State {
         rest
     }
 
+    /// This state without one registration of a publisher.
+    pub(crate) fn without_publisher(&self, topic: &str, node: &str) -> Self {
+        let mut rest = self.clone();
+        for (_, nodes) in rest.publishers.iter_mut().filter(|(name, _)| name == topic) {
+            nodes.retain(|name| name != node);
+        }
+        rest.publishers.retain(|(_, nodes)| !nodes.is_empty());
+        rest
+    }
+
     /// This state without one topic type.
     pub(crate) fn without_type(&self, topic: &str) -> Self {
         let mut rest = self.clone();
