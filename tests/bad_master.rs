@@ -1,6 +1,6 @@
 //! A master, or a node that is asked by the census, that answers garbage: the client gets the master's own
-//! bytes where they are HTTP, else a closed connection, or the mirror's answer to what only reads; never an
-//! invented one. Nothing is recorded that was no success.
+//! bytes where they are HTTP. A master whose answer is not HTTP, or breaks off, counts as away: the mirror
+//! answers, and the next master that can takes what it has answered.
 
 #![allow(
     clippy::unwrap_used,
@@ -20,8 +20,8 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
-    Client, FakeMaster, FakeNode, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, encode_call,
-    eventually, holds, http_request, params, status,
+    Client, FakeMaster, FakeNode, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, State,
+    encode_call, eventually, holds, http_request, params, status,
 };
 
 /// A master that is real but for calls that mention a word: those get the answer that is given.
@@ -31,7 +31,7 @@ struct Poisoned {
     _fake: FakeMaster,
     real: Rosmaster,
     answer: Arc<Mutex<(&'static [u8], Vec<u8>)>>,
-    _scratch: Scratch,
+    scratch: Scratch,
 }
 
 impl Poisoned {
@@ -60,7 +60,7 @@ impl Poisoned {
             _fake: fake,
             real,
             answer,
-            _scratch: scratch,
+            scratch,
         }
     }
 
@@ -103,11 +103,11 @@ fn bomb() -> Vec<u8> {
     encoder.finish().unwrap().repeat(64)
 }
 
-/// Calls that change a master's state, and calls that do not, all of them poisoned. (`subscribeParam` is
-/// not among them: if its reply is whole and cannot be read it is recorded as foretold, because no look
+/// Calls of `/c` that change a master's state, and calls that do not, all of them poisoned. (`subscribeParam`
+/// is not among them: if its reply is whole and cannot be read it is recorded as predicted, because no look
 /// shows what became of it.)
-fn poisoned_calls() -> [Vec<(&'static str, Vec<Value>)>; 2] {
-    let api = "http://127.0.0.1:1/";
+fn poisoned_calls(node: &FakeNode) -> [Vec<(&'static str, Vec<Value>)>; 2] {
+    let (api, service) = (node.api.as_str(), node.service_api());
     let set = || Call::new("setParam", params!["/c", "/poison", "in the cup"]);
     let get = Call::new("getParam", params!["/c", "/poison"]);
     let changes = vec![
@@ -115,10 +115,7 @@ fn poisoned_calls() -> [Vec<(&'static str, Vec<Value>)>; 2] {
         ("deleteParam", params!["/c", "/poison"]),
         ("registerPublisher", params!["/c", "/poison", "a/B", api]),
         ("registerSubscriber", params!["/c", "/poison", "a/B", api]),
-        (
-            "registerService",
-            params!["/c", "/poison", "rosrpc://127.0.0.1:1", api],
-        ),
+        ("registerService", params!["/c", "/poison", service, api]),
         ("unregisterPublisher", params!["/c", "/poison", api]),
         ("system.multicall", Call::multicall([set(), set()]).params),
     ];
@@ -132,11 +129,10 @@ fn poisoned_calls() -> [Vec<(&'static str, Vec<Value>)>; 2] {
 }
 
 #[test]
-fn garbage_from_the_master() {
-    let broken = |head: &str, body: &str| (format!("{head}\r\n\r\n{body}").into_bytes(), None);
+fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
     let whole = |status: &str, body: &[u8]| {
         let code: u16 = status.split(' ').next().unwrap().parse().unwrap();
-        (with_status(status, body), Some((code, body.to_vec())))
+        (with_status(status, body), (code, body.to_vec()))
     };
     let fine = "<methodResponse><params><param><value><array><data><value><int>1</int></value>\
                 <value><string>ok</string></value><value><int>0</int></value></data></array></value>\
@@ -148,19 +144,8 @@ fn garbage_from_the_master() {
         "HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: {}\r\n\r\n",
         bomb.len()
     );
-    // What the master says, and status and body that the client must get; none if it is no whole
-    // HTTP answer.
-    type Case = (Vec<u8>, Option<(u16, Vec<u8>)>);
-    let cases: Vec<Case> = vec![
-        (b"".to_vec(), None),
-        (b"SSH-2.0-OpenSSH_9.2\r\n".to_vec(), None),
-        (b"\x00\x01\x02\x03".to_vec(), None),
-        (b"HTTP/1.1".to_vec(), None),
-        (b"HTTP/1.1 200 OK\r\nContent-".to_vec(), None),
-        broken("HTTP/1.1 200 OK\r\nContent-Length: 100000", fine),
-        broken("HTTP/1.1 200 OK\r\nContent-Length: many", fine),
-        broken("HTTP/1.1 200 OK\r\nContent-Length: 10000000000", fine),
-        broken("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked", "zz\r\n"),
+    // What the master says, and status and body that the client must get.
+    let cases = [
         whole("200 OK", b""),
         whole("200 OK", b"not xml"),
         whole("200 OK", b"<methodResponse>"),
@@ -169,44 +154,28 @@ fn garbage_from_the_master() {
         whole("200 OK", FAULT.as_bytes()),
         whole("500 Internal Server Error", b"<html>oops</html>"),
         whole("503 Busy", fine.as_bytes()),
-        ([bomb_head.as_bytes(), &bomb].concat(), Some((200, bomb))),
+        ([bomb_head.as_bytes(), &bomb].concat(), (200, bomb)),
     ];
     let poisoned = Poisoned::start(Vec::new());
-    let (client, real) = (poisoned.rescue.client(), poisoned.real.client());
-    let [changes, reads] = poisoned_calls();
+    let client = poisoned.rescue.client();
+    let node = FakeNode::start("/c");
+    let [changes, reads] = poisoned_calls(&node);
     let several = changes.last().unwrap().clone();
-    for (number, (answer, due)) in cases.into_iter().enumerate() {
+    for (number, (answer, (code, body))) in cases.into_iter().enumerate() {
         poisoned.say(b"/poison", &answer);
-        for (is_read, (method, params)) in [(false, &changes), (true, &reads)]
-            .into_iter()
-            .flat_map(|(is_read, calls)| calls.iter().map(move |call| (is_read, call)))
-        {
-            if !is_read && *method == "system.multicall" && answer.ends_with(FAULT.as_bytes()) {
+        for (method, params) in &[changes.clone(), reads.clone()].concat() {
+            if params == &several.1 && answer.ends_with(FAULT.as_bytes()) {
                 continue; // Below.
             }
             let case = format!("case {number}, {method}");
             let request = http_request(&encode_call(method, params.clone()));
-            match (client.exchange(&request), &due) {
-                // The master's own bytes.
-                (Ok(response), Some((code, body))) => {
-                    assert!(
-                        response.code == *code && response.body == *body,
-                        "{case}: {response:.1000?}"
-                    );
-                    let length = body.len().to_string();
-                    assert_eq!(response.header("content-length"), Some(&*length), "{case}");
-                }
-                // The mirror's answer, which is what the master would have said.
-                (Ok(response), None) if is_read => {
-                    let true_one = real.exchange(&request).unwrap();
-                    assert_eq!(response.text(), true_one.text(), "{case}");
-                }
-                // A closed connection, not one that is kept waiting.
-                (Err(error), None) if !is_read => {
-                    assert_ne!(error.kind(), std::io::ErrorKind::WouldBlock, "{case}");
-                }
-                (got, _) => panic!("{case}: {got:?}"),
-            }
+            let response = client.exchange(&request).expect(&case);
+            assert!(
+                response.code == code && response.body == body,
+                "{case}: {response:.1000?}"
+            );
+            let length = body.len().to_string();
+            assert_eq!(response.header("content-length"), Some(&*length), "{case}");
         }
         let round = i32::try_from(number).unwrap();
         poisoned.assert_sound(&format!("case {number}"), round);
@@ -227,6 +196,59 @@ fn garbage_from_the_master() {
     assert!(most < 300 << 10, "{most} KiB");
 }
 
+/// Each answer is to the byte that of a master that is well, and is true as soon as this one is well again.
+#[test]
+fn a_master_whose_answers_are_no_http_counts_as_away() {
+    let broken = |head: &str, body: &str| format!("{head}\r\n\r\n{body}").into_bytes();
+    let fine = "<methodResponse/>";
+    let cases = [
+        b"".to_vec(),
+        b"SSH-2.0-OpenSSH_9.2\r\n".to_vec(),
+        b"\x00\x01\x02\x03".to_vec(),
+        b"HTTP/1.1".to_vec(),
+        b"HTTP/1.1 200 OK\r\nContent-".to_vec(),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: 100000", fine),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: many", fine),
+        broken("HTTP/1.1 200 OK\r\nContent-Length: 10000000000", fine),
+        broken("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked", "zz\r\n"),
+    ];
+    let poisoned = Poisoned::start(Vec::new());
+    let client = poisoned.rescue.client();
+    let real = poisoned.real.client();
+    let twin = Rosmaster::start(&poisoned.scratch);
+    let well = twin.client();
+    let node = FakeNode::start("/c");
+    node.claim_subscription("/poison", "a/B");
+    let [changes, reads] = poisoned_calls(&node);
+    for (number, answer) in cases.into_iter().enumerate() {
+        poisoned.say(b"/poison", &answer);
+        for (change, read) in changes.iter().zip(reads.iter().cycle()) {
+            for (method, params) in [change, read] {
+                let case = format!("case {number}, {method}");
+                let request = http_request(&encode_call(method, params.clone()));
+                let response = client.exchange(&request).expect(&case);
+                let right = well.exchange(&request).unwrap();
+                assert_eq!(response.text(), right.text(), "{case}");
+            }
+        }
+        assert_eq!(status(&client)["open"], false, "case {number}");
+        assert_eq!(real.param("/poison"), None, "case {number}");
+        poisoned.say(b"nobody says this", b"");
+        eventually("the gate is open", || status(&client)["open"] == true);
+        let right = State::read(&well);
+        right.assert_same(&State::read(&real), &format!("after case {number}"));
+        right.assert_same(&State::read(&client), &format!("after case {number}"));
+        for master in [&client, &well] {
+            master.ok("deleteParam", params!["/c", "/poison"]);
+            let params = params!["/c", "/poison", node.api.as_str()];
+            assert_eq!(master.ok("unregisterSubscriber", params), Value::Int(1));
+            let params = params!["/c", "/poison", node.service_api()];
+            assert_eq!(master.ok("unregisterService", params), Value::Int(1));
+        }
+    }
+    poisoned.rescue.assert_no_panic();
+}
+
 /// Such as a master that is out of memory.
 #[test]
 fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
@@ -240,21 +262,24 @@ fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
         let call = encode_call("setParam", params!["/c", "/poison", 1]);
         client.exchange(&http_request(&call))
     };
+    let is_success = |text: &str| text.contains("parameter /poison set");
     eventually("the gate is shut", || {
         // Until then it is the master's own answer.
-        let answer = set();
-        assert!(
-            answer.as_ref().is_ok_and(|it| it.text() == FAULT) || !is_open(),
-            "{answer:?}"
-        );
+        let text = set().expect("an answer").text();
+        assert!(text == FAULT || is_success(&text) && !is_open(), "{text}");
         !is_open()
     });
-    assert!(set().is_err(), "nobody has run it");
+    let text = set().unwrap().text();
+    assert!(is_success(&text), "{text}");
+    assert_eq!(poisoned.real.client().param("/poison"), None);
     assert_eq!(client.param("/kept"), Some(1.into()));
+    assert_eq!(client.param("/poison"), Some(1.into()));
     poisoned.say(b"nobody says this", b"");
     eventually("the gate is open", is_open);
-    assert_eq!(poisoned.real.client().param("/kept"), Some(1.into()));
-    poisoned.assert_sound("a fault for everything", 2);
+    for key in ["/kept", "/poison"] {
+        assert_eq!(poisoned.real.client().param(key), Some(1.into()), "{key}");
+    }
+    poisoned.rescue.assert_no_panic();
 }
 
 /// What is HTTP and a success arrives, in whatever form the master sends it.

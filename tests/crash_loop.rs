@@ -154,7 +154,6 @@ impl Patient {
             }
         }
     }
-
 }
 
 /// Whether it is what the census asks.

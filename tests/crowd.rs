@@ -17,8 +17,7 @@ use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
-    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, http_request, params,
-    tree,
+    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, http_request, params, tree,
 };
 
 /// Clients of the crowd; a multiple of four.
@@ -222,7 +221,12 @@ fn multicalls_in_an_outage_are_answered_at_once_and_in_order() {
         Call::new("getParam", params!["/roslaunch", "/launched/a"]),
     ]);
     assert_eq!(launch, [0.into(), 0.into(), Value::Int(1)]);
-    let params = params!["/staying", "/late", "std_msgs/String", nodes[0].api.as_str()];
+    let params = params![
+        "/staying",
+        "/late",
+        "std_msgs/String",
+        nodes[0].api.as_str()
+    ];
     call(vec![Call::new("registerPublisher", params)]);
     nodes[1].claim_publication("/topic", None);
     assert_eq!(call(vec![unregister(&nodes[1], "/topic")]), [Value::Int(1)]);

@@ -159,17 +159,18 @@ fn a_deletion_whose_reply_was_lost_is_answered_as_done() {
 }
 
 #[test]
-fn a_call_that_was_given_up_may_have_been_run() {
+fn a_call_whose_replies_are_lost_is_answered_and_done() {
     let scratch = Scratch::new();
     let (master, relay, rescue) = relayed(&scratch);
     let client = rescue.client();
-    relay.swallow("/given_up", 3);
-    assert!(
-        client
-            .call("setParam", params!["/n", "/given_up", 5])
-            .is_err()
-    );
-    assert_eq!(master.client().param("/given_up"), Some(5.into()));
+    relay.swallow("/swallowed", 3);
+    let reply = client.call("setParam", params!["/n", "/swallowed", 5]);
+    assert_eq!(code(&reply.unwrap()), Some(1));
+    assert_eq!(client.param("/swallowed"), Some(5.into()));
+    eventually("calls pass", || {
+        relay.hunger() == 0 && status(&client)["open"] == true
+    });
+    assert_eq!(master.client().param("/swallowed"), Some(5.into()));
     eventually("the mirror knows", || mirrored(&client) == 1);
 }
 

@@ -96,7 +96,10 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     );
     let both = [node.api.clone(), coming.api.clone()];
     eventually("the subscriber is told of the new publisher", || {
-        watcher.updates("/topic").last().is_some_and(|it| *it == both)
+        watcher
+            .updates("/topic")
+            .last()
+            .is_some_and(|it| *it == both)
     });
     let every = [1, 2, 3].map(|number| (number, true));
     eventually("the node is told of every value", || {
@@ -229,7 +232,9 @@ fn ten_hangs_under_writes_lose_nothing() {
     for (key, written) in keys.into_iter().zip(written) {
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
         eventually("the node is told of the last value", || {
-            told(&watcher, key).last().is_some_and(|(value, _)| *value == written)
+            told(&watcher, key)
+                .last()
+                .is_some_and(|(value, _)| *value == written)
         });
         // Every value, and those from the master once and in order.
         let told = told(&watcher, key);
@@ -249,7 +254,11 @@ fn ten_hangs_under_writes_lose_nothing() {
     );
     let left = state.publishers.iter();
     let left = left.filter(|(_, nodes)| nodes.contains(&leaving.name));
-    assert_eq!(left.count() as u64, 10 - shut, "what was unregistered is back");
+    assert_eq!(
+        left.count() as u64,
+        10 - shut,
+        "what was unregistered is back"
+    );
     state.assert_same(&State::read(&client), "through rosrescue");
     for node in [&watcher, &publisher, &leaving] {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());

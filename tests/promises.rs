@@ -19,8 +19,8 @@ use std::time::Duration;
 use rosrescue::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 use support::{
-    Client, FakeNode, Mode, Relay, Rescue, Robot, Rosmaster, Scratch, Setup, eventually,
-    holds, params, signal, status, stop, unreadable,
+    Client, FakeNode, Mode, Relay, Rescue, Robot, Rosmaster, Scratch, Setup, eventually, holds,
+    params, signal, status, stop, unreadable,
 };
 
 /// A disk on which nothing is forced while it is held.
@@ -133,7 +133,13 @@ fn a_call_that_cannot_be_read_is_answered_without_a_checkpoint() {
     fs::write(&obstacle, "").unwrap();
     let setup = Setup::proxy(&scratch, master.port).at_checkpoint(obstacle.join("checkpoint"));
     let rescue = setup.start();
-    assert_done(&rescue.client().exchange(&unreadable("/a", 1)).unwrap().reply());
+    assert_done(
+        &rescue
+            .client()
+            .exchange(&unreadable("/a", 1))
+            .unwrap()
+            .reply(),
+    );
 }
 
 /// A rosmaster behind a relay, and rosrescue before it.

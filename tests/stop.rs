@@ -18,8 +18,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use support::{
-    Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params,
-    unreadable,
+    Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params, unreadable,
 };
 
 #[test]
@@ -76,7 +75,7 @@ fn an_orderly_stop_in_an_outage_keeps_what_was_answered_and_answers_nothing_fals
         assert!(call.join().unwrap().is_err());
     }
     let checkpoint = fs::read_to_string(robot.rescue.checkpoint()).unwrap();
-    assert!(checkpoint.contains("answered: 4"), "{checkpoint}");
+    assert!(checkpoint.contains("\"answered\": 4"), "{checkpoint}");
     assert!(!checkpoint.contains("waiting"), "{checkpoint}");
 }
 

@@ -1,0 +1,131 @@
+use super::*;
+
+fn call(method: &str, params: &[&str]) -> Call {
+    let params = params.iter().map(|text| Value::from(*text));
+    Call::new(method, params.collect())
+}
+
+fn publish(node: &str, topic: &str) -> Call {
+    call("registerPublisher", &[node, topic, "x/Y", "http://n:1/"])
+}
+
+fn apply(activity: &mut Activity, now: Instant, call: &Call) {
+    activity.applied(now, call, Noticed::default(), |_| true);
+}
+
+#[test]
+fn a_process_id_is_sure_until_the_node_registers_again() {
+    let now = Instant::now();
+    let mut activity = Activity::default();
+    apply(&mut activity, now, &publish("/a", "/t"));
+    let registered = activity.deeds("/a").registered;
+    activity.remember_pid("/a", "http://n:1/", registered, 7);
+    assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
+    assert_eq!(activity.pid_of("/a", "http://n:2/"), None);
+    let gone = call("unregisterPublisher", &["/a", "/t", "http://n:1/"]);
+    apply(&mut activity, now, &gone);
+    assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
+    apply(&mut activity, now, &Call::multicall([publish("/a", "/u")]));
+    assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
+    // An answer to a question that was asked before is too old.
+    activity.remember_pid("/a", "http://n:1/", registered, 8);
+    assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
+}
+
+#[test]
+fn a_new_node_is_to_be_asked_once_after_its_last_registration() {
+    let start = Instant::now();
+    let second = Duration::from_secs(1);
+    let mut activity = Activity::default();
+    apply(&mut activity, start, &publish("/a", "/t"));
+    apply(&mut activity, start + second, &publish("/a", "/u"));
+    let none = Vec::<String>::new();
+    assert_eq!(activity.take_strangers(start), none);
+    assert_eq!(activity.take_strangers(start + second), ["/a"]);
+    assert_eq!(activity.take_strangers(start + second), none);
+}
+
+fn subscribed() -> (Master, Call) {
+    let mut master = Master::default();
+    let subscribe = call("registerSubscriber", &["/s", "/t", "*", "http://s:1/"]);
+    master.apply(&subscribe);
+    (master, publish("/a", "/t"))
+}
+
+#[test]
+fn changes_are_collected_only_while_a_master_may_be_late() {
+    let now = Instant::now();
+    let mut activity = Activity::default();
+    let (mut master, publish) = subscribed();
+    let mut apply = |activity: &mut Activity, standing_in| {
+        let mut noticed = Noticed::new(standing_in);
+        master.apply_telling(&publish, &mut noticed);
+        activity.applied(now, &publish, noticed, |_| true)
+    };
+    assert!(!apply(&mut activity, false));
+    activity.set_telling(true);
+    assert!(apply(&mut activity, false));
+    let changes = activity.take_outbox().changes;
+    assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
+    assert_eq!(activity.take_owed(now).topics, ["/t"]);
+    assert_eq!(activity.take_owed(now).topics, Vec::<String>::new());
+    // While no master is there, it is told at once and in the master's words.
+    assert!(apply(&mut activity, true));
+    let outbox = activity.take_outbox();
+    assert!(outbox.changes.is_empty());
+    let [(to, call)] = &outbox.calls[..] else {
+        panic!("{outbox:?}")
+    };
+    assert_eq!(
+        (to.as_str(), call.method.as_str()),
+        ("http://s:1/", "publisherUpdate")
+    );
+    assert_eq!(**call, master.publisher_update("/t"));
+}
+
+#[test]
+fn who_is_displaced_is_known_with_what_it_did() {
+    let now = Instant::now();
+    let mut activity = Activity::default();
+    let (mut master, publish) = subscribed();
+    master.apply(&publish);
+    apply(&mut activity, now, &publish);
+    let registered = activity.deeds("/a").registered;
+    activity.remember_pid("/a", "http://n:1/", registered, 7);
+    let again = call("registerPublisher", &["/a", "/u", "x/Y", "http://n:2/"]);
+    let expected = Displaced {
+        node: "/a".to_owned(),
+        api: "http://n:1/".to_owned(),
+        pid: Some(7),
+        topics: vec!["/t".to_owned()],
+    };
+    for again in [again.clone(), Call::multicall([again])] {
+        let mut noticed = Noticed::new(false);
+        noticed.displaced = activity.displaced_by(&master, &again);
+        assert_eq!(noticed.displaced, std::slice::from_ref(&expected));
+        activity.applied(now, &again, noticed, |_| true);
+    }
+    assert_eq!(activity.take_owed(now).displaced.len(), 2);
+    assert_eq!(activity.take_owed(now).displaced, []);
+}
+
+#[test]
+fn a_key_is_kept_once_for_all_its_subscribers() {
+    let now = Instant::now();
+    let mut activity = Activity::default();
+    activity.set_telling(true);
+    let subscribers: Vec<_> = (0..NOTICES)
+        .map(|port| format!("http://s:{port}/"))
+        .collect();
+    let mut noticed = Noticed::new(false);
+    noticed.param_update(&subscribers, "/key/", &Value::Int(1));
+    activity.applied(now, &publish("/a", "/t"), noticed, |_| true);
+    let noticed = activity.take_owed(now).params;
+    assert_eq!(noticed.len(), NOTICES);
+    let (_, first) = &noticed[0];
+    assert!(noticed.iter().all(|(_, key)| Arc::ptr_eq(key, first)));
+    let is_shared =
+        |change: &Change| matches!(change, Change::Param(_, key) if Arc::ptr_eq(key, first));
+    let changes = activity.take_outbox().changes;
+    assert!(changes.len() == NOTICES && changes.iter().all(is_shared));
+}
