@@ -2,8 +2,8 @@
 
 use super::Config;
 
-/// Clients do not get these: census and letters open up to 192 at a time.
-const RESERVED: u64 = 192;
+/// Clients do not get these: census and letters open up to 320 at a time.
+const RESERVED: u64 = 320;
 /// Where there are few, clients get one in so many. The checkpoint, the connections to the master and
 /// its process take some 30 of the others; census and letters do with what is left, and try again.
 const SHARE: u64 = 4;
@@ -44,7 +44,7 @@ mod tests {
             (64, 16),
             (128, 32),
             (200, 50),
-            (1024, 832),
+            (1024, 704),
             (1 << 20, 10_000),
         ] {
             let mut config = config.clone();

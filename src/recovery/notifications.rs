@@ -7,6 +7,7 @@
 
 use std::{
     collections::{HashMap, VecDeque},
+    pin::pin,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -26,6 +27,10 @@ use crate::{
 
 /// Nodes that are notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
+/// Whoever takes longer makes room for the next one: a living node answers within a few milliseconds.
+const PROMPT: Duration = Duration::from_millis(10);
+/// Nodes beside those that are still waited for. The packets to some computer vanish, and it had many.
+const SLOW: usize = 128;
 /// A node that takes its notifications so much slower than they come gets the latest of each.
 const QUEUE_MAX: usize = 256;
 /// Pauses before a node that is to shut down and does not answer is asked again.
@@ -37,6 +42,7 @@ pub struct Notifications {
     /// What each address is still to be told; an entry for each that is being told something.
     pending: Mutex<HashMap<String, VecDeque<Notification>>>,
     permits: Semaphore,
+    slow: Semaphore,
 }
 
 impl Default for Notifications {
@@ -44,6 +50,7 @@ impl Default for Notifications {
         Self {
             pending: Mutex::default(),
             permits: Semaphore::new(AT_ONCE),
+            slow: Semaphore::new(SLOW),
         }
     }
 }
@@ -148,11 +155,17 @@ async fn deliver(proxy: Arc<Proxy>, api: String) {
                 .with_mirror(|mirror| compose(mirror, &api, &notification))
         };
         // Never closed.
-        let permit = notifications.permits.acquire().await;
+        let permit = notifications.permits.acquire().await.ok();
         let Some(call) = compose() else { continue };
         proxy.stats.notifications.count();
-        let sign = node::ask(&api, &call, proxy.config.census_timeout).await;
-        drop(permit);
+        let mut asked = pin!(node::ask(&api, &call, proxy.config.census_timeout));
+        let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
+            Ok(sign) => sign,
+            Err(_) => {
+                let _room = notifications.slow.try_acquire().ok().or(permit);
+                asked.await
+            }
+        };
         if sign != Sign::Alive {
             notifications.lock().remove(&api);
             proxy.nodes.suspect(&proxy, &api);
