@@ -215,7 +215,7 @@ fn displace(robot: &Robot) {
     ] {
         let name = format!("twin_{first:?}_{name}").to_lowercase();
         let remaps = [&*format!("__name:={name}"), "chatter:=/twins"];
-        let arguments = [HZ, "quiet", remaps[0], remaps[1]];
+        let arguments = [HZ, "quiet", "logged", remaps[0], remaps[1]];
         let mut displaced = robot.node(first, "talker", &arguments);
         let mut stays = robot.node(second, "talker", &arguments);
         displaced.wait();

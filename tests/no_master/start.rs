@@ -9,7 +9,8 @@ use std::{
 };
 
 use super::support::{
-    Client, FakeNode, Mode, NODES, Robot, Scratch, Setup, State, eventually, free_port, params,
+    Client, FakeNode, Mode, NODES, Robot, Scratch, Setup, State, eventually, eventually_some,
+    free_port, params,
 };
 
 /// A first answer takes no longer, from the moment at which the port is open: roslaunch and nodes find their
@@ -61,11 +62,13 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
 
         fs::remove_file(scratch.path("away")).unwrap();
         rescue.wait_serving();
-        eventually("rosout is at work", || {
-            State::try_read(&bare).is_ok_and(|state| state.knows("/rosout"))
+        let state = eventually_some("rosout is at work", || {
+            let state = State::try_read(&bare).ok()?;
+            (state.subscribers_of("/rosout") == ["/rosout"]).then_some(state)
         });
-        let state = State::read(&bare);
-        State::read(&client).assert_same(&state, "in the master");
+        eventually("the mirror is equal to the master", || {
+            State::read(&client) == State::read(&bare)
+        });
         assert_eq!(state.publishers_of("/chatter"), ["/early"]);
         assert_eq!(state.subscribers_of("/chatter"), ["/early_too"]);
         assert_eq!(bare.param("/early/gain"), Some(1.5.into()));
@@ -81,7 +84,7 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
     println!("getPid, and five registrations after it, from the open port: {times:?}");
     let (pid, all) = times[STARTS / 2];
     assert!(pid < AT_ONCE, "{times:?}");
-    assert!(all < 2 * AT_ONCE, "{times:?}");
+    assert!(all < 5 * AT_ONCE, "{times:?}");
 }
 
 /// The checkpoint of a session that goes on.

@@ -1,4 +1,7 @@
-// Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ [quiet]]
+// Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ [quiet [logged]]]
+//
+// `logged`: as if it had logged before. A roscpp node that is told to shut down logs that; if it is the first thing
+// that it logs it calls subscribeParam, and so takes its name back from whoever displaced it.
 //
 // A quiet one does not say what it has sent. Nothing is thrown away when a listener is slow.
 #include <cstdlib>
@@ -20,6 +23,9 @@ int main(int argc, char** argv)
   const double hz = argc > 1 ? std::atof(argv[1]) : 50.0;
   const bool quiet = argc > 2 && std::string(argv[2]) == "quiet";
   ros::NodeHandle node;
+  bool off = false;
+  if (argc > 3 && std::string(argv[3]) == "logged")
+    ros::param::getCached("/rosout_disable_topics_generation", off);
   publisher = node.advertise<std_msgs::String>("chatter", 0, on_link, on_link);
   say("ready " + ros::this_node::getName());
   ros::Rate rate(hz);
