@@ -1,4 +1,4 @@
-//! A client that makes the same call all the time.
+//! A client that calls all the time.
 
 use std::{
     sync::{
@@ -44,16 +44,19 @@ pub(crate) struct Caller {
 }
 
 impl Caller {
-    /// Starts one that sends `body` to `master`, on one connection for as long as it lasts.
-    pub(crate) fn start(master: Client, body: &[u8]) -> Self {
-        let request = http_request(body);
+    /// Starts one that sends to `master` what `call` makes of the number of the call, on one connection for
+    /// as long as it lasts.
+    pub(crate) fn start(master: Client, call: impl Fn(i32) -> Vec<u8> + Send + 'static) -> Self {
         let log = Arc::new(Mutex::new(Log::default()));
         let done = Arc::new(AtomicBool::new(false));
         let (theirs, end) = (log.clone(), done.clone());
         let thread = thread::spawn(move || {
             let mut wire = None;
-            while !end.load(Ordering::Relaxed) {
-                let answer = call(&master, &mut wire, &request);
+            for number in 0.. {
+                if end.load(Ordering::Relaxed) {
+                    return;
+                }
+                let answer = exchange(&master, &mut wire, &http_request(&call(number)));
                 let now = Instant::now();
                 let mut log = theirs.lock().expect("the log");
                 match answer {
@@ -104,7 +107,7 @@ impl Drop for Caller {
 }
 
 /// Whether the call was a success; nothing if it got no answer.
-fn call(master: &Client, wire: &mut Option<Wire>, request: &[u8]) -> Option<bool> {
+fn exchange(master: &Client, wire: &mut Option<Wire>, request: &[u8]) -> Option<bool> {
     if wire.is_none() {
         *wire = master.connect().ok();
     }

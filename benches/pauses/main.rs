@@ -1,9 +1,9 @@
 //! How long those who use the master wait when it dies: `cargo bench --bench pauses`.
 //!
-//! A client that reads a parameter all the time, one that registers a publisher all the time, and a stream
-//! of messages at 200 Hz, over many SIGKILLs of the master: under `rosrescue core`, behind `rosrescue proxy`
-//! with a rosmaster that is started again at once, and with such a rosmaster alone. What is measured how is said below
-//! the table.
+//! A client that reads a parameter all the time, one that sets a parameter all the time, and one that
+//! subscribes a parameter that is not set all the time, as loggers do; with many SIGKILLs of the master, and
+//! with a master that stays away; under `rosrescue core`, behind `rosrescue proxy` with a rosmaster that is
+//! started again at once, and with such a rosmaster alone. What is measured how is said below the tables.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,11 +17,12 @@ mod caller;
 mod shared;
 mod subject;
 
-use std::fmt::Write;
+use std::time::Duration;
 
 use clap::Args;
 
 use crate::{
+    caller::Seen,
     shared::machine,
     subject::{Kind, Subject, Window},
 };
@@ -33,8 +34,24 @@ const KILLS_A_LIFE: usize = 5;
 #[derive(Debug, Args)]
 struct Options {
     /// Kills for each line of the table
-    #[arg(long, value_name = "COUNT", default_value_t = 100)]
+    #[arg(
+        long,
+        env = "ROSRESCUE_KILLS",
+        value_name = "COUNT",
+        default_value_t = 100
+    )]
     kills: usize,
+    /// Nodes that are registered, with seven registrations each
+    #[arg(long, value_name = "COUNT", default_value_t = 80)]
+    nodes: usize,
+    /// For how long a master stays away; 0 for not at all
+    #[arg(
+        long,
+        env = "ROSRESCUE_AWAY_SECONDS",
+        value_name = "SECONDS",
+        default_value_t = 60
+    )]
+    away: u64,
     /// What to measure
     #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Kind::Core, Kind::Proxy, Kind::Bare])]
@@ -45,66 +62,144 @@ fn main() {
     let Some(options) = shared::options::<Options>("pauses") else {
         return;
     };
-    let mut lines = String::new();
-    for kind in options.kinds {
-        let (mut quiet, mut kills) = (Vec::new(), Vec::new());
-        while kills.len() < options.kills {
-            let mut subject = Subject::start(kind);
-            let life = match kind {
-                Kind::Core => KILLS_A_LIFE,
-                Kind::Proxy | Kind::Bare => usize::MAX,
-            };
-            for _ in 0..life.min(options.kills - kills.len()) {
-                quiet.push(subject.window(|_| {}));
-                let window = subject.window(Subject::kill_master);
-                eprintln!("{kind}: {window:.1?}");
-                kills.push(window);
-                subject.repair();
-            }
-        }
-        let forgotten = kills.iter().filter(|window| window.forgotten).count();
-        line(&mut lines, kind, "", &kills, &forgotten.to_string());
-        line(&mut lines, kind, ", nobody killed", &quiet, "–");
-    }
-    println!("{}, {} kills each.\n", machine::describe(), options.kills);
+    let lines: Vec<_> = options
+        .kinds
+        .iter()
+        .map(|kind| kills(*kind, &options))
+        .collect();
     println!(
-        "| | read | registration | stream at 200 Hz | calls without an answer | reads that said \
-         \"not set\" | kills after which the nodes are unknown |"
+        "{}, {} nodes, {} kills each.\n",
+        machine::describe(),
+        options.nodes,
+        options.kills
+    );
+    println!(
+        "| | read | write | write that changes nothing | bare injection | calls without an answer | answers that were no success |"
     );
     println!("|---|--:|--:|--:|--:|--:|--:|");
-    println!("{lines}");
+    println!("{}", lines.concat());
+    let guarded = options.kinds.iter().filter(|kind| **kind != Kind::Bare);
+    if options.away > 0 {
+        println!("Without a master for {} s:\n", options.away);
+        println!("| | read | write | write that changes nothing | a subscriber is notified |");
+        println!("|---|--:|--:|--:|--:|");
+        for kind in guarded.clone() {
+            println!("{}", outage(*kind, &options));
+        }
+        println!();
+    }
+    let deaths: Vec<_> = guarded.filter_map(|kind| deaths(*kind, &options)).collect();
+    if !deaths.is_empty() {
+        println!("rosrescue itself is killed:\n");
+        println!("| | read | write | write that changes nothing | calls without an answer |");
+        println!("|---|--:|--:|--:|--:|");
+        println!("{}\n", deaths.join("\n"));
+    }
     println!("{}", EXPLANATION.trim());
 }
 
 const EXPLANATION: &str = "
-Milliseconds, median (largest) over the kills.
+Milliseconds, median (largest) over the kills; without a master the largest.
 
-* *read*, *registration*: the longest time between two answers that a client got which calls `getParam` or `registerPublisher` all the time, a
-  millisecond after each answer, and again a millisecond after each failure. Any answer counts, a wrong one too.
-* *stream*: the longest time between two messages of a roscpp talker at a roscpp listener; 5 ms is none.
+* *read*, *write*, *write that changes nothing*: the longest time between two answers that a client got which calls `getParam`, `setParam` with
+  a new value, or `subscribeParam` of a parameter that is not set all the time, a millisecond after each answer, and again a millisecond
+  after each failure. Any answer counts, a wrong one too.
+* *bare injection*: one multicall that brings the same state to another rosmaster of the same kind, before each kill.
 * *calls without an answer*: refused or cut off. rospy's and roscpp's `getParam` fail then.
+* *a subscriber is notified*: from a `registerPublisher`, one a second, until a subscriber of the topic has its `publisherUpdate`: median (largest).
 * The rosmaster of `proxy` and the bare one are started again at once by the bench, and `core` does so itself.
 * *nobody killed*: the same in as many spans of half a second without a kill.
 ";
 
-/// One line of the table.
-fn line(lines: &mut String, kind: Kind, what: &str, windows: &[Window], forgotten: &str) {
-    let cell = |of: fn(&Window) -> f64| {
-        let mut times: Vec<_> = windows.iter().map(of).collect();
-        times.sort_by(f64::total_cmp);
-        let last = times.last().copied().unwrap_or(f64::NAN);
-        let median = times.get(times.len() / 2).copied().unwrap_or(f64::NAN);
-        format!("{median:.1} ({last:.1})")
+/// Median and largest.
+fn cell(times: impl IntoIterator<Item = f64>) -> String {
+    let mut times: Vec<_> = times.into_iter().collect();
+    times.sort_by(f64::total_cmp);
+    match (times.get(times.len() / 2), times.last()) {
+        (Some(median), Some(last)) => format!("{median:.1} ({last:.1})"),
+        _ => "–".to_owned(),
+    }
+}
+
+/// Two lines of the first table: with kills, and without.
+fn kills(kind: Kind, options: &Options) -> String {
+    let (mut quiet, mut kills, mut injections) = (Vec::new(), Vec::new(), Vec::new());
+    while kills.len() < options.kills {
+        let mut subject = Subject::start(kind, options.nodes);
+        let life = match kind {
+            Kind::Core => KILLS_A_LIFE,
+            Kind::Proxy => usize::MAX,
+            // Its nodes are unknown after one.
+            Kind::Bare => 1,
+        };
+        for _ in 0..life.min(options.kills - kills.len()) {
+            if kind != Kind::Bare {
+                injections.push(subject.bare_injection());
+            }
+            quiet.push(subject.window(|_| {}));
+            let window = subject.window(Subject::kill_master);
+            eprintln!(
+                "{kind}: read {:.1}, write {:.1}, write that changes nothing {:.1}, injection {:.1?}",
+                window.read.pause,
+                window.write.pause,
+                window.idle.pause,
+                injections.last()
+            );
+            kills.push(window);
+            subject.repair();
+        }
+    }
+    let line = |what: &str, windows: &[Window], injections: &[f64]| {
+        let count =
+            |of: fn(&Seen) -> usize| -> usize { windows.iter().flat_map(all).map(of).sum() };
+        format!(
+            "| {kind}{what} | {} | {} | {} | {} | {} | {} |\n",
+            cell(windows.iter().map(|window| window.read.pause)),
+            cell(windows.iter().map(|window| window.write.pause)),
+            cell(windows.iter().map(|window| window.idle.pause)),
+            cell(injections.iter().copied()),
+            count(|seen| seen.failed),
+            count(|seen| seen.refused),
+        )
     };
-    let sum = |of: fn(&Window) -> usize| windows.iter().map(of).sum::<usize>();
-    writeln!(
-        lines,
-        "| {kind}{what} | {} | {} | {} | {} | {} | {forgotten} |",
-        cell(|window| window.read),
-        cell(|window| window.registration),
-        cell(|window| window.stream),
-        sum(|window| window.failed),
-        sum(|window| window.unset),
+    line("", &kills, &injections) + &line(", nobody killed", &quiet, &[])
+}
+
+fn all(window: &Window) -> [&Seen; 3] {
+    [&window.read, &window.write, &window.idle]
+}
+
+/// A line of the second table.
+fn outage(kind: Kind, options: &Options) -> String {
+    let mut subject = Subject::start(kind, options.nodes);
+    let (window, notified) = subject.outage(Duration::from_secs(options.away));
+    let failed: usize = all(&window)
+        .map(|seen| seen.failed + seen.refused)
+        .iter()
+        .sum();
+    assert_eq!(failed, 0, "{window:?}");
+    format!(
+        "| {kind} | {:.1} | {:.1} | {:.1} | {} |",
+        window.read.pause,
+        window.write.pause,
+        window.idle.pause,
+        cell(notified)
     )
-    .expect("a string");
+}
+
+/// A line of the third table; none if nobody starts rosrescue again.
+fn deaths(kind: Kind, options: &Options) -> Option<String> {
+    let mut subject = Subject::start(kind, options.nodes);
+    let windows: Vec<_> = (0..KILLS_A_LIFE)
+        .map_while(|_| subject.kill_rosrescue())
+        .collect();
+    (!windows.is_empty()).then(|| {
+        let failed: usize = windows.iter().flat_map(all).map(|seen| seen.failed).sum();
+        format!(
+            "| {kind} | {} | {} | {} | {failed} |",
+            cell(windows.iter().map(|window| window.read.pause)),
+            cell(windows.iter().map(|window| window.write.pause)),
+            cell(windows.iter().map(|window| window.idle.pause)),
+        )
+    })
 }

@@ -1,25 +1,39 @@
-//! A master with clients and a stream, and what they see of its death.
+//! A master with nodes and clients, and what they see of its death.
 
 use std::{
-    fmt,
+    fmt, fs,
     thread::sleep,
     time::{Duration, Instant},
 };
 
 use clap::ValueEnum;
+use rustix::process::Signal;
 
 use crate::{
-    caller::Caller,
-    shared::support::{
-        Client, FakeNode, Library, Mode, Node, Robot, Rosmaster, Scratch, State, encode_call,
-        eventually, params,
+    caller::{Caller, Seen},
+    shared::{
+        injection::injection,
+        nodes,
+        second::SecondMaster,
+        support::{
+            Client, FakeNode, Mode, Robot, Rosmaster, Scratch, State, encode_call, eventually,
+            free_port, http_request, params, signal,
+        },
     },
 };
 
 /// A span in which pauses are looked for: longer than any recovery, which is waited for in any case.
 const SPAN: Duration = Duration::from_millis(500);
 /// What the reader reads.
-const PARAM: &str = "/pauses/value";
+const READ: &str = "/pauses/value";
+/// What the writer sets.
+const WRITTEN: &str = "/pauses/count";
+/// What a logger subscribes again and again: it is not set.
+const UNSET: &str = "/rosout_disable_topics_generation";
+/// A publisher registers so often while there is no master.
+const REGISTRATIONS: Duration = Duration::from_secs(1);
+/// How exactly it is known when a subscriber was notified.
+const LOOK: Duration = Duration::from_micros(200);
 
 /// Who is in charge of the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -42,18 +56,13 @@ impl fmt::Display for Kind {
     }
 }
 
-/// What was seen in one span. Times in milliseconds.
+/// What was seen in one span, by each client.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Window {
-    pub(crate) read: f64,
-    pub(crate) registration: f64,
-    pub(crate) stream: f64,
-    /// Calls that got no answer.
-    pub(crate) failed: usize,
-    /// Reads of a parameter that was set and is not any more.
-    pub(crate) unset: usize,
-    /// The nodes of the stream are unknown to the master.
-    pub(crate) forgotten: bool,
+    pub(crate) read: Seen,
+    pub(crate) write: Seen,
+    /// A write that changes nothing.
+    pub(crate) idle: Seen,
 }
 
 #[derive(Debug)]
@@ -65,8 +74,8 @@ enum Master {
 impl Master {
     fn start(kind: Kind) -> Self {
         match kind {
-            Kind::Core => Self::Guarded(Box::new(Robot::start(Mode::Core))),
-            Kind::Proxy => Self::Guarded(Box::new(Robot::start(Mode::Proxy))),
+            Kind::Core => Self::Guarded(Box::new(Robot::start_for_outages(Mode::Core))),
+            Kind::Proxy => Self::Guarded(Box::new(Robot::start_for_outages(Mode::Proxy))),
             Kind::Bare => {
                 let scratch = Scratch::new();
                 let master = Rosmaster::start(&scratch);
@@ -84,12 +93,10 @@ impl Master {
         }
     }
 
-    fn node(&self, node: &str, arguments: &[&str]) -> Node {
+    fn robot(&mut self) -> &mut Robot {
         match self {
-            Self::Guarded(robot) => robot.node(Library::Roscpp, node, arguments),
-            Self::Bare(scratch, _, port) => {
-                Node::start(scratch, Library::Roscpp, *port, node, arguments)
-            }
+            Self::Guarded(robot) => robot,
+            Self::Bare(..) => panic!("there is no rosrescue"),
         }
     }
 
@@ -98,8 +105,8 @@ impl Master {
         match self {
             Self::Guarded(robot) => {
                 let dead = robot.master_pid();
-                robot.kill_master();
-                robot.revive_master();
+                robot.kill_master_at_once(dead);
+                robot.revive_proxied_master();
                 robot.await_recovery(dead);
             }
             Self::Bare(scratch, master, port) => {
@@ -117,41 +124,35 @@ impl Master {
 pub(crate) struct Subject {
     // In the order of the drops.
     reader: Caller,
-    registrar: Caller,
-    /// Who the registrar registers: it answers when it is asked for a sign of life.
-    _node: FakeNode,
-    listener: Node,
-    talker: Node,
+    writer: Caller,
+    logger: Caller,
+    nodes: Vec<FakeNode>,
     master: Master,
     kind: Kind,
 }
 
 impl Subject {
-    pub(crate) fn start(kind: Kind) -> Self {
+    /// Starts one with so many nodes.
+    pub(crate) fn start(kind: Kind, count: usize) -> Self {
         let master = Master::start(kind);
         let client = master.client();
-        client.set_param(PARAM, 1);
-        let talker = master.node("talker", &["200", "quiet"]);
-        // It says its longest pause every tenth of a second.
-        let listener = master.node("listener", &["20"]);
-        listener.wait_messages("/talker", 3);
-        let node = FakeNode::start("/pauses");
-        node.claim_publication("/pauses/topic", Some("std_msgs/String"));
-        let topic = params![
-            "/pauses",
-            "/pauses/topic",
-            "std_msgs/String",
-            node.api.as_str()
-        ];
+        client.set_param(READ, 1);
+        let nodes = nodes::synthetic(&client, count);
+        let own = nodes[0].api.clone();
+        let name = nodes[0].name.clone();
+        let reader = |_| encode_call("getParam", params!["/pauses", READ]);
+        let writer = |number| encode_call("setParam", params!["/pauses", WRITTEN, number]);
+        let logger = move |_| {
+            encode_call(
+                "subscribeParam",
+                params![name.as_str(), own.as_str(), UNSET],
+            )
+        };
         Self {
-            reader: Caller::start(
-                client.clone(),
-                &encode_call("getParam", params!["/pauses", PARAM]),
-            ),
-            registrar: Caller::start(client, &encode_call("registerPublisher", topic)),
-            _node: node,
-            listener,
-            talker,
+            reader: Caller::start(client.clone(), reader),
+            writer: Caller::start(client.clone(), writer),
+            logger: Caller::start(client, logger),
+            nodes,
             master,
             kind,
         }
@@ -163,49 +164,107 @@ impl Subject {
 
     /// What the clients see while `event` takes place and for as long as it has consequences.
     pub(crate) fn window(&mut self, event: impl FnOnce(&mut Self)) -> Window {
-        let said = self.listener.said("pause").len();
         let begin = Instant::now();
         event(self);
         let after = Instant::now();
-        eventually("both clients are answered", || {
-            [&self.reader, &self.registrar]
+        eventually("all clients are answered", || {
+            [&self.reader, &self.writer, &self.logger]
                 .iter()
                 .all(|caller| caller.answered_since(after))
         });
         sleep(SPAN.saturating_sub(begin.elapsed()));
-        let (read, registered) = (
-            self.reader.seen_since(begin),
-            self.registrar.seen_since(begin),
-        );
-        // The line that is due next still tells of this span.
-        let now = self.listener.said("pause").len();
-        eventually("the stream flows", || {
-            self.listener.said("pause").len() > now
-        });
-        let pauses = self.listener.said("pause");
-        let pauses = pauses[said..].iter().map(|line| {
-            let ms = line.split(' ').nth(1).expect("a number");
-            ms.parse::<f64>().expect("a number")
-        });
-        let state = State::read(&self.master.client());
-        self.listener.assert_no_gap("/talker");
-        self.talker.assert_no_link_lost();
         Window {
-            read: read.pause,
-            registration: registered.pause,
-            stream: pauses.fold(0.0, f64::max),
-            failed: read.failed + registered.failed,
-            unset: read.refused,
-            forgotten: !["/talker", "/listener"]
-                .iter()
-                .all(|node| state.knows(node)),
+            read: self.reader.seen_since(begin),
+            write: self.writer.seen_since(begin),
+            idle: self.logger.seen_since(begin),
         }
     }
 
     /// Sets the parameter again where that is nobody else's duty.
     pub(crate) fn repair(&mut self) {
         if self.kind == Kind::Bare {
-            self.master.client().set_param(PARAM, 1);
+            self.master.client().set_param(READ, 1);
         }
     }
+
+    /// How long one compact multicall takes, in milliseconds, that brings the master's state to another
+    /// rosmaster, started in the same way. Nothing is looked at or compared.
+    pub(crate) fn bare_injection(&mut self) -> f64 {
+        let robot = self.master.robot();
+        let request = http_request(&injection(&robot.state()));
+        let port = free_port();
+        let log = robot.scratch.path("bare");
+        let mut command = SecondMaster::command(robot.master_pid(), port, &log);
+        let _master = SecondMaster::spawn(&mut command);
+        let client = Client::new(port);
+        eventually("a second rosmaster answers", || {
+            client.master_pid().is_some()
+        });
+        let mut wire = client.connect().expect("a connection");
+        let begin = Instant::now();
+        wire.send(&request).expect("a call");
+        wire.response().expect("an answer");
+        ms(begin.elapsed())
+    }
+
+    /// What the clients see while there is no master for `away`, and how many milliseconds after its
+    /// registration each publisher that registers meanwhile is known to a subscriber.
+    pub(crate) fn outage(&mut self, away: Duration) -> (Window, Vec<f64>) {
+        let client = self.master.client();
+        let subscriber = FakeNode::start("/pauses_subscriber");
+        let mut notified = Vec::new();
+        let dead = self.master.robot().master_pid();
+        let window = self.window(|subject| {
+            let robot = subject.master.robot();
+            robot.kill_master();
+            eventually("the mirror stands in", || !robot.is_open());
+            let end = Instant::now() + away;
+            for number in 0.. {
+                let next = Instant::now() + REGISTRATIONS;
+                if next > end {
+                    break;
+                }
+                let topic = format!("/pauses/topic_{number}");
+                subscriber.subscribe(&client, &topic, "std_msgs/String");
+                let publisher = &subject.nodes[number % subject.nodes.len()];
+                let begin = Instant::now();
+                publisher.publish(&client, &topic, "std_msgs/String");
+                while subscriber.updates(&topic).is_empty() {
+                    sleep(LOOK);
+                }
+                notified.push(ms(begin.elapsed()));
+                sleep(next.saturating_duration_since(Instant::now()));
+            }
+            sleep(end.saturating_duration_since(Instant::now()));
+        });
+        let robot = self.master.robot();
+        robot.revive_master();
+        robot.await_recovery(dead);
+        let (mirror, held) = (State::read(&robot.client()), robot.state());
+        let counted = mirror.with_params_of(&held);
+        counted.assert_same(&held, "after the outage");
+        (window, notified)
+    }
+
+    /// SIGKILL to the process of rosrescue that answers calls, if another one keeps its sockets: none
+    /// if there is no such process.
+    pub(crate) fn kill_rosrescue(&mut self) -> Option<Window> {
+        let guardian = self.master.robot().rescue.pid();
+        let worker = worker_of(guardian)?;
+        Some(self.window(|_| signal(worker, Signal::KILL)))
+    }
+}
+
+/// The child of `guardian` that is the same program.
+fn worker_of(guardian: u32) -> Option<u32> {
+    let program = |pid: u32| fs::read_link(format!("/proc/{pid}/exe")).ok();
+    let children = fs::read_to_string(format!("/proc/{guardian}/task/{guardian}/children")).ok()?;
+    let mut children = children
+        .split_whitespace()
+        .filter_map(|pid| pid.parse().ok());
+    children.find(|pid| program(*pid).is_some() && program(*pid) == program(guardian))
+}
+
+fn ms(duration: Duration) -> f64 {
+    duration.as_secs_f64() * 1e3
 }

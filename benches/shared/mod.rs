@@ -1,6 +1,10 @@
 //! What the benches share.
 
+#[allow(dead_code, reason = "not every bench compares with it")]
+pub(crate) mod injection;
 pub(crate) mod machine;
+#[allow(dead_code, reason = "not every bench has nodes")]
+pub(crate) mod nodes;
 #[allow(dead_code, reason = "not every bench compares with it")]
 pub(crate) mod second;
 

@@ -15,9 +15,12 @@ use rosrescue::{
 use rustix::process::Signal;
 use serde_json::Value as Json;
 
-use crate::shared::support::{
-    Client, FakeNode, NODES, Process, Rescue, Scratch, Setup, State, encode_call, eventually,
-    eventually_some, free_port, http_request, params, request, signal,
+use crate::shared::{
+    nodes::{synthetic, topics},
+    support::{
+        Client, FakeNode, NODES, Process, Rescue, Scratch, Setup, State, encode_call, eventually,
+        eventually_some, free_port, http_request, params, request, signal,
+    },
 };
 
 /// After a recovery every node is asked for a sign of life. That delays no call, but it would be in
@@ -192,32 +195,6 @@ impl Robot {
 
 fn number(json: &Json) -> f64 {
     json.as_f64().expect("a number")
-}
-
-/// Topics of node `number` of `count`, two that it publishes and two of its neighbour.
-fn topics(number: usize, count: usize) -> [[String; 2]; 2] {
-    let of = |number: usize| [1, 2].map(|topic| format!("/node_{number:03}/topic_{topic}"));
-    [of(number), of((number + 1) % count)]
-}
-
-fn synthetic(client: &Client, count: usize) -> Vec<FakeNode> {
-    let start = |number| {
-        let name = format!("/node_{number:03}");
-        let node = FakeNode::start(&name);
-        let [published, subscribed] = topics(number, count);
-        node.publish(client, "/rosout", "rosgraph_msgs/Log");
-        for service in ["get_loggers", "set_logger_level"] {
-            node.offer(client, &format!("{name}/{service}"));
-        }
-        for topic in published {
-            node.publish(client, &topic, "std_msgs/String");
-        }
-        for topic in subscribed {
-            node.subscribe(client, &topic, "std_msgs/String");
-        }
-        node
-    };
-    (0..count).map(start).collect()
 }
 
 /// Starts so many at a time that each gets on: a rospy node takes half a second of a core.

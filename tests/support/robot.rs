@@ -220,6 +220,14 @@ impl Robot {
         }
     }
 
+    /// A new master where that is the test's task: a core has begun to start one already.
+    #[track_caller]
+    pub(crate) fn revive_proxied_master(&mut self) {
+        if self.mode == Mode::Proxy {
+            self.revive_master();
+        }
+    }
+
     /// Waits until a master other than `dead` serves through rosrescue.
     #[track_caller]
     pub(crate) fn await_recovery(&self, dead: u32) {
