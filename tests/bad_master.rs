@@ -12,16 +12,13 @@
 mod support;
 
 use std::fs;
-use std::io::Write;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use flate2::Compression;
-use flate2::write::GzEncoder;
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
     Client, FakeMaster, FakeNode, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, State,
-    encode_call, eventually, holds, http_request, params, status,
+    encode_call, eventually, gzip, holds, http_request, params, status,
 };
 
 /// A master that is real but for calls that mention a word: those get the answer that is given.
@@ -98,9 +95,7 @@ fn with_status(status: &str, body: &[u8]) -> Vec<u8> {
 
 /// A gigabyte of zeros, packed, as the answer to a call.
 fn bomb() -> Vec<u8> {
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-    encoder.write_all(&vec![0; 16 << 20]).unwrap();
-    encoder.finish().unwrap().repeat(64)
+    gzip(&vec![0; 16 << 20]).repeat(64)
 }
 
 /// Calls of `/c` that change a master's state, and calls that do not, all of them poisoned. (`subscribeParam`

@@ -73,12 +73,6 @@ impl FirstLook {
         self.params.is_some()
     }
 
-    /// The same look, with parameters that were read otherwise.
-    pub fn with_params(mut self, params: Struct) -> Self {
-        self.params = Some(params);
-        self
-    }
-
     /// The look itself: one multicall of `getPid`, `lookupNode` of the token and its session, `getSystemState`,
     /// `getTopicTypes` and `getParam('/')`. Changes nothing.
     pub fn call(token: &Token) -> Call {

@@ -2,7 +2,7 @@
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`kind`] and [`accepted`]: what a call may do, and what of it a master has done.
-//! * [`Token`], [`FirstLook`] and [`Salvage`]: recognising a master, and learning the state of an
+//! * [`Token`] and [`FirstLook`]: recognising a master, and learning the state of an
 //!   unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
 //! * [`reconcile`]: what a master that was out of reach is to hold when it is reached again.
@@ -27,7 +27,6 @@ mod python;
 mod reconcile;
 mod registry;
 mod restore;
-mod salvage;
 mod snapshot;
 mod state;
 mod tell;
@@ -45,7 +44,6 @@ pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
 pub use plan::{Mismatch, Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
-pub use salvage::Salvage;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{is_plain_topic, param_update, publisher_update, registrant, shutdown};

@@ -126,10 +126,6 @@ impl Params {
         Ok(())
     }
 
-    pub(super) fn into_tree(self) -> Struct {
-        self.tree
-    }
-
     /// `delete_param` of a key with a trailing slash; none if the parameter is not set.
     pub(super) fn delete<'a>(
         &mut self,

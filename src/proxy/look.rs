@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use super::upstream::{CallError, Connection};
-use crate::master::{FirstLook, Master, NotAMaster, Salvage, Token};
+use crate::master::{FirstLook, Master, NotAMaster, Token};
 use crate::xmlrpc::Call;
 
 /// A look that showed nothing.
@@ -45,46 +45,20 @@ fn is_broken_document(error: &LookError) -> bool {
 
 /// The second look, and with it the state that the master holds.
 pub async fn second(
-    mut first: FirstLook,
+    first: FirstLook,
     connection: &mut Connection,
     previous: &Master,
 ) -> Result<Master, LookError> {
     if !first.has_params() {
-        first = salvage(first, connection, previous).await?;
+        tracing::warn!(
+            "the master holds a parameter that it can never return, and with it none of the others: \
+             the mirror keeps what it knows of them. Delete it, or set it to numbers of 32 bits and \
+             dates without markup"
+        );
     }
     let second = match first.second_call(previous) {
         Some(call) => Some(connection.call(&call).await?),
         None => None,
     };
     Ok(first.into_master(second.as_ref(), previous)?)
-}
-
-/// The look with the parameters of a master that holds one that it cannot return: each that can be
-/// read, and the others as they were.
-async fn salvage(
-    first: FirstLook,
-    connection: &mut Connection,
-    previous: &Master,
-) -> Result<FirstLook, LookError> {
-    let names = connection.call(&Salvage::names()).await?;
-    let Some(mut salvage) = Salvage::new(&names, previous.params()) else {
-        return Ok(first);
-    };
-    while let Some(call) = salvage.question() {
-        match connection.call(&call).await.map_err(LookError::from) {
-            Ok(reply) => salvage.take(Some(&reply)),
-            Err(error) if is_broken_document(&error) => salvage.take(None),
-            Err(error) => return Err(error),
-        }
-    }
-    let (params, unreadable) = salvage.finish();
-    if !unreadable.is_empty() {
-        tracing::warn!(
-            ?unreadable,
-            "the master holds parameters that it can never return; they are not protected, and neither \
-         they nor the namespaces around them can be read by anybody. Delete them, or set them to \
-         numbers of 32 bits and dates without markup"
-        );
-    }
-    Ok(first.with_params(params))
 }

@@ -46,10 +46,9 @@ fn launch_file() -> String {
 
 fn launched(state: &State) -> usize {
     let names = ["left", "right"].into_iter().flat_map(|group| {
-        let nodes = LIBRARIES
+        LIBRARIES
             .iter()
-            .flat_map(move |(_, suffix)| EACH.map(|node| format!("/{group}/{node}_{suffix}")));
-        nodes
+            .flat_map(move |(_, suffix)| EACH.map(|node| format!("/{group}/{node}_{suffix}")))
     });
     names.filter(|name| state.knows(name)).count()
 }
