@@ -72,6 +72,13 @@ impl Rx {
         }
     }
 
+    /// As [`Self::look`], and whether the state has changed since the last look or since
+    /// [`Self::changed`] returned.
+    pub fn look_changed(&mut self) -> (State, bool) {
+        let state = self.0.borrow_and_update();
+        (*state, state.has_changed())
+    }
+
     /// The state now, and the point from which [`Self::changed`] looks for changes.
     pub fn look(&mut self) -> State {
         *self.0.borrow_and_update()
@@ -106,6 +113,20 @@ impl Rx {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn a_look_tells_of_a_change_that_nobody_has_waited_for() {
+        let (tx, mut rx) = gate();
+        tx.set(State::StandingIn);
+        assert_eq!(rx.look_changed(), (State::StandingIn, true));
+        assert_eq!(rx.look_changed(), (State::StandingIn, false));
+        tx.set(State::Open { incarnation: 1 });
+        tx.set(State::StandingIn);
+        assert_eq!(rx.look_changed(), (State::StandingIn, true));
+        tx.set(State::Injecting);
+        rx.changed().await;
+        assert_eq!(rx.look_changed(), (State::Injecting, false));
+    }
 
     #[tokio::test(start_paused = true)]
     async fn the_count_starts_anew_after_an_opening() {

@@ -297,10 +297,12 @@ async fn write(
                 return Err(Closed("the master did not come back in time, see --hold"));
             }
             () = &mut patience, if patient => {
-                patient = false;
                 if !proxy.gate.is_open() {
+                    // It may open to a master that hangs.
+                    patience.as_mut().reset(tokio::time::Instant::now() + PATIENCE);
                     continue;
                 }
+                patient = false;
                 proxy.slow.notify_one();
                 let idle = call.filter(|call| master::is_answerable(call));
                 let answer = idle.and_then(|call| proxy.ledger.answer_idle(Instant::now(), call));

@@ -104,12 +104,13 @@ impl Worker {
         let mut gate = proxy.gate.clone();
         let mut resync = proxy.config.resync_interval.map(tokio::time::interval);
         loop {
+            let mut changed = false;
             tokio::select! {
                 item = self.items.recv() => match item {
                     Some(item) => self.queue.push_back(item),
                     None => return,
                 },
-                () = gate.changed() => (self.retry_at, self.lost) = (None, false),
+                () = gate.changed() => changed = true,
                 done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
                     // A look that takes longer than the interval must leave time for calls.
                     if matches!(done.result, Ok(Outcome::Held(_))) && let Some(resync) = &mut resync {
@@ -132,7 +133,12 @@ impl Worker {
             }
             // Answered already, or sent away.
             self.queue.retain(|item| !item.answer.is_closed());
-            match gate.look() {
+            // Whatever woke us: nobody is told of a change once it has been looked at.
+            let (state, unseen) = gate.look_changed();
+            if changed || unseen {
+                (self.retry_at, self.lost) = (None, false);
+            }
+            match state {
                 State::Open { incarnation } => self.send(&proxy, incarnation),
                 State::StandingIn => self.stand_in(&proxy),
                 State::Injecting | State::Unknown => self.grace = None,
