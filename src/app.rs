@@ -22,12 +22,12 @@ use crate::{
     config::{Config, MasterConfig},
     guardian::handover::Sockets,
     master::Master,
+    process::{ProcessError, Rosmaster},
     proxy::{
-        Proxy,
+        Proxy, checkpointer,
         clients::Clients,
         gate,
         idle::Idle,
-        keeper,
         ledger::Ledger,
         listener,
         pool::Pool,
@@ -36,11 +36,10 @@ use crate::{
         write_queue::{self, Worker},
     },
     record::Session,
-    recovery::{Guard, Nodes, core_duties, master_process::MasterProcess, nodes},
+    recovery::{Driver, Nodes, core_duties, master_process::MasterProcess, nodes},
     ros_env::MasterUri,
     session::{self, Decision, Evidence, Rebuilt},
     store::{self, OpenError, Store},
-    supervisor::{Rosmaster, SupervisorError},
     xmlrpc::Call,
 };
 
@@ -64,7 +63,7 @@ pub enum RunError {
     Checkpoint(OpenError),
     /// No master can be run.
     #[error(transparent)]
-    Supervisor(#[from] SupervisorError),
+    Supervisor(#[from] ProcessError),
     /// The master's address is our own.
     #[error(
         "--master {master} is this rosrescue itself: give the address of the real rosmaster, and \
@@ -193,8 +192,8 @@ pub async fn run(
         }
     });
     proxy.board.set_open(false);
-    let guard = Guard::new(proxy.clone(), gate_tx, process, restored);
-    let process = serve(&proxy, listeners, worker, guard, &halt, || {
+    let driver = Driver::new(proxy.clone(), gate_tx, process, restored);
+    let process = serve(&proxy, listeners, worker, driver, &halt, || {
         let counts = proxy.ledger.with_mirror(Master::counts);
         say(&format!("{story}: {counts}"));
         say("ROS Rescue enabled. Master is now fault tolerant!!");
@@ -212,7 +211,7 @@ async fn serve(
     proxy: &Arc<Proxy>,
     listeners: Vec<TcpListener>,
     worker: Worker,
-    guard: Guard,
+    driver: Driver,
     stop: &CancellationToken,
     announce: impl Fn(),
 ) -> Result<Option<MasterProcess>, RunError> {
@@ -230,9 +229,9 @@ async fn serve(
         ));
     }
     tasks.spawn(worker.run(proxy.clone()));
-    tasks.spawn(keeper::keep(proxy.clone(), stop.clone()));
+    tasks.spawn(checkpointer::run(proxy.clone(), stop.clone()));
     tasks.spawn(nodes::watch(proxy.clone()));
-    let mut guard = tokio::spawn(guard.run(stop.clone()));
+    let mut driver = tokio::spawn(driver.run(stop.clone()));
     let opening = async {
         proxy.board.first_opening().await;
         announce();
@@ -245,7 +244,7 @@ async fn serve(
         }
     };
     let process = tokio::select! {
-        process = &mut guard => match process {
+        process = &mut driver => match process {
             Ok(process) => process?,
             Err(panic) => std::panic::resume_unwind(panic.into_panic()),
         },

@@ -29,7 +29,7 @@ use signal_hook::{
 };
 use thiserror::Error;
 
-use crate::supervisor::signal_process;
+use crate::process::signal_process;
 
 pub mod handover;
 pub mod restart;

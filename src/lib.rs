@@ -6,9 +6,9 @@
 //! work goes out as values.
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
-//! * [`master`]: the Master API as a state machine, the look at a foreign master, the injection plan.
-//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts, which record masters
-//!   die of.
+//! * [`master`]: the Master API as a state machine, inspecting a foreign master, reconciling,
+//!   the injection plan.
+//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
 //! * [`census`]: what is to be made of what a node says of itself; who is suspect.
 //! * [`session`]: whether a checkpoint's session goes on.
 //! * [`record`]: the checkpoint's snapshot and records to and from bytes.
@@ -18,9 +18,9 @@
 //! * [`cli`], [`config`], [`ros_env`]: what is to be run, and what ROS's environment means.
 //! * [`store`]: the checkpoint on the disk.
 //! * [`guardian`]: the parent process that keeps the sockets and starts the worker again.
-//! * [`proxy`]: listener, door, gate, lane, pool, mirror.
-//! * [`recovery`]: watching the master, examining and injecting, census and healing.
-//! * [`supervisor`]: the processes of rosmaster and rosout.
+//! * [`proxy`]: listener, admission, gate, write queue, pool, ledger, checkpointer.
+//! * [`recovery`]: watching the master, reconciling and injecting, notifications, census.
+//! * [`process`]: the processes of rosmaster and rosout.
 //! * [`admin`]: the status page.
 //! * [`resolver`]: the addresses of hosts, by name servers that may not answer.
 //! * [`wait`]: waiting for what may not be there.
@@ -35,6 +35,7 @@ pub mod config;
 pub mod guardian;
 pub mod lifecycle;
 pub mod master;
+pub mod process;
 pub mod proxy;
 pub mod record;
 pub mod recovery;
@@ -42,6 +43,5 @@ pub mod resolver;
 pub mod ros_env;
 pub mod session;
 pub mod store;
-pub mod supervisor;
 pub mod wait;
 pub mod xmlrpc;

@@ -8,9 +8,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-mod words;
+mod types;
 
-pub use words::{Action, Cause, Input, Probing, Supervision};
+pub use types::{Action, Cause, Input, Probing, Supervision};
 
 /// Deaths older than this no longer count towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);

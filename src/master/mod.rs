@@ -2,7 +2,7 @@
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`kind`] and [`accepted`]: what a call may do, and what of it a master has done.
-//! * [`Token`] and [`FirstLook`]: recognising a master, and learning the state of an
+//! * [`Token`] and [`Inspection`]: recognising a master, and learning the state of an
 //!   unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
 //! * [`reconcile`]: what a master that was out of reach is to hold when it is reached again.
@@ -15,8 +15,8 @@ mod accepted;
 mod api;
 mod checks;
 mod difference;
+mod inspect;
 mod kind;
-mod look;
 mod methods;
 mod multicall;
 mod names;
@@ -38,8 +38,8 @@ mod updates;
 pub use accepted::{Accepted, Agreement, Answered, accepted, is_success};
 pub use api::Outcome;
 pub use difference::difference;
+pub use inspect::{Inspection, NotAMaster};
 pub use kind::{Kind, is_answerable, kind, writes};
-pub use look::{FirstLook, NotAMaster};
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
 pub use plan::{Mismatch, Plan, Skipped};

@@ -4,7 +4,7 @@ use std::fmt;
 
 use bytes::Bytes;
 
-use super::look::lookup;
+use super::inspect::lookup;
 use super::restore::{self, Restore};
 use super::{CALLER_ID, Master, Token, multicall, python};
 use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};

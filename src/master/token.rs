@@ -36,7 +36,7 @@ pub enum Bears {
 
 impl Token {
     /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII
-    /// letters, digits and `-` become `_`.
+    /// notifications, digits and `-` become `_`.
     pub fn new(id: &str, number: u64) -> Self {
         let safe = |c: char| {
             if c.is_ascii_alphanumeric() || c == '-' {

@@ -81,7 +81,7 @@ pub struct Outbox {
 /// When a node's registrations last changed, as numbers that grow with every call: equal numbers
 /// mean that nothing came between.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Deeds {
+pub struct LastCalls {
     /// It registered something.
     pub registered: u64,
     /// Something of it was unregistered.
@@ -111,8 +111,8 @@ pub struct Activity {
     topics: IndexMap<String, Noted>,
     /// By address and key.
     params: IndexMap<(String, Arc<str>), Noted>,
-    deeds: HashMap<String, Deeds>,
-    /// Nodes that are no more are forgotten when `deeds` is longer than this.
+    last_calls: HashMap<String, LastCalls>,
+    /// Nodes that are no more are forgotten when `last_calls` is longer than this.
     prune_at: usize,
     pids: HashMap<String, Pid>,
     /// Nodes that registered and have not been asked for their process id since, and when.
@@ -177,7 +177,7 @@ impl Activity {
         registered: impl Fn(&str) -> bool,
     ) -> bool {
         self.note(now, call, LEVELS);
-        if self.deeds.len() > self.prune_at.max(NODES) {
+        if self.last_calls.len() > self.prune_at.max(NODES) {
             self.prune(registered);
         }
         let standing_in = noticed.calls.is_some();
@@ -251,12 +251,15 @@ impl Activity {
         };
         self.count += 1;
         if master::registrant(call).is_some() {
-            self.deeds.entry(caller.to_owned()).or_default().registered = self.count;
+            self.last_calls
+                .entry(caller.to_owned())
+                .or_default()
+                .registered = self.count;
             if self.strangers.len() < NOTICES {
                 self.strangers.insert(caller.to_owned(), now);
             }
         } else if call.method.starts_with("un") {
-            self.deeds
+            self.last_calls
                 .entry(caller.to_owned())
                 .or_default()
                 .unregistered = self.count;
@@ -264,15 +267,15 @@ impl Activity {
     }
 
     fn prune(&mut self, registered: impl Fn(&str) -> bool) {
-        self.deeds.retain(|node, _| registered(node));
+        self.last_calls.retain(|node, _| registered(node));
         self.pids.retain(|node, _| registered(node));
         self.strangers.retain(|node, _| registered(node));
-        self.prune_at = 2 * self.deeds.len();
+        self.prune_at = 2 * self.last_calls.len();
     }
 
     /// When the registrations of `node` last changed.
-    pub fn deeds(&self, node: &str) -> Deeds {
-        self.deeds.get(node).copied().unwrap_or_default()
+    pub fn last_calls(&self, node: &str) -> LastCalls {
+        self.last_calls.get(node).copied().unwrap_or_default()
     }
 
     /// Changes so shortly before `now`, or since, that a master which died then may not have told
@@ -345,7 +348,7 @@ impl Activity {
     /// `pid` is behind `api`, at which `node` is registered, and was asked for after the deed that
     /// `registered` numbers.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
-        if self.deeds(node).registered == registered {
+        if self.last_calls(node).registered == registered {
             self.strangers.shift_remove(node);
             let api = api.to_owned();
             let pid = Pid {
@@ -361,7 +364,7 @@ impl Activity {
     /// has registered something since: a process that takes an old port under the same name does.
     pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
         let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
-        Some((pid.pid, pid.registered != self.deeds(node).registered))
+        Some((pid.pid, pid.registered != self.last_calls(node).registered))
     }
 
     /// Nodes that last registered something at `before` or earlier, and have not been asked for

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use tokio::sync::oneshot;
 
 use super::{
-    activity::Deeds,
+    activity::LastCalls,
     upstream::{Head, RawReply},
 };
 use crate::{
@@ -46,22 +46,22 @@ pub struct Item {
     pub condition: Option<Condition>,
 }
 
-/// A node and its last deeds, as they were when it was found out that something is to be registered or
+/// A node and its last last_calls, as they were when it was found out that something is to be registered or
 /// unregistered for it. A node that does the contrary itself meanwhile knows better.
 #[derive(Clone, Debug)]
 pub struct Condition {
     /// The node.
     pub node: String,
-    /// Its last deeds then.
-    pub deeds: Deeds,
+    /// Its last last_calls then.
+    pub last_calls: LastCalls,
 }
 
 impl Condition {
-    /// Whether it still holds for a call of this kind, now that these are the node's last deeds.
-    pub fn holds(&self, kind: Kind, now: Deeds) -> bool {
+    /// Whether it still holds for a call of this kind, now that these are the node's last last_calls.
+    pub fn holds(&self, kind: Kind, now: LastCalls) -> bool {
         match kind {
-            Kind::Unregister => self.deeds.registered == now.registered,
-            _ => self.deeds.unregistered == now.unregistered,
+            Kind::Unregister => self.last_calls.registered == now.registered,
+            _ => self.last_calls.unregistered == now.unregistered,
         }
     }
 }

@@ -19,7 +19,7 @@ use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use super::{
     Proxy,
-    pace::{Pace, Paced},
+    deadlines::{Deadlines, Timed},
     service,
 };
 
@@ -166,18 +166,23 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
     let clients = proxy.clone();
     let _present = clients.clients.enter(peer);
-    let pace = Pace::default();
+    let deadlines = Deadlines::default();
     let close = Arc::new(Notify::new());
-    let paced = Paced::new(stream, pace.clone(), &clients.idle, close.clone());
+    let timed = Timed::new(stream, deadlines.clone(), &clients.idle, close.clone());
     let service = |request| {
         // On the heap: idle connections do not keep space for it.
-        Box::pin(service::serve(proxy.clone(), peer, pace.clone(), request))
+        Box::pin(service::serve(
+            proxy.clone(),
+            peer,
+            deadlines.clone(),
+            request,
+        ))
     };
     let connection = hyper::server::conn::http1::Builder::new()
         .title_case_headers(true)
         .half_close(true)
         .max_buf_size(BUFFER)
-        .serve_connection(TokioIo::new(paced), service_fn(service));
+        .serve_connection(TokioIo::new(timed), service_fn(service));
     let mut connection = std::pin::pin!(connection);
     let ended = loop {
         tokio::select! {
@@ -185,7 +190,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: Can
             biased;
             ended = &mut connection => break ended,
             () = close.notified() => {
-                if pace.is_idle() {
+                if deadlines.is_idle() {
                     tracing::debug!(%peer, "closed, having been idle for longest");
                     return;
                 }

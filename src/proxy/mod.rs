@@ -1,17 +1,17 @@
-//! Between the nodes and the master: listener, door, gate, write queue, pool, ledger.
+//! Between the nodes and the master: listener, admission, gate, write queue, pool, ledger.
 
 pub mod activity;
+pub mod admission;
 pub mod batch;
 pub mod body;
+pub mod checkpointer;
 pub mod clients;
-pub mod door;
+pub mod deadlines;
 pub mod gate;
 pub mod idle;
-pub mod keeper;
+pub mod inspect;
 pub mod ledger;
 pub mod listener;
-pub mod look;
-pub mod pace;
 pub mod pool;
 pub mod service;
 pub(crate) mod sockets;
@@ -31,7 +31,7 @@ pub struct Proxy {
     pub config: Config,
     /// What others use as `ROS_MASTER_URI`.
     pub uri: String,
-    /// Names of this computer, for the door.
+    /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
     /// Tells this process from every other; see [`upstream::INSTANCE_HEADER`].
     pub instance: String,

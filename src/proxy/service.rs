@@ -18,11 +18,11 @@ use tokio::sync::oneshot;
 
 use super::{
     Proxy,
+    admission::{self, Refusal},
     batch::{self, Answer, Item},
     body::{self, BodyError, Room},
-    door::{self, Refusal},
+    deadlines::Deadlines,
     gate::State,
-    pace::Pace,
     pool,
     upstream::{Head, INSTANCE_HEADER, RawReply},
 };
@@ -56,12 +56,12 @@ const UNDECODED: &str = "rosrescue cannot decode this request, and takes such fr
 pub async fn serve(
     proxy: Arc<Proxy>,
     peer: SocketAddr,
-    pace: Pace,
+    deadlines: Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
-    pace.serving();
+    deadlines.serving();
     let reply = route(proxy, peer, request).await;
-    pace.replying();
+    deadlines.replying();
     reply
 }
 
@@ -71,10 +71,12 @@ async fn route(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
-        Method::GET => Ok(match door::check_host(request.headers(), &proxy.names) {
-            Ok(()) => admin::page(&proxy, request.uri().path()),
-            Err(refusal) => refuse(&proxy, peer, &refusal),
-        }),
+        Method::GET => Ok(
+            match admission::check_host(request.headers(), &proxy.names) {
+                Ok(()) => admin::page(&proxy, request.uri().path()),
+                Err(refusal) => refuse(&proxy, peer, &refusal),
+            },
+        ),
         Method::POST => post(proxy, peer, request).await,
         ref method => Ok(text(
             StatusCode::NOT_IMPLEMENTED,
@@ -99,7 +101,7 @@ async fn post(
             "this is rosrescue itself\n".to_owned(),
         ));
     }
-    if let Err(refusal) = door::check_post(request.headers(), &proxy.names) {
+    if let Err(refusal) = admission::check_post(request.headers(), &proxy.names) {
         return Ok(refuse(&proxy, peer, &refusal));
     }
     let head = Head {
@@ -145,7 +147,7 @@ async fn post(
         tracing::debug!(%peer, method = call.method, caller_id, "call");
     } else {
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
-        if !door::may_shut_down(peer.ip()) {
+        if !admission::may_shut_down(peer.ip()) {
             proxy.stats.refused.count();
             tracing::warn!(%peer, "refused a request of another computer that cannot be decoded");
             return Ok(xml(&Reply::Fault {
@@ -171,13 +173,13 @@ async fn answer(
             let reply = proxy.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
             Ok(xml(&reply))
         }
-        (_, Kind::Shutdown) if !door::may_shut_down(peer.ip()) => {
+        (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
             tracing::warn!(%peer, "refused to shut the master down for another computer");
             Ok(no_shutdown(
                 "shutdown is taken from the master's own computer only",
             ))
         }
-        (Some(call), Kind::Shutdown) if door::is_for_a_node(call) => {
+        (Some(call), Kind::Shutdown) if admission::is_for_a_node(call) => {
             tracing::warn!(%peer, "refused to shut down for a node that is registered at our address");
             Ok(no_shutdown("this is the master, and no node"))
         }

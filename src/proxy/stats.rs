@@ -42,7 +42,7 @@ pub struct Stats {
     pub undecoded: Counter,
     /// Replies in which the mirror and the master differed.
     pub divergences: Counter,
-    /// Requests that were turned away at the door.
+    /// Requests refused by the checks on their head.
     pub refused: Counter,
     /// Masters that were brought to the mirror's state.
     pub injections: Counter,
@@ -90,7 +90,7 @@ impl Stats {
             ),
             (
                 "refused",
-                "requests turned away at the door",
+                "requests refused by the checks on their head",
                 self.refused.value(),
             ),
             (

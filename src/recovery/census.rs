@@ -160,7 +160,7 @@ pub(super) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<N
             node: node.to_owned(),
             known_pid: pid.map(|(pid, _)| pid),
             registered_since: pid.is_some_and(|(_, since)| since),
-            registered: activity.deeds(node).registered,
+            registered: activity.last_calls(node).registered,
         }
     });
     names.collect()
@@ -246,7 +246,7 @@ impl Drop for Waiting {
     }
 }
 
-/// The names at a port before the question, with the numbers of their last deeds.
+/// The names at a port before the question, with the numbers of their last last_calls.
 struct Asked {
     names: Vec<Name>,
     unregistered: Vec<u64>,
@@ -263,9 +263,9 @@ impl Asked {
     fn new(proxy: &Proxy, api: &str) -> Self {
         proxy.ledger.with_activity(|mirror, activity| {
             let names = names_at(mirror, activity, api);
-            let last = names.iter().map(|name| activity.deeds(&name.node));
+            let last = names.iter().map(|name| activity.last_calls(&name.node));
             Self {
-                unregistered: last.map(|deeds| deeds.unregistered).collect(),
+                unregistered: last.map(|last_calls| last_calls.unregistered).collect(),
                 names,
             }
         })
@@ -279,8 +279,10 @@ impl Asked {
             let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
             let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
             for ((name, unregistered), verdict) in judged {
-                let deeds = activity.deeds(&name.node);
-                if mirror.api_of(&name.node) != Some(api) || deeds.registered != name.registered {
+                let last_calls = activity.last_calls(&name.node);
+                if mirror.api_of(&name.node) != Some(api)
+                    || last_calls.registered != name.registered
+                {
                     continue;
                 }
                 if verdict == Verdict::Stranger {
@@ -294,12 +296,12 @@ impl Asked {
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
-                    && deeds.unregistered == *unregistered
+                    && last_calls.unregistered == *unregistered
                 {
                     let mending = Mending::new(mirror, &name.node, claims);
                     let condition = Condition {
                         node: name.node.clone(),
-                        deeds,
+                        last_calls,
                     };
                     findings.mendings.push((condition, verdict, mending));
                 }
@@ -387,15 +389,16 @@ async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
     // What it has on its way to the master comes first.
     barrier(proxy).await;
     let found = proxy.ledger.with_activity(|mirror, activity| {
-        let deeds = activity.deeds(&name.node);
-        let same = mirror.api_of(&name.node) == Some(api) && deeds.registered == name.registered;
-        same.then(|| (mirror.unregister_calls(&name.node), deeds))
+        let last_calls = activity.last_calls(&name.node);
+        let same =
+            mirror.api_of(&name.node) == Some(api) && last_calls.registered == name.registered;
+        same.then(|| (mirror.unregister_calls(&name.node), last_calls))
     });
-    let Some((calls, deeds)) = found.filter(|(calls, _)| !calls.is_empty()) else {
+    let Some((calls, last_calls)) = found.filter(|(calls, _)| !calls.is_empty()) else {
         return false;
     };
     let node = name.node.clone();
-    let (call, condition) = (Call::multicall(calls), Condition { node, deeds });
+    let (call, condition) = (Call::multicall(calls), Condition { node, last_calls });
     let reply = proxy
         .write_queue
         .call_if(call, Kind::Unregister, condition)

@@ -10,8 +10,8 @@ use tokio_util::sync::CancellationToken;
 use super::node::{self, Sign};
 use crate::{
     master::Kind,
+    process::{self, Rosout},
     proxy::Proxy,
-    supervisor::{self, Rosout},
     xmlrpc::{Call, Reply, Value},
 };
 
@@ -90,7 +90,7 @@ async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
     if has(proxy, key) {
         return None;
     }
-    let version = supervisor::output_of("rosversion", &[argument], VERSION_TIME).await;
+    let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
     if version.is_none() {
         tracing::warn!(key, "not set: `rosversion {argument}` gave no answer");
     }
@@ -109,7 +109,7 @@ async fn keep_rosout(proxy: &Proxy) {
         match living_rosout(proxy).await.or_else(|| rosout.left_behind()) {
             Some(pid) => {
                 proxy.rosout.store(pid, Ordering::Relaxed);
-                while supervisor::is_alive(pid) {
+                while process::is_alive(pid) {
                     tokio::time::sleep(RESPAWN).await;
                 }
             }
@@ -118,7 +118,7 @@ async fn keep_rosout(proxy: &Proxy) {
                     let pid = child.id().unwrap_or_default();
                     proxy.rosout.store(pid, Ordering::Relaxed);
                     tracing::info!(pid, "started rosout");
-                    let how = child.wait().await.map(supervisor::describe);
+                    let how = child.wait().await.map(process::describe);
                     let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
                     tracing::warn!(pid, how, last_words, "rosout has ended");
                 }
@@ -159,12 +159,12 @@ async fn end_rosout(proxy: &Proxy) {
     let Some(pid) = pid else { return };
     // A process that has just been started has no command line for a moment.
     let named = async {
-        while supervisor::is_alive(pid) && !supervisor::runs(pid, "rosout") {
+        while process::is_alive(pid) && !process::runs(pid, "rosout") {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
     let _ = tokio::time::timeout(STARTED, named).await;
-    if supervisor::runs(pid, "rosout") {
-        supervisor::stop(pid, || !supervisor::runs(pid, "rosout")).await;
+    if process::runs(pid, "rosout") {
+        process::stop(pid, || !process::runs(pid, "rosout")).await;
     }
 }

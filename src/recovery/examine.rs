@@ -12,16 +12,16 @@ use std::{
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::{beside, report::Outcome};
+use super::{report::Outcome, stall_probe};
 use crate::{
     config::MasterConfig,
     lifecycle::Input,
-    master::{self, Authority, Bears, Counts, FirstLook, Master, Plan, Token},
+    master::{self, Authority, Bears, Counts, Inspection, Master, Plan, Token},
     proxy::{
         Proxy,
         gate::{State, Tx},
+        inspect::{self, InspectError},
         ledger::Basis,
-        look::{self, LookError},
         sockets,
         upstream::{CallError, Connection},
     },
@@ -49,7 +49,7 @@ pub enum ExamineError {
     },
     /// A call of ours failed, or what answers is no master.
     #[error(transparent)]
-    Look(#[from] LookError),
+    Look(#[from] InspectError),
 }
 
 impl From<CallError> for ExamineError {
@@ -63,7 +63,7 @@ impl ExamineError {
     pub fn as_input(&self) -> Input {
         match self {
             Self::Silent { .. } => Input::Unreachable,
-            Self::Look(LookError::Call(
+            Self::Look(InspectError::Call(
                 CallError::NotSent(error) | CallError::MaybeSent(error),
             )) if !error.is_parse() => Input::ConnectionLost,
             Self::Look(_) => Input::NotAMaster,
@@ -152,11 +152,11 @@ pub async fn examine(
     let start = Instant::now();
     let served = matches!(manner.known, Known::ServedIfPresent);
     // Every call that it was sent has been answered, or it is not the one.
-    let resumes = |first: &FirstLook| {
+    let resumes = |first: &Inspection| {
         served && first.bears() == Bears::Present && proxy.ledger.pending() == 0
     };
     let mut first = match manner.known {
-        Known::New { pid } => FirstLook::at_new(pid),
+        Known::New { pid } => Inspection::at_new(pid),
         _ => first_look(proxy, connection).await?,
     };
     if !matches!(manner.known, Known::New { .. }) && !resumes(&first) {
@@ -234,7 +234,7 @@ async fn inject(
     proxy: &Arc<Proxy>,
     tx: &Tx,
     connection: &mut Connection,
-    first: FirstLook,
+    first: Inspection,
     manner: Manner,
     start: Instant,
     examination: &mut Examination,
@@ -253,7 +253,7 @@ async fn inject(
                 Bears::Nothing => Master::default(),
                 _ => proxy.ledger.may_hold(),
             };
-            while_alive(proxy, look::second(first, connection, &previous)).await?
+            while_alive(proxy, inspect::second(first, connection, &previous)).await?
         }
     };
     examination.look = start.elapsed();
@@ -389,7 +389,7 @@ async fn bring(
         );
         // The truth of the master wins over what we expected of it; the rest is tried again.
         let first = first_look(proxy, connection).await?;
-        let found = look::second(first, connection, plan.expected());
+        let found = inspect::second(first, connection, plan.expected());
         let found = while_alive(proxy, found).await?;
         let plan = Plan::new(state, &found, token);
         next = Prepared {
@@ -404,8 +404,11 @@ async fn bring(
     Ok(())
 }
 
-async fn first_look(proxy: &Proxy, connection: &mut Connection) -> Result<FirstLook, ExamineError> {
-    while_alive(proxy, look::first(connection, &proxy.ledger.token())).await
+async fn first_look(
+    proxy: &Proxy,
+    connection: &mut Connection,
+) -> Result<Inspection, ExamineError> {
+    while_alive(proxy, inspect::first(connection, &proxy.ledger.token())).await
 }
 
 /// Waits for what may take long, as long as the master shows signs of life.
@@ -415,7 +418,7 @@ async fn while_alive<T, E: Into<ExamineError>>(
 ) -> Result<T, ExamineError> {
     tokio::select! {
         done = within(INJECTION_LIMIT, work) => done,
-        limit = beside::silence(proxy) => Err(ExamineError::Silent { limit }),
+        limit = stall_probe::silence(proxy) => Err(ExamineError::Silent { limit }),
     }
 }
 

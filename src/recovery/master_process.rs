@@ -4,9 +4,9 @@ use tokio::sync::mpsc;
 
 use crate::{
     lifecycle::Input,
+    process::{self, ProcessError, Rosmaster},
     proxy::Proxy,
     ros_env::MasterUri,
-    supervisor::{self, Rosmaster, SupervisorError},
 };
 
 /// A child's process id, and how it ended.
@@ -43,7 +43,7 @@ impl MasterProcess {
         if let (Some(pid), Some(port)) = (left, port) {
             tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
             this.watch(pid, async move {
-                supervisor::ended(pid).await;
+                process::ended(pid).await;
                 "it was no child of this rosrescue".to_owned()
             });
         }
@@ -65,7 +65,7 @@ impl MasterProcess {
     }
 
     /// Starts a master and tells `proxy` where it is.
-    pub fn spawn(&mut self, proxy: &Proxy) -> Result<(), SupervisorError> {
+    pub fn spawn(&mut self, proxy: &Proxy) -> Result<(), ProcessError> {
         let port = self.rosmaster.choose_port(self.port)?;
         let address = MasterUri {
             host: "127.0.0.1".to_owned(),
@@ -84,7 +84,7 @@ impl MasterProcess {
         tracing::info!(pid, port, "started rosmaster");
         self.watch(pid, async move {
             match child.wait().await {
-                Ok(status) => supervisor::describe(status),
+                Ok(status) => process::describe(status),
                 Err(error) => error.to_string(),
             }
         });
@@ -133,7 +133,7 @@ impl MasterProcess {
         // holds but for the moment between the two.
         if let Some(pid) = self.current {
             tracing::warn!(pid, "killing the master");
-            supervisor::signal_process(pid, rustix::process::Signal::KILL);
+            process::signal_process(pid, rustix::process::Signal::KILL);
         }
     }
 
@@ -141,7 +141,7 @@ impl MasterProcess {
     pub async fn stop(mut self) {
         let Some(pid) = self.current else { return };
         let ends = &mut self.ends.1;
-        supervisor::stop(pid, || ends.try_recv().is_ok_and(|(ended, _)| ended == pid)).await;
+        process::stop(pid, || ends.try_recv().is_ok_and(|(ended, _)| ended == pid)).await;
     }
 
     /// The end of what the last master wrote.

@@ -1,16 +1,16 @@
 //! Watches the master and brings it back: the shell around [`crate::lifecycle`].
 
-mod beside;
 pub mod census;
 pub mod core_duties;
-mod early_end;
 pub mod examine;
 pub mod master_process;
 pub mod node;
 pub mod nodes;
 pub mod notifications;
 pub mod report;
-mod saying;
+mod reporting;
+mod stall_probe;
+mod thread_exit;
 
 pub use nodes::Nodes;
 
@@ -33,13 +33,13 @@ use self::{
 };
 use crate::{
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    process::{self, ProcessError},
     proxy::{
         Proxy,
         gate::{State, Tx},
         pool::{VerifyError, connect_verified},
         upstream::{ConnectError, Connection},
     },
-    supervisor::{self, SupervisorError},
     wait,
 };
 
@@ -55,7 +55,7 @@ type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Carries out what the lifecycle decides.
-pub struct Guard {
+pub struct Driver {
     proxy: Arc<Proxy>,
     gate: Tx,
     lifecycle: Lifecycle,
@@ -80,8 +80,8 @@ pub struct Guard {
     said: Option<(String, Instant)>,
 }
 
-impl Guard {
-    /// A guard for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
+impl Driver {
+    /// A driver for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
     /// mirror comes from a checkpoint whose session goes on.
     pub fn new(
         proxy: Arc<Proxy>,
@@ -120,7 +120,7 @@ impl Guard {
     pub async fn run(
         mut self,
         stop: CancellationToken,
-    ) -> Result<Option<MasterProcess>, SupervisorError> {
+    ) -> Result<Option<MasterProcess>, ProcessError> {
         if self.known {
             self.keep_shut();
         }
@@ -198,7 +198,7 @@ impl Guard {
         }
     }
 
-    fn carry_out(&mut self, action: Action) -> Result<(), SupervisorError> {
+    fn carry_out(&mut self, action: Action) -> Result<(), ProcessError> {
         match action {
             Action::Connect => {
                 self.disconnect();
@@ -398,7 +398,7 @@ impl Guard {
         self.served.is_none() && !self.restored
     }
 
-    fn spawn(&mut self) -> Result<(), SupervisorError> {
+    fn spawn(&mut self) -> Result<(), ProcessError> {
         // There is nothing to protect yet: better to say what is wrong than to try for ever.
         let is_fatal = self.begins() && self.proxy.ledger.pending() == 0;
         let Some(process) = &mut self.process else {
@@ -418,9 +418,9 @@ impl Guard {
 
 /// The end of a thread of the master `pid`, if it is on this computer and the kernel can tell.
 fn thread_of(connection: &Connection, pid: i32) -> Option<Ended> {
-    let is_master = |pid| connection.is_local() && supervisor::runs(pid, "rosmaster");
+    let is_master = |pid| connection.is_local() && process::runs(pid, "rosmaster");
     u32::try_from(pid).ok().filter(|pid| is_master(*pid))?;
-    let ended = early_end::of(pid).ok()?;
+    let ended = thread_exit::of(pid).ok()?;
     Some(Box::pin(ended))
 }
 

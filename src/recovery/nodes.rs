@@ -257,7 +257,7 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
         let new = activity.take_strangers(before).into_iter();
         let new = new.filter_map(|name| {
             let api = mirror.api_of(&name)?.to_owned();
-            let registered = activity.deeds(&name).registered;
+            let registered = activity.last_calls(&name).registered;
             Some((name, api, registered))
         });
         new.collect::<Vec<_>>()

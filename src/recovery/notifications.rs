@@ -74,9 +74,9 @@ pub fn tell_subscribers(proxy: &Arc<Proxy>, topic: &str) -> bool {
 
 /// Tells the node at `api` of every topic and every parameter that it subscribes.
 pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
-    let letters = proxy.ledger.with_mirror(|mirror| {
+    let notifications = proxy.ledger.with_mirror(|mirror| {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
-        let letters = names.flat_map(|(name, _)| {
+        let notifications = names.flat_map(|(name, _)| {
             let topics = mirror.subscriptions(name).map(str::to_owned);
             // What is not set, and may never have been, is no news.
             let keys = mirror.param_subscriptions(name);
@@ -85,9 +85,9 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
                 .map(Notification::Topic)
                 .chain(keys.map(Notification::Param))
         });
-        letters.collect::<Vec<_>>()
+        notifications.collect::<Vec<_>>()
     });
-    for letter in letters {
+    for letter in notifications {
         send(proxy, api, letter);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{FirstLook, Master, Plan, Skipped, Token, is_answerable};
+use rosrescue::master::{Inspection, Master, Plan, Skipped, Token, is_answerable};
 use rosrescue::xmlrpc::Call;
 use rustix::process::Signal;
 
@@ -95,8 +95,10 @@ impl Rig {
         let mut model = Master::default();
         while self.supervised && !is_complete(&model) {
             assert!(Instant::now() < deadline, "core is never complete");
-            let look = wire.call(&FirstLook::call(&Token::new("none", 1))).unwrap();
-            let look = FirstLook::decode(&look).unwrap();
+            let look = wire
+                .call(&Inspection::call(&Token::new("none", 1)))
+                .unwrap();
+            let look = Inspection::decode(&look).unwrap();
             let nothing = Master::default();
             let second = look
                 .second_call(&nothing)

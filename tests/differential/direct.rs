@@ -1,7 +1,7 @@
 //! The model against a bare rosmaster.
 
 use rosrescue::master::{
-    Bears, FirstLook, Master, NotAMaster, Notice, Plan, Skipped, Token, difference,
+    Bears, Inspection, Master, NotAMaster, Notice, Plan, Skipped, Token, difference,
 };
 use rosrescue::xmlrpc::{Call, decode_call};
 
@@ -146,9 +146,9 @@ fn succeed(
 /// A look at the real master, with the model as the state known before, must show the model.
 fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     let mark = Token::new("none", 1);
-    let look = match FirstLook::decode(&wire.call(&FirstLook::call(&mark))?) {
+    let look = match Inspection::decode(&wire.call(&Inspection::call(&mark))?) {
         Err(NotAMaster::ParamsUnreadable { .. }) => {
-            FirstLook::decode(&wire.call(&FirstLook::call_without_params(&mark))?)
+            Inspection::decode(&wire.call(&Inspection::call_without_params(&mark))?)
         }
         look => look,
     };

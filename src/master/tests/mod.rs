@@ -1,7 +1,7 @@
 //! The model on its own. That it is rosmaster's equal is for `tests/differential.rs`.
 
 mod costs;
-mod looking;
+mod inspect;
 mod params;
 mod planning;
 mod quirks;

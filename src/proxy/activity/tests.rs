@@ -18,7 +18,7 @@ fn a_process_id_is_sure_until_the_node_registers_again() {
     let now = Instant::now();
     let mut activity = Activity::default();
     apply(&mut activity, now, &publish("/a", "/t"));
-    let registered = activity.deeds("/a").registered;
+    let registered = activity.last_calls("/a").registered;
     activity.remember_pid("/a", "http://n:1/", registered, 7);
     assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
     assert_eq!(activity.pid_of("/a", "http://n:2/"), None);
@@ -90,7 +90,7 @@ fn who_is_displaced_is_known_with_what_it_did() {
     let (mut master, publish) = subscribed();
     master.apply(&publish);
     apply(&mut activity, now, &publish);
-    let registered = activity.deeds("/a").registered;
+    let registered = activity.last_calls("/a").registered;
     activity.remember_pid("/a", "http://n:1/", registered, 7);
     let again = call("registerPublisher", &["/a", "/u", "x/Y", "http://n:2/"]);
     let expected = Displaced {

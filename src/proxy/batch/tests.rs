@@ -13,19 +13,19 @@ fn item(call: Call) -> Item {
 
 #[test]
 fn a_node_knows_better_only_by_the_contrary() {
-    let deeds = |registered, unregistered| Deeds {
+    let last_calls = |registered, unregistered| LastCalls {
         registered,
         unregistered,
     };
     let condition = Condition {
         node: "/n".to_owned(),
-        deeds: deeds(3, 2),
+        last_calls: last_calls(3, 2),
     };
     for (kind, now, holds) in [
-        (Kind::Unregister, deeds(3, 4), true),
-        (Kind::Unregister, deeds(4, 2), false),
-        (Kind::Mutate, deeds(4, 2), true),
-        (Kind::Mutate, deeds(3, 4), false),
+        (Kind::Unregister, last_calls(3, 4), true),
+        (Kind::Unregister, last_calls(4, 2), false),
+        (Kind::Mutate, last_calls(4, 2), true),
+        (Kind::Mutate, last_calls(3, 4), false),
     ] {
         assert_eq!(condition.holds(kind, now), holds, "{kind:?} {now:?}");
     }

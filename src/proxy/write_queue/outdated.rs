@@ -11,8 +11,8 @@ use crate::{
 pub(super) fn is_outdated(proxy: &Proxy, item: &Item) -> bool {
     let condition = item.condition.as_ref();
     let is_false = condition.is_some_and(|of| {
-        let deeds = |_: &Master, activity: &mut Activity| activity.deeds(&of.node);
-        !of.holds(item.kind, proxy.ledger.with_activity(deeds))
+        let last_calls = |_: &Master, activity: &mut Activity| activity.last_calls(&of.node);
+        !of.holds(item.kind, proxy.ledger.with_activity(last_calls))
     });
     let own = item.call.as_deref().filter(|_| item.raw.is_none());
     is_false || own.is_some_and(|call| bumps(proxy, call))

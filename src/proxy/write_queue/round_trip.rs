@@ -9,7 +9,7 @@ use crate::{
     master::Master,
     proxy::{
         Proxy,
-        look::{self, LookError},
+        inspect::{self, InspectError},
         pool::{VerifyError, verified},
         upstream::{CallError, Connection, Head, RawReply},
     },
@@ -40,7 +40,7 @@ pub(super) enum RoundTripError {
     Call(#[from] CallError),
     /// The look at the master failed.
     #[error(transparent)]
-    Look(#[from] LookError),
+    Look(#[from] InspectError),
 }
 
 impl RoundTripError {
@@ -99,8 +99,8 @@ async fn connect(proxy: &Proxy) -> Result<Connection, VerifyError> {
 }
 
 /// What the master behind `connection` holds.
-async fn held(proxy: &Proxy, connection: &mut Connection) -> Result<Master, LookError> {
+async fn held(proxy: &Proxy, connection: &mut Connection) -> Result<Master, InspectError> {
     let previous = proxy.ledger.with_mirror(Clone::clone);
-    let first = look::first(connection, &proxy.ledger.token()).await?;
-    look::second(first, connection, &previous).await
+    let first = inspect::first(connection, &proxy.ledger.token()).await?;
+    inspect::second(first, connection, &previous).await
 }

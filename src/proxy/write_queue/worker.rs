@@ -20,7 +20,7 @@ use crate::{
         Proxy,
         batch::{self, Answer, Item},
         gate::State,
-        look::LookError,
+        inspect::InspectError,
         upstream::{Connection, RawReply},
     },
     wait,
@@ -248,7 +248,7 @@ impl Worker {
                 RoundTripError::Connect(_) => self.resync_due = true,
                 _ => self.resync_at = Some(now + LOOK_PAUSE),
             }
-            if matches!(error, RoundTripError::Look(LookError::NotAMaster(_))) {
+            if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
                 // It lives and shows nothing: a client need not wait for that.
                 self.answer_opaque(proxy);
             }

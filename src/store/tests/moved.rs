@@ -8,7 +8,7 @@ fn path() -> &'static Path {
     Path::new(PATH)
 }
 
-/// As the keeper of the checkpoint does every round.
+/// As the checkpointer does every round.
 fn check(store: &mut Store<SimFs>) {
     if let Some(job) = store.check_job() {
         let _ = store.checked(job.run());

@@ -1,14 +1,14 @@
 use super::*;
-use crate::master::{Bears, FirstLook, NotAMaster, Token, difference};
+use crate::master::{Bears, Inspection, NotAMaster, Token, difference};
 
 /// Looks at `master` as rosrescue does over the wire.
 fn look(master: &mut Master, previous: &Master) -> Master {
     let token = Token::new("m", 1);
-    let reply = master.apply(&FirstLook::call(&token)).reply;
-    let look = match FirstLook::decode(&reply) {
+    let reply = master.apply(&Inspection::call(&token)).reply;
+    let look = match Inspection::decode(&reply) {
         Err(NotAMaster::ParamsUnreadable { .. }) => {
-            let reply = master.apply(&FirstLook::call_without_params(&token)).reply;
-            FirstLook::decode(&reply).unwrap()
+            let reply = master.apply(&Inspection::call_without_params(&token)).reply;
+            Inspection::decode(&reply).unwrap()
         }
         look => look.unwrap(),
     };
@@ -79,7 +79,7 @@ fn an_empty_master_is_empty_and_bears_no_token() {
     let mut master = Master::default();
     master.set_identity(42, "http://h/".to_owned());
     let look = |master: &mut Master| {
-        FirstLook::decode(&master.apply(&FirstLook::call(&token)).reply).unwrap()
+        Inspection::decode(&master.apply(&Inspection::call(&token)).reply).unwrap()
     };
     let first = look(&mut master);
     assert_eq!(
@@ -108,7 +108,7 @@ fn poisoned_params_come_from_the_previous_state() {
 fn what_vanishes_between_the_looks_is_left_out() {
     let mut master = busy();
     let token = Token::new("m", 1);
-    let first = FirstLook::decode(&master.apply(&FirstLook::call(&token)).reply).unwrap();
+    let first = Inspection::decode(&master.apply(&Inspection::call(&token)).reply).unwrap();
     for call in master.unregister_calls("/q") {
         master.apply(&call);
     }
@@ -121,7 +121,7 @@ fn what_vanishes_between_the_looks_is_left_out() {
 
 #[test]
 fn what_is_no_master_is_said_to_be_none() {
-    let form = |reply| FirstLook::decode(&reply).unwrap_err();
+    let form = |reply| Inspection::decode(&reply).unwrap_err();
     assert!(matches!(
         form(Reply::Value(1.into())),
         NotAMaster::Form { .. }

@@ -10,7 +10,7 @@ use std::{
 use tokio::process::{Child, Command};
 
 use super::{
-    add_ros_paths, beside, command, create, find_program, is_program, left, runs, tail_of,
+    add_ros_paths, beside, command, create, find_program, is_program, orphan, runs, tail_of,
 };
 
 /// Starts rosouts.
@@ -32,14 +32,14 @@ impl Rosout {
         Some(Self {
             program,
             output: beside(checkpoint, ".rosout-output.log"),
-            owner: left::owner(checkpoint),
+            owner: orphan::owner(checkpoint),
         })
     }
 
     /// The rosout that an earlier rosrescue with this checkpoint left behind. It may not have
     /// registered yet.
     pub fn left_behind(&self) -> Option<u32> {
-        let mut all = left::find(&self.owner).into_iter();
+        let mut all = orphan::find(&self.owner).into_iter();
         all.find(|pid| runs(*pid, "rosout"))
     }
 
@@ -53,7 +53,7 @@ impl Rosout {
     fn command(&self, uri: &str) -> Command {
         let mut command = command(&self.program);
         command.arg("__name:=rosout").env("ROS_MASTER_URI", uri);
-        command.env(left::OWNER, &self.owner);
+        command.env(orphan::OWNER, &self.owner);
         add_ros_paths(&mut command, &self.program, 3);
         command
             .stdin(Stdio::null())

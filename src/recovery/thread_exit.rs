@@ -9,7 +9,7 @@ use std::{fs, future::poll_fn, io, task::Poll};
 use rustix::{fs::OFlags, process::PidfdFlags};
 use tokio::net::unix::pipe::Receiver;
 
-use crate::supervisor::pidfd;
+use crate::process::pidfd;
 
 /// So many threads are watched: one of them may be the last. A rosmaster with `-w 1` has no more that
 /// live as long as it does, one that calls nodes and one that serves.

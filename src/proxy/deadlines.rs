@@ -30,7 +30,7 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 
 /// Where a connection stands between requests.
 #[derive(Clone, Debug, Default)]
-pub struct Pace {
+pub struct Deadlines {
     place: Arc<AtomicU8>,
 }
 
@@ -39,7 +39,7 @@ const HEAD: u8 = 1;
 const SERVING: u8 = 2;
 const REPLYING: u8 = 3;
 
-impl Pace {
+impl Deadlines {
     /// The head has been read; the body and the answer have limits of their own.
     pub fn serving(&self) {
         self.place.store(SERVING, Ordering::Relaxed);
@@ -60,11 +60,11 @@ impl Pace {
     }
 }
 
-/// A stream that keeps `pace`, and is one of the idle ones between requests.
+/// A stream that keeps `deadlines`, and is one of the idle ones between requests.
 #[derive(Debug)]
-pub struct Paced<'a, S> {
+pub struct Timed<'a, S> {
     stream: S,
-    pace: Pace,
+    deadlines: Deadlines,
     deadline: Pin<Box<Sleep>>,
     /// The peer takes nothing.
     stuck: bool,
@@ -74,12 +74,12 @@ pub struct Paced<'a, S> {
     idling: Option<Idling<'a>>,
 }
 
-impl<'a, S> Paced<'a, S> {
+impl<'a, S> Timed<'a, S> {
     /// `stream` before its first request. `close` is told when `idle` has too many.
-    pub fn new(stream: S, pace: Pace, idle: &'a Idle, close: Arc<Notify>) -> Self {
+    pub fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
-            pace,
+            deadlines,
             deadline: Box::pin(tokio::time::sleep(HEAD_TIME)),
             stuck: false,
             idling: Some(idle.enter(&close)),
@@ -106,7 +106,7 @@ impl<'a, S> Paced<'a, S> {
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Paced<'_, S> {
+impl<S: AsyncRead + Unpin> AsyncRead for Timed<'_, S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -117,19 +117,22 @@ impl<S: AsyncRead + Unpin> AsyncRead for Paced<'_, S> {
         let polled = Pin::new(&mut this.stream).poll_read(cx, buf);
         if buf.filled().len() > before {
             this.idling = None;
-            if this.pace.is(IDLE) {
-                this.pace.place.store(HEAD, Ordering::Relaxed);
+            if this.deadlines.is(IDLE) {
+                this.deadlines.place.store(HEAD, Ordering::Relaxed);
                 this.deadline.as_mut().reset(Instant::now() + HEAD_TIME);
             }
         }
-        if polled.is_pending() && this.pace.is(HEAD) && this.deadline.as_mut().poll(cx).is_ready() {
+        if polled.is_pending()
+            && this.deadlines.is(HEAD)
+            && this.deadline.as_mut().poll(cx).is_ready()
+        {
             return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
         }
         polled
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<'_, S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Timed<'_, S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -143,8 +146,8 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Paced<'_, S> {
         let this = &mut *self;
         let polled = Pin::new(&mut this.stream).poll_flush(cx);
         // hyper flushes when it has written all of an answer.
-        if polled.is_ready() && this.pace.is(REPLYING) {
-            this.pace.place.store(IDLE, Ordering::Relaxed);
+        if polled.is_ready() && this.deadlines.is(REPLYING) {
+            this.deadlines.place.store(IDLE, Ordering::Relaxed);
             this.idling = Some(this.idle.enter(&this.close));
         }
         polled
@@ -178,19 +181,19 @@ mod tests {
     async fn idle_time_does_not_count_and_a_dribbled_head_does() {
         let (mut peer, ours) = tokio::io::duplex(64);
         let idle = Idle::among(16);
-        let pace = Pace::default();
-        let mut paced = Paced::new(ours, pace.clone(), &idle, Arc::default());
+        let deadlines = Deadlines::default();
+        let mut stream = Timed::new(ours, deadlines.clone(), &idle, Arc::default());
         let mut byte = [0];
         for _ in 0..3 {
             let late = async {
                 tokio::time::sleep(HEAD_TIME * 100).await;
                 peer.write_all(b"P").await.unwrap();
             };
-            let (read, ()) = tokio::join!(paced.read(&mut byte), late);
+            let (read, ()) = tokio::join!(stream.read(&mut byte), late);
             assert_eq!(read.unwrap(), 1);
-            pace.serving();
-            pace.replying();
-            paced.flush().await.unwrap();
+            deadlines.serving();
+            deadlines.replying();
+            stream.flush().await.unwrap();
         }
         let start = Instant::now();
         let dribble = async {
@@ -201,7 +204,7 @@ mod tests {
         };
         let reader = async {
             loop {
-                if let Err(error) = paced.read(&mut byte).await {
+                if let Err(error) = stream.read(&mut byte).await {
                     return (error.kind(), start.elapsed());
                 }
             }
@@ -214,7 +217,7 @@ mod tests {
     async fn an_answer_may_be_taken_slowly_but_not_never() {
         let (mut peer, ours) = tokio::io::duplex(64);
         let idle = Idle::among(16);
-        let mut paced = Paced::new(ours, Pace::default(), &idle, Arc::default());
+        let mut stream = Timed::new(ours, Deadlines::default(), &idle, Arc::default());
         let start = Instant::now();
         let slow = async {
             for _ in 0..5 {
@@ -223,7 +226,7 @@ mod tests {
             }
             start.elapsed()
         };
-        let (written, last) = tokio::join!(paced.write_all(&[0; 1000]), slow);
+        let (written, last) = tokio::join!(stream.write_all(&[0; 1000]), slow);
         assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
         assert_eq!(start.elapsed(), last + WRITE_TIME);
     }
@@ -233,19 +236,19 @@ mod tests {
         let (mut peer, ours) = tokio::io::duplex(64);
         let idle = Idle::among(2);
         let close = Arc::new(Notify::new());
-        let pace = Pace::default();
-        let mut paced = Paced::new(ours, pace.clone(), &idle, close.clone());
+        let deadlines = Deadlines::default();
+        let mut stream = Timed::new(ours, deadlines.clone(), &idle, close.clone());
         let mut bytes = [0; 2];
         peer.write_all(b"PO").await.unwrap();
-        paced.read_exact(&mut bytes).await.unwrap();
-        pace.serving();
-        pace.replying();
-        paced.write_all(b"HTTP").await.unwrap();
-        assert!(!pace.is_idle());
+        stream.read_exact(&mut bytes).await.unwrap();
+        deadlines.serving();
+        deadlines.replying();
+        stream.write_all(b"HTTP").await.unwrap();
+        assert!(!deadlines.is_idle());
         // Another one is idle meanwhile.
         drop(idle.enter(&Arc::default()));
-        paced.flush().await.unwrap();
-        assert!(pace.is_idle());
+        stream.flush().await.unwrap();
+        assert!(deadlines.is_idle());
         let _other = idle.enter(&Arc::default());
         close.notified().await;
     }

@@ -137,7 +137,7 @@ mod tests {
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
         let end = tokio::spawn(ended(orphan));
-        crate::supervisor::signal_process(orphan, rustix::process::Signal::KILL);
+        crate::process::signal_process(orphan, rustix::process::Signal::KILL);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is told").unwrap().unwrap();
         assert_eq!(find(&owner), Vec::<u32>::new());

@@ -22,7 +22,7 @@ pub enum NotAMaster {
         text: String,
     },
     /// The parameters cannot be read, because one of them cannot be returned: look again with
-    /// [`FirstLook::call_without_params`].
+    /// [`Inspection::call_without_params`].
     #[error(
         "the master holds a parameter that it cannot return ({text}): look again without parameters"
     )]
@@ -42,7 +42,7 @@ pub enum NotAMaster {
 
 /// What a first look at a master shows.
 #[derive(Clone, Debug)]
-pub struct FirstLook {
+pub struct Inspection {
     pid: i32,
     bears: Bears,
     publishers: IndexMap<String, Vec<String>>,
@@ -54,7 +54,7 @@ pub struct FirstLook {
     params: Option<Struct>,
 }
 
-impl FirstLook {
+impl Inspection {
     /// What a look at a rosmaster that has just been started would show. Its process is `pid`.
     pub fn at_new(pid: i32) -> Self {
         Self {
@@ -200,7 +200,7 @@ impl FirstLook {
     ///
     /// # Errors
     ///
-    /// If `second`, the reply to [`FirstLook::second_call`] with the same `previous`, is not that of
+    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not that of
     /// a master.
     pub fn into_master(
         self,

@@ -17,7 +17,7 @@ use tokio::process::{Child, Command};
 
 use crate::{config::SupervisedConfig, guardian::handover};
 
-mod left;
+mod orphan;
 pub mod pidfd;
 mod rosout;
 
@@ -52,7 +52,7 @@ format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
 /// A child process that cannot be had.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum SupervisorError {
+pub enum ProcessError {
     /// No rosmaster anywhere.
     #[error(
         "no rosmaster is on the PATH or in /opt/ros/*/bin: install it (apt-get install \
@@ -96,11 +96,11 @@ pub struct Rosmaster {
 
 impl Rosmaster {
     /// Finds the program. Files for it will lie beside `checkpoint`.
-    pub fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, SupervisorError> {
+    pub fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
         let program = match &config.rosmaster {
             Some(path) if is_program(path) => path.clone(),
-            Some(path) => return Err(SupervisorError::NotAProgram { path: path.clone() }),
-            None => find_program("rosmaster", &["bin"]).ok_or(SupervisorError::NoRosmaster)?,
+            Some(path) => return Err(ProcessError::NotAProgram { path: path.clone() }),
+            None => find_program("rosmaster", &["bin"]).ok_or(ProcessError::NoRosmaster)?,
         };
         Ok(Self {
             program,
@@ -112,18 +112,18 @@ impl Rosmaster {
     }
 
     /// Where its port should be: the given one, else `remembered` if that is free, else a free one.
-    pub fn choose_port(&self, remembered: Option<u16>) -> Result<u16, SupervisorError> {
+    pub fn choose_port(&self, remembered: Option<u16>) -> Result<u16, ProcessError> {
         if let Some(port) = self.config.port {
             return if is_free(port) {
                 Ok(port)
             } else {
-                Err(SupervisorError::PortInUse { port })
+                Err(ProcessError::PortInUse { port })
             };
         }
         if let Some(port) = remembered.filter(|port| is_free(*port)) {
             return Ok(port);
         }
-        let spawn_error = |source| SupervisorError::Spawn {
+        let spawn_error = |source| ProcessError::Spawn {
             program: self.program.clone(),
             source,
         };
@@ -133,9 +133,9 @@ impl Rosmaster {
     /// The rosmaster that an earlier rosrescue with this checkpoint left behind at `port`. Any that
     /// does not listen there has never served, or never will: it is ended.
     pub fn left_behind(&self, port: Option<u16>) -> Option<u32> {
-        let mut all = left::find(&left::owner(&self.checkpoint));
+        let mut all = orphan::find(&orphan::owner(&self.checkpoint));
         all.retain(|pid| !runs(*pid, "rosout"));
-        let serves = |pid: &u32| port.is_some_and(|port| left::listens(*pid, port));
+        let serves = |pid: &u32| port.is_some_and(|port| orphan::listens(*pid, port));
         let found = all.iter().copied().find(serves);
         if found.is_none() {
             for pid in all.into_iter().filter(|pid| runs(*pid, "rosmaster")) {
@@ -150,7 +150,7 @@ impl Rosmaster {
     }
 
     /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
-    pub fn spawn(&self, port: u16) -> Result<Child, SupervisorError> {
+    pub fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
         command.arg("--core").arg("-p").arg(port.to_string());
         command.arg("-w").arg(self.config.numworkers.to_string());
@@ -158,7 +158,7 @@ impl Rosmaster {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
         add_ros_paths(&mut command, &self.program, 2);
-        command.env(left::OWNER, left::owner(&self.checkpoint));
+        command.env(orphan::OWNER, orphan::owner(&self.checkpoint));
         // Loopback only: nodes come through us.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
@@ -180,7 +180,7 @@ impl Rosmaster {
             .stdout(stdout)
             .stderr(stderr)
             .process_group(0);
-        command.spawn().map_err(|source| SupervisorError::Spawn {
+        command.spawn().map_err(|source| ProcessError::Spawn {
             program: self.program.clone(),
             source,
         })
@@ -302,7 +302,7 @@ pub fn runs(pid: u32, name: &str) -> bool {
 
 /// Returns when the process `pid`, which is no child of ours, has ended.
 pub async fn ended(pid: u32) {
-    if left::ended(pid).await.is_err() {
+    if orphan::ended(pid).await.is_err() {
         while is_alive(pid) {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }

@@ -1,9 +1,9 @@
-//! What the guard says: in the log, in reports, and to whoever sees to the nodes after a recovery.
+//! What the driver reports: log lines, status and the recovery report.
 
 use std::time::{Duration, Instant};
 
 use super::{
-    Guard, census,
+    Driver, census,
     examine::Examination,
     report::{Outage, Outcome},
 };
@@ -12,7 +12,7 @@ use crate::lifecycle::Cause;
 /// A message about a state that lasts is repeated after this time.
 const REPEAT: Duration = Duration::from_secs(10);
 
-impl Guard {
+impl Driver {
     /// Reports what an examination came to; census and healing add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.begins() && examination.outcome == Outcome::Injected {

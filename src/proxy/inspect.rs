@@ -3,13 +3,13 @@
 use thiserror::Error;
 
 use super::upstream::{CallError, Connection};
-use crate::master::{FirstLook, Master, NotAMaster, Token};
+use crate::master::{Inspection, Master, NotAMaster, Token};
 use crate::xmlrpc::Call;
 
 /// A look that showed nothing.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum LookError {
+pub enum InspectError {
     /// The connection failed.
     #[error(transparent)]
     Call(#[from] CallError),
@@ -19,14 +19,14 @@ pub enum LookError {
 }
 
 /// The first look; without the parameters if the master cannot return one of them.
-pub async fn first(connection: &mut Connection, token: &Token) -> Result<FirstLook, LookError> {
-    let whole = look(connection, &FirstLook::call(token)).await;
+pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspection, InspectError> {
+    let whole = look(connection, &Inspection::call(token)).await;
     match whole {
-        Err(LookError::NotAMaster(
+        Err(InspectError::NotAMaster(
             NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
-        )) => look(connection, &FirstLook::call_without_params(token)).await,
+        )) => look(connection, &Inspection::call_without_params(token)).await,
         Err(error) if is_broken_document(&error) => {
-            let rest = look(connection, &FirstLook::call_without_params(token)).await;
+            let rest = look(connection, &Inspection::call_without_params(token)).await;
             // Whoever speaks no XML-RPC at all may have closed the connection.
             rest.map_err(|_| error)
         }
@@ -34,21 +34,21 @@ pub async fn first(connection: &mut Connection, token: &Token) -> Result<FirstLo
     }
 }
 
-async fn look(connection: &mut Connection, call: &Call) -> Result<FirstLook, LookError> {
-    Ok(FirstLook::decode(&connection.call(call).await?)?)
+async fn look(connection: &mut Connection, call: &Call) -> Result<Inspection, InspectError> {
+    Ok(Inspection::decode(&connection.call(call).await?)?)
 }
 
 /// Whether a parameter may have broken the document: a master does not escape a date's text.
-fn is_broken_document(error: &LookError) -> bool {
-    matches!(error, LookError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
+fn is_broken_document(error: &InspectError) -> bool {
+    matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
 
 /// The second look, and with it the state that the master holds.
 pub async fn second(
-    first: FirstLook,
+    first: Inspection,
     connection: &mut Connection,
     previous: &Master,
-) -> Result<Master, LookError> {
+) -> Result<Master, InspectError> {
     if !first.has_params() {
         tracing::warn!(
             "the master holds a parameter that it can never return, and with it none of the others: \

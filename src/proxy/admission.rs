@@ -1,4 +1,4 @@
-//! Who may come in: checks on a request's head, without IO.
+//! Checks on a request's head before it is admitted, without IO.
 //!
 //! ROS 1 has no authentication. What can be kept out without any ROS client noticing is a web page
 //! that makes a person's browser call the master, and a `shutdown` from another computer.

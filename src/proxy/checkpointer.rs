@@ -26,8 +26,8 @@ const QUIET: Duration = Duration::from_secs(2);
 const BETWEEN: Duration = Duration::from_secs(10);
 
 /// Keeps the checkpoint until `stop`.
-pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
-    let mut keeper = Keeping {
+pub async fn run(proxy: Arc<Proxy>, stop: CancellationToken) {
+    let mut checkpointer = Checkpointer {
         seq: 0,
         recorded_at: Instant::now(),
         compacted_at: None,
@@ -37,23 +37,23 @@ pub async fn keep(proxy: Arc<Proxy>, stop: CancellationToken) {
         proxy,
     };
     loop {
-        let proxy = &keeper.proxy;
+        let proxy = &checkpointer.proxy;
         tokio::select! {
             () = stop.cancelled() => return,
             () = proxy.ledger.work.notified() => {}
             () = tokio::time::sleep(LOOK) => {}
         }
-        keeper.round(true).await;
-        if keeper.proxy.config.sync != Sync::Always {
+        checkpointer.round(true).await;
+        if checkpointer.proxy.config.sync != Sync::Always {
             tokio::select! {
                 () = stop.cancelled() => return,
-                () = keeper.pause() => {}
+                () = checkpointer.pause() => {}
             }
         }
     }
 }
 
-struct Keeping {
+struct Checkpointer {
     proxy: Arc<Proxy>,
     /// The journal's last record at the last round.
     seq: u64,
@@ -64,7 +64,7 @@ struct Keeping {
     said: Option<String>,
 }
 
-impl Keeping {
+impl Checkpointer {
     /// Until the next sync, however long that is: the file is looked at all the same.
     async fn pause(&mut self) {
         let end = Instant::now() + self.proxy.config.sync_interval;
