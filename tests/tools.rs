@@ -1,5 +1,5 @@
 //! The tools of ROS through rosrescue: what they print is what they print at a bare master, before and
-//! after a crash of the master; roslaunch brings a whole robot up; a late node waits for the master.
+//! after a crash of the master; roslaunch brings a whole robot up, also without a master.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,8 +17,8 @@ use std::time::Duration;
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 use support::{
-    Library, Mode, NODES, Node, Process, Robot, Rosmaster, Scratch, Tool, eventually, holds,
-    params, ros_command, sorted, tree,
+    Client, Library, Mode, NODES, Node, Process, Robot, Rosmaster, Scratch, State, Tool,
+    eventually, holds, params, ros_command, sorted, tree,
 };
 
 /// A small robot: what the tools look at.
@@ -246,14 +246,15 @@ fn launch(robot: &Robot, file: &str, namespace: &str) -> Process {
     Process::start(format!("roslaunch {namespace}"), &mut command)
 }
 
-fn await_launched(robot: &Robot, launch: &mut Process, namespace: &str) {
+/// Waits until what `launch` brings up is up, as `master` says.
+fn await_launched(master: &Client, launch: &mut Process, namespace: &str) {
     let nodes = ["talker", "cpp_listener", "py_listener", "server", "client"];
     eventually(&format!("the nodes of {namespace} are up"), || {
         assert!(launch.exited().is_none(), "roslaunch ended");
-        let state = robot.state();
-        nodes
-            .iter()
-            .all(|node| state.knows(&format!("/{namespace}/{node}")))
+        State::try_read(master).is_ok_and(|state| {
+            let mut nodes = nodes.iter();
+            nodes.all(|node| state.knows(&format!("/{namespace}/{node}")))
+        })
     });
     let namespace_says = |what: &str| {
         launch
@@ -269,15 +270,11 @@ fn await_launched(robot: &Robot, launch: &mut Process, namespace: &str) {
                 && namespace_says(&format!("reply /{namespace}/server")) >= 3
         },
     );
-    let params = robot
-        .bare()
+    let params = master
         .param(&format!("/{namespace}"))
         .expect("the parameters");
     assert_eq!(sorted(&params), sorted(&launched_params()));
-    assert_eq!(
-        robot.bare().param("/use_sim_time"),
-        Some(Value::Bool(false))
-    );
+    assert_eq!(master.param("/use_sim_time"), Some(Value::Bool(false)));
 }
 
 fn roslaunch_before_and_after_a_crash(mode: Mode) {
@@ -288,13 +285,13 @@ fn roslaunch_before_and_after_a_crash(mode: Mode) {
     let empty = robot.settled_state();
 
     let mut first = launch(&robot, file, "first");
-    await_launched(&robot, &mut first, "first");
+    await_launched(&robot.bare(), &mut first, "first");
     let before = robot.settled_state();
     robot.crash_master();
     before.assert_same(&robot.state(), "after the crash");
 
     let mut second = launch(&robot, file, "second");
-    await_launched(&robot, &mut second, "second");
+    await_launched(&robot.bare(), &mut second, "second");
     assert!(
         holds(Duration::from_secs(1), || first.exited().is_none()),
         "the first launch ended"
@@ -322,8 +319,8 @@ fn roslaunch_before_and_after_a_crash(mode: Mode) {
 }
 
 /// The nodes that are registered beside those of `empty`, once that does not change any more.
-fn eventually_only(robot: &Robot, empty: &support::State) -> Vec<String> {
-    let others = |state: &support::State| -> Vec<String> {
+fn eventually_only(robot: &Robot, empty: &State) -> Vec<String> {
+    let others = |state: &State| -> Vec<String> {
         let nodes = state.nodes.iter().map(|(name, _)| name.clone());
         nodes.filter(|name| !empty.knows(name)).collect()
     };
@@ -340,10 +337,11 @@ fn roslaunch_before_and_after_a_crash_in_proxy() {
     roslaunch_before_and_after_a_crash(Mode::Proxy);
 }
 
-/// roslaunch itself, started while there is no master, neither fails nor starts one.
+/// All of them start, find each other and work while there is no master, and the next one knows them.
 #[test]
-fn late_nodes_and_a_late_roslaunch_come_up_by_themselves() {
+fn late_nodes_and_a_whole_roslaunch_come_up_without_a_master() {
     let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
     let talker = robot.node(Library::Roscpp, "talker", &[]);
     let file = robot.scratch.path("robot.launch");
     fs::write(&file, LAUNCH).unwrap();
@@ -351,47 +349,42 @@ fn late_nodes_and_a_late_roslaunch_come_up_by_themselves() {
     let dead = robot.master_pid();
     robot.kill_master();
 
-    let names = [
-        "/late_py",
-        "/late_cpp",
-        "/late_py_talker",
-        "/late_cpp_talker",
-    ];
     let late = [
-        robot.spawn_node(Library::Rospy, "listener", &["__name:=late_py"]),
-        robot.spawn_node(Library::Roscpp, "listener", &["__name:=late_cpp"]),
-        robot.spawn_node(Library::Rospy, "talker", &["__name:=late_py_talker"]),
-        robot.spawn_node(Library::Roscpp, "talker", &["__name:=late_cpp_talker"]),
+        robot.node(Library::Rospy, "listener", &["__name:=late_py"]),
+        robot.node(Library::Roscpp, "listener", &["__name:=late_cpp"]),
+        robot.node(Library::Rospy, "talker", &["__name:=late_py_talker"]),
+        robot.node(Library::Roscpp, "talker", &["__name:=late_cpp_talker"]),
     ];
-    let mut launched = launch(&robot, file.to_str().unwrap(), "late");
-    // Longer than the eight seconds for which a call is held: some are closed and come again.
-    assert!(
-        holds(Duration::from_secs(10), || launched.exited().is_none()),
-        "roslaunch gave up"
-    );
-    robot.revive_master();
-    robot.await_recovery(dead);
-
     for listener in &late[..2] {
         for publisher in ["/talker", "/late_py_talker", "/late_cpp_talker"] {
             listener.wait_messages(publisher, 5);
         }
     }
-    await_launched(&robot, &mut launched, "late");
-    let state = robot.state();
-    for name in names {
-        assert!(state.knows(name), "{state}");
-    }
+    let mut launched = launch(&robot, file.to_str().unwrap(), "late");
+    await_launched(&client, &mut launched, "late");
+    let mut last = State::read(&client);
+    eventually("all that is said at the start has been said", || {
+        std::thread::sleep(Duration::from_millis(300));
+        let before = std::mem::replace(&mut last, State::read(&client));
+        before == last
+    });
+    assert!(!robot.is_open(), "there was a master");
+    robot.revive_master();
+    robot.await_recovery(dead);
+    last.assert_same(&robot.state(), "in the next master");
     for (name, address) in &before.nodes {
-        assert_eq!(
-            state
-                .nodes
-                .iter()
-                .find(|(other, _)| other == name)
-                .unwrap()
-                .1,
-            *address
-        );
+        let same = last
+            .nodes
+            .iter()
+            .any(|node| node == &(name.clone(), address.clone()));
+        assert!(same, "{name} at {address}:\n{last}");
+    }
+    let said = launched.output();
+    for bad in ["RLException", "auto-starting", "Traceback"] {
+        assert!(said.iter().all(|line| !line.contains(bad)), "{bad}");
+    }
+    for node in &late {
+        node.assert_no_link_lost();
     }
     talker.assert_no_link_lost();
     let pid = robot.client().ok("getPid", params!["/test"]);
