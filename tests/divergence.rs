@@ -159,11 +159,11 @@ fn a_deletion_whose_reply_was_lost_is_answered_as_done() {
 }
 
 #[test]
-fn a_call_whose_replies_are_lost_is_answered_and_done() {
+fn a_write_whose_reply_was_lost_is_answered_as_done() {
     let scratch = Scratch::new();
     let (master, relay, rescue) = relayed(&scratch);
     let client = rescue.client();
-    relay.swallow("/swallowed", 3);
+    relay.swallow("/swallowed", 1);
     let reply = client.call("setParam", params!["/n", "/swallowed", 5]);
     assert_eq!(code(&reply.unwrap()), Some(1));
     assert_eq!(client.param("/swallowed"), Some(5.into()));

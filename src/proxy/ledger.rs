@@ -20,7 +20,7 @@ use super::activity::{Activity, Noticed};
 use super::stats::Stats;
 use crate::{
     master::{self, Agreement, Answered, Master, Token},
-    record::{Checkpoint, Entry, Session},
+    record::{Entry, Session},
     store::Store,
     xmlrpc::{Call, Reply},
 };
@@ -392,11 +392,6 @@ impl Ledger {
         } = &mut *inner;
         work(mirror, activity)
     }
-
-    /// What a checkpoint written now holds.
-    pub fn checkpoint(&self) -> Checkpoint {
-        self.lock().checkpoint()
-    }
 }
 
 /// Whether a call, if it is no multicall, takes something away that its caller registered.
@@ -491,30 +486,6 @@ impl Inner {
                 tracing::debug!(%error, "append");
                 None
             }
-        }
-    }
-
-    fn checkpoint(&self) -> Checkpoint {
-        Checkpoint {
-            seq: self.seq(),
-            session: self.session.clone(),
-            pending: self.pending.calls().to_vec(),
-            snapshot: self.mirror.snapshot(),
-        }
-    }
-
-    fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
-        let method = answered.call.method.as_str();
-        if self.diverged.insert(method.to_owned()) {
-            let [master, mirror] =
-                [&answered.reply, mirror].map(|reply| summary::summary(method, reply));
-            tracing::warn!(
-                method,
-                mirror,
-                master,
-                "the mirror's reply differs from the master's; the mirror is made anew from the \
-                 master if their states can differ (said once for each method)"
-            );
         }
     }
 }

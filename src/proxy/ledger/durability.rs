@@ -1,6 +1,6 @@
 //! What the checkpointer does with mirror and journal, and how others wait for it.
 
-use super::Ledger;
+use super::{Inner, Ledger};
 use crate::{
     record::Checkpoint,
     store::{Store, StoreError},
@@ -94,6 +94,11 @@ impl Ledger {
         self.lock().store = Some(store);
     }
 
+    /// What a checkpoint written now holds.
+    pub fn checkpoint(&self) -> Checkpoint {
+        self.lock().checkpoint()
+    }
+
     /// Whether the mirror changed otherwise than by journaled calls since the last checkpoint.
     pub fn checkpoint_due(&self) -> bool {
         self.lock().whole.is_due()
@@ -109,6 +114,17 @@ impl Ledger {
         let failure = inner.whole.failure.as_deref();
         let failure = failure.filter(|_| inner.whole.is_due());
         store.unprotected().or(failure).map(str::to_owned)
+    }
+}
+
+impl Inner {
+    pub(super) fn checkpoint(&self) -> Checkpoint {
+        Checkpoint {
+            seq: self.seq(),
+            session: self.session.clone(),
+            pending: self.pending.calls().to_vec(),
+            snapshot: self.mirror.snapshot(),
+        }
     }
 }
 

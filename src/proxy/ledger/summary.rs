@@ -1,6 +1,10 @@
 //! Replies in the log.
 
-use crate::xmlrpc::{Reply, Value};
+use super::Inner;
+use crate::{
+    master::Answered,
+    xmlrpc::{Reply, Value},
+};
 
 /// Replies in a log line are cut to so many bytes.
 const LOGGED_REPLY: usize = 300;
@@ -34,5 +38,21 @@ mod tests {
         let text = "ä".repeat(LOGGED_REPLY);
         assert_eq!(cut(&text).len(), LOGGED_REPLY);
         assert_eq!(cut("short"), "short");
+    }
+}
+
+impl Inner {
+    pub(super) fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
+        let method = answered.call.method.as_str();
+        if self.diverged.insert(method.to_owned()) {
+            let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
+            tracing::warn!(
+                method,
+                mirror,
+                master,
+                "the mirror's reply differs from the master's; the mirror is made anew from the \
+                 master if their states can differ (said once for each method)"
+            );
+        }
     }
 }
