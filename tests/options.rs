@@ -17,9 +17,11 @@ use support::{Rosmaster, Scratch, Setup, signal};
 fn the_log_as_json() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
-    let rescue = Setup::proxy(&scratch, master.client().port())
+    let mut rescue = Setup::proxy(&scratch, master.client().port())
         .env("ROSRESCUE_LOG_FORMAT", "json")
         .start();
+    // Standard error may be read after standard output.
+    rescue.wait_line("something in its log", |line| line.starts_with('{'));
     let log = rescue.output();
     let lines: Vec<serde_json::Value> = log
         .iter()

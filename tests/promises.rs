@@ -89,7 +89,7 @@ fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
 }
 
 #[test]
-fn an_unregistration_in_an_outage_is_on_the_disk_before_its_answer() {
+fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let disk = Disk::new(&scratch);
@@ -100,7 +100,20 @@ fn an_unregistration_in_an_outage_is_on_the_disk_before_its_answer() {
     node.publish(&client, "/topic", "std_msgs/String");
     master.kill();
     eventually("the gate is shut", || status(&client)["open"] == false);
-    disk.holds_up(move || node.unpublish(&client, "/topic"));
+    let leaving = client.clone();
+    disk.holds_up(move || node.unpublish(&leaving, "/topic"));
+    // What changes nothing is no safer than what made it so.
+    disk.holds_up(move || {
+        let first = thread::spawn({
+            let client = client.clone();
+            move || client.set_param("/same", 1)
+        });
+        eventually("the mirror has it", || client.param("/same").is_some());
+        client.set_param("/same", 1);
+        first
+    })
+    .join()
+    .unwrap();
 }
 
 /// rosrescue and the master are killed when it has been answered.
