@@ -173,6 +173,7 @@ fn all(window: &Window) -> [&Seen; 3] {
 fn outage(kind: Kind, options: &Options) -> String {
     let mut subject = Subject::start(kind, options.nodes);
     let (window, notified) = subject.outage(Duration::from_secs(options.away));
+    eprintln!("{kind}, notified after {notified:.1?}");
     let failed: usize = all(&window)
         .map(|seen| seen.failed + seen.refused)
         .iter()
