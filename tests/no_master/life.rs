@@ -235,6 +235,9 @@ fn displace(robot: &Robot) {
 
 /// Nodes that are asked to end do so, and are no longer known.
 fn end(robot: &Robot) {
+    // A rospy node that is told to end while it is in a call to the master waits for its own lock for ever, and it
+    // calls all the time for a parameter that is not set.
+    robot.client().set_param("/leaving", 1);
     for (library, suffix) in LIBRARIES {
         for node in ["listener", "server", "param_user"] {
             let name = format!("leaving_{node}_{suffix}");
