@@ -29,18 +29,6 @@ fn cut(text: &str) -> &str {
     text.get(..end.min(text.len())).unwrap_or(text)
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn long_replies_are_cut_at_a_character() {
-        let text = "ä".repeat(LOGGED_REPLY);
-        assert_eq!(cut(&text).len(), LOGGED_REPLY);
-        assert_eq!(cut("short"), "short");
-    }
-}
-
 impl Inner {
     pub(super) fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
         let method = answered.call.method.as_str();
@@ -54,5 +42,17 @@ impl Inner {
                  master if their states can differ (said once for each method)"
             );
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_replies_are_cut_at_a_character() {
+        let text = "ä".repeat(LOGGED_REPLY);
+        assert_eq!(cut(&text).len(), LOGGED_REPLY);
+        assert_eq!(cut("short"), "short");
     }
 }
