@@ -261,8 +261,8 @@ async fn read(
     }
 }
 
-/// Queues a write. While the master is away the mirror answers it from there; behind a master that takes
-/// too long, only if it changes nothing.
+/// Queues a write. While the master is away the mirror answers it from there; during an injection and
+/// behind a master that takes too long, only if it changes nothing.
 async fn write(
     proxy: &Arc<Proxy>,
     head: Head,
@@ -270,6 +270,11 @@ async fn write(
     call: Option<Arc<Call>>,
     kind: Kind,
 ) -> Result<HttpReply, Closed> {
+    if proxy.gate.state() == State::Injecting
+        && let Some(reply) = answer_idle(proxy, call.as_deref()).await
+    {
+        return Ok(reply);
+    }
     let (answer, mut answered) = oneshot::channel();
     let item = Item {
         raw: Some((head, body)),
@@ -306,19 +311,24 @@ async fn write(
                 }
                 patient = false;
                 proxy.slow.notify_one();
-                let idle = call.filter(|call| master::is_answerable(call));
-                let answer = idle.and_then(|call| proxy.ledger.answer_idle(Instant::now(), call));
-                if let Some((reply, seq)) = answer {
-                    // It may be the disk that takes so long, and not the master.
-                    if let Some(seq) = seq.filter(|_| proxy.config.sync == Sync::Always) {
-                        proxy.ledger.durable(seq).await;
-                    }
-                    proxy.stats.stood_in.count();
-                    return Ok(xml(&reply));
+                if let Some(reply) = answer_idle(proxy, call).await {
+                    return Ok(reply);
                 }
             }
         }
     }
+}
+
+/// The mirror's answer to a write that changes nothing; none if it does.
+async fn answer_idle(proxy: &Proxy, call: Option<&Call>) -> Option<HttpReply> {
+    let call = call.filter(|call| master::is_answerable(call))?;
+    let (reply, seq) = proxy.ledger.answer_idle(Instant::now(), call)?;
+    // What made it idle may not be on the disk yet.
+    if let Some(seq) = seq.filter(|_| proxy.config.sync == Sync::Always) {
+        proxy.ledger.durable(seq).await;
+    }
+    proxy.stats.stood_in.count();
+    Some(xml(&reply))
 }
 
 fn made(proxy: &Proxy, call: Option<&Call>, reply: &Reply) -> HttpReply {
