@@ -1,7 +1,7 @@
 #!/bin/sh
 # Runs every check of rosrescue on a bare Debian or Ubuntu: installs what is missing of ROS 1, then
-# formatting, clippy, the documentation, the fuzz targets (whether they compile), and unit, integration
-# and documentation tests. Needs a Rust toolchain.
+# formatting, clippy, the documentation, the dependencies (if cargo-deny is installed), the fuzz targets
+# (whether they compile), and unit, integration and documentation tests. Needs a Rust toolchain.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -18,5 +18,16 @@ fi
 cargo fmt --all --check
 cargo clippy --locked --all-targets -- -D warnings
 RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps
+if command -v cargo-deny >/dev/null; then
+    cargo deny --locked --offline check licenses bans sources
+    for advisories in "${CARGO_HOME:-$HOME/.cargo}"/advisory-dbs/*/crates; do
+        if [ -d "$advisories" ]; then
+            cargo deny --locked --offline check advisories
+            break
+        fi
+    done
+else
+    echo "tests/run.sh: no cargo-deny: dependencies are not checked (cargo install --locked cargo-deny)" >&2
+fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 cargo test --locked
