@@ -145,7 +145,7 @@ impl Ledger {
     pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         // An unregistration of what is not here may be of what is on its way to the master.
-        let idle = !is_unregistration(write)
+        let idle = !master::writes(write).iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         idle.then(|| {

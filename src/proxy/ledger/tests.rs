@@ -120,6 +120,21 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert!(ledger.stand_in(now, &bye).is_some());
 }
 
+/// A registration that it takes back may be on its way to a master that takes its time.
+#[test]
+fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    ledger.stand_in(now, &watch);
+    let bye = call("unregisterPublisher", &["/n", "/gone", "http://n:1/"]);
+    assert!(ledger.answer_idle(now, &watch).is_some());
+    for calls in [vec![bye.clone()], vec![watch.clone(), bye.clone()]] {
+        assert_eq!(ledger.answer_idle(now, &Call::multicall(calls)), None);
+    }
+    assert_eq!(ledger.answer_idle(now, &bye), None);
+}
+
 /// What loggers say all the time takes no room, and does not outdate an injection that is made ready.
 #[test]
 fn what_changes_nothing_leaves_no_trace() {
