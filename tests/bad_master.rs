@@ -213,7 +213,7 @@ fn a_master_whose_answers_are_no_http_counts_as_away() {
     let twin = Rosmaster::start(&poisoned.scratch);
     let well = twin.client();
     let node = FakeNode::start("/c");
-    node.claim_subscription("/poison", "a/B");
+    node.claim_subscription("/poison", Some("a/B"));
     let [changes, reads] = poisoned_calls(&node);
     for (number, answer) in cases.into_iter().enumerate() {
         poisoned.say(b"/poison", &answer);

@@ -59,7 +59,7 @@ fn names_that_resolve_slowly_delay_nobody() {
     let living = FakeNode::start("/living");
     // By a name that the computer knows itself.
     let api = format!("http://localhost:{}/", living.port());
-    living.claim_subscription("/chatter", "std_msgs/String");
+    living.claim_subscription("/chatter", Some("std_msgs/String"));
     client.ok(
         "registerSubscriber",
         params!["/living", "/chatter", "std_msgs/String", api],
@@ -185,7 +185,7 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
 
     // It moves during an outage. At the old address the port refuses: that would be death.
     let second = start(2);
-    second.claim_subscription("/chatter", "std_msgs/String");
+    second.claim_subscription("/chatter", Some("std_msgs/String"));
     server.set("mover.test", host(2));
     drop(first);
     let dead = kill_master(&client);
@@ -206,7 +206,7 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
     let dead = kill_master(&client);
     assert_eq!(names(&report(&client, dead)["suspects"]), ["/mover"]);
     let third = start(3);
-    third.claim_subscription("/chatter", "std_msgs/String");
+    third.claim_subscription("/chatter", Some("std_msgs/String"));
     server.set("mover.test", host(3));
     eventually("it is suspect no more", || {
         names(&status(&client)["suspects"]).is_empty()

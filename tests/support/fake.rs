@@ -158,8 +158,12 @@ impl FakeNode {
     }
 
     /// As [`Self::claim_publication`], for a topic that it subscribes.
-    pub(crate) fn claim_subscription(&self, topic: &str, topic_type: &str) {
-        lock(&self.inner.subscriptions).insert(topic.to_owned(), topic_type.to_owned());
+    pub(crate) fn claim_subscription(&self, topic: &str, topic_type: Option<&str>) {
+        let mut subscriptions = lock(&self.inner.subscriptions);
+        match topic_type {
+            Some(topic_type) => subscriptions.insert(topic.to_owned(), topic_type.to_owned()),
+            None => subscriptions.remove(topic),
+        };
     }
 
     /// Its address for services. Nobody answers there in TCPROS.
