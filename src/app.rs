@@ -252,7 +252,7 @@ async fn serve(
         error = looped => return Err(error),
     };
     connections.close();
-    // Calls that are parked have nobody to answer them any more: their connections are closed.
+    // Calls that still wait cannot be answered any more: their connections are closed.
     let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
     tasks.shutdown().await;
     Ok(process)

@@ -1,5 +1,5 @@
-//! What is to be made of what a node says of itself: whether it is the node that registered, and in
-//! what the mirror differs from it.
+//! Judges a node's answers: whether it is the node that registered, and where the mirror differs from
+//! what it says.
 //!
 //! Without evidence a node is what it is registered as: a robot that loses a healthy node is worse
 //! off than one that keeps a dead one.

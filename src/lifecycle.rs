@@ -20,7 +20,7 @@ const DEATHS_AT_ONCE: usize = 5;
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause of a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that has served for so long ends a crash loop. One that always lived longer could not
+/// A master that has served for this time ends a crash loop. One that always lived longer could not
 /// die more than [`DEATHS_AT_ONCE`] times within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
 /// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
@@ -264,7 +264,7 @@ impl Lifecycle {
             _ => {
                 let mut actions = self.connect_later(now, false);
                 if std::mem::take(&mut self.lost) {
-                    // Whoever closed the connection no longer listens.
+                    // The process that closed the connection no longer listens.
                     actions.extend(self.their_death(now));
                 }
                 actions

@@ -139,7 +139,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
-    // The terminal was closed. Whoever started us with nohup does not want to know.
+    // The terminal was closed. Under nohup that is to be ignored.
     let mut hangup = match guardian::is_hangup_ignored() {
         true => None,
         false => Some(signal(SignalKind::hangup())?),

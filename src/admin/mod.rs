@@ -1,4 +1,4 @@
-//! What people and monitors are told, by GET on the port that nodes use. Read-only.
+//! Status page and metrics, by GET on the port that nodes use. Read-only.
 //!
 //! | path | answer |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! Tells whoever watches over this process how it is: its guardian, and systemd (`sd_notify(3)`).
+//! Reports readiness and status to the guardian and to systemd (`sd_notify(3)`).
 
 use std::{os::unix::net::UnixStream as StdLink, sync::Arc, time::Duration};
 

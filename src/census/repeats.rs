@@ -1,4 +1,4 @@
-//! News that we tell beside the master, which may be late.
+//! Notifications that we send beside the master, whose own may be late.
 //!
 //! rosmaster makes each list of publishers when something changes, and sends it when one of its
 //! threads gets to it: after minutes, where nodes that cannot be reached hold them up. So we tell the
@@ -16,7 +16,7 @@ use super::backoff::Backoff;
 /// How long nothing must have changed before we tell it: idle threads of rosmaster look for work
 /// every 100 ms.
 const QUIET: Duration = Duration::from_millis(300);
-/// What changes all the time is told so long after the first change.
+/// Longest delay of a notification whose subject keeps changing.
 const LATEST: Duration = Duration::from_millis(600);
 /// Pause before it is told again.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);

@@ -113,7 +113,7 @@ pub enum Action {
     Spawn,
     /// End the master at once.
     Kill,
-    /// Say that the master dies again and again; so many deaths within a minute.
+    /// Report a crash loop: the number of deaths within a minute.
     ReportCrashLoop(usize),
     /// Say that it no longer does.
     ReportCalm,

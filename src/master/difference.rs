@@ -1,4 +1,4 @@
-//! What two states do not have in common, in words.
+//! The differences between two states, as lines of text.
 
 use indexmap::IndexMap;
 

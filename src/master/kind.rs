@@ -1,4 +1,4 @@
-//! What sort of call a call is.
+//! Classifies calls: read, write, or known only to the master.
 
 use super::multicall::{self, Entry};
 use super::{api, names, python};

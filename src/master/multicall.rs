@@ -40,7 +40,7 @@ pub(super) fn entries(params: &[Value]) -> Result<Cow<'_, [Value]>, String> {
     }
 }
 
-/// The fault of a multicall with so many parameters.
+/// The fault for a multicall with this number of parameters.
 fn too_many(count: usize) -> String {
     format!(
         "<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() takes 2 positional arguments but {} were given",

@@ -267,7 +267,7 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
     }
 }
 
-/// Whether arrays and structs lie in each other more than so many levels.
+/// Whether arrays and structs are nested more than `levels` deep.
 fn is_deeper(value: &Value, levels: usize) -> bool {
     match value {
         Value::Array(_) | Value::Struct(_) if levels == 0 => true,

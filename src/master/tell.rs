@@ -1,4 +1,4 @@
-//! What a master would tell a node of its state as it is now.
+//! The notifications that a master would send for its present state.
 
 use std::sync::Arc;
 

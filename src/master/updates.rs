@@ -1,4 +1,4 @@
-//! Whom a changed parameter concerns: `compute_param_updates` of `rosmaster/paramserver.py`.
+//! The subscribers whom a changed parameter concerns: `compute_param_updates` of `rosmaster/paramserver.py`.
 
 use std::{collections::HashSet, sync::LazyLock};
 

@@ -27,7 +27,7 @@ static LAST: Semaphore = Semaphore::const_new(1);
 /// Why there is no body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BodyError {
-    /// It is larger than so many bytes.
+    /// It is larger than this limit, in bytes.
     TooLarge {
         /// The limit.
         limit: usize,
@@ -86,7 +86,7 @@ impl<'a> Room<'a> {
     }
 }
 
-/// The time for a body of so many bytes.
+/// The time in which a body of this size must arrive.
 fn time_for(bytes: usize) -> Duration {
     TIME + Duration::from_secs(bytes as u64 / RATE)
 }

@@ -16,9 +16,9 @@ use crate::{
     store::{CheckJob, Store, SyncJob},
 };
 
-/// The file is checked at least so often: what somebody does to it is noticed well within a second.
+/// Longest time between two checks of the file: tampering is noticed well within a second.
 const LOOK: Duration = Duration::from_millis(500);
-/// An unprotected store is re-armed so often.
+/// Time between attempts to protect an unprotected store again.
 const AGAIN: Duration = Duration::from_secs(1);
 /// The journal is compacted when nothing was recorded for this time,
 const QUIET: Duration = Duration::from_secs(2);
@@ -32,7 +32,7 @@ pub async fn run(proxy: Arc<Proxy>, stop: CancellationToken) {
         recorded_at: Instant::now(),
         compacted_at: None,
         failed_at: None,
-        // Whoever opened the checkpoint has said it.
+        // Logged when the checkpoint was opened.
         said: proxy.ledger.unprotected(),
         proxy,
     };

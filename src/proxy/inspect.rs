@@ -27,7 +27,7 @@ pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspect
         )) => look(connection, &Inspection::call_without_params(token)).await,
         Err(error) if is_broken_document(&error) => {
             let rest = look(connection, &Inspection::call_without_params(token)).await;
-            // Whoever speaks no XML-RPC at all may have closed the connection.
+            // A server that speaks no XML-RPC may have closed the connection.
             rest.map_err(|_| error)
         }
         whole => whole,

@@ -25,7 +25,7 @@ use crate::{
     xmlrpc::{Call, Reply},
 };
 
-/// Unregistrations that take nothing away are pending beside so many others.
+/// Most pending writes beside which unregistrations that take nothing away are kept.
 const IDLE_PENDING: usize = 1000;
 
 /// Memory that the answers to the reads in one multicall may take, in bytes. A few short reads of a large

@@ -287,7 +287,7 @@ async fn write(
     let call = call.as_deref();
     let mut gate = proxy.gate.clone();
     let mut held = std::pin::pin!(gate.shut_for(proxy.config.hold));
-    // Whoever finds others waiting need not wait as long again.
+    // A master that has kept others waiting gets no fresh 100 ms.
     let now = tokio::time::Instant::now();
     let since = proxy.write_queue.unanswered_since().unwrap_or(now);
     let mut patience = std::pin::pin!(tokio::time::sleep_until(since + PATIENCE));

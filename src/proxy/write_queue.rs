@@ -76,7 +76,7 @@ impl WriteQueue {
     }
 
     /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until
-    /// the gate has changed. For the one who writes the gate.
+    /// the gate has changed. Called by the gate's only writer.
     pub async fn lost(&self) {
         self.lost.notified().await;
     }

@@ -1,7 +1,7 @@
 //! The census: which nodes still live, whether they are the ones that registered, and in what the
 //! mirror differs from what they say.
 //!
-//! Nothing here may hold up a call: a roscpp node that is itself inside a parked registration
+//! Nothing here may hold up a call: a roscpp node that is itself waiting for its registration
 //! cannot answer us before that call is through.
 
 use std::{
@@ -38,7 +38,7 @@ use crate::{
 const AT_ONCE: usize = 64;
 /// Pause before a node is asked again about what is to be taken from it.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
-/// A node that says something else each time is asked so often.
+/// Most questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
 
 static PERMITS: Semaphore = Semaphore::const_new(AT_ONCE);
@@ -166,7 +166,7 @@ pub(super) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<N
     names.collect()
 }
 
-/// Asks what is behind `api` until it is clear what is to be made of it.
+/// Asks the node behind `api` until its answers allow a verdict.
 pub(super) fn visit(
     proxy: &Arc<Proxy>,
     api: String,
@@ -271,7 +271,7 @@ impl Asked {
         })
     }
 
-    /// What is to be made of the answer, for those who have done nothing since the question.
+    /// The verdict, for nodes that have registered nothing since the question.
     fn findings(&self, proxy: &Proxy, api: &str, interview: &Interview) -> Findings {
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();

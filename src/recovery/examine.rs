@@ -29,7 +29,7 @@ use crate::{
 
 /// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
-/// A master that differs from what was injected is looked at and mended so often.
+/// Most rounds of comparing and mending a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 /// How long the end of calls of closed connections is waited for. A `setParam` of 60,000 keys takes
 /// some 10 s.

@@ -1,4 +1,4 @@
-//! Notifying nodes: what a master would tell them, has not told them, or will tell them late.
+//! Notifications to nodes that the master would send, has not sent, or will send late.
 //!
 //! Each node gets its own in order, one at a time, and one that does not answer delays nobody else.
 //! A node does nothing with a list of publishers that it knows already; a stale one could make it
@@ -27,7 +27,7 @@ use crate::{
 
 /// Nodes that are notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
-/// Whoever takes longer makes room for the next one: a living node answers within a few milliseconds.
+/// A node that takes longer gives its place to the next one: living nodes answer within milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
 /// Nodes beside those that are still waited for. The packets to some computer vanish, and it had many.
 const SLOW: usize = 128;

@@ -15,7 +15,7 @@ pub(super) async fn silence(proxy: &Proxy) -> Duration {
         if missed == 0 {
             tokio::time::sleep(probing.interval).await;
         }
-        // Whoever refuses, or answers nonsense, does not hang: the injection itself tells of it.
+        // A master that refuses or answers nonsense does not hang: the injection itself will fail.
         let probe = async {
             if let Ok(mut connection) = proxy.upstream.connect().await {
                 let _ = connection.call(&sign_of_life).await;

@@ -33,7 +33,7 @@ struct Inode {
     modified: i128,
     /// The medium does not give it back.
     unreadable: bool,
-    /// A sync failed: whoever touches the file again has not understood what that means.
+    /// A sync failed: touching the file again is an error, because its dirty pages may be gone.
     poisoned: bool,
 }
 

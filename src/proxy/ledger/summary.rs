@@ -6,7 +6,7 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Replies in a log line are cut to so many bytes.
+/// Limit on a reply in a log line, in bytes.
 const LOGGED_REPLY: usize = 300;
 
 /// A reply for the log. Values of parameters are nobody's business there.
