@@ -250,6 +250,34 @@ fn what_was_unregistered_in_a_hang_is_told_to_a_master_that_holds_nothing_else()
     assert_eq!(robot.master_pid(), pid);
 }
 
+/// The master that goes on runs it itself.
+#[test]
+fn an_unsubscription_under_way_in_a_master_that_hangs_is_done_once_it_goes_on() {
+    let probes = ["--probe-interval", "100", "--probe-timeout", "300"];
+    let robot = Robot::start_with(Mode::Proxy, &probes);
+    let client = robot.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    node.watch_param(&client, "/key");
+    let pid = robot.master_pid();
+    stop(pid);
+    client.ok(
+        "unsubscribeParam",
+        params!["/node", node.api.as_str(), "/key"],
+    );
+    signal(pid, Signal::CONT);
+    eventually("the gate is open", || robot.is_open());
+    assert_eq!(robot.master_pid(), pid);
+    let told = node.heard("paramUpdate").len();
+    client.set_param("/key", 1);
+    let quiet = || node.heard("paramUpdate").len() == told;
+    assert!(holds(Duration::from_millis(500), quiet));
+    assert_eq!(robot.state().publishers_of("/topic"), ["/node"]);
+    assert_eq!(status(&client)["counters"]["divergences"], 0);
+    let log = robot.rescue.stderr().join("\n");
+    assert!(!log.contains("differs from what was injected"), "{log}");
+}
+
 /// The node is asked what it publishes while it does not, and before anything follows from that it does
 /// again: its registration, in the outage that has begun meanwhile, is the last word.
 #[test]
