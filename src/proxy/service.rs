@@ -286,7 +286,16 @@ async fn write(
     proxy.write_queue.submit(item).await;
     let call = call.as_deref();
     let mut gate = proxy.gate.clone();
-    let mut held = std::pin::pin!(gate.shut_for(proxy.config.hold));
+    let mut held = std::pin::pin!(async {
+        let answerable = call.is_some_and(master::is_answerable);
+        loop {
+            gate.shut_for(proxy.config.hold).await;
+            // An injection ends by itself, and the mirror answers if it fails.
+            if !answerable || gate.state() != State::Injecting {
+                return;
+            }
+        }
+    });
     // A master that has kept others waiting gets no fresh 100 ms.
     let now = tokio::time::Instant::now();
     let since = proxy.write_queue.unanswered_since().unwrap_or(now);
