@@ -211,7 +211,8 @@ async fn read(
     loop {
         match gate.look() {
             State::Open { incarnation } => {
-                if proxy.pool.is_stalled()
+                let patience = patience(proxy);
+                if patience <= tokio::time::Instant::now()
                     && let Some(reply) = from_mirror()
                 {
                     return Ok(reply);
@@ -220,7 +221,7 @@ async fn read(
                     let (proxy, head, body) = (proxy.clone(), head.clone(), body.clone());
                     async move { pool::forward(&proxy, incarnation, &head, &body).await }
                 });
-                let reply = match tokio::time::timeout(PATIENCE, &mut forwarding).await {
+                let reply = match tokio::time::timeout_at(patience, &mut forwarding).await {
                     Ok(reply) => reply,
                     Err(_) => {
                         proxy.slow.notify_one();
@@ -296,10 +297,7 @@ async fn write(
             }
         }
     });
-    // A master that has kept others waiting gets no fresh 100 ms.
-    let now = tokio::time::Instant::now();
-    let since = proxy.write_queue.unanswered_since().unwrap_or(now);
-    let mut patience = std::pin::pin!(tokio::time::sleep_until(since + PATIENCE));
+    let mut patience = std::pin::pin!(tokio::time::sleep_until(patience(proxy)));
     let mut patient = true;
     loop {
         tokio::select! {
@@ -326,6 +324,16 @@ async fn write(
             }
         }
     }
+}
+
+/// Until when the master may answer before the mirror does. One that keeps others waiting gets no fresh
+/// [`PATIENCE`].
+fn patience(proxy: &Proxy) -> tokio::time::Instant {
+    let now = tokio::time::Instant::now();
+    if proxy.pool.is_stalled() {
+        return now;
+    }
+    proxy.write_queue.unanswered_since().unwrap_or(now) + PATIENCE
 }
 
 /// The mirror's answer to a write that changes nothing; none if it does.
