@@ -18,7 +18,7 @@ use std::time::Duration;
 use rosrescue::xmlrpc::{Call, Reply, Value};
 use support::{
     Client, FakeMaster, FakeNode, Mode, Rescue, Robot, Rosmaster, Scratch, Setup, State,
-    encode_call, eventually, gzip, holds, http_request, params, status,
+    encode_call, eventually, eventually_some, gzip, holds, http_request, params, status,
 };
 
 /// A master that is real but for calls that mention a word: those get the answer that is given.
@@ -164,11 +164,11 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
             }
             let case = format!("case {number}, {method}");
             let request = http_request(&encode_call(method, params.clone()));
-            let response = client.exchange(&request).expect(&case);
-            assert!(
-                response.code == code && response.body == body,
-                "{case}: {response:.1000?}"
-            );
+            // The mirror may answer what changes nothing if this computer is busy.
+            let response = eventually_some(&case, || {
+                let response = client.exchange(&request).expect(&case);
+                (response.code == code && response.body == body).then_some(response)
+            });
             let length = body.len().to_string();
             assert_eq!(response.header("content-length"), Some(&*length), "{case}");
         }

@@ -235,7 +235,7 @@ fn without_places_or_files_it_waits_calmly() {
     };
     let before = files(&rescue);
     let wires = begun(900);
-    eventually("the places are taken", || files(&rescue) > 800);
+    eventually("the places are taken", || files(&rescue) > 650);
     assert_calm(&rescue, Duration::from_secs(2));
     drop(wires);
     client.set_param("/x", 2);
