@@ -79,7 +79,7 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
         .await;
     let start = Instant::now();
     let incarnation = proxy.ledger.incarnation();
-    // Parked calls first: they wait, and what nodes say in them is newer than what they say to us.
+    // Queued calls first: what nodes say in them is newer than what they say to us.
     barrier(&proxy).await;
     let mut healed = match outcome {
         // A master that lives on tells its news itself.
