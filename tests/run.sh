@@ -19,7 +19,7 @@ cargo fmt --all --check
 cargo clippy --locked --all-targets -- -D warnings
 RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps
 if command -v cargo-deny >/dev/null; then
-    cargo deny --locked --offline check licenses bans sources
+    cargo deny --locked check licenses bans sources
     for advisories in "${CARGO_HOME:-$HOME/.cargo}"/advisory-dbs/*/crates; do
         if [ -d "$advisories" ]; then
             cargo deny --locked --offline check advisories

@@ -9,6 +9,7 @@
 )]
 
 use std::{
+    collections::BTreeSet,
     fs,
     path::{Path, PathBuf},
     process::Command,
@@ -16,6 +17,9 @@ use std::{
 
 /// A longer file holds more than one idea.
 const LINES_MOST: usize = 500;
+
+/// A longer README is read by nobody: one screen and a half, and tables.
+const README_BYTES_MOST: usize = 12 << 10;
 
 /// The modules that do no IO, as `src/lib.rs` has them: a file or a folder each.
 const CORE: [&str; 6] = [
@@ -122,81 +126,182 @@ fn block<'a>(text: &'a str, first: &str) -> &'a str {
 }
 
 #[test]
-fn the_readme_has_the_help_as_the_program_prints_it() {
-    let readme = read("README.md");
+fn the_documents_have_the_help_as_the_program_prints_it() {
+    let document = read("docs/cli.md");
     for command in ["core", "proxy"] {
         assert_eq!(
-            block(&readme, &format!("$ rosrescue {command} --help")),
+            block(&document, &format!("$ rosrescue {command} --help")),
             printed(&[command, "--help"]),
-            "put this help of `rosrescue {command}` into the README"
+            "put this help of `rosrescue {command}` into docs/cli.md"
         );
     }
 }
 
 #[test]
-fn the_readme_names_the_rust_that_is_needed() {
-    let manifest = read("Cargo.toml");
-    let (_, rest) = manifest.split_once("\nrust-version = \"").unwrap();
-    let needed = rest.split_once('"').unwrap().0;
-    let readme = read("README.md");
-    let named: Vec<_> = readme
-        .split("Rust ")
-        .skip(1)
-        .map(|after| {
-            after
-                .split(|c: char| !c.is_ascii_digit() && c != '.')
-                .next()
-                .unwrap()
-                .trim_end_matches('.')
-        })
-        .filter(|version| !version.is_empty())
-        .collect();
-    assert!(!named.is_empty(), "the README names no version of Rust");
+fn the_readme_stays_short() {
+    let bytes = read("README.md").len();
     assert!(
-        named.iter().all(|version| *version == needed),
-        "{named:?} are not {needed}"
+        bytes <= README_BYTES_MOST,
+        "the README has {bytes} bytes; move something to docs"
     );
 }
 
 #[test]
-fn the_readme_gives_a_reason_for_every_dependency() {
+fn the_documents_name_the_rust_that_is_needed() {
     let manifest = read("Cargo.toml");
-    let readme = read("README.md");
+    let (_, rest) = manifest.split_once("\nrust-version = \"").unwrap();
+    let needed = rest.split_once('"').unwrap().0;
+    for document in ["README.md", "CONTRIBUTING.md"] {
+        let text = read(document);
+        let named: Vec<_> = text
+            .split("Rust ")
+            .skip(1)
+            .map(|after| {
+                after
+                    .split(|c: char| !c.is_ascii_digit() && c != '.')
+                    .next()
+                    .unwrap()
+                    .trim_end_matches('.')
+            })
+            .filter(|version| !version.is_empty())
+            .collect();
+        assert!(!named.is_empty(), "{document} names no version of Rust");
+        assert!(
+            named.iter().all(|version| *version == needed),
+            "{document}: {named:?} are not {needed}"
+        );
+    }
+}
+
+#[test]
+fn there_is_a_reason_for_every_dependency_and_for_no_other() {
+    let manifest = read("Cargo.toml");
+    let document = read("CONTRIBUTING.md");
     let mut listed = false;
-    let mut count = 0;
+    let mut names = BTreeSet::new();
     for line in manifest.lines() {
         if line.starts_with('[') {
             listed = ["[dependencies]", "[dev-dependencies]"].contains(&line);
         } else if listed && let Some((name, _)) = line.split_once(" = ") {
             assert!(
-                readme.contains(&format!("\n| `{name}`")),
-                "no reason for `{name}`"
+                document.contains(&format!("\n| `{name}`")),
+                "no reason for `{name}` in CONTRIBUTING.md"
             );
-            count += 1;
+            names.insert(name);
         }
     }
-    assert!(count > 10, "the manifest is not read as it is written");
+    assert!(
+        names.len() > 10,
+        "the manifest is not read as it is written"
+    );
+    let (_, table) = document.split_once("\n| crate | for |\n").unwrap();
+    for row in table.lines().filter_map(|line| line.strip_prefix("| `")) {
+        let name = row.split('`').next().unwrap();
+        assert!(names.contains(name), "`{name}` is no dependency any more");
+    }
+}
+
+/// The documents at the top and below `docs`.
+fn documents() -> Vec<PathBuf> {
+    let folders = ["", "docs", "docs/decisions", "fuzz"].map(|folder| root().join(folder));
+    let files = folders
+        .iter()
+        .flat_map(|folder| fs::read_dir(folder).unwrap());
+    let files = files.map(|entry| entry.unwrap().path());
+    files
+        .filter(|file| file.extension().is_some_and(|extension| extension == "md"))
+        .collect()
+}
+
+/// The anchors of a document's headings, as they are made of the headings' text.
+fn anchors(text: &str) -> BTreeSet<String> {
+    let mut fenced = false;
+    let mut anchors = BTreeSet::new();
+    for line in text.lines() {
+        fenced ^= line.starts_with("```");
+        if !fenced && line.starts_with('#') {
+            let heading = line.trim_start_matches('#').trim().to_lowercase();
+            let letters = heading.chars().filter_map(|letter| match letter {
+                ' ' => Some('-'),
+                letter if letter.is_alphanumeric() || "-_".contains(letter) => Some(letter),
+                _ => None,
+            });
+            anchors.insert(letters.collect());
+        }
+    }
+    anchors
 }
 
 #[test]
 fn links_in_documents_lead_somewhere() {
-    let documents = fs::read_dir(root().join("docs")).unwrap();
-    let documents = documents.map(|entry| entry.unwrap().path());
-    let own = ["README.md", "ROS_MASTER_URI.md", "CHANGELOG.md"];
     let mut links = 0;
-    for document in documents.chain(own.map(|name| root().join(name))) {
+    for document in documents() {
         let text = read(&document);
         for link in text.split("](").skip(1) {
-            let target = link.split([')', '#']).next().unwrap();
-            if target.is_empty() || target.starts_with("https://") {
+            let link = link.split(')').next().unwrap();
+            if link.starts_with("https://") {
                 continue;
             }
-            let path = document.parent().unwrap().join(target);
-            assert!(path.exists(), "{} links to {target}", document.display());
+            let (target, anchor) = link.split_once('#').unwrap_or((link, ""));
+            let path = match target {
+                "" => document.clone(),
+                _ => document.parent().unwrap().join(target),
+            };
+            assert!(path.exists(), "{} links to {link}", document.display());
+            assert!(
+                anchor.is_empty() || anchors(&read(&path)).contains(anchor),
+                "{} links to {link}, which has no such heading",
+                document.display()
+            );
             links += 1;
         }
     }
-    assert!(links > 5);
+    assert!(links > 50);
+}
+
+/// Comments name documents by their path from the top, too.
+#[test]
+fn documents_that_the_source_names_exist() {
+    for file in rust_files(&root().join("src")) {
+        for name in read(&file).split("`docs/").skip(1) {
+            let name = format!("docs/{}", name.split('`').next().unwrap());
+            assert!(
+                root().join(&name).exists(),
+                "{} names {name}",
+                file.display()
+            );
+        }
+    }
+}
+
+#[test]
+fn every_decision_is_numbered_dated_and_in_the_index() {
+    let folder = root().join("docs/decisions");
+    let index = read(folder.join("README.md"));
+    let names = fs::read_dir(&folder).unwrap();
+    let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let mut names: Vec<_> = names.filter(|name| name != "README.md").collect();
+    names.sort();
+    assert!(!names.is_empty());
+    for (name, number) in names.iter().zip(1..) {
+        assert!(
+            name.starts_with(&format!("{number:04}-")),
+            "{name} is not number {number}"
+        );
+        let text = read(folder.join(name));
+        let title = text.lines().next().unwrap();
+        let title = title.strip_prefix(&format!("# {number}. "));
+        let title = title.unwrap_or_else(|| panic!("the title of {name} has another number"));
+        let (_, date) = text.split_once("\nDate: ").expect("a date");
+        let row = format!("| [{number}]({name}) | {title} | {} |", &date[..10]);
+        assert!(index.contains(&row), "the index lacks: {row}");
+        for section in ["Context", "Decision", "Why", "Consequences"] {
+            assert!(
+                text.contains(&format!("\n## {section}\n")),
+                "{name} lacks {section}"
+            );
+        }
+    }
 }
 
 /// The text of a source file without comments and without the tests at its end; none if all of it
