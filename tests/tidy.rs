@@ -274,6 +274,47 @@ fn documents_that_the_source_names_exist() {
     }
 }
 
+/// What stands between backticks in a document, on one line.
+fn quoted(text: &str) -> impl Iterator<Item = &str> {
+    text.lines()
+        .flat_map(|line| line.split('`').skip(1).step_by(2))
+}
+
+/// A file that is renamed leaves its name behind in documents.
+#[test]
+fn files_and_functions_that_documents_name_exist() {
+    let sources: Vec<_> = rust_files(&root().join("src")).iter().map(read).collect();
+    let is_in_source = |text: &str| sources.iter().any(|source| source.contains(text));
+    let (mut files, mut functions) = (0, 0);
+    for document in documents() {
+        let text = read(&document);
+        for name in quoted(&text) {
+            let is_path = name.ends_with(".rs") && !name.contains([' ', '*']);
+            if is_path {
+                let mut places = ["", "src", "tests"].iter().map(|place| root().join(place));
+                let exists = places.any(|place| place.join(name).exists());
+                assert!(exists, "{} names the file {name}", document.display());
+                files += 1;
+            }
+            let path = name.split('(').next().unwrap();
+            let is_item = |c: char| c.is_ascii_alphanumeric() || "_:".contains(c);
+            if path.contains("::") && path.chars().all(is_item) {
+                let item = path.rsplit("::").next().unwrap();
+                let is_function = item.starts_with(|c: char| c.is_ascii_lowercase());
+                let exists = match is_function {
+                    true => ["(", "<"]
+                        .iter()
+                        .any(|end| is_in_source(&format!("fn {item}{end}"))),
+                    false => is_in_source(item),
+                };
+                assert!(exists, "{} names {name}", document.display());
+                functions += 1;
+            }
+        }
+    }
+    assert!(files > 10 && functions > 30, "{files}, {functions}");
+}
+
 #[test]
 fn every_decision_is_numbered_dated_and_in_the_index() {
     let folder = root().join("docs/decisions");
