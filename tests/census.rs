@@ -252,9 +252,12 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
     // has time to answer.
     fs::write(robot.scratch.path("slow"), "3 registerSubscriber").unwrap();
     robot.revive_master();
+    let mut value = 0;
     let held = eventually_some("a write waits for the end of the injection", || {
         let client = client.clone();
-        let setting = thread::spawn(move || client.set_param("/held", 1));
+        // What changes nothing does not wait.
+        value += 1;
+        let setting = thread::spawn(move || client.set_param("/held", value));
         holds(Duration::from_millis(300), || !setting.is_finished()).then_some(setting)
     });
     node.signal(Signal::USR1);

@@ -104,11 +104,11 @@ impl Board {
     /// The state in a line; `unprotected` is why it is not recorded.
     pub fn line(&self, unprotected: Option<String>) -> String {
         let inner = self.lock();
-        let mut line = match (inner.open, unprotected) {
-            (false, _) if inner.crash_loop => "the master dies again and again".to_owned(),
-            (false, _) => "the master is away".to_owned(),
-            (true, Some(reason)) => format!("unprotected: {reason}"),
-            (true, None) => "protected".to_owned(),
+        let mut line = match (unprotected, inner.open) {
+            (Some(reason), _) => format!("unprotected: {reason}"),
+            (None, false) if inner.crash_loop => "the master dies again and again".to_owned(),
+            (None, false) => "the master is away".to_owned(),
+            (None, true) => "protected".to_owned(),
         };
         if let Guarded::NoLonger(pid) = inner.guarded {
             line += &format!("; unguarded: the guardian, process {pid}, has ended");
@@ -310,6 +310,9 @@ mod tests {
         assert_eq!(board.line(None), "protected");
         let line = board.line(Some("the disk\nis full".to_owned()));
         assert_eq!(line, "unprotected: the disk is full");
+        board.set_open(false);
+        assert_eq!(board.line(Some("why".to_owned())), "unprotected: why");
+        board.set_open(true);
         board.set_guarded(Guarded::NoLonger(7));
         assert!(board.line(None).contains("unguarded"));
     }

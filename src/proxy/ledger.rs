@@ -4,6 +4,7 @@
 //! the old master that arrives after its state was taken for the injection is not acknowledged.
 
 mod durability;
+mod injection;
 mod pending;
 mod summary;
 
@@ -86,6 +87,8 @@ struct Inner {
     /// A master is being brought to the mirror's state, which must not change meanwhile.
     injecting: bool,
     doubted: bool,
+    /// The present incarnation may still run a batch that nobody waits for any more.
+    abandoned: bool,
 }
 
 impl Ledger {
@@ -110,6 +113,7 @@ impl Ledger {
             diverged: HashSet::new(),
             injecting: false,
             doubted: false,
+            abandoned: false,
         };
         inner.add_pending(pending);
         Self {
@@ -297,51 +301,6 @@ impl Ledger {
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         master::may_hold(&inner.mirror, inner.pending.calls())
-    }
-
-    /// The mirror must not change from now on, until [`Self::end_injection`]. What a master that is about to
-    /// be brought to its state is planned from.
-    pub fn begin_injection(&self) -> Basis {
-        let mut inner = self.lock();
-        inner.injecting = true;
-        Basis {
-            mirror: inner.mirror.clone(),
-            version: inner.version,
-            pending: inner.pending.calls().to_vec(),
-        }
-    }
-
-    /// The mirror's version and state, and the token that the next incarnation will get.
-    pub fn next(&self) -> (u64, Master, Token) {
-        let inner = self.lock();
-        let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
-        (inner.version, inner.mirror.clone(), token)
-    }
-
-    /// The next incarnation takes over, to be brought to the mirror's state: replies of the one before no
-    /// longer count. The new one's token.
-    pub fn succeed(&self) -> Token {
-        let mut inner = self.lock();
-        inner.next_incarnation();
-        // The new one is brought to the mirror's state, or the mirror to its.
-        inner.doubted = false;
-        inner.token()
-    }
-
-    /// The present incarnation holds what the mirror holds.
-    pub fn delivered(&self) {
-        let mut inner = self.lock();
-        if !inner.pending.calls().is_empty() {
-            inner.pending.clear();
-            let seq = inner.seq();
-            inner.update_session(|session| session.delivered = seq);
-            self.work.notify_one();
-        }
-    }
-
-    /// The mirror may change again.
-    pub fn end_injection(&self) {
-        self.lock().injecting = false;
     }
 
     /// The present master may not be what the mirror is: it is to be read again.

@@ -151,17 +151,18 @@ pub async fn examine(
 ) -> Result<Examination, ExamineError> {
     let start = Instant::now();
     let served = matches!(manner.known, Known::ServedIfPresent);
-    // Every call that it was sent has been answered, or it is not the one.
-    let resumes = |first: &Inspection| {
-        served && first.bears() == Bears::Present && proxy.ledger.pending() == 0
-    };
+    let resumes =
+        |first: &Inspection| served && first.bears() == Bears::Present && proxy.ledger.resume();
     let mut first = match manner.known {
         Known::New { pid } => Inspection::at_new(pid),
         _ => first_look(proxy, connection).await?,
     };
-    if !matches!(manner.known, Known::New { .. }) && !resumes(&first) {
+    let mut resumed = resumes(&first);
+    if !matches!(manner.known, Known::New { .. }) && !resumed {
         settle(proxy, connection).await?;
+        proxy.ledger.settled();
         first = first_look(proxy, connection).await?;
+        resumed = resumes(&first);
     }
     let mut examination = Examination {
         outcome: Outcome::Resumed,
@@ -172,7 +173,7 @@ pub async fn examine(
         look: start.elapsed(),
         injection: Duration::ZERO,
     };
-    if !resumes(&first) {
+    if !resumed {
         inject(
             proxy,
             tx,

@@ -258,7 +258,10 @@ pub(crate) fn run(
                     if *during { Ok(()) } else { rig.crash() }
                 })
             }
-            Step::Away if skipped(&stage.model).is_empty() && rig.master.is_some() => {
+            // A call that is to be in flight needs a master.
+            Step::Away
+                if !in_flight && skipped(&stage.model).is_empty() && rig.master.is_some() =>
+            {
                 stage.settle().and_then(|()| {
                     let repeats = stage.repeats.get_or_insert_default();
                     repeats.crash(&stage.model);

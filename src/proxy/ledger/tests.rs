@@ -120,6 +120,31 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert!(ledger.stand_in(now, &bye).is_some());
 }
 
+/// What is in flight when a master goes away may be run when it is back, also if it changes nothing now.
+#[test]
+fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let set = call("setParam", &["/n", "/a", "1"]);
+    ledger.abandon_batch();
+    assert!(!ledger.resume());
+    ledger.settled();
+    assert!(ledger.stand_in(now, &set).is_some());
+    assert!(!ledger.resume());
+    ledger.delivered();
+    assert!(ledger.resume());
+    assert_eq!(
+        ledger.stand_in(now, &set),
+        None,
+        "the mirror changed before the gate opened"
+    );
+    ledger.end_injection();
+    assert!(ledger.stand_in(now, &set).is_some());
+    ledger.abandon_batch();
+    ledger.succeed();
+    assert!(ledger.resume());
+}
+
 /// A registration that it takes back may be on its way to a master that takes its time.
 #[test]
 fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {

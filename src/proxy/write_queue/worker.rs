@@ -256,6 +256,7 @@ impl Worker {
         }
         self.take_back(items);
         if error.may_have_run() {
+            proxy.ledger.abandon_batch();
             // Whether it has run shows only when the master is seen again. Until then the mirror answers.
             self.lost = true;
             self.tell_lost.notify_one();
@@ -349,6 +350,9 @@ impl Worker {
             return;
         }
         self.grace = None;
+        if self.in_flight.is_some() {
+            proxy.ledger.abandon_batch();
+        }
         // Its end is what a master that comes back waits for: no call of it is running any more.
         self.connection = None;
         if let Some(batch) = self
