@@ -94,8 +94,8 @@ impl Cause {
     }
 }
 
-/// What the shell is to do, in order. `Connect`, `Examine` and `Probe` replace one another: a new
-/// one cancels the one under way.
+/// What the shell is to do, in order. A new `Connect` or `Examine` cancels the step that is under way;
+/// a `Probe` leaves it alone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
     /// Connect to the master; answer `Connected`, `Refused` or `Unreachable`.

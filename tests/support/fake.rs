@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
+use std::os::fd::AsRawFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
@@ -359,8 +360,9 @@ impl Server {
                     continue;
                 };
                 let _ = stream.set_nodelay(true);
+                let handle = other.as_raw_fd();
                 lock(&connections).push(other);
-                let serve = Arc::clone(&serve);
+                let (serve, connections) = (Arc::clone(&serve), Arc::clone(&connections));
                 thread::spawn(move || {
                     let closing = stream.try_clone();
                     serve(stream);
@@ -368,6 +370,7 @@ impl Server {
                     if let Ok(stream) = closing {
                         let _ = stream.shutdown(Shutdown::Both);
                     }
+                    lock(&connections).retain(|other| other.as_raw_fd() != handle);
                 });
             }
         });
