@@ -253,8 +253,7 @@ fn receive_signals() -> io::Result<Receiver<i32>> {
     Ok(receiver)
 }
 
-/// Whether we were started with SIGHUP ignored, as by nohup: whoever did so wants us to outlive the
-/// terminal.
+/// Whether we were started with SIGHUP ignored, as by nohup: we are to outlive the terminal then.
 pub fn is_hangup_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

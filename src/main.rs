@@ -126,7 +126,7 @@ fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn
         .enable_all()
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));
-    // The closing checkpoint is on the disk, and has overtaken whatever was being written. What still
+    // The closing checkpoint is on the disk, and is newer than any write still under way. What still
     // runs in a thread may be a question to a name server that never answers: the end of a process
     // does not wait for that, but the drop of a runtime would.
     runtime.shutdown_timeout(LAST_JOBS);

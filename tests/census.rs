@@ -223,7 +223,8 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
 /// only thread for calls. The health check after a recovery waits for what came during the injection.
 #[test]
 fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
-    let options = ["--hold", "40", "--census-timeout", "1500"];
+    // The injection takes longer than `--hold`.
+    let options = ["--hold", "1", "--census-timeout", "1500"];
     let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
     let client = robot.client();
     client.set_param("/gain", 7);
@@ -260,6 +261,11 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
         let setting = thread::spawn(move || client.set_param("/held", value));
         holds(Duration::from_millis(300), || !setting.is_finished()).then_some(setting)
     });
+    client.set_param("/gain", 7);
+    assert!(
+        !held.is_finished(),
+        "what changes nothing waited for the injection"
+    );
     node.signal(Signal::USR1);
     eventually("it cannot answer", || !answers("getSubscriptions"));
     assert!(!answers("getPid"));

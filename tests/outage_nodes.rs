@@ -185,14 +185,7 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
 
     // A node that is there and ends says so at once, and is believed.
     for node in &mut leaving {
-        let start = Instant::now();
-        node.signal(Signal::INT);
-        node.wait();
-        assert!(
-            start.elapsed() < Duration::from_secs(20),
-            "{:?}",
-            start.elapsed()
-        );
+        end(node, Signal::INT);
     }
     let now = support::State::read(&robot.client());
     assert!(
@@ -216,14 +209,7 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
     }
     for (nodes, signal) in brief.iter_mut().zip([Signal::KILL, Signal::INT]) {
         for node in nodes {
-            let start = Instant::now();
-            node.signal(signal);
-            node.wait();
-            assert!(
-                start.elapsed() < Duration::from_secs(20),
-                "{:?}",
-                start.elapsed()
-            );
+            end(node, signal);
         }
     }
     let now = support::State::read(&robot.client());
@@ -250,4 +236,13 @@ fn after_types(state: &support::State, robot: &Robot) -> support::State {
         topic_types: robot.state().topic_types,
         ..state.clone()
     }
+}
+
+/// Ends a node, which must not wait for the master.
+fn end(node: &mut Node, signal: Signal) {
+    let start = Instant::now();
+    node.signal(signal);
+    node.wait();
+    let took = start.elapsed();
+    assert!(took < Duration::from_secs(20), "{took:?}");
 }

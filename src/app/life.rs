@@ -20,8 +20,8 @@ use crate::{
 const LIFE_SIGN: Duration = Duration::from_secs(1);
 
 /// Whether any node of `state` answers. After a boot of this computer (`same_boot` is false) only
-/// nodes elsewhere count: none of its own processes has survived, and whoever answers at the port of
-/// one is a stranger.
+/// nodes elsewhere count: none of its own processes has survived, and a process at the port of one
+/// is a stranger.
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     let call = Call::new("getPid", vec![CALLER_ID.into()]);
     let mut questions = JoinSet::new();

@@ -1,8 +1,8 @@
 //! Notifications that we send beside the master, whose own may be late.
 //!
 //! rosmaster makes each list of publishers when something changes, and sends it when one of its
-//! threads gets to it: after minutes, where nodes that cannot be reached hold them up. So we tell the
-//! news ourselves, but not before the master would have done so if nothing held it up: a list of its
+//! threads gets to it: after minutes, where nodes that cannot be reached hold them up. So we tell the change
+//! ourselves, but not before the master would have done so if nothing held it up: a list of its
 //! that comes after a newer one of ours makes roscpp nodes drop links, until they are told anew. And
 //! we tell them again and again, because such a list may still be on its way.
 
@@ -64,7 +64,7 @@ impl<K: Ord + Clone> Repeats<K> {
     }
 
     /// What is to be told now. `holding_up`: there are nodes that do not answer. While all do, the
-    /// master tells the news itself.
+    /// master notifies nodes itself.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {

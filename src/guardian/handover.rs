@@ -71,7 +71,7 @@ pub struct Sockets {
 pub enum Guard {
     /// Nobody that we know of.
     Nobody,
-    /// systemd, or whoever else speaks its protocol.
+    /// systemd, or another supervisor with its protocol.
     Systemd,
     /// The guardian.
     Guardian {

@@ -212,7 +212,7 @@ fn is_returnable(value: &Value, levels: usize) -> bool {
     error_within(value, levels).is_none() && !holds_markup(value)
 }
 
-/// Whether a date's text is taken for markup by whoever reads the reply: CPython does not escape it.
+/// Whether a date's text breaks the reply's XML: CPython does not escape it.
 fn holds_markup(value: &Value) -> bool {
     match value {
         Value::DateTime(text) if text.contains(['<', '>', '&']) => {

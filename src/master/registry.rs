@@ -98,7 +98,7 @@ impl Registry {
         bumped
     }
 
-    /// Like [`Registry::register`]: takes the service from whoever has it, who keeps a reference.
+    /// Like [`Registry::register`]: takes the service from its present provider, which keeps a reference.
     pub(super) fn register_service(
         &mut self,
         service: &str,

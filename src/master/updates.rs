@@ -10,8 +10,7 @@ use crate::xmlrpc::{Struct, Value};
 /// The value of what is gone, in a `paramUpdate`.
 pub(super) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
-/// A `paramUpdate` to the subscribers of one key. The value is that of the call, or a part of it, for
-/// whoever it goes to.
+/// A `paramUpdate` to the subscribers of one key. The value is that of the call, or a part of it.
 pub(super) struct Update<'a> {
     pub(super) nodes: &'a [String],
     /// Of these, the one that is not told: it made the change.

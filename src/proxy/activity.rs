@@ -16,7 +16,7 @@ use crate::{
 /// How long before an outage a change may lie whose notices the dead master still owed. Its three
 /// notifier threads can be held up by nodes that cannot be reached.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
-/// Topics, and parameters of one node, remembered for that; and news at the same time.
+/// Topics, and parameters of one node, remembered for that; and changes to tell at the same time.
 const NOTICES: usize = 4096;
 /// So many nodes may be remembered that are not registered any more.
 const NODES: usize = 1024;
@@ -345,7 +345,7 @@ impl Activity {
         self.outbox.changes.extend(topics.chain(params));
     }
 
-    /// `pid` is behind `api`, at which `node` is registered, and was asked for after the deed that
+    /// `pid` is behind `api`, at which `node` is registered, and was asked for after the call that
     /// `registered` numbers.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
         if self.last_calls(node).registered == registered {

@@ -14,7 +14,8 @@ pub enum State {
     },
     /// The mirror answers reads and writes: the master is away.
     StandingIn,
-    /// The mirror answers reads. Writes wait, because a master is being brought to its state.
+    /// The mirror answers reads, and writes that change nothing. Other writes wait: a master is being
+    /// brought to its state.
     Injecting,
     /// Nowhere: no master was ever seen, and nobody knows what its state would be.
     Unknown,

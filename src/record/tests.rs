@@ -70,7 +70,7 @@ fn assert_flips_noticed(step: usize) {
     }
 }
 
-/// Every [`FLIP_STEP`]th bit; all of them with `ROSRESCUE_FLIP_STEP=1 cargo test --release flipped`.
+/// Flips each [`FLIP_STEP`]th bit; all of them with `ROSRESCUE_FLIP_STEP=1 cargo test --release flipped`.
 #[test]
 fn bits_of_a_large_file_flipped_are_noticed() {
     let step = std::env::var("ROSRESCUE_FLIP_STEP").map(|step| step.parse().unwrap());

@@ -68,7 +68,7 @@ pub(super) struct Outcome {
     pub(super) mended: Vec<String>,
 }
 
-/// What follows a recovery that took place since `outage`, beside traffic: who did not hear the news
+/// What follows a recovery that took place since `outage`, beside traffic: who was not notified
 /// is told, and the census is taken.
 pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Recovered) {
     let under_way = Nodes::begin_census(&proxy);
@@ -82,7 +82,7 @@ pub(super) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     // Queued calls first: what nodes say in them is newer than what they say to us.
     barrier(&proxy).await;
     let mut healed = match outcome {
-        // A master that lives on tells its news itself.
+        // A master that lives on notifies nodes itself.
         Recovered::Adopted => Vec::new(),
         Recovered::Reconciled => {
             // It may tell now what it knew before.

@@ -270,10 +270,12 @@ async fn inject(
     let takes_over = !found.is_empty() && mirror.is_empty();
     let (state, replaced) = match bears {
         Bears::Nothing => {
-            examination.outcome = match mirror.is_empty() {
-                _ if takes_over => Outcome::Adopted,
-                true => Outcome::Begun,
-                false => Outcome::Injected,
+            examination.outcome = if takes_over {
+                Outcome::Adopted
+            } else if mirror.is_empty() {
+                Outcome::Begun
+            } else {
+                Outcome::Injected
             };
             (mirror.clone(), None)
         }

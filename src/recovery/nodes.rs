@@ -98,7 +98,7 @@ impl Nodes {
         was
     }
 
-    /// News are told by us as long as somebody is suspect, or may be. Answers whether that begins.
+    /// We tell changes beside the master as long as somebody is suspect, or may be. Answers whether that begins.
     fn update_telling(&self, proxy: &Proxy) -> bool {
         // One lock around the other, here and nowhere else: the last word is the latest.
         let suspects = self.lock();
@@ -109,7 +109,7 @@ impl Nodes {
             && telling
     }
 
-    /// News are told by us until the result is dropped: nobody knows yet who is suspect.
+    /// We tell changes beside the master until the result is dropped: nobody knows yet who is suspect.
     pub(super) fn begin_census(proxy: &Arc<Proxy>) -> CensusUnderWay {
         proxy.nodes.censuses.fetch_add(1, Ordering::Relaxed);
         proxy.nodes.update_telling(proxy);

@@ -78,7 +78,7 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
         let notifications = names.flat_map(|(name, _)| {
             let topics = mirror.subscriptions(name).map(str::to_owned);
-            // What is not set, and may never have been, is no news.
+            // What is not set, and may never have been, is nothing to tell.
             let keys = mirror.param_subscriptions(name);
             let keys = keys.filter(|key| mirror.is_set(key)).map(Arc::from);
             topics
@@ -87,8 +87,8 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
         });
         notifications.collect::<Vec<_>>()
     });
-    for letter in notifications {
-        send(proxy, api, letter);
+    for notification in notifications {
+        send(proxy, api, notification);
     }
 }
 

@@ -15,14 +15,28 @@ fn check(store: &mut Store<SimFs>) {
     }
 }
 
-/// A store with two records.
-fn started(fs: &SimFs, model: &mut Model) -> Store<SimFs> {
-    let (mut store, _) = open(fs).unwrap();
+/// A store with two records, on a disk of its own.
+fn started() -> (SimFs, Model, Store<SimFs>) {
+    let (fs, mut model) = (SimFs::default(), Model::default());
+    let (mut store, _) = open(&fs).unwrap();
     model.begin(&mut store);
     model.append(&mut store, 2);
     check(&mut store);
     assert_eq!(store.unprotected(), None);
-    store
+    (fs, model, store)
+}
+
+/// Checks every file system that a crash at operation `at` may leave. The next start leaves `kept` alone.
+fn at_each_image(fs: &SimFs, at: usize, kept: &[u8], check: impl Fn(&SimFs, &str)) {
+    let mut images = fs.after_power_loss(4_096);
+    images.push(fs.after_kill());
+    for (nth, image) in images.iter().enumerate() {
+        let context = format!("operation {at}, image {nth}");
+        assert!(image.has(kept), "{context}");
+        check(image, &context);
+        go_on(image, &context);
+        assert!(image.has(kept), "{context}");
+    }
 }
 
 /// The whole file with one byte changed.
@@ -32,9 +46,9 @@ fn changed(fs: &SimFs) -> Vec<u8> {
     bytes
 }
 
-type Deed = fn(&SimFs);
+type Change = fn(&SimFs);
 
-const DEEDS: [(&str, &str, Deed); 7] = [
+const CHANGES: [(&str, &str, Change); 7] = [
     ("removed", "removed or renamed", |fs| fs.take_away(path())),
     ("replaced", "another file", |fs| {
         fs.overwrite(path(), FOREIGN, false);
@@ -61,11 +75,9 @@ const DEEDS: [(&str, &str, Deed); 7] = [
 #[test]
 fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
     // In a quiet time, and in the middle of traffic.
-    for ((what, word, deed), traffic) in DEEDS.into_iter().flat_map(|it| [(it, 0), (it, 1)]) {
-        let fs = SimFs::default();
-        let mut model = Model::default();
-        let mut store = started(&fs, &mut model);
-        deed(&fs);
+    for ((what, word, change), traffic) in CHANGES.into_iter().flat_map(|it| [(it, 0), (it, 1)]) {
+        let (fs, mut model, mut store) = started();
+        change(&fs);
         model.append(&mut store, traffic);
         check(&mut store);
         let reason = store.unprotected().expect(what);
@@ -84,9 +96,7 @@ fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
 
 #[test]
 fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (fs, mut model, mut store) = started();
     fs.overwrite(path(), b"", true);
     model.append(&mut store, 1);
     assert_eq!(model.acked, 2);
@@ -95,9 +105,7 @@ fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
 
 #[test]
 fn a_file_that_was_merely_touched_goes_on() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (fs, mut model, mut store) = started();
     let bytes = fs.read(path(), 1 << 20).unwrap();
     fs.overwrite(path(), &bytes, true);
     model.append(&mut store, 1);
@@ -108,9 +116,7 @@ fn a_file_that_was_merely_touched_goes_on() {
 
 #[test]
 fn a_check_of_an_earlier_generation_says_nothing_of_this_one() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (_, mut model, mut store) = started();
     let late = store.check_job().unwrap();
     model.begin(&mut store);
     store.checked(late.run()).unwrap();
@@ -122,9 +128,7 @@ fn a_check_of_an_earlier_generation_says_nothing_of_this_one() {
 #[test]
 fn what_is_found_at_the_path_is_kept_at_every_crash() {
     for at in 0.. {
-        let fs = SimFs::default();
-        let mut model = Model::default();
-        let mut store = started(&fs, &mut model);
+        let (fs, mut model, mut store) = started();
         model.begin(&mut store);
         fs.overwrite(path(), FOREIGN, false);
         fs.arm(at, Fault::Kill(4));
@@ -133,20 +137,13 @@ fn what_is_found_at_the_path_is_kept_at_every_crash() {
         model.sync(&mut store);
         drop(store);
         let reached = fs.disarm();
-        let mut images = fs.after_power_loss(4_096);
-        images.push(fs.after_kill());
-        for (nth, image) in images.iter().enumerate() {
-            let context = format!("operation {at}, image {nth}");
-            assert!(image.has(FOREIGN), "{context}");
+        at_each_image(&fs, at, FOREIGN, |image, context| {
             let loaded = open(image).unwrap().1;
             assert!(
                 !done || loaded.is_some_and(|loaded| loaded.exact),
                 "{context}"
             );
-            // And the next start keeps it, too.
-            go_on(image, &context);
-            assert!(image.has(FOREIGN), "{context}");
-        }
+        });
         if !reached {
             assert!(done && at > 5);
             break;
@@ -156,9 +153,7 @@ fn what_is_found_at_the_path_is_kept_at_every_crash() {
 
 #[test]
 fn a_state_that_comes_from_elsewhere_replaces_no_file() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);
     let names = Names { path: PATH.into() };
@@ -190,9 +185,7 @@ fn a_state_that_comes_from_elsewhere_replaces_no_file() {
 
 #[test]
 fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
-    let disk = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&disk, &mut model);
+    let (disk, mut model, mut store) = started();
     model.sync(&mut store);
     model.begin(&mut store);
     drop(store);
@@ -209,15 +202,10 @@ fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
             model.begin(&mut store);
         }
         let reached = fs.disarm();
-        let mut images = fs.after_power_loss(4_096);
-        images.push(fs.after_kill());
-        for (nth, image) in images.iter().enumerate() {
-            let context = format!("operation {at}, image {nth}");
+        at_each_image(&fs, at, &unread, |image, context| {
             let loaded = open(image).unwrap().1.unwrap();
             assert_eq!(state(&loaded), model.applied, "{context}");
-            go_on(image, &context);
-            assert!(image.has(&unread), "{context}");
-        }
+        });
         if !reached {
             let names = fs.list(Path::new("/log")).unwrap();
             assert!(names.contains(&"latest-chkpt.yaml.unreadable-1".to_owned()));
@@ -229,9 +217,7 @@ fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
 /// Without a fallback nothing is known, and nothing is touched.
 #[test]
 fn what_cannot_be_read_stays_if_there_is_no_other() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);
     let names = Names { path: PATH.into() };
@@ -244,9 +230,7 @@ fn what_cannot_be_read_stays_if_there_is_no_other() {
 
 #[test]
 fn a_previous_generation_that_cannot_be_read_is_kept() {
-    let fs = SimFs::default();
-    let mut model = Model::default();
-    let mut store = started(&fs, &mut model);
+    let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);
     let names = Names { path: PATH.into() };

@@ -1,0 +1,234 @@
+//! One connection to the master: requests, replies, and its end.
+
+use std::{io, net::SocketAddr};
+
+use bytes::Bytes;
+use http_body_util::{BodyExt, Collected, Full, Limited};
+use hyper::{
+    Request,
+    body::Body,
+    client::conn::http1::SendRequest,
+    header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
+};
+use hyper_util::rt::TokioIo;
+use tokio::{net::TcpStream, sync::watch};
+
+use super::{CallError, Head, INSTANCE_HEADER, RawReply, Writer, is_local};
+use crate::{
+    ros_env::MasterUri,
+    xmlrpc::{self, Call, Reply},
+};
+
+/// One keep-alive connection to the master, for one call at a time.
+#[derive(Debug)]
+pub struct Connection {
+    sender: SendRequest<Full<Bytes>>,
+    ended: watch::Receiver<()>,
+    local: bool,
+    peer: SocketAddr,
+    host: HeaderValue,
+    instance: HeaderValue,
+    max_reply: usize,
+}
+
+impl Connection {
+    /// A connection to the server at `address` over `stream`. Replies of more than `max_reply` bytes
+    /// are not taken.
+    pub async fn over(
+        stream: TcpStream,
+        address: &MasterUri,
+        instance: HeaderValue,
+        max_reply: usize,
+    ) -> io::Result<Self> {
+        Self::open(stream, address, instance, max_reply, None).await
+    }
+
+    pub(super) async fn open(
+        stream: TcpStream,
+        address: &MasterUri,
+        instance: HeaderValue,
+        max_reply: usize,
+        writer: Option<Writer>,
+    ) -> io::Result<Self> {
+        stream.set_nodelay(true)?;
+        let (local, peer) = (is_local(&stream)?, stream.peer_addr()?);
+        let (sender, driver) = hyper::client::conn::http1::Builder::new()
+            .title_case_headers(true)
+            .handshake(TokioIo::new(stream))
+            .await
+            .map_err(io::Error::other)?;
+        let (end, ended) = watch::channel(());
+        tokio::spawn(async move {
+            // Its error, if any, is also that of the call under way.
+            let _ = driver.await;
+            drop((end, writer));
+        });
+        let host = HeaderValue::from_str(&address.authority()).map_err(io::Error::other)?;
+        Ok(Self {
+            sender,
+            ended,
+            local,
+            peer,
+            host,
+            instance,
+            max_reply,
+        })
+    }
+
+    /// Whether the connection is known to have ended.
+    pub fn is_closed(&self) -> bool {
+        self.sender.is_closed()
+    }
+
+    /// Whether the other end is on this computer, or seems to be: a tunnel's is here too.
+    pub fn is_local(&self) -> bool {
+        self.local
+    }
+
+    /// The other end.
+    pub fn peer(&self) -> SocketAddr {
+        self.peer
+    }
+
+    /// Returns when the connection has ended.
+    pub fn ended(&self) -> impl Future<Output = ()> + Send + 'static {
+        let mut ended = self.ended.clone();
+        async move {
+            // Nothing is ever sent: it ends in the error that the sender is gone.
+            while ended.changed().await.is_ok() {}
+        }
+    }
+
+    /// Sends `body` as it is; the reply comes back as it is.
+    pub async fn forward(&mut self, head: &Head, body: Bytes) -> Result<RawReply, CallError> {
+        self.exchange(head, body, None).await
+    }
+
+    /// Sends a body of our own. As far as the reply is what was `predicted` it is only compared, and
+    /// takes no memory.
+    pub async fn predicted(
+        &mut self,
+        body: Bytes,
+        predicted: &Bytes,
+    ) -> Result<RawReply, CallError> {
+        let head = Head::default();
+        self.exchange(&head, body, Some(predicted)).await
+    }
+
+    async fn exchange(
+        &mut self,
+        head: &Head,
+        body: Bytes,
+        predicted: Option<&Bytes>,
+    ) -> Result<RawReply, CallError> {
+        // rosmaster gzips replies when it may, in Python: it may not.
+        let mut request = Request::post(head.path.as_str())
+            .header(HOST, &self.host)
+            .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
+            .header(CONTENT_TYPE, "text/xml")
+            // Of an empty body too: without it rosmaster answers with a status 500 and no body.
+            .header(CONTENT_LENGTH, body.len())
+            .header(INSTANCE_HEADER, &self.instance);
+        if let Some(encoding) = &head.encoding {
+            request = request.header(CONTENT_ENCODING, encoding);
+        }
+        let request = request
+            .body(Full::new(body))
+            .map_err(|error| CallError::BrokenReply(error.into()))?;
+        if let Err(error) = self.sender.ready().await {
+            return Err(CallError::NotSent(error));
+        }
+        let reply = match self.sender.send_request(request).await {
+            Ok(reply) => reply,
+            Err(error) if error.is_canceled() => return Err(CallError::NotSent(error)),
+            Err(error) => return Err(CallError::MaybeSent(error)),
+        };
+        let (parts, body) = reply.into_parts();
+        let body = Limited::new(body, self.max_reply);
+        let body = match predicted {
+            Some(predicted) => collect(body, predicted).await,
+            None => body.collect().await.map(Collected::to_bytes),
+        };
+        Ok(RawReply {
+            status: parts.status,
+            reason: parts.extensions.get().cloned(),
+            headers: parts.headers,
+            body: body.map_err(CallError::BrokenReply)?,
+        })
+    }
+
+    /// Makes a call of our own.
+    pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
+        let body = Bytes::from(xmlrpc::encode_call(call));
+        self.forward(&Head::default(), body).await?.decode()
+    }
+}
+
+/// The whole of `body`. As far as it is what was `predicted`, that stands for it.
+async fn collect<B: Body<Data = Bytes> + Unpin>(
+    mut body: B,
+    predicted: &Bytes,
+) -> Result<Bytes, B::Error> {
+    let mut same = 0;
+    while let Some(frame) = body.frame().await {
+        let Ok(data) = frame?.into_data() else {
+            continue;
+        };
+        let (before, ahead) = predicted.split_at(same);
+        if !ahead.starts_with(&data) {
+            let rest = body.collect().await?.to_bytes();
+            return Ok([before, &data, &rest].concat().into());
+        }
+        same += data.len();
+    }
+    Ok(predicted.slice(..same))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{
+        convert::Infallible,
+        pin::Pin,
+        task::{Context, Poll},
+    };
+
+    use hyper::body::Frame;
+
+    use super::*;
+
+    /// A body that comes in these pieces.
+    struct Pieces(std::vec::IntoIter<&'static str>);
+
+    impl Body for Pieces {
+        type Data = Bytes;
+        type Error = Infallible;
+
+        fn poll_frame(
+            mut self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+        ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+            let piece = self.0.next();
+            Poll::Ready(piece.map(|piece| Ok(Frame::data(Bytes::from(piece)))))
+        }
+    }
+
+    #[tokio::test]
+    async fn a_predicted_reply_is_kept_once_and_any_other_as_it_is() {
+        let predicted = Bytes::from("what is predicted");
+        for pieces in [
+            vec!["what is ", "predicted"],
+            vec!["what is ", "", "predicted", " and more"],
+            vec!["what is ", "fore", "seen", "?"],
+            vec!["what", " is"],
+            vec!["nothing of it"],
+            vec![],
+        ] {
+            let whole = pieces.concat();
+            let got = collect(Pieces(pieces.into_iter()), &predicted).await;
+            let got = got.unwrap_or_default();
+            assert_eq!(got, whole);
+            let is_kept = got.as_ptr() == predicted.as_ptr();
+            assert_eq!(is_kept, predicted.starts_with(whole.as_bytes()), "{whole}");
+        }
+    }
+}
