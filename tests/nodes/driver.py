@@ -1,7 +1,7 @@
 #!/usr/bin/python3
-"""A driver as robots have them: at 50 Hz it publishes, at 10 Hz it logs, and it runs `diagnostic_updater`, which asks
-for its period at 4 Hz. It says each fifth of a second how long its longest pass took in milliseconds since it last
-said so.
+"""A driver as robots have them: at 50 Hz it publishes, at 10 Hz it reads a parameter and logs, and it runs
+`diagnostic_updater`, which asks for its period at 4 Hz. It says each fifth of a second how long its longest pass took
+in milliseconds since it last said so.
 
 Neither `~diagnostic_period` nor `/rosout_disable_topics_generation` is set, as on most robots: rospy's
 `get_param_cached` then calls `subscribeParam` each time.
@@ -30,6 +30,7 @@ def main():
         begin = time.monotonic()
         publisher.publish("%s %d" % (rospy.get_name(), number))
         if number % (HZ // 10) == 0:
+            rospy.get_param("/gain", 0)
             rospy.loginfo("pass %d", number)
         updater.update()
         longest = max(longest, time.monotonic() - begin)
