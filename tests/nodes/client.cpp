@@ -15,8 +15,11 @@ int main(int argc, char** argv)
   ros::Rate rate(hz);
   while (ros::ok())
   {
+    // Not ros::service::call: one such call in some 40,000 fails, at a bare rosmaster, too, because the server closes
+    // the connection before roscpp has read the reply (ros_comm issue 1976). A persistent connection stays open.
+    ros::ServiceClient client = node.serviceClient<roscpp::GetLoggers>("who", true);
     roscpp::GetLoggers call;
-    if (ros::service::call("who", call) && !call.response.loggers.empty())
+    if (client.call(call) && !call.response.loggers.empty())
       say("reply " + call.response.loggers[0].name);
     else if (ros::ok())
       say("failed the call of the service");
