@@ -167,7 +167,11 @@ impl<S: Storage> Store<S> {
 
     /// [`latch`](Self::latch) because of what somebody else did.
     pub(super) fn changed(&mut self, change: Change) -> StoreError {
-        if !matches!(change, Change::Lock) {
+        if matches!(change, Change::Lock) {
+            // While the open file, which is locked too, still keeps others out. A failure comes up again
+            // when the next generation is written.
+            let _ = self.hold_lock();
+        } else {
             // Whatever is at the path now is not ours to replace without keeping it.
             self.present = None;
         }

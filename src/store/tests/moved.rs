@@ -94,6 +94,17 @@ fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
     }
 }
 
+/// Whoever looks between the two finds one of them.
+#[test]
+fn a_lock_file_is_there_again_before_the_locked_file_is_closed() {
+    let (fs, _, mut store) = started();
+    let lock = Names { path: PATH.into() }.lock();
+    fs.take_away(&lock);
+    check(&mut store);
+    assert!(store.unprotected().is_some());
+    assert!(fs.id_at(&lock).unwrap().is_some());
+}
+
 #[test]
 fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
     let (fs, mut model, mut store) = started();
