@@ -17,29 +17,27 @@ use tokio::{
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
-    admin::Board,
+    checkpoint::{
+        format::Session,
+        session::{self, Decision, Evidence, Rebuilt},
+        store::{self, OpenError, Store},
+    },
     clock,
     config::{Config, MasterConfig},
+    gate,
     guardian::handover::Sockets,
+    ledger::{Ledger, checkpointer},
     master::Master,
+    nodes::{self, Nodes},
     process::{ProcessError, Rosmaster},
-    proxy::{
-        Proxy, checkpointer,
-        clients::Clients,
-        gate,
-        idle::Idle,
-        ledger::Ledger,
-        listener,
-        pool::Pool,
-        stats::Stats,
-        upstream::Upstream,
-        write_queue::{self, Worker},
-    },
-    record::Session,
-    recovery::{Driver, Nodes, core_duties, master_process::MasterProcess, nodes},
+    proxy::Proxy,
+    recovery::{Driver, master_process::MasterProcess},
     ros_env::MasterUri,
-    session::{self, Decision, Evidence, Rebuilt},
-    store::{self, OpenError, Store},
+    roscore,
+    server::{clients::Clients, idle::Idle, listener},
+    status::{Board, stats::Stats},
+    upstream::{Upstream, pool::Pool},
+    write_queue::{self, Worker},
     xmlrpc::Call,
 };
 
@@ -176,9 +174,9 @@ pub async fn run(
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
         if !left {
-            core_duties::seed_run_id(&proxy);
+            roscore::seed_run_id(&proxy);
         }
-        tokio::spawn(core_duties::run(proxy.clone(), rosout, stop.clone()))
+        tokio::spawn(roscore::run(proxy.clone(), rosout, stop.clone()))
     });
     tokio::spawn({
         let halt = halt.clone();
@@ -353,7 +351,7 @@ async fn begin(config: &Config) -> Result<Beginning, RunError> {
     session.boot_id = boot_id;
     session.closed = false;
     if let Some(open) = &mut store {
-        let checkpoint = crate::record::Checkpoint {
+        let checkpoint = crate::checkpoint::format::Checkpoint {
             seq: open.seq(),
             session: session.clone(),
             snapshot: mirror.snapshot(),

@@ -7,7 +7,7 @@ use clap::{
     builder::{FalseyValueParser, PossibleValue},
 };
 
-use crate::session::Restore;
+use crate::checkpoint::session::Restore;
 
 /// Keeps a ROS 1 robot running when its master dies.
 ///

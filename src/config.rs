@@ -9,10 +9,10 @@ use std::{
 use thiserror::Error;
 
 use crate::{
+    checkpoint::session::Restore,
     cli::{CommonArgs, CoreArgs, ProxyArgs, Sync},
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
-    session::Restore,
 };
 
 mod files;

@@ -7,45 +7,55 @@
 //! work goes out as values.
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
-//! * [`master`]: the Master API as a state machine; what a master holds and is to hold, and the one call
-//!   that brings it there.
+//! * [`master`]: the Master API as a state machine.
+//! * [`replay`]: knowing a master again, learning what it holds, and the one call that brings it to a state.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
-//! * [`census`]: what is to be made of what a node says of itself; which nodes are unreachable.
-//! * [`session`]: whether a checkpoint's session goes on, and what state it holds.
-//! * [`record`]: the checkpoint's snapshot and records to and from bytes.
+//! * [`health`]: what is to be made of what a node says of itself; which nodes are unreachable.
+//! * [`checkpoint::session`]: whether a checkpoint's session goes on, and what state it holds.
+//! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
 //!
-//! The *shell* does IO and decides as little as possible.
+//! The *shell* does IO and decides as little as possible. From the bottom to the top:
 //!
 //! * [`cli`], [`config`], [`ros_env`]: what is to be run, and what ROS's environment means.
-//! * [`store`]: the checkpoint on the disk.
-//! * [`guardian`]: the parent process that keeps the sockets and starts the worker again.
-//! * [`proxy`]: listener, gate, write queue, read pool, and the ledger of mirror and journal.
-//! * [`recovery`]: watching the master, examining and injecting; notifications and the health check of nodes.
+//! * [`clock`], [`resolver`], [`wait`]: the wall clock; addresses of hosts; waiting for what may not be there.
+//! * [`gate`]: whether calls pass to the master.
+//! * [`status`]: plain data for people and monitors, which others fill.
+//! * [`checkpoint::store`]: the checkpoint on the disk.
+//! * [`ledger`]: mirror and journal under one lock.
+//! * [`upstream`]: connections to the master.
+//! * [`write_queue`]: where writes wait for the master.
 //! * [`process`]: the processes of rosmaster and rosout, and those that an earlier rosrescue left behind.
-//! * [`admin`]: the status page.
-//! * [`clock`]: the one place that reads the wall clock.
-//! * [`resolver`]: the addresses of hosts, by name servers that may not answer.
-//! * [`wait`]: waiting for what may not be there.
+//! * [`nodes`]: calls to nodes: health check and notifications.
+//! * [`recovery`]: watching the master, examining and injecting.
+//! * [`roscore`]: roscore's other duties.
+//! * [`server`]: what clients talk to.
+//! * [`guardian`]: the parent process that keeps the sockets and starts the worker again.
 //! * [`app`]: puts it all together.
 //!
 //! `docs/architecture.md` follows a call, and a record, through them by the names of functions.
 
-pub mod admin;
 pub mod app;
-pub mod census;
+pub mod checkpoint;
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod gate;
 pub mod guardian;
+pub mod health;
+pub mod ledger;
 pub mod lifecycle;
 pub mod master;
+pub mod nodes;
 pub mod process;
 pub mod proxy;
-pub mod record;
 pub mod recovery;
+pub mod replay;
 pub mod resolver;
 pub mod ros_env;
-pub mod session;
-pub mod store;
+pub mod roscore;
+pub mod server;
+pub mod status;
+pub mod upstream;
 pub mod wait;
+pub mod write_queue;
 pub mod xmlrpc;

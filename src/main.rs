@@ -16,7 +16,7 @@ use rosrescue::{
         self,
         handover::{Guard, Sockets},
     },
-    proxy::listener,
+    server::listener,
 };
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;

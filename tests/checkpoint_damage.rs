@@ -6,11 +6,11 @@
 use std::path::Path;
 
 use indexmap::IndexMap;
-use rosrescue::master::{Snapshot, SnapshotNode};
-use rosrescue::record::{
+use rosrescue::checkpoint::format::{
     Checkpoint, DecodeError, Decoded, Entry, Record, Session, SnapshotError, Stamp, decode,
     encode_checkpoint, encode_record,
 };
+use rosrescue::master::{Snapshot, SnapshotNode};
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
 fn checkpoint(seq: u64) -> Checkpoint {

@@ -7,8 +7,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use rosrescue::record::{Checkpoint, Entry};
-use rosrescue::store::{Store, SyncJob};
+use rosrescue::checkpoint::format::{Checkpoint, Entry};
+use rosrescue::checkpoint::store::{Store, SyncJob};
 use rosrescue::xmlrpc::{Call, Value};
 
 const FILE: &str = "ROSRESCUE_TEST_CHECKPOINT";

@@ -11,7 +11,7 @@ mod support;
 
 use std::process::Command;
 
-use rosrescue::record::{Checkpoint, encode_checkpoint};
+use rosrescue::checkpoint::format::{Checkpoint, encode_checkpoint};
 use rosrescue::xmlrpc::{Struct, Value};
 use support::{Rosmaster, Scratch, find_program};
 

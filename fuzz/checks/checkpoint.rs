@@ -5,10 +5,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
+use rosrescue::checkpoint::format::{self, Checkpoint, Entry, Record};
+use rosrescue::checkpoint::session::{Rebuilt, rebuild};
+use rosrescue::checkpoint::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::master::Master;
-use rosrescue::record::{self, Checkpoint, Entry, Record};
-use rosrescue::session::{Rebuilt, rebuild};
-use rosrescue::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::xmlrpc::Call;
 
 /// Parts the present file from its previous generation, which may follow it.
@@ -76,7 +76,7 @@ fn sealed(bytes: &[u8]) -> Vec<u8> {
 
 /// Panics if loading does, or if what was loaded is not what comes back when it is written.
 fn load(present: &[u8], previous: Option<&[u8]>) {
-    if let Ok(decoded) = record::decode(present) {
+    if let Ok(decoded) = format::decode(present) {
         decoded.records.iter().for_each(check_record);
     }
     let path = Path::new("/c/latest-chkpt.yaml");
@@ -138,9 +138,9 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
 }
 
 fn check_record(record: &Record) {
-    let fresh = record::encode_checkpoint(&Checkpoint::default(), 1).expect("an empty state");
-    let line = record::encode_record(record, fresh.stamp).expect("what was read can be written");
-    let again = record::decode(&[fresh.bytes, line].concat()).expect("our own file");
+    let fresh = format::encode_checkpoint(&Checkpoint::default(), 1).expect("an empty state");
+    let line = format::encode_record(record, fresh.stamp).expect("what was read can be written");
+    let again = format::decode(&[fresh.bytes, line].concat()).expect("our own file");
     assert_eq!(again.records.as_slice(), std::slice::from_ref(record));
 }
 

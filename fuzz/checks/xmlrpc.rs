@@ -1,6 +1,7 @@
 //! What holds of any bytes that come as XML-RPC.
 
 use rosrescue::master::{self, Master};
+use rosrescue::replay;
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_call, encode_reply};
 
 /// Panics if decoding does, or if what was decoded is not what comes out of its own encoding.
@@ -11,7 +12,7 @@ pub(crate) fn check(bytes: &[u8]) {
         master::kind(&call);
         let mut mirror = Master::default();
         let reply = mirror.apply(&call).reply;
-        master::accepted(&Master::default(), &call, &reply);
+        replay::accepted(&Master::default(), &call, &reply);
         assert!(decode_reply(&encode_reply(&reply)).is_ok(), "{reply:?}");
         assert_eq!(
             Master::from_snapshot(mirror.snapshot()).as_ref(),

@@ -10,7 +10,7 @@ use tokio::{task::JoinSet, time::timeout};
 
 use crate::{
     master::{CALLER_ID, Master},
-    recovery::node::{self, Sign},
+    nodes::client::{self, Sign},
     resolver,
     ros_env::MasterUri,
     xmlrpc::Call,
@@ -29,7 +29,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
         let (api, call) = (api.to_owned(), call.clone());
         questions.spawn(async move {
             (same_boot || is_elsewhere(&api).await)
-                && node::ask(&api, &call, LIFE_SIGN).await == Sign::Alive
+                && client::ask(&api, &call, LIFE_SIGN).await == Sign::Alive
         });
     }
     while let Some(alive) = questions.join_next().await {

@@ -11,9 +11,10 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    admin::Guarded,
+    gate::State,
     guardian::handover::{self, Guard},
-    proxy::{Proxy, gate::State},
+    proxy::Proxy,
+    status::Guarded,
 };
 
 /// How often systemd may be told another status.

@@ -4,11 +4,11 @@ use super::{Kind, Master, Notice, NoticeSink, python};
 use crate::xmlrpc::{Call, Reply, Value};
 
 /// What a method returns: status code, message, value.
-pub(super) type Answer = Result<(i32, String, Value), Failure>;
+pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 
 /// Why a method ends early.
 #[derive(Debug, PartialEq)]
-pub(super) enum Failure {
+pub(crate) enum Failure {
     /// A check refuses a parameter: the text is the message.
     Refused(String),
     /// A Python `TypeError`.
@@ -18,9 +18,9 @@ pub(super) enum Failure {
 }
 
 /// One method of the Master API.
-pub(super) struct Method {
+pub(crate) struct Method {
     name: &'static str,
-    pub(super) kind: Kind,
+    pub(crate) kind: Kind,
     /// Number of parameters, the caller id included.
     arity: usize,
     /// The value that goes with an error.
@@ -80,12 +80,12 @@ fn list() -> Value {
     Value::Array(Vec::new())
 }
 
-pub(super) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
+pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
     Value::Array(texts.into_iter().map(Value::String).collect())
 }
 
 /// The method of that name.
-pub(super) fn method(name: &str) -> Option<&'static Method> {
+pub(crate) fn method(name: &str) -> Option<&'static Method> {
     METHODS.iter().find(|method| method.name == name)
 }
 
@@ -129,7 +129,7 @@ impl Master {
     }
 
     /// `_dispatch` of anything but a multicall; an error is the text of a fault.
-    pub(super) fn dispatch(
+    pub(crate) fn dispatch(
         &mut self,
         name: &str,
         params: &[Value],
@@ -179,11 +179,16 @@ impl Master {
     }
 }
 
-pub(super) fn bad_arity() -> Failure {
+/// Whether a method was answered with code 1.
+pub fn is_success(reply: &Reply) -> bool {
+    matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
+}
+
+pub(crate) fn bad_arity() -> Failure {
     Failure::Refused("Error: bad call arity".to_owned())
 }
 
-pub(super) fn fault(text: &str) -> Reply {
+pub(crate) fn fault(text: &str) -> Reply {
     Reply::Fault {
         code: 1,
         text: text.to_owned(),
@@ -191,7 +196,7 @@ pub(super) fn fault(text: &str) -> Reply {
 }
 
 /// The fault of a name that is no method.
-pub(super) fn unsupported(name: &str, arity: usize) -> String {
+pub(crate) fn unsupported(name: &str, arity: usize) -> String {
     if let Some((_, kind)) = NOT_CALLABLE
         .iter()
         .find(|(attribute, _)| *attribute == name)

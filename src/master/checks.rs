@@ -13,7 +13,7 @@ fn refuse<T>(what: &str, complaint: &str) -> Checked<T> {
 }
 
 /// `non_empty_str('key')`.
-pub(super) fn key(value: &Value) -> Checked<&str> {
+pub(crate) fn key(value: &Value) -> Checked<&str> {
     if !python::is_true(value) {
         return refuse("key", "must be specified and non-empty");
     }
@@ -24,7 +24,7 @@ pub(super) fn key(value: &Value) -> Checked<&str> {
 }
 
 /// `not_none('value')`.
-pub(super) fn param_value(value: &Value) -> Checked<&Value> {
+pub(crate) fn param_value(value: &Value) -> Checked<&Value> {
     match value {
         Value::Nil => refuse("value", "must be specified"),
         _ => Ok(value),
@@ -32,7 +32,7 @@ pub(super) fn param_value(value: &Value) -> Checked<&Value> {
 }
 
 /// `is_api`.
-pub(super) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
+pub(crate) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
     match value.as_str() {
         None | Some("") => refuse(what, "is not an XMLRPC URI"),
         Some(text) if text.starts_with("http://") || text.starts_with("rosrpc://") => Ok(text),
@@ -41,7 +41,7 @@ pub(super) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
 }
 
 /// `valid_name`.
-pub(super) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+pub(crate) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
     match value.as_str() {
         None | Some("") => refuse(what, "must be a non-empty string"),
         Some(text) if names::has_illegal_chars(text) => refuse(what, "contains illegal chars"),
@@ -50,7 +50,7 @@ pub(super) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String
 }
 
 /// `is_topic` and `is_service`.
-pub(super) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
+pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
     let resolved = name(what, value, caller_id)?;
     match value.as_str() {
         Some("/") => refuse(what, "cannot be the global namespace"),
@@ -60,7 +60,7 @@ pub(super) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<St
 
 /// `valid_type_name('topic_type')`. A date that reads `*` passes there too, as what it is; here it
 /// becomes the string.
-pub(super) fn topic_type(value: &Value) -> Checked<&str> {
+pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     match value {
         Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),
         Value::String(text) if text.matches('/').count() == 1 => Ok(text),
@@ -72,7 +72,7 @@ pub(super) fn topic_type(value: &Value) -> Checked<&str> {
 }
 
 /// `empty_or_valid_name('subgraph')`.
-pub(super) fn subgraph(value: &Value, caller_id: &str) -> Checked<String> {
+pub(crate) fn subgraph(value: &Value, caller_id: &str) -> Checked<String> {
     match value.as_str() {
         None => refuse("subgraph", "must be a string"),
         Some("") => Ok(String::new()),

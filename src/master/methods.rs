@@ -6,19 +6,19 @@ use super::{Master, NoticeSink, checks, names};
 use crate::xmlrpc::{Struct, Value};
 
 impl Master {
-    pub(super) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, String::new(), self.pid.into()))
     }
 
-    pub(super) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, String::new(), self.uri.as_str().into()))
     }
 
-    pub(super) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
         Ok((1, "shutdown".to_owned(), 0.into()))
     }
 
-    pub(super) fn register_publisher(
+    pub(crate) fn register_publisher(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -38,7 +38,7 @@ impl Master {
         Ok((1, message, strings(subscribers)))
     }
 
-    pub(super) fn register_subscriber(
+    pub(crate) fn register_subscriber(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -57,7 +57,7 @@ impl Master {
         Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
     }
 
-    pub(super) fn register_service(
+    pub(crate) fn register_service(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -75,7 +75,7 @@ impl Master {
         Ok((1, message, 1.into()))
     }
 
-    pub(super) fn unregister_publisher(
+    pub(crate) fn unregister_publisher(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -93,7 +93,7 @@ impl Master {
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(super) fn unregister_subscriber(
+    pub(crate) fn unregister_subscriber(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -108,7 +108,7 @@ impl Master {
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(super) fn unregister_service(
+    pub(crate) fn unregister_service(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -123,7 +123,7 @@ impl Master {
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(super) fn lookup_service(
+    pub(crate) fn lookup_service(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -140,7 +140,7 @@ impl Master {
         })
     }
 
-    pub(super) fn lookup_node(
+    pub(crate) fn lookup_node(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -154,7 +154,7 @@ impl Master {
         })
     }
 
-    pub(super) fn get_published_topics(
+    pub(crate) fn get_published_topics(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -175,7 +175,7 @@ impl Master {
         ))
     }
 
-    pub(super) fn get_topic_types(
+    pub(crate) fn get_topic_types(
         &mut self,
         _: &str,
         _: &[Value],
@@ -187,7 +187,7 @@ impl Master {
         Ok((1, message, Value::Array(pairs.collect())))
     }
 
-    pub(super) fn get_system_state(
+    pub(crate) fn get_system_state(
         &mut self,
         _: &str,
         _: &[Value],
@@ -212,7 +212,7 @@ impl Master {
         Ok((1, "current system state".to_owned(), Value::Array(state)))
     }
 
-    pub(super) fn set_param(
+    pub(crate) fn set_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -228,7 +228,7 @@ impl Master {
         Ok((1, format!("parameter {key} set"), 0.into()))
     }
 
-    pub(super) fn delete_param(
+    pub(crate) fn delete_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -247,7 +247,7 @@ impl Master {
         })
     }
 
-    pub(super) fn get_param(
+    pub(crate) fn get_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -261,7 +261,7 @@ impl Master {
         })
     }
 
-    pub(super) fn has_param(
+    pub(crate) fn has_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -273,7 +273,7 @@ impl Master {
         Ok((1, key, has.into()))
     }
 
-    pub(super) fn search_param(
+    pub(crate) fn search_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -290,7 +290,7 @@ impl Master {
         })
     }
 
-    pub(super) fn get_param_names(
+    pub(crate) fn get_param_names(
         &mut self,
         _: &str,
         _: &[Value],
@@ -303,7 +303,7 @@ impl Master {
         ))
     }
 
-    pub(super) fn subscribe_param(
+    pub(crate) fn subscribe_param(
         &mut self,
         caller_id: &str,
         params: &[Value],
@@ -321,7 +321,7 @@ impl Master {
         Ok((1, format!("Subscribed to parameter [{key}]"), value))
     }
 
-    pub(super) fn unsubscribe_param(
+    pub(crate) fn unsubscribe_param(
         &mut self,
         caller_id: &str,
         params: &[Value],

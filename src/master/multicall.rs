@@ -7,16 +7,16 @@ use super::{Kind, Master, NoticeSink, python};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// The name of the method.
-pub(super) const METHOD: &str = "system.multicall";
+pub(crate) const METHOD: &str = "system.multicall";
 
 /// Multicalls within multicalls that Python's recursion limit allows, and no more than our stack does.
-pub(super) const DEEPEST: usize = 480;
+pub(crate) const DEEPEST: usize = 480;
 
 /// More parameters than any method takes.
 const TOO_MANY: usize = 5;
 
 /// One entry of a multicall.
-pub(super) enum Entry<'a> {
+pub(crate) enum Entry<'a> {
     /// Something that is run.
     Call {
         method: &'a str,
@@ -30,7 +30,7 @@ pub(super) enum Entry<'a> {
 
 /// The entries of a multicall with these parameters, or the fault if there are none to find. Of what is
 /// iterable and no list only the first: no item of that is an entry, and the first ends the multicall.
-pub(super) fn entries(params: &[Value]) -> Result<Cow<'_, [Value]>, String> {
+pub(crate) fn entries(params: &[Value]) -> Result<Cow<'_, [Value]>, String> {
     match params {
         [] => Err("<class 'TypeError'>:SimpleXMLRPCDispatcher.system_multicall() missing 1 required positional argument: 'call_list'".to_owned()),
         [list] => python::items(list, 1).ok_or_else(|| {
@@ -50,7 +50,7 @@ fn too_many(count: usize) -> String {
 
 impl<'a> Entry<'a> {
     /// What the dispatcher makes of an element of the list.
-    pub(super) fn new(element: &'a Value) -> Self {
+    pub(crate) fn new(element: &'a Value) -> Self {
         let Some(members) = element.as_struct() else {
             return Self::Malformed(format!(
                 "<class 'TypeError'>:{}",
@@ -106,7 +106,7 @@ fn not_iterable(name: &str, params: &Value) -> String {
 
 impl Master {
     /// Runs a whole multicall: what it returns, or the text of its fault.
-    pub(super) fn run_multicall(
+    pub(crate) fn run_multicall(
         &mut self,
         params: &[Value],
         notices: &mut dyn NoticeSink,
@@ -231,7 +231,7 @@ fn fault_entry(text: String) -> Value {
 }
 
 /// A reply as an entry of a multicall's result.
-pub(super) fn reply_entry(reply: Reply) -> Value {
+pub(crate) fn reply_entry(reply: Reply) -> Value {
     match reply {
         Reply::Value(value) => Value::Array(vec![value]),
         Reply::Fault { text, .. } => fault_entry(text),
@@ -239,7 +239,7 @@ pub(super) fn reply_entry(reply: Reply) -> Value {
 }
 
 /// The reply that an entry of a multicall's result stands for.
-pub(super) fn entry_reply(result: &Value) -> Option<Reply> {
+pub(crate) fn entry_reply(result: &Value) -> Option<Reply> {
     match result {
         Value::Array(only) => match only.as_slice() {
             [value] => Some(Reply::Value(value.clone())),

@@ -9,7 +9,7 @@ use std::borrow::Cow;
 pub const CALLER_ID: &str = "/rosrescue";
 
 /// `canonicalize_name`: without doubled and trailing slashes.
-pub(super) fn canonicalize(name: &str) -> Cow<'_, str> {
+pub(crate) fn canonicalize(name: &str) -> Cow<'_, str> {
     let global = name.starts_with('/');
     if name.len() < 2 || !(name.contains("//") || name.ends_with('/')) {
         return Cow::Borrowed(name);
@@ -28,12 +28,12 @@ pub(super) fn canonicalize(name: &str) -> Cow<'_, str> {
 }
 
 /// The non-empty parts of a name.
-pub(super) fn parts(name: &str) -> impl Iterator<Item = &str> {
+pub(crate) fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 
 /// `namespace`: up to and with the last slash, one trailing slash not counted.
-pub(super) fn namespace(name: &str) -> &str {
+pub(crate) fn namespace(name: &str) -> &str {
     let name = name.strip_suffix('/').unwrap_or(name);
     match name.rfind('/') {
         Some(slash) => name.get(..=slash).unwrap_or("/"),
@@ -42,7 +42,7 @@ pub(super) fn namespace(name: &str) -> &str {
 }
 
 /// `resolve_name` of a name that is not empty.
-pub(super) fn resolve(name: &str, caller_id: &str) -> String {
+pub(crate) fn resolve(name: &str, caller_id: &str) -> String {
     let name = canonicalize(name);
     if name.starts_with('/') {
         name.into_owned()
@@ -54,7 +54,7 @@ pub(super) fn resolve(name: &str, caller_id: &str) -> String {
 }
 
 /// `ns_join`, which leaves alone a name that starts with `/` or `~`, and needs no slash behind `~`.
-pub(super) fn join(namespace: &str, name: &str) -> String {
+pub(crate) fn join(namespace: &str, name: &str) -> String {
     if name.starts_with(['/', '~']) || namespace.is_empty() {
         name.to_owned()
     } else if namespace == "~" || namespace.ends_with('/') {
@@ -65,7 +65,7 @@ pub(super) fn join(namespace: &str, name: &str) -> String {
 }
 
 /// The form in which parameter subscriptions are kept and announced: with a trailing slash.
-pub(super) fn param_key(key: &str) -> String {
+pub(crate) fn param_key(key: &str) -> String {
     let mut key = canonicalize(key).into_owned();
     if key != "/" {
         key.push('/');
@@ -74,13 +74,13 @@ pub(super) fn param_key(key: &str) -> String {
 }
 
 /// What validators refuse in the name of a topic, service or node.
-pub(super) fn has_illegal_chars(name: &str) -> bool {
+pub(crate) fn has_illegal_chars(name: &str) -> bool {
     name.contains([':', ' '])
 }
 
 /// A name that the master resolves to `key` when `caller_id` says it. Each key that a caller has
 /// ever registered has one.
-pub(super) fn name_for(key: &str, caller_id: &str) -> Option<String> {
+pub(crate) fn name_for(key: &str, caller_id: &str) -> Option<String> {
     let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
     if plain && canonicalize(key) == key {
         return Some(key.to_owned());
@@ -91,7 +91,7 @@ pub(super) fn name_for(key: &str, caller_id: &str) -> Option<String> {
 }
 
 /// Like [`name_for`] for a key of a parameter subscription.
-pub(super) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
+pub(crate) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
     let trimmed = if key == "/" {
         key
     } else {
@@ -121,7 +121,7 @@ fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<Str
 /// A caller id and a name that the master resolves to `key`, where the caller id may be any that is
 /// `usable`, and is `preferred` wherever that can be. None for what no such call can name, such as a
 /// node that calls itself `/a/`.
-pub(super) fn reach(
+pub(crate) fn reach(
     key: &str,
     preferred: &str,
     usable: impl Fn(&str) -> bool,

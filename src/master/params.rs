@@ -14,7 +14,7 @@ const DEEPEST_TREE: usize = 512;
 
 /// The parameter tree.
 #[derive(Clone, Default)]
-pub(super) struct Params {
+pub(crate) struct Params {
     tree: Struct,
     /// Results of a multicall under way that are dicts of the tree itself: see [`Live`].
     live: Vec<Live>,
@@ -47,22 +47,22 @@ impl Found<'_> {
 }
 
 impl Params {
-    pub(super) fn new(tree: Struct) -> Self {
+    pub(crate) fn new(tree: Struct) -> Self {
         Self {
             tree,
             live: Vec::new(),
         }
     }
 
-    pub(super) fn tree(&self) -> &Struct {
+    pub(crate) fn tree(&self) -> &Struct {
         &self.tree
     }
 
-    pub(super) fn get(&self, key: &str) -> Option<Value> {
+    pub(crate) fn get(&self, key: &str) -> Option<Value> {
         Some(self.find(read_path(key))?.to_value())
     }
 
-    pub(super) fn has(&self, key: &str) -> bool {
+    pub(crate) fn has(&self, key: &str) -> bool {
         self.find(read_path(key)).is_some()
     }
 
@@ -80,7 +80,7 @@ impl Params {
 
     /// `set_param` of a key with a trailing slash. The tree changes even where working out the updates
     /// fails.
-    pub(super) fn set<'a>(
+    pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
         value: &'a Value,
@@ -102,7 +102,7 @@ impl Params {
     }
 
     /// Puts a value there; namespaces are made. Of what lies too deep only a nil is left.
-    pub(super) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
+    pub(crate) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
         let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
         let value = match value {
@@ -127,7 +127,7 @@ impl Params {
     }
 
     /// `delete_param` of a key with a trailing slash; none if the parameter is not set.
-    pub(super) fn delete<'a>(
+    pub(crate) fn delete<'a>(
         &mut self,
         key: &'a str,
         subscribers: &'a Registrations,
@@ -162,7 +162,7 @@ impl Params {
     }
 
     /// `search_param`.
-    pub(super) fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, Failure> {
+    pub(crate) fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, Failure> {
         if key.starts_with('~') {
             return Err(Failure::Internal("invalid key".to_owned()));
         }
@@ -190,7 +190,7 @@ impl Params {
     }
 
     /// `get_param_names`: every key that is no dict.
-    pub(super) fn names(&self) -> Vec<String> {
+    pub(crate) fn names(&self) -> Vec<String> {
         fn collect(key: &str, members: &Struct, found: &mut Vec<String>) {
             for (name, value) in members {
                 let key = names::join(key, name);
@@ -206,7 +206,7 @@ impl Params {
     }
 
     /// How many parameters are no dicts.
-    pub(super) fn leaves(&self) -> usize {
+    pub(crate) fn leaves(&self) -> usize {
         fn count(members: &Struct) -> usize {
             let leaves = members.values().map(|value| match value {
                 Value::Struct(inner) => count(inner),
@@ -218,7 +218,7 @@ impl Params {
     }
 
     /// Notes that the dict under `key` is part of a multicall's result.
-    pub(super) fn watch(&mut self, key: &str, at: Vec<usize>) {
+    pub(crate) fn watch(&mut self, key: &str, at: Vec<usize>) {
         self.live.push(Live {
             at,
             path: read_path(key).map(str::to_owned).collect(),
@@ -227,7 +227,7 @@ impl Params {
     }
 
     /// The values of the dicts watched since the multicall began, and where they go.
-    pub(super) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
+    pub(crate) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
         let live = std::mem::take(&mut self.live);
         live.into_iter()
             .filter_map(|live| {

@@ -10,7 +10,7 @@ use crate::xmlrpc::{Reply, Struct, Value, decode_reply, encode_reply};
 const DEEPEST_REPLY: usize = 492;
 
 /// The name of the Python type.
-pub(super) fn type_name(value: &Value) -> &'static str {
+pub(crate) fn type_name(value: &Value) -> &'static str {
     match value {
         Value::Nil => "NoneType",
         Value::Bool(_) => "bool",
@@ -25,7 +25,7 @@ pub(super) fn type_name(value: &Value) -> &'static str {
 }
 
 /// `bool(value)`.
-pub(super) fn is_true(value: &Value) -> bool {
+pub(crate) fn is_true(value: &Value) -> bool {
     match value {
         Value::Nil => false,
         Value::Bool(truth) => *truth,
@@ -40,7 +40,7 @@ pub(super) fn is_true(value: &Value) -> bool {
 
 /// The items that `for x in value` or `f(*value)` sees, if it is iterable. Those of a text or a dict
 /// have to be made: no more than `most` of them are, for a text may have millions.
-pub(super) fn items(value: &Value, most: usize) -> Option<Cow<'_, [Value]>> {
+pub(crate) fn items(value: &Value, most: usize) -> Option<Cow<'_, [Value]>> {
     match value {
         Value::Array(elements) => Some(Cow::Borrowed(elements)),
         Value::Struct(members) => {
@@ -56,7 +56,7 @@ pub(super) fn items(value: &Value, most: usize) -> Option<Cow<'_, [Value]>> {
 }
 
 /// How many items there are in all.
-pub(super) fn count(value: &Value) -> usize {
+pub(crate) fn count(value: &Value) -> usize {
     match value {
         Value::Array(elements) => elements.len(),
         Value::Struct(members) => members.len(),
@@ -66,7 +66,7 @@ pub(super) fn count(value: &Value) -> usize {
 }
 
 /// About how much memory a value takes, in bytes.
-pub(super) fn size(value: &Value) -> usize {
+pub(crate) fn size(value: &Value) -> usize {
     let within = match value {
         Value::BigInt(text) | Value::String(text) | Value::DateTime(text) => text.len(),
         Value::Base64(bytes) => bytes.len(),
@@ -82,7 +82,7 @@ pub(super) fn size(value: &Value) -> usize {
 }
 
 /// What `value["name"]` raises for a value that is no dict.
-pub(super) fn subscript_error(value: &Value) -> String {
+pub(crate) fn subscript_error(value: &Value) -> String {
     match value {
         Value::String(_) => "string indices must be integers, not 'str'".to_owned(),
         Value::Array(_) => "list indices must be integers or slices, not str".to_owned(),
@@ -92,7 +92,7 @@ pub(super) fn subscript_error(value: &Value) -> String {
 
 /// What `del value[name]` after `name in value` raises for a value that is no dict; none if `name`
 /// is not in it.
-pub(super) fn delete_error(value: &Value, name: &str) -> Option<String> {
+pub(crate) fn delete_error(value: &Value, name: &str) -> Option<String> {
     match value {
         Value::String(text) => text
             .contains(name)
@@ -112,7 +112,7 @@ pub(super) fn delete_error(value: &Value, name: &str) -> Option<String> {
 }
 
 /// `repr` of a string.
-pub(super) fn repr(text: &str) -> String {
+pub(crate) fn repr(text: &str) -> String {
     let quote = if text.contains('\'') && !text.contains('"') {
         '"'
     } else {
@@ -148,7 +148,7 @@ fn is_printable(c: char) -> bool {
 }
 
 /// `str` of a number, truth or None: what an unknown method's name looks like in the fault.
-pub(super) fn text(value: &Value) -> Option<String> {
+pub(crate) fn text(value: &Value) -> Option<String> {
     match value {
         Value::Nil => Some("None".to_owned()),
         Value::Bool(true) => Some("True".to_owned()),
@@ -180,12 +180,12 @@ fn float(number: f64) -> String {
 }
 
 /// What rosmaster answers instead of a reply that it cannot write, if it cannot write it.
-pub(super) fn write_error(reply: &Value) -> Option<&'static str> {
+pub(crate) fn write_error(reply: &Value) -> Option<&'static str> {
     error_within(reply, DEEPEST_REPLY)
 }
 
 /// Like [`write_error`] for a parameter's value, which travels in `[code, message, value]`.
-pub(super) fn param_error(value: &Value) -> Option<&'static str> {
+pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
     error_within(value, DEEPEST_REPLY - 1)
 }
 
@@ -230,23 +230,23 @@ fn holds_markup(value: &Value) -> bool {
 const DEEPEST_NAMESPACE: usize = DEEPEST_REPLY - 4;
 
 /// Whether a multicall can return the whole tree.
-pub(super) fn is_writable(tree: &Struct) -> bool {
+pub(crate) fn is_writable(tree: &Struct) -> bool {
     tree.values().all(is_readable)
 }
 
 /// Whether a multicall can return a value of the tree.
-pub(super) fn is_readable(value: &Value) -> bool {
+pub(crate) fn is_readable(value: &Value) -> bool {
     is_returnable(value, DEEPEST_NAMESPACE)
 }
 
 /// Whether a multicall can return the whole tree with `value` at a key of so many `names`.
-pub(super) fn is_readable_at(names: usize, value: &Value) -> bool {
+pub(crate) fn is_readable_at(names: usize, value: &Value) -> bool {
     let levels = DEEPEST_NAMESPACE.checked_sub(names.saturating_sub(1));
     levels.is_some_and(|levels| is_returnable(value, levels))
 }
 
 /// The tree without what a master could take but never return, and the keys of what was left out.
-pub(super) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
+pub(crate) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();
     let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);
     (kept, left_out)

@@ -5,11 +5,11 @@ use indexmap::{IndexMap, IndexSet};
 use super::snapshot::ServiceEntry;
 
 /// Caller ids by topic or parameter key, in the order in which they registered.
-pub(super) type Registrations = IndexMap<String, Vec<String>>;
+pub(crate) type Registrations = IndexMap<String, Vec<String>>;
 
 /// The kinds of registration that many nodes may share.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Shared {
+pub(crate) enum Shared {
     Publishers,
     Subscribers,
     ParamSubscribers,
@@ -17,24 +17,24 @@ pub(super) enum Shared {
 
 /// A node reference: what rosmaster counts before it forgets a node.
 #[derive(Clone, Default, PartialEq)]
-pub(super) struct Node {
-    pub(super) api: String,
-    pub(super) publications: IndexSet<String>,
-    pub(super) subscriptions: IndexSet<String>,
-    pub(super) param_subscriptions: IndexSet<String>,
+pub(crate) struct Node {
+    pub(crate) api: String,
+    pub(crate) publications: IndexSet<String>,
+    pub(crate) subscriptions: IndexSet<String>,
+    pub(crate) param_subscriptions: IndexSet<String>,
     /// Services that this node registered, those included that another one has taken over since.
-    pub(super) services: IndexSet<String>,
+    pub(crate) services: IndexSet<String>,
 }
 
 impl Node {
-    pub(super) fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.publications.is_empty()
             && self.subscriptions.is_empty()
             && self.param_subscriptions.is_empty()
             && self.services.is_empty()
     }
 
-    pub(super) fn keys(&mut self, kind: Shared) -> &mut IndexSet<String> {
+    pub(crate) fn keys(&mut self, kind: Shared) -> &mut IndexSet<String> {
         match kind {
             Shared::Publishers => &mut self.publications,
             Shared::Subscribers => &mut self.subscriptions,
@@ -45,19 +45,19 @@ impl Node {
 
 /// rosmaster's `RegistrationManager`.
 #[derive(Clone, Default)]
-pub(super) struct Registry {
+pub(crate) struct Registry {
     /// Node references. No reply shows their order.
-    pub(super) nodes: IndexMap<String, Node>,
-    pub(super) publishers: Registrations,
-    pub(super) subscribers: Registrations,
-    pub(super) param_subscribers: Registrations,
-    pub(super) services: IndexMap<String, ServiceEntry>,
+    pub(crate) nodes: IndexMap<String, Node>,
+    pub(crate) publishers: Registrations,
+    pub(crate) subscribers: Registrations,
+    pub(crate) param_subscribers: Registrations,
+    pub(crate) services: IndexMap<String, ServiceEntry>,
     /// Whether any service was ever registered: shows only in a message of `unregisterService`.
-    pub(super) had_services: bool,
+    pub(crate) had_services: bool,
 }
 
 impl Registry {
-    pub(super) fn shared(&self, kind: Shared) -> &Registrations {
+    pub(crate) fn shared(&self, kind: Shared) -> &Registrations {
         match kind {
             Shared::Publishers => &self.publishers,
             Shared::Subscribers => &self.subscribers,
@@ -74,7 +74,7 @@ impl Registry {
     }
 
     /// The addresses of the nodes registered under `key`, in order.
-    pub(super) fn apis(&self, kind: Shared, key: &str) -> Vec<String> {
+    pub(crate) fn apis(&self, kind: Shared, key: &str) -> Vec<String> {
         let callers = self.shared(kind).get(key).map_or(&[][..], Vec::as_slice);
         callers
             .iter()
@@ -83,7 +83,7 @@ impl Registry {
     }
 
     /// Registers; gives the address of the node that this bumps.
-    pub(super) fn register(
+    pub(crate) fn register(
         &mut self,
         kind: Shared,
         key: &str,
@@ -99,7 +99,7 @@ impl Registry {
     }
 
     /// Like [`Registry::register`]: takes the service from its present provider, which keeps a reference.
-    pub(super) fn register_service(
+    pub(crate) fn register_service(
         &mut self,
         service: &str,
         caller_id: &str,
@@ -157,7 +157,7 @@ impl Registry {
     }
 
     /// Unregisters; gives the message and whether there was something to unregister.
-    pub(super) fn unregister(
+    pub(crate) fn unregister(
         &mut self,
         kind: Shared,
         key: &str,
@@ -177,7 +177,7 @@ impl Registry {
     }
 
     /// Like [`Registry::unregister`].
-    pub(super) fn unregister_service(
+    pub(crate) fn unregister_service(
         &mut self,
         service: &str,
         caller_id: &str,

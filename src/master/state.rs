@@ -20,11 +20,11 @@ use crate::xmlrpc::{Call, Struct};
 /// parameter subscriptions are behind them. The identity is not compared.
 #[derive(Clone, Default)]
 pub struct Master {
-    pub(super) registry: Registry,
-    pub(super) topic_types: IndexMap<String, String>,
-    pub(super) params: Params,
-    pub(super) pid: i32,
-    pub(super) uri: String,
+    pub(crate) registry: Registry,
+    pub(crate) topic_types: IndexMap<String, String>,
+    pub(crate) params: Params,
+    pub(crate) pid: i32,
+    pub(crate) uri: String,
 }
 
 /// How much a master holds.
@@ -251,7 +251,7 @@ impl Master {
     }
 
     /// The services that the node registered and no longer provides.
-    pub(super) fn taken_over<'a>(
+    pub(crate) fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,
         node: &'a Node,
@@ -353,7 +353,7 @@ fn unknown_node(key: &str, caller_id: &str) -> InvalidSnapshot {
 
 impl Registry {
     /// Queues the callbacks for changed parameters. A value that cannot be written is never sent.
-    pub(super) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
+    pub(crate) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
         for update in updates {
             if super::python::param_error(update.value).is_some() {
                 continue;

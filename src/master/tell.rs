@@ -104,7 +104,7 @@ pub fn shutdown(node: &str) -> Call {
 }
 
 /// What rosmaster says to such a node.
-pub(super) fn bump_reason(node: &str) -> String {
+pub(crate) fn bump_reason(node: &str) -> String {
     format!("[{node}] Reason: new node registered with same name")
 }
 

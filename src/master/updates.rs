@@ -8,19 +8,19 @@ use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
 /// The value of what is gone, in a `paramUpdate`.
-pub(super) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
+pub(crate) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
 /// A `paramUpdate` to the subscribers of one key. The value is that of the call, or a part of it.
-pub(super) struct Update<'a> {
-    pub(super) nodes: &'a [String],
+pub(crate) struct Update<'a> {
+    pub(crate) nodes: &'a [String],
     /// Of these, the one that is not told: it made the change.
-    pub(super) ignored: Option<&'a str>,
-    pub(super) key: &'a str,
-    pub(super) value: &'a Value,
+    pub(crate) ignored: Option<&'a str>,
+    pub(crate) key: &'a str,
+    pub(crate) value: &'a Value,
 }
 
 /// The updates of `key`, which ends in a slash and has this value now, but for those to `ignored`.
-pub(super) fn updates<'a>(
+pub(crate) fn updates<'a>(
     subscribers: &'a Registrations,
     key: &'a str,
     value: &'a Value,

@@ -12,18 +12,20 @@ use std::{
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::{report::Outcome, stall_probe};
+use super::stall_probe;
+use crate::status::report::Outcome;
 use crate::{
     config::MasterConfig,
+    gate::{State, Tx},
+    ledger::Basis,
     lifecycle::Input,
-    master::{self, Authority, Bears, Counts, Inspection, Master, Plan, Token},
-    proxy::{
-        Proxy,
-        gate::{State, Tx},
+    master::{Counts, Master},
+    proxy::Proxy,
+    replay::{self, Authority, Bears, Inspection, Plan, Token},
+    upstream::{
+        CallError, Connection,
         inspect::{self, InspectError},
-        ledger::Basis,
         sockets,
-        upstream::{CallError, Connection},
     },
 };
 
@@ -291,7 +293,7 @@ async fn inject(
                 _ => (Authority::Mirror, Outcome::Injected),
             };
             examination.outcome = outcome;
-            let state = master::reconcile(&mirror, &found, &pending, authority);
+            let state = replay::reconcile(&mirror, &found, &pending, authority);
             // No look shows who subscribes parameters.
             let hidden = |call: &crate::xmlrpc::Call| call.method.ends_with("bscribeParam");
             if state == found && !pending.iter().any(hidden) {

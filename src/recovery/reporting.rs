@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use super::{
-    Driver, census,
-    examine::Examination,
-    report::{Outage, Outcome},
-};
+use super::{Driver, examine::Examination};
 use crate::lifecycle::Cause;
+use crate::{
+    nodes::health_check,
+    status::report::{Outage, Outcome},
+};
 
 /// A message about a state that lasts is repeated after this time.
 const REPEAT: Duration = Duration::from_secs(10);
@@ -40,7 +40,11 @@ impl Driver {
             });
         }
         if outcome != Outcome::Resumed {
-            tokio::spawn(census::after_recovery(self.proxy.clone(), since, outcome));
+            tokio::spawn(health_check::after_recovery(
+                self.proxy.clone(),
+                since,
+                outcome,
+            ));
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use rosrescue::store::{OpenError, Store};
+use rosrescue::checkpoint::store::{OpenError, Store};
 
 use super::{checkpoint, entry, names, started};
 
@@ -175,7 +175,7 @@ fn without_any_snapshot_the_records_are_left() {
     let mut bytes = fs::read(&path).unwrap();
     bytes[200] ^= 1;
     fs::write(&path, &bytes).unwrap();
-    let loaded = rosrescue::store::read(&path).unwrap().unwrap();
+    let loaded = rosrescue::checkpoint::store::read(&path).unwrap().unwrap();
     assert!(loaded.checkpoint.is_none() && !loaded.exact);
     assert_eq!(loaded.records.len(), 3);
 }

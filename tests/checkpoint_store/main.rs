@@ -10,8 +10,8 @@ use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
-use rosrescue::record::{Checkpoint, Entry, Session};
-use rosrescue::store::{OpenError, Store, StoreError};
+use rosrescue::checkpoint::format::{Checkpoint, Entry, Session};
+use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
 use rosrescue::xmlrpc::{Call, Value};
 
 fn entry(nth: i32) -> Entry {
@@ -166,7 +166,7 @@ fn what_is_recorded_during_a_compaction_is_in_both_files() {
     );
     assert!(loaded.exact);
     assert_eq!(store.generation(), 2);
-    let previous = rosrescue::store::read(&folder.path().join("c.yaml.previous"))
+    let previous = rosrescue::checkpoint::store::read(&folder.path().join("c.yaml.previous"))
         .unwrap()
         .unwrap();
     assert_eq!(
@@ -266,10 +266,10 @@ fn a_file_that_was_removed_to_start_afresh_stays_removed() {
 fn jobs_can_run_on_another_thread() {
     fn sendable<T: Send + 'static>() {}
     sendable::<Store>();
-    sendable::<rosrescue::store::SyncJob<rosrescue::store::Disk>>();
-    sendable::<rosrescue::store::Synced>();
-    sendable::<rosrescue::store::CompactionJob<rosrescue::store::Disk>>();
-    sendable::<rosrescue::store::Compacted<rosrescue::store::Disk>>();
+    sendable::<rosrescue::checkpoint::store::SyncJob<rosrescue::checkpoint::store::Disk>>();
+    sendable::<rosrescue::checkpoint::store::Synced>();
+    sendable::<rosrescue::checkpoint::store::CompactionJob<rosrescue::checkpoint::store::Disk>>();
+    sendable::<rosrescue::checkpoint::store::Compacted<rosrescue::checkpoint::store::Disk>>();
 }
 
 #[test]

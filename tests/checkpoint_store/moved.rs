@@ -5,7 +5,7 @@ use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::process::Command;
 
-use rosrescue::store::{CheckJob, OpenError, Store, StoreError};
+use rosrescue::checkpoint::store::{CheckJob, OpenError, Store, StoreError};
 
 use super::{checkpoint, entry, names, started};
 

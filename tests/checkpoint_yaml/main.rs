@@ -9,11 +9,11 @@ mod python;
 use catalogue::{catalogue, values};
 use indexmap::IndexMap;
 use proptest::prelude::*;
-use rosrescue::master::{ServiceEntry, Snapshot, SnapshotNode};
-use rosrescue::record::{
+use rosrescue::checkpoint::format::{
     Checkpoint, DEPTH_MAX, EncodeError, Entry, Record, Session, decode, encode_checkpoint,
     encode_record,
 };
+use rosrescue::master::{ServiceEntry, Snapshot, SnapshotNode};
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
 fn nested(levels: usize, wrap: impl Fn(Value) -> Value) -> Value {

@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Inspection, Master, Plan, Skipped, Token, is_answerable};
+use rosrescue::master::{Master, is_answerable};
+use rosrescue::replay::{Inspection, Plan, Skipped, Token};
 use rosrescue::xmlrpc::Call;
 use rustix::process::Signal;
 

@@ -1,8 +1,7 @@
 //! The model against a bare rosmaster.
 
-use rosrescue::master::{
-    Bears, Inspection, Master, NotAMaster, Notice, Plan, Skipped, Token, difference,
-};
+use rosrescue::master::{Master, Notice};
+use rosrescue::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
 use rosrescue::xmlrpc::{Call, decode_call};
 
 use crate::dice::{Cast, Dice};

@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Notice, accepted, difference};
+use rosrescue::master::{Master, Notice};
+use rosrescue::replay::{accepted, difference};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 use crate::dice::{CALLERS, KEYS, NAMES};

@@ -1,5 +1,5 @@
 use super::*;
-use crate::master::{Bears, Inspection, NotAMaster, Token, difference};
+use crate::replay::{Bears, Inspection, NotAMaster, Token, difference};
 
 /// Looks at `master` as rosrescue does over the wire.
 fn look(master: &mut Master, previous: &Master) -> Master {

@@ -1,6 +1,9 @@
 use super::*;
-use crate::master::{Kind, Mismatch, Plan, Skipped, Token, difference, kind};
 use crate::xmlrpc::{decode_call, encode_call, encode_reply};
+use crate::{
+    master::{Kind, kind},
+    replay::{Mismatch, Plan, Skipped, Token, difference},
+};
 
 fn token() -> Token {
     Token::new("m", 1)

@@ -1,0 +1,241 @@
+//! Whether a checkpoint's session goes on, or the robot was switched on anew.
+//!
+//! A robot that is switched on in the morning must not wake up with yesterday's parameters.
+
+use crate::{
+    checkpoint::format::{Checkpoint, Entry, Record, Session},
+    master::Master,
+    xmlrpc::Call,
+};
+
+/// When a checkpoint is restored at start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Restore {
+    /// If the session goes on: same boot and no orderly stop, or a registered node still lives.
+    Auto,
+    /// Always.
+    Always,
+    /// Never: the old file is kept under another name.
+    Never,
+}
+
+/// What is known about a recorded session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Evidence {
+    /// The computer has not been booted since.
+    pub same_boot: bool,
+    /// rosrescue was stopped in order.
+    pub closed: bool,
+    /// A node that was registered answers; one on another computer, unless it is the same boot.
+    pub node_alive: bool,
+}
+
+/// Why a checkpoint is restored or not, in words.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Decision {
+    /// Restore it.
+    Restore(&'static str),
+    /// Begin a new session.
+    Fresh(&'static str),
+}
+
+/// Whether the decision hangs on [`Evidence::node_alive`], which takes time to find out.
+pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
+    let with = |node_alive| {
+        decide(
+            policy,
+            Evidence {
+                node_alive,
+                ..evidence
+            },
+        )
+    };
+    with(true) != with(false)
+}
+
+/// Decides.
+pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
+    let Evidence {
+        same_boot,
+        closed,
+        node_alive,
+    } = evidence;
+    match policy {
+        Restore::Always => Decision::Restore("--restore always"),
+        Restore::Never => Decision::Fresh("--restore never"),
+        Restore::Auto if same_boot && !closed => {
+            Decision::Restore("the session goes on: rosrescue was not stopped in order")
+        }
+        Restore::Auto if node_alive => Decision::Restore("the session goes on: nodes are alive"),
+        Restore::Auto if closed => {
+            Decision::Fresh("rosrescue was stopped in order and no node is alive")
+        }
+        Restore::Auto => Decision::Fresh("the computer was booted anew and no node is alive"),
+    }
+}
+
+/// What a checkpoint and the records after it make.
+#[derive(Debug, Default)]
+pub struct Rebuilt {
+    /// The master's state.
+    pub mirror: Master,
+    /// The newest session.
+    pub session: Option<Session>,
+    /// The writes that have not reached the master yet, in order.
+    pub pending: Vec<Call>,
+    /// Why the snapshot was left out: it is no state of a master.
+    pub trouble: Option<String>,
+}
+
+/// Applies the records to the checkpoint.
+pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
+    let mut rebuilt = Rebuilt::default();
+    // Each with the number of its record; those of the snapshot with the snapshot's.
+    let mut pending: Vec<(u64, Call)> = Vec::new();
+    if let Some(checkpoint) = checkpoint {
+        let writes = checkpoint.pending.into_iter();
+        pending.extend(writes.map(|call| (checkpoint.seq, call)));
+        rebuilt.session = Some(checkpoint.session);
+        match Master::from_snapshot(checkpoint.snapshot) {
+            Ok(state) => rebuilt.mirror = state,
+            Err(error) => rebuilt.trouble = Some(error.to_string()),
+        }
+    }
+    let delivered = |session: &Option<Session>| session.as_ref().map_or(0, |it| it.delivered);
+    for Record { seq, entry } in records {
+        match entry {
+            Entry::Call {
+                call,
+                pending: waits,
+            } => {
+                rebuilt.mirror.apply(&call);
+                if waits {
+                    pending.push((seq, call));
+                }
+            }
+            Entry::Session(session) => {
+                if session.delivered > delivered(&rebuilt.session) {
+                    pending.retain(|(seq, _)| *seq > session.delivered);
+                }
+                rebuilt.session = Some(session);
+            }
+        }
+    }
+    rebuilt.pending = pending.into_iter().map(|(_, call)| call).collect();
+    rebuilt
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(seq: u64, pending: bool) -> Record {
+        let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
+        let call = Call::new("setParam", params);
+        let entry = Entry::Call { call, pending };
+        Record { seq, entry }
+    }
+
+    fn delivered(seq: u64, delivered: u64) -> Record {
+        let entry = Entry::Session(Session {
+            delivered,
+            ..Session::default()
+        });
+        Record { seq, entry }
+    }
+
+    /// The numbers of the writes that wait, of those in a snapshot as of record 5 and in `records`.
+    fn waiting(records: &[Record]) -> Vec<String> {
+        let Entry::Call { call, .. } = write(4, true).entry else {
+            unreachable!()
+        };
+        let mut checkpoint = Checkpoint {
+            seq: 5,
+            pending: vec![call],
+            ..Checkpoint::default()
+        };
+        checkpoint.session.delivered = 3;
+        let rebuilt = rebuild(Some(checkpoint), records.to_vec());
+        let name = |call: &Call| call.params[1].as_str().unwrap().to_owned();
+        rebuilt.pending.iter().map(name).collect()
+    }
+
+    #[test]
+    fn writes_wait_until_they_were_delivered() {
+        let mut records = vec![write(6, false), write(7, true), write(8, true)];
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        // The session changed for another reason.
+        records.push(delivered(9, 3));
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        // That of the snapshot counts as of the snapshot.
+        records.push(delivered(10, 4));
+        assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
+        records.push(delivered(11, 7));
+        assert_eq!(waiting(&records), ["/p8"]);
+        records.extend([write(12, true), delivered(13, 12)]);
+        assert_eq!(waiting(&records), [""; 0]);
+        records.push(write(14, true));
+        assert_eq!(waiting(&records), ["/p14"]);
+    }
+
+    fn restores(policy: Restore, same_boot: bool, closed: bool, node_alive: bool) -> bool {
+        let evidence = Evidence {
+            same_boot,
+            closed,
+            node_alive,
+        };
+        matches!(decide(policy, evidence), Decision::Restore(_))
+    }
+
+    #[test]
+    fn a_session_goes_on_after_a_crash_or_while_nodes_live() {
+        assert!(
+            restores(Restore::Auto, true, false, false),
+            "crash and start"
+        );
+        assert!(
+            !restores(Restore::Auto, true, true, false),
+            "orderly stop and start"
+        );
+        assert!(
+            restores(Restore::Auto, true, true, true),
+            "orderly stop, nodes alive"
+        );
+        assert!(!restores(Restore::Auto, false, false, false), "reboot");
+        assert!(
+            restores(Restore::Auto, false, false, true),
+            "reboot, nodes on another computer"
+        );
+    }
+
+    #[test]
+    fn nodes_are_asked_only_if_it_matters() {
+        for (policy, same_boot, closed, matters) in [
+            (Restore::Auto, true, false, false),
+            (Restore::Auto, true, true, true),
+            (Restore::Auto, false, false, true),
+            (Restore::Auto, false, true, true),
+            (Restore::Always, false, true, false),
+            (Restore::Never, false, true, false),
+        ] {
+            for node_alive in [false, true] {
+                let evidence = Evidence {
+                    same_boot,
+                    closed,
+                    node_alive,
+                };
+                let depends = depends_on_nodes(policy, evidence);
+                assert_eq!(depends, matters, "{policy:?} {evidence:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn always_and_never_say_so_outright() {
+        for evidence in 0..8 {
+            let [boot, closed, alive] = [1, 2, 4].map(|bit| evidence & bit != 0);
+            assert!(restores(Restore::Always, boot, closed, alive));
+            assert!(!restores(Restore::Never, boot, closed, alive));
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! What can go wrong with the file.
+
+use std::io;
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use super::Change;
+use crate::checkpoint::format::EncodeError;
+
+/// Why a checkpoint cannot be opened. Nothing has been changed then.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// Another rosrescue has it.
+    #[error(
+        "the checkpoint `{}` is in use by another rosrescue{}; stop that one or choose another file with --checkpoint",
+        path.display(),
+        holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
+    )]
+    Locked {
+        /// The checkpoint.
+        path: PathBuf,
+        /// The process that holds the lock, if it left its number.
+        holder: Option<u32>,
+    },
+    /// Something else is there.
+    #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
+    NotACheckpoint {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A later rosrescue wrote it.
+    #[error(
+        "`{}` was written in checkpoint format {version} by a newer rosrescue; use that one, or move the file away",
+        path.display()
+    )]
+    NewerVersion {
+        /// The file.
+        path: PathBuf,
+        /// Its format.
+        version: u32,
+    },
+    /// The operating system refused.
+    #[error(
+        "cannot {doing} `{}`: {source}; make it readable and writable for this user or choose another file with --checkpoint",
+        path.display()
+    )]
+    Io {
+        /// What was tried.
+        doing: &'static str,
+        /// On which file or folder.
+        path: PathBuf,
+        /// What it said.
+        source: io::Error,
+    },
+}
+
+impl OpenError {
+    /// What the operating system said, without what to do about it.
+    pub(super) fn without_advice(&self) -> String {
+        match self {
+            Self::Io {
+                doing,
+                path,
+                source,
+            } => format!("cannot {doing} `{}`: {source}", path.display()),
+            other => other.to_string(),
+        }
+    }
+}
+
+/// Why something was not recorded. Calls go on being forwarded.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    /// An earlier failure, or no [`begin`](super::Store::begin) yet.
+    #[error("`{}` records nothing: {reason}", path.display())]
+    Unprotected {
+        /// The checkpoint.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The operating system refused.
+    #[error("cannot {doing} `{}`: {source}", path.display())]
+    Io {
+        /// What was tried.
+        doing: &'static str,
+        /// On which file.
+        path: PathBuf,
+        /// What it said.
+        source: io::Error,
+    },
+    /// Somebody else changed the file.
+    #[error("`{}` was changed by somebody else: {change}", path.display())]
+    Changed {
+        /// The checkpoint.
+        path: PathBuf,
+        /// How.
+        change: Change,
+    },
+    /// Another rosrescue took the lock after ours had been removed.
+    #[error(
+        "`{}` is in use by another rosrescue{} now; stop one of the two",
+        path.display(),
+        holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
+    )]
+    Taken {
+        /// The checkpoint.
+        path: PathBuf,
+        /// The process that holds the lock, if it left its number.
+        holder: Option<u32>,
+    },
+    /// The snapshot is older than the journal.
+    #[error(
+        "a snapshot as of record {snapshot} cannot replace a journal that has reached {journal}; take a new one"
+    )]
+    Stale {
+        /// The record that the snapshot goes up to.
+        snapshot: u64,
+        /// The journal's last record.
+        journal: u64,
+    },
+    /// A second one was begun.
+    #[error("another generation of the checkpoint is being written; finish that one first")]
+    Busy,
+    /// A generation that is no longer wanted: a later one was begun, the file was set aside, or too
+    /// much was recorded while it was written.
+    #[error("the new generation of `{}` was overtaken and has been dropped; begin another", path.display())]
+    Overtaken {
+        /// The checkpoint.
+        path: PathBuf,
+    },
+    /// What should be written cannot be.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+}

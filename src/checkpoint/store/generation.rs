@@ -1,0 +1,398 @@
+//! Writing a new generation of the file while calls go on being recorded.
+
+use std::io;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+
+use super::journal::Active;
+use super::storage::FileId;
+use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
+use crate::checkpoint::format::{self, Checkpoint, Stamp};
+
+/// A journal that is smaller than this is not worth a new generation.
+pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
+/// What is recorded while a new generation is written is kept in memory too, up to this size;
+/// beyond it that generation is given up and the present file goes on.
+pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// A new generation that is being written.
+pub(super) struct Pending {
+    generation: u64,
+    /// Bodies of the records since, each with a line feed.
+    pub(super) meanwhile: Vec<u8>,
+    overtaken: bool,
+    /// Dangles when the job or its result was dropped instead of being finished.
+    ticket: Weak<Ticket>,
+}
+
+/// Whether a generation is still wanted; locked while its job changes names, so that no job that
+/// was overtaken touches the files of the one that overtook it.
+#[derive(Debug)]
+struct Ticket(Mutex<bool>);
+
+impl Ticket {
+    fn lock(&self) -> MutexGuard<'_, bool> {
+        // A truth value is whole whatever became of the thread that wrote it.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Writes a new generation; from [`Store::begin_compaction`](super::Store::begin_compaction).
+#[must_use = "the journal goes on growing until the job has run and has been finished"]
+pub struct CompactionJob<S: Storage> {
+    plan: Plan<S>,
+    checkpoint: Checkpoint,
+}
+
+/// Where a new generation goes.
+struct Plan<S: Storage> {
+    storage: S,
+    names: Names,
+    generation: u64,
+    /// The present file, if it becomes the previous generation.
+    keep_present: Option<FileId>,
+    /// What comes first then: the generation before may be the only one to have some of the present
+    /// file's records on the medium.
+    settle: Option<SyncJob<S>>,
+    ticket: Arc<Ticket>,
+}
+
+/// A new generation on disk under a name of its own, or why there is none.
+#[must_use = "give it to `Store::finish_compaction`"]
+pub struct Compacted<S: Storage> {
+    generation: u64,
+    settled: Option<Synced>,
+    result: Result<Written<S>, StoreError>,
+    _ticket: Arc<Ticket>,
+}
+
+struct Written<S: Storage> {
+    file: S::File,
+    stamp: Stamp,
+    snapshot_bytes: u64,
+    crc: u32,
+    /// The file that is the previous generation now.
+    previous: Option<FileId>,
+    /// Whether the previous generation is the present file itself, so that it has what is appended
+    /// to that until the new one takes its place.
+    linked: bool,
+}
+
+impl<S: Storage> CompactionJob<S> {
+    /// Encodes, writes and syncs; blocks as long as the disk does.
+    pub fn run(self) -> Compacted<S> {
+        self.plan.run(&self.checkpoint)
+    }
+}
+
+impl<S: Storage> Plan<S> {
+    fn run(mut self, checkpoint: &Checkpoint) -> Compacted<S> {
+        let settled = self.settle.take().map(SyncJob::run);
+        Compacted {
+            generation: self.generation,
+            settled,
+            result: self.write(checkpoint),
+            _ticket: self.ticket,
+        }
+    }
+
+    fn write(&self, checkpoint: &Checkpoint) -> Result<Written<S>, StoreError> {
+        let Self {
+            storage,
+            names,
+            generation,
+            ..
+        } = self;
+        let generation = *generation;
+        let encoded = format::encode_checkpoint(checkpoint, generation)?;
+        let path = names.fresh(generation);
+        let file = match self.write_at(&path, &encoded.bytes) {
+            Err(StoreError::Io { source, .. })
+                if source.kind() == io::ErrorKind::StorageFull && self.make_room() =>
+            {
+                self.write_at(&path, &encoded.bytes)
+            }
+            other => other,
+        }?;
+        let wanted = self.ticket.lock();
+        if !*wanted {
+            return Err(names.overtaken());
+        }
+        let mut linked = true;
+        let mut previous = None;
+        if self.present_is_there() {
+            let path = names.previous();
+            linked = storage
+                .link(&names.path, &path)
+                .map_err(failed("keep", &path))?;
+            previous = self.keep_present;
+        }
+        // Both names are on the medium before the new generation takes the path: whatever part of
+        // the rest a loss of power undoes, the records are in one of the two.
+        storage
+            .sync_dir(names.folder())
+            .map_err(failed("sync the folder of", &path))?;
+        let snapshot_bytes = encoded.bytes.len() as u64;
+        Ok(Written {
+            file,
+            stamp: encoded.stamp,
+            snapshot_bytes,
+            crc: crc32c::crc32c(&encoded.bytes),
+            previous,
+            linked,
+        })
+    }
+
+    /// Whether the present file is to be kept and nobody has moved it away.
+    fn present_is_there(&self) -> bool {
+        let there = self.storage.id_at(&self.names.path).ok().flatten();
+        there.is_some() && there == self.keep_present
+    }
+
+    /// A file at `path` that holds `bytes`, on the medium.
+    fn write_at(&self, path: &Path, bytes: &[u8]) -> Result<S::File, StoreError> {
+        let storage = &self.storage;
+        let file = storage.create(path).map_err(failed("create", path))?;
+        append_all(storage, &file, bytes)
+            .and_then(|()| storage.sync(&file))
+            .map_err(failed("write", path))?;
+        Ok(file)
+    }
+
+    /// Removes the previous generation, which the present file is about to replace anyway. The present
+    /// file itself never gives way: it is the only copy until there is a new one.
+    fn make_room(&self) -> bool {
+        let wanted = self.ticket.lock();
+        *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
+    }
+}
+
+impl<S: Storage> Store<S> {
+    /// Writes `checkpoint` as a fresh generation and returns when it is on the medium. The present
+    /// file becomes the previous generation.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be written: the store is unprotected if it was before, else it goes on with the
+    /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
+    pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        if checkpoint.seq >= self.seq {
+            self.overtake();
+        }
+        let done = self.plan(checkpoint.seq)?.run(checkpoint);
+        self.finish_compaction(done)?;
+        match self.sync_job().map(SyncJob::run) {
+            Some(done) => self.synced(done),
+            None => Ok(()),
+        }
+    }
+
+    /// Whether the journal has outgrown the snapshot, so that a new generation is worth writing.
+    pub fn wants_compaction(&self) -> bool {
+        !self.is_busy()
+            && self.active.as_ref().is_some_and(|active| {
+                active.journal_bytes > active.snapshot_bytes.max(self.compact_above)
+            })
+    }
+
+    /// Begins a new generation with `checkpoint`, taken as of now: its [`Checkpoint::seq`] is
+    /// [`seq`](Self::seq). Run the job anywhere, go on appending, then give its result to
+    /// [`finish_compaction`](Self::finish_compaction). Also the way to re-arm an unprotected store
+    /// beside traffic.
+    ///
+    /// # Errors
+    ///
+    /// If the checkpoint is behind the journal or another generation is being written.
+    pub fn begin_compaction(
+        &mut self,
+        checkpoint: Checkpoint,
+    ) -> Result<CompactionJob<S>, StoreError> {
+        let plan = self.plan(checkpoint.seq)?;
+        Ok(CompactionJob { plan, checkpoint })
+    }
+
+    fn plan(&mut self, seq: u64) -> Result<Plan<S>, StoreError> {
+        if seq < self.seq {
+            return Err(StoreError::Stale {
+                snapshot: seq,
+                journal: self.seq,
+            });
+        }
+        if self.is_busy() {
+            return Err(StoreError::Busy);
+        }
+        self.hold_lock()?;
+        self.seq = seq;
+        self.generation += 1;
+        let generation = self.generation;
+        let ticket = Arc::new(Ticket(Mutex::new(true)));
+        self.pending = Some(Pending {
+            generation,
+            meanwhile: Vec::new(),
+            overtaken: false,
+            ticket: Arc::downgrade(&ticket),
+        });
+        let unsettled = self.active.as_ref().is_some_and(|active| !active.named);
+        Ok(Plan {
+            storage: self.storage.clone(),
+            names: self.names.clone(),
+            generation,
+            keep_present: self
+                .present
+                .filter(|present| present.usable)
+                .map(|present| present.id),
+            settle: if unsettled { self.sync_job() } else { None },
+            ticket,
+        })
+    }
+
+    /// Whether a new generation is being written.
+    fn is_busy(&self) -> bool {
+        let ticket = self.pending.as_ref().map(|pending| &pending.ticket);
+        ticket.is_some_and(|ticket| ticket.strong_count() > 0)
+    }
+
+    /// Takes care that a generation that is being written touches no file but its own from now on.
+    pub(super) fn overtake(&mut self) {
+        if let Some(ticket) = self
+            .pending
+            .take()
+            .and_then(|pending| pending.ticket.upgrade())
+        {
+            *ticket.lock() = false;
+        }
+    }
+
+    /// Adds what was recorded meanwhile to the new generation and puts it in the present file's
+    /// place. Quick: it waits for no disk that can give a file two names.
+    ///
+    /// # Errors
+    ///
+    /// If there is no new generation. The present file goes on as it was, and the next compaction
+    /// is wanted when it has doubled.
+    pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
+        let fresh = self.names.fresh(done.generation);
+        let pending = self
+            .pending
+            .take_if(|pending| pending.generation == done.generation);
+        let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
+        let finished = settled.and_then(|()| self.switch(pending, done));
+        if finished.is_err() {
+            // It may not be there at all; if it stays, the next start removes it.
+            let _ = self.storage.remove(&fresh);
+            let journal = self
+                .active
+                .as_ref()
+                .map_or(0, |active| active.journal_bytes);
+            self.compact_above = journal.saturating_mul(2).max(COMPACTION_BYTES_MIN);
+        }
+        finished
+    }
+
+    fn switch(&mut self, pending: Option<Pending>, done: Compacted<S>) -> Result<(), StoreError> {
+        let fresh = self.names.fresh(done.generation);
+        let written = done.result?;
+        let Some(pending) = pending.filter(|pending| !pending.overtaken) else {
+            return Err(self.names.overtaken());
+        };
+        let mut journal = Vec::with_capacity(pending.meanwhile.len());
+        for body in pending
+            .meanwhile
+            .split(|&byte| byte == b'\n')
+            .filter(|body| !body.is_empty())
+        {
+            let start = journal.len();
+            journal.extend_from_slice(body);
+            format::seal(&mut journal, start, written.stamp);
+        }
+        append_all(&self.storage, &written.file, &journal)
+            .and_then(|()| match written.linked {
+                true => Ok(()),
+                // The one case in which it waits: on file systems such as FAT.
+                false => self.storage.sync(&written.file),
+            })
+            .map_err(failed("write", &fresh))?;
+        let status = self
+            .storage
+            .status(&written.file)
+            .map_err(failed("check", &fresh))?;
+        if let Err(source) = self.take_path(&fresh, written.previous) {
+            // Which file the path names now, nobody knows.
+            return Err(self.latch(failed("replace", &self.names.path)(source)));
+        }
+        self.active = Some(Active {
+            file: Arc::new(written.file),
+            stamp: written.stamp,
+            generation: done.generation,
+            snapshot_bytes: written.snapshot_bytes,
+            journal_bytes: journal.len() as u64,
+            id: status.id,
+            crc: crc32c::crc32c_append(written.crc, &journal),
+            modified: status.modified,
+            suspect: false,
+            clean: journal.is_empty(),
+            named: false,
+        });
+        self.present = Some(Present {
+            id: status.id,
+            usable: true,
+        });
+        self.unprotected = None;
+        self.compact_above = COMPACTION_BYTES_MIN;
+        Ok(())
+    }
+
+    /// Ends being unprotected: [`begin`](Self::begin) under the name that says why.
+    ///
+    /// # Errors
+    ///
+    /// As `begin`; try again later.
+    pub fn rearm(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        self.begin(checkpoint)
+    }
+
+    /// Writes a last generation, which `checkpoint` says is closed, and stops recording.
+    ///
+    /// # Errors
+    ///
+    /// As [`begin`](Self::begin).
+    pub fn close(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
+        self.begin(checkpoint)?;
+        self.active = None;
+        self.unprotected = Some("it is closed".to_owned());
+        Ok(())
+    }
+}
+
+impl Pending {
+    pub(super) fn keep(&mut self, body: &[u8]) {
+        self.overtaken |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
+        if self.overtaken {
+            self.meanwhile = Vec::new();
+        } else if !body.is_empty() {
+            self.meanwhile.extend_from_slice(body);
+            self.meanwhile.push(b'\n');
+        }
+    }
+}
+
+/// Appends all of `bytes`, in as many writes as it takes.
+pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) -> io::Result<()> {
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        match storage.append(file, rest)? {
+            0 => return Err(io::ErrorKind::WriteZero.into()),
+            taken => rest = rest.get(taken..).unwrap_or_default(),
+        }
+    }
+    Ok(())
+}
+
+/// Says what was done to which file when it failed.
+pub(super) fn failed(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> StoreError {
+    move |source| StoreError::Io {
+        doing,
+        path: path.to_owned(),
+        source,
+    }
+}

@@ -1,0 +1,209 @@
+//! Appending records to the present file, and bringing them to the medium.
+
+use std::io;
+use std::sync::Arc;
+
+use super::generation::failed;
+use super::storage::FileId;
+use super::{Names, Storage, Store, StoreError};
+use crate::checkpoint::format::{self, Entry, Stamp};
+
+/// Room for encoding that is kept between appends.
+const BUFFER_BYTES_MAX: usize = 1024 * 1024;
+
+/// The file that records go to.
+pub(super) struct Active<S: Storage> {
+    pub(super) file: Arc<S::File>,
+    pub(super) stamp: Stamp,
+    pub(super) generation: u64,
+    pub(super) snapshot_bytes: u64,
+    pub(super) journal_bytes: u64,
+    /// Which file it is.
+    pub(super) id: FileId,
+    /// The check sum of all that was written.
+    pub(super) crc: u32,
+    /// The time of modification that our last write has left.
+    pub(super) modified: i128,
+    /// Whether somebody else may have written to it, so that the content must be read.
+    pub(super) suspect: bool,
+    /// Whether everything appended is on the medium.
+    pub(super) clean: bool,
+    /// Whether the file's name is.
+    pub(super) named: bool,
+}
+
+impl<S: Storage> Store<S> {
+    /// Records `entries` with one write. Each gets a number, whether it could be recorded or not;
+    /// the last one's is returned. When this returns they survive the death of every process; a
+    /// [`sync_job`](Self::sync_job) makes them survive a loss of power.
+    ///
+    /// # Errors
+    ///
+    /// If they were not recorded. Unless the reason is an [`EncodeError`](crate::checkpoint::format::EncodeError),
+    /// the store is unprotected now.
+    pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
+        let first = self.seq.saturating_add(1);
+        self.seq = self.seq.saturating_add(entries.len() as u64);
+        let mut encoded = Ok(());
+        self.buffer.clear();
+        self.buffer.shrink_to(BUFFER_BYTES_MAX);
+        for (seq, entry) in (first..).zip(entries) {
+            let start = self.buffer.len();
+            if let Err(error) = format::push_body(&mut self.buffer, seq, entry) {
+                encoded = Err(error);
+            }
+            let body = self.buffer.get(start..).unwrap_or_default();
+            if let Some(pending) = &mut self.pending {
+                pending.keep(body);
+            }
+            if let Some(active) = &self.active
+                && !body.is_empty()
+            {
+                format::seal(&mut self.buffer, start, active.stamp);
+            }
+        }
+        let active = match (&mut self.active, &self.unprotected) {
+            (Some(active), None) => active,
+            (_, reason) => {
+                let reason = reason.clone().unwrap_or_default();
+                return Err(StoreError::Unprotected {
+                    path: self.names.path.clone(),
+                    reason,
+                });
+            }
+        };
+        // Nothing is acknowledged that went behind somebody else's bytes, or into a file cut off.
+        if let Ok(status) = self.storage.status(&active.file)
+            && let Err(change) = active.compare(&status)
+        {
+            return Err(self.changed(change));
+        }
+        active.clean &= self.buffer.is_empty();
+        let length = active.length() + self.buffer.len() as u64;
+        let appended = match length > self.file_bytes_max {
+            // It would never be read again.
+            true => Err(io::ErrorKind::FileTooLarge.into()),
+            false => self.storage.append(&active.file, &self.buffer),
+        };
+        let written = match appended {
+            Ok(taken) if taken == self.buffer.len() => Ok(()),
+            // The rest would fail too; the next write would only say why.
+            Ok(taken) => Err(io::Error::new(
+                io::ErrorKind::StorageFull,
+                format!("only {taken} of {} bytes were taken", self.buffer.len()),
+            )),
+            Err(error) => Err(error),
+        };
+        match written {
+            Ok(()) => {
+                active.journal_bytes += self.buffer.len() as u64;
+                active.crc = crc32c::crc32c_append(active.crc, &self.buffer);
+                if let Ok(status) = self.storage.status(&active.file) {
+                    active.modified = status.modified;
+                    if let Err(change) = active.compare(&status) {
+                        return Err(self.changed(change));
+                    }
+                }
+                encoded?;
+                Ok(self.seq)
+            }
+            Err(source) => Err(self.latch(failed("write", &self.names.path)(source))),
+        }
+    }
+
+    /// Stops recording, for good as far as the present file is concerned.
+    pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
+        self.unprotected = Some(error.to_string());
+        if self.active.take().is_some_and(|active| !active.named)
+            && let Some(present) = &mut self.present
+        {
+            // Nobody knows what of it is on the medium, and the generation before has all of it that was.
+            present.usable = false;
+        }
+        error
+    }
+
+    /// The work that brings what was appended to the medium; `None` if there is none.
+    pub fn sync_job(&self) -> Option<SyncJob<S>> {
+        let active = self
+            .active
+            .as_ref()
+            .filter(|active| !active.clean || !active.named)?;
+        Some(SyncJob {
+            storage: self.storage.clone(),
+            file: Arc::clone(&active.file),
+            names: (!active.named).then(|| self.names.clone()),
+            generation: active.generation,
+            seq: self.seq,
+        })
+    }
+
+    /// Takes note of a sync.
+    ///
+    /// # Errors
+    ///
+    /// If it failed: the store is unprotected now.
+    pub fn synced(&mut self, done: Synced) -> Result<(), StoreError> {
+        let active = self
+            .active
+            .as_mut()
+            .filter(|active| active.generation == done.generation);
+        match (done.result, active) {
+            (Ok(()), active) => {
+                self.synced_seq = self.synced_seq.max(done.seq);
+                if let Some(active) = active {
+                    active.named |= done.named;
+                    active.clean |= done.seq == self.seq;
+                }
+                Ok(())
+            }
+            (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
+            // Of a file that has been replaced since; what it held is in its successor, which is
+            // not synced yet.
+            (Err(_), None) => Ok(()),
+        }
+    }
+}
+
+/// Brings everything that was appended so far to the medium; from
+/// [`Store::sync_job`](super::Store::sync_job).
+#[must_use = "nothing is synced until it has run"]
+pub struct SyncJob<S: Storage> {
+    pub(super) storage: S,
+    pub(super) file: Arc<S::File>,
+    /// The names, if the folder is to be synced too.
+    pub(super) names: Option<Names>,
+    generation: u64,
+    seq: u64,
+}
+
+/// How a sync went.
+#[must_use = "give it to `Store::synced`"]
+pub struct Synced {
+    generation: u64,
+    seq: u64,
+    pub(super) named: bool,
+    pub(super) result: io::Result<()>,
+}
+
+impl<S: Storage> SyncJob<S> {
+    /// Syncs; blocks as long as the disk does.
+    pub fn run(self) -> Synced {
+        let mut result = self.storage.sync(&self.file);
+        if let (Ok(()), Some(names)) = (&result, &self.names) {
+            result = self.storage.sync_dir(names.folder());
+        }
+        let Self {
+            generation,
+            seq,
+            names,
+            ..
+        } = self;
+        Synced {
+            generation,
+            seq,
+            named: names.is_some(),
+            result,
+        }
+    }
+}

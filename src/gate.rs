@@ -1,0 +1,147 @@
+//! Whether calls pass to the master. One writer, the recovery's driver; everybody may look and wait.
+
+use std::time::Duration;
+
+use tokio::{sync::watch, time::Instant};
+
+/// Where calls go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// To the master of this incarnation number.
+    Open {
+        /// See [`Token`](crate::replay::Token).
+        incarnation: u64,
+    },
+    /// The mirror answers reads and writes: the master is away.
+    StandingIn,
+    /// The mirror answers reads, and writes that change nothing. Other writes wait: a master is being
+    /// brought to its state.
+    Injecting,
+    /// Nowhere: no master was ever seen, and nobody knows what its state would be.
+    Unknown,
+}
+
+/// A gate that is shut, in two halves.
+pub fn gate() -> (Tx, Rx) {
+    let (tx, rx) = watch::channel(State::Unknown);
+    (Tx(tx), Rx(rx))
+}
+
+/// Opens and shuts the gate.
+#[derive(Debug, Clone)]
+pub struct Tx(watch::Sender<State>);
+
+impl Tx {
+    /// Changes the state; waiters see it at once. The same state again wakes nobody.
+    pub fn set(&self, state: State) {
+        self.0.send_if_modified(|now| {
+            if *now == state {
+                return false;
+            }
+            tracing::debug!("gate: {now:?} => {state:?}");
+            *now = state;
+            true
+        });
+    }
+
+    /// The state now.
+    pub fn state(&self) -> State {
+        *self.0.borrow()
+    }
+}
+
+/// Looks at the gate and waits for it.
+#[derive(Clone, Debug)]
+pub struct Rx(watch::Receiver<State>);
+
+impl Rx {
+    /// The state now.
+    pub fn state(&self) -> State {
+        *self.0.borrow()
+    }
+
+    /// Whether calls pass to the master.
+    pub fn is_open(&self) -> bool {
+        matches!(self.state(), State::Open { .. })
+    }
+
+    /// Returns when the state has changed since the last look by this method or by
+    /// [`Self::look`]. Cancel safe. Pends for ever once the sender is gone.
+    pub async fn changed(&mut self) {
+        if self.0.changed().await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    }
+
+    /// As [`Self::look`], and whether the state has changed since the last look or since
+    /// [`Self::changed`] returned.
+    pub fn look_changed(&mut self) -> (State, bool) {
+        let state = self.0.borrow_and_update();
+        (*state, state.has_changed())
+    }
+
+    /// The state now, and the point from which [`Self::changed`] looks for changes.
+    pub fn look(&mut self) -> State {
+        *self.0.borrow_and_update()
+    }
+
+    /// Returns when the state is one that `is_it` says yes to. Cancel safe.
+    pub async fn wait_for(&mut self, is_it: impl Fn(State) -> bool) -> State {
+        loop {
+            let state = self.look();
+            if is_it(state) {
+                return state;
+            }
+            self.changed().await;
+        }
+    }
+
+    /// Returns when no call has passed for `time` in one piece, counted from now at the earliest.
+    /// Never returns while the gate is open. Cancel safe, but the count starts anew.
+    pub async fn shut_for(&mut self, time: Duration) {
+        let is_open = |state| matches!(state, State::Open { .. });
+        loop {
+            self.wait_for(|state| !is_open(state)).await;
+            let deadline = Instant::now() + time;
+            tokio::select! {
+                () = tokio::time::sleep_until(deadline) => return,
+                _ = self.wait_for(is_open) => {}
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_look_tells_of_a_change_that_nobody_has_waited_for() {
+        let (tx, mut rx) = gate();
+        tx.set(State::StandingIn);
+        assert_eq!(rx.look_changed(), (State::StandingIn, true));
+        assert_eq!(rx.look_changed(), (State::StandingIn, false));
+        tx.set(State::Open { incarnation: 1 });
+        tx.set(State::StandingIn);
+        assert_eq!(rx.look_changed(), (State::StandingIn, true));
+        tx.set(State::Injecting);
+        rx.changed().await;
+        assert_eq!(rx.look_changed(), (State::Injecting, false));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_count_starts_anew_after_an_opening() {
+        let (tx, mut rx) = gate();
+        let start = Instant::now();
+        let opener = async {
+            tokio::time::sleep(Duration::from_secs(7)).await;
+            tx.set(State::Open { incarnation: 1 });
+            tokio::time::sleep(Duration::from_secs(60)).await;
+            tx.set(State::StandingIn);
+            tokio::time::sleep(Duration::from_secs(1)).await;
+            tx.set(State::Injecting);
+        };
+        tokio::join!(opener, rx.shut_for(Duration::from_secs(8)));
+        assert_eq!(start.elapsed(), Duration::from_secs(7 + 60 + 8));
+    }
+}

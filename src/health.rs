@@ -1,0 +1,250 @@
+//! Judges a node's answers: whether it is the node that registered, and where the mirror differs from
+//! what it says.
+//!
+//! Without evidence a node is what it is registered as: a robot that loses a healthy node is worse
+//! off than one that keeps a dead one.
+
+mod backoff;
+mod repeats;
+mod unreachable;
+
+pub use repeats::Repeats;
+pub use unreachable::Unreachable;
+
+use std::collections::BTreeMap;
+
+use crate::{
+    master::{self, Master},
+    xmlrpc::{Call, Value},
+};
+
+/// Topics that nodes of all kinds have: they tell no node from another.
+const COMMON: [&str; 6] = [
+    "/rosout",
+    "/clock",
+    "/statistics",
+    "/tf",
+    "/tf_static",
+    "/diagnostics",
+];
+
+/// Topics with their types, as a node lists them.
+type Topics = BTreeMap<String, String>;
+
+/// What a node says that it publishes and subscribes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Claims {
+    publications: Topics,
+    subscriptions: Topics,
+}
+
+impl Claims {
+    /// Reads what `getPublications` and `getSubscriptions` return: lists of topic and type. None
+    /// unless every entry is one that could be registered as it is: then it is not known what the
+    /// node means.
+    pub fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
+        Some(Self {
+            publications: topics(publications)?,
+            subscriptions: topics(subscriptions)?,
+        })
+    }
+
+    /// Whether it has one of these topics that not every node has.
+    pub fn shares(&self, topics: &[String]) -> bool {
+        let mut own = self.all().filter(|topic| !COMMON.contains(topic));
+        own.any(|topic| topics.iter().any(|other| other == topic))
+    }
+
+    fn all(&self) -> impl Iterator<Item = &str> {
+        let both = self.publications.keys().chain(self.subscriptions.keys());
+        both.map(String::as_str)
+    }
+}
+
+fn topics(list: &Value) -> Option<Topics> {
+    let topics = list.as_array()?.iter().map(|entry| {
+        let [topic, topic_type] = entry.as_array()? else {
+            return None;
+        };
+        let topic = topic
+            .as_str()
+            .filter(|topic| master::is_plain_topic(topic))?;
+        Some((topic.to_owned(), topic_type.as_str()?.to_owned()))
+    });
+    topics.collect()
+}
+
+/// What the node behind a port is to a name that is registered with that port.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// There is evidence that it bears this name.
+    Itself,
+    /// There is evidence that it is another one.
+    Stranger,
+    /// There is no evidence.
+    Unknown,
+}
+
+/// A name that is registered with a port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Name {
+    /// The caller id.
+    pub node: String,
+    /// The process id that was behind the port when somebody last asked.
+    pub known_pid: Option<i32>,
+    /// Whether it has registered something since then: it may be another process by now, which took
+    /// the port under the same name.
+    pub registered_since: bool,
+    /// A number that is the larger the later it last registered something; 0 if that is not known.
+    pub registered: u64,
+}
+
+/// Judges each of `names`, which are registered with the same port. `pid` and `claims` are what is
+/// said behind it now.
+pub fn judge(
+    mirror: &Master,
+    names: &[Name],
+    pid: Option<i32>,
+    claims: Option<&Claims>,
+) -> Vec<Verdict> {
+    let said = claims.into_iter().flat_map(Claims::all);
+    let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
+    // How many of its topics are said, and whether those are all.
+    let match_of = |node: &str| {
+        let held = mirror.publications(node).chain(mirror.subscriptions(node));
+        let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
+        let count = held.iter().filter(|topic| said.contains(topic)).count();
+        let comparable = !held.is_empty() && !said.is_empty();
+        comparable.then_some((count, count == held.len()))
+    };
+    let matches: Vec<_> = names.iter().map(|name| match_of(&name.node)).collect();
+    let fitting = names.iter().zip(&matches);
+    let fitting = fitting.filter(|(_, found)| found.is_some_and(|(_, all)| all));
+    let last_fitting = fitting.map(|(name, _)| name.registered).max();
+    let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
+        None => Verdict::Unknown,
+        Some((0, _)) => Verdict::Stranger,
+        // It shares topics with the one that came after it.
+        Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Stranger,
+        Some(_) => Verdict::Itself,
+    };
+    // Who took a port may have been asked in the name of the one before.
+    let of_pid = names.iter().filter(|name| name.known_pid == pid);
+    let last_of_pid = of_pid.map(|name| name.registered).max();
+    let verdicts = names.iter().zip(&matches);
+    let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
+        (Some(known), Some(pid)) if known == pid => match by_topics(name, found) {
+            Verdict::Stranger if last_of_pid > Some(name.registered) => Verdict::Stranger,
+            _ => Verdict::Itself,
+        },
+        (Some(_), Some(_)) if !name.registered_since => Verdict::Stranger,
+        _ => by_topics(name, found),
+    });
+    let mut verdicts: Vec<_> = verdicts.collect();
+    // A port has one process behind it: who registered with it before the one that is there is gone.
+    let present = names.iter().zip(&verdicts);
+    let present = present.filter(|(_, verdict)| **verdict == Verdict::Itself);
+    if let Some(last) = present.map(|(name, _)| name.registered).max() {
+        for (name, verdict) in names.iter().zip(&mut verdicts) {
+            if *verdict == Verdict::Unknown && name.registered < last {
+                *verdict = Verdict::Stranger;
+            }
+        }
+    }
+    verdicts
+}
+
+/// One registration of a node.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Registration {
+    publishes: bool,
+    topic: String,
+    topic_type: String,
+}
+
+impl Registration {
+    /// The call by which the node itself would register it.
+    pub fn register(&self, node: &str, api: &str) -> Call {
+        let method = match self.publishes {
+            true => "registerPublisher",
+            false => "registerSubscriber",
+        };
+        let words = [node, &self.topic, &self.topic_type, api];
+        Call::new(method, words.map(Value::from).into())
+    }
+
+    /// The call by which the node itself would take it back.
+    pub fn unregister(&self, node: &str, api: &str) -> Call {
+        let method = match self.publishes {
+            true => "unregisterPublisher",
+            false => "unregisterSubscriber",
+        };
+        Call::new(method, [node, &self.topic, api].map(Value::from).into())
+    }
+
+    /// In words, such as `/talker publishes /chatter`.
+    pub fn describe(&self, node: &str) -> String {
+        let verb = match self.publishes {
+            true => "publishes",
+            false => "subscribes",
+        };
+        format!("{node} {verb} {}", self.topic)
+    }
+
+    /// Whether the two are the same but for the type.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.publishes == other.publishes && self.topic == other.topic
+    }
+}
+
+/// In what the mirror differs from what a node says.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Mending {
+    /// What the node has and the mirror lacks.
+    pub missing: Vec<Registration>,
+    /// What the mirror has and the node lacks. To be believed only if it stays so: a node may
+    /// register first and make its list after.
+    pub extra: Vec<Registration>,
+}
+
+impl Mending {
+    /// The difference for `node`. Services are left alone: nodes cannot be asked for theirs.
+    pub fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
+        let mut mending = Self::default();
+        let publications: Vec<&str> = mirror.publications(node).collect();
+        let subscriptions: Vec<&str> = mirror.subscriptions(node).collect();
+        for (publishes, held, said) in [
+            (true, &publications, &claims.publications),
+            (false, &subscriptions, &claims.subscriptions),
+        ] {
+            let missing = said
+                .iter()
+                .filter(|(topic, _)| !held.contains(&topic.as_str()));
+            mending
+                .missing
+                .extend(missing.map(|(topic, topic_type)| Registration {
+                    publishes,
+                    topic: topic.clone(),
+                    topic_type: topic_type.clone(),
+                }));
+            // What a node with a strange name made of its topics is not comparable.
+            let extra = held
+                .iter()
+                .filter(|topic| master::is_plain_topic(topic) && !said.contains_key(**topic));
+            mending.extra.extend(extra.map(|topic| Registration {
+                publishes,
+                topic: (*topic).to_owned(),
+                topic_type: mirror.type_of(topic).unwrap_or("*").to_owned(),
+            }));
+        }
+        mending
+    }
+
+    /// Whether there is nothing to mend.
+    pub fn is_empty(&self) -> bool {
+        self.missing.is_empty() && self.extra.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests;

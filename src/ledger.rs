@@ -1,0 +1,458 @@
+//! Mirror and journal under one lock: a write is recorded and applied in one step.
+//!
+//! The lock also orders both against the moment at which a new incarnation takes over: a reply of
+//! the old master that arrives after its state was taken for the injection is not acknowledged.
+
+pub mod activity;
+pub mod checkpointer;
+mod durability;
+mod injection;
+mod pending;
+mod summary;
+
+use std::{
+    collections::HashSet,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::Instant,
+};
+
+use tokio::sync::{Notify, watch};
+
+use self::activity::{Activity, Noticed};
+use self::{durability::Whole, pending::PendingWrites};
+use crate::status::stats::Stats;
+use crate::{
+    checkpoint::{
+        format::{Entry, Session},
+        store::Store,
+    },
+    master::{self, Master},
+    replay::{self, Agreement, Answered, Token},
+    xmlrpc::{Call, Reply},
+};
+
+/// Most pending writes beside which unregistrations that take nothing away are kept.
+const IDLE_PENDING: usize = 1000;
+
+/// Memory that the answers to the reads in one multicall may take, in bytes. A few short reads of a large
+/// state ask for any amount of it, and wait for the master instead.
+const ANSWER_MOST: usize = 64 << 20;
+
+/// The master that answered has been succeeded by another one, or what it showed by what the mirror has
+/// taken since: it does not count, and must be asked again.
+#[derive(Debug)]
+pub struct Superseded;
+
+/// What became of calls that the master answered.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Recorded {
+    /// The journal's last record of them; none if nothing had to be recorded.
+    pub seq: Option<u64>,
+    /// Whether the mirror is no longer known to equal the master.
+    pub doubtful: bool,
+}
+
+/// What an injection starts from.
+#[derive(Debug)]
+pub struct Basis {
+    /// The mirror's state.
+    pub mirror: Master,
+    /// Its version.
+    pub version: u64,
+    /// Writes that the present incarnation may not have run.
+    pub pending: Vec<Call>,
+}
+
+/// The mirror, the journal and what belongs to them.
+pub struct Ledger {
+    inner: Mutex<Inner>,
+    stats: &'static Stats,
+    durable: watch::Sender<u64>,
+    /// The mirror's version in the last whole checkpoint that was attempted.
+    attempted: watch::Sender<u64>,
+    /// Wakes the checkpointer.
+    pub work: Notify,
+    /// Wakes those who notify nodes.
+    pub news: Notify,
+}
+
+struct Inner {
+    mirror: Master,
+    /// What getPid and getUri answer; no part of the state.
+    identity: (i32, String),
+    session: Session,
+    /// None if no checkpoint could be opened: unprotected.
+    store: Option<Store>,
+    /// Changes with every change of the mirror.
+    version: u64,
+    whole: Whole,
+    pending: PendingWrites,
+    activity: Activity,
+    diverged: HashSet<String>,
+    /// A master is being brought to the mirror's state, which must not change meanwhile.
+    injecting: bool,
+    doubted: bool,
+    /// The present incarnation may still run a batch that nobody waits for any more.
+    abandoned: bool,
+}
+
+impl Ledger {
+    /// A ledger of `mirror`, recorded in `store`. `pending`: writes that the incarnation of `session` may not
+    /// have run.
+    pub fn new(
+        mirror: Master,
+        session: Session,
+        pending: Vec<Call>,
+        store: Option<Store>,
+        stats: &'static Stats,
+    ) -> Self {
+        let mut inner = Inner {
+            mirror,
+            identity: (-1, String::new()),
+            session,
+            store,
+            version: 0,
+            whole: Whole::default(),
+            pending: PendingWrites::default(),
+            activity: Activity::default(),
+            diverged: HashSet::new(),
+            injecting: false,
+            doubted: false,
+            abandoned: false,
+        };
+        inner.add_pending(pending);
+        Self {
+            inner: Mutex::new(inner),
+            stats,
+            durable: watch::channel(0).0,
+            attempted: watch::channel(0).0,
+            work: Notify::new(),
+            news: Notify::new(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // No code under the lock can panic half-way through a change that matters.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Looks at the mirror.
+    pub fn with_mirror<T>(&self, look: impl FnOnce(&Master) -> T) -> T {
+        look(&self.lock().mirror)
+    }
+
+    /// What the master would answer to a read; none if it is a multicall that asks for too much.
+    pub fn answer(&self, read: &Call) -> Option<Reply> {
+        let mirror = &mut self.lock().mirror;
+        let fits = mirror.fits(read, ANSWER_MOST);
+        fits.then(|| mirror.apply_telling(read, &mut ()))
+    }
+
+    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it does. Nodes
+    /// that a master would notify of it are notified. With the reply comes the journal's last record:
+    /// what has changed nothing may be as new as that.
+    pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<(Reply, Option<u64>)> {
+        let mut inner = self.lock();
+        // An unregistration of what is not here may be of what is on its way to the master.
+        let idle = !master::writes(write).iter().any(is_unregistration)
+            && !inner.mirror.would_change(write)
+            && inner.mirror.fits(write, ANSWER_MOST);
+        idle.then(|| {
+            let reply = inner.apply(now, write, Some(false), &self.news);
+            (reply, inner.last_seq())
+        })
+    }
+
+    /// Tells the mirror what getPid and getUri answer.
+    pub fn set_identity(&self, pid: i32, uri: String) {
+        let mut inner = self.lock();
+        inner.mirror.set_identity(pid, uri.clone());
+        inner.identity = (pid, uri);
+    }
+
+    /// The session as it is recorded.
+    pub fn session(&self) -> Session {
+        self.lock().session.clone()
+    }
+
+    /// Changes the session and records it.
+    pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
+        self.lock().update_session(change);
+        self.work.notify_one();
+    }
+
+    /// The number of the present incarnation: replies must come from it.
+    pub fn incarnation(&self) -> u64 {
+        self.lock().session.incarnation
+    }
+
+    /// The token of the present incarnation.
+    pub fn token(&self) -> Token {
+        self.lock().token()
+    }
+
+    /// Records and applies calls that the master of `incarnation` has answered, in its order.
+    pub fn record(
+        &self,
+        now: Instant,
+        incarnation: u64,
+        batch: &[(&Call, &Reply)],
+    ) -> Result<Recorded, Superseded> {
+        let mut inner = self.lock();
+        if inner.session.incarnation != incarnation || inner.injecting {
+            return Err(Superseded);
+        }
+        let mut recorded = Recorded::default();
+        let mut answered = Vec::with_capacity(batch.len());
+        for (call, reply) in batch {
+            let accepted = replay::accepted(&inner.mirror, call, reply);
+            recorded.doubtful |= !accepted.certain;
+            answered.extend(accepted.calls);
+        }
+        let writes = |of: &Answered| matches!(of.call.method.as_str(), "setParam" | "deleteParam");
+        let last_write = answered.iter().rposition(writes).unwrap_or_default();
+        let mut entries = Vec::with_capacity(answered.len());
+        for (index, answered) in answered.into_iter().enumerate() {
+            let outcome = inner.apply(now, &answered.call, None, &self.news);
+            let agreement = answered.compare(&outcome, index < last_write);
+            if agreement != Agreement::Same {
+                self.stats.divergences.count();
+                inner.report_divergence(&answered, &outcome);
+            }
+            if agreement == Agreement::Diverged {
+                recorded.doubtful = true;
+                if !answered.executed {
+                    // What the master refused is in no journal.
+                    inner.changed_unrecorded();
+                }
+            }
+            if answered.executed {
+                entries.push(Entry::call(answered.call));
+            }
+        }
+        if !entries.is_empty() {
+            self.stats.recorded.add(entries.len() as u64);
+            recorded.seq = inner.append(&entries);
+            drop(inner);
+            self.work.notify_one();
+        }
+        Ok(recorded)
+    }
+
+    /// What the master would answer to this call.
+    pub fn predict(&self, call: &Call) -> Reply {
+        let mut model = self.with_mirror(Clone::clone);
+        model.apply_telling(call, &mut ())
+    }
+
+    /// Records and applies a call of our own before there is any master.
+    pub fn seed(&self, call: &Call) {
+        let mut inner = self.lock();
+        inner.apply(Instant::now(), call, None, &self.news);
+        inner.append(&[Entry::call(call.clone())]);
+    }
+
+    /// Answers a call of the Master API as the master would while it is away: records what it changes as
+    /// pending, applies it, and has nodes notified. With the reply comes the journal's last record, of it
+    /// or, if it changes nothing, of what made it so.
+    ///
+    /// None while a master is being brought to the mirror's state, or if the call reads too much besides:
+    /// it has to wait.
+    pub fn stand_in(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
+        let mut inner = self.lock();
+        if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
+            return None;
+        }
+        let changes = inner.mirror.would_change(call);
+        let reply = inner.apply(now, call, Some(changes), &self.news);
+        let mut writes = match reply {
+            // Only its answer could not be written. What is refused once is refused again.
+            Reply::Fault { .. } => master::writes(call),
+            Reply::Value(_) => {
+                let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
+                let executed = accepted.into_iter().filter(|of| of.executed);
+                executed.map(|of| of.call).collect()
+            }
+        };
+        if !changes {
+            // The master may know what the mirror does not: a registration that it ran for a rosrescue
+            // that died before the reply.
+            let room = inner.pending.calls().len() < IDLE_PENDING;
+            writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
+        }
+        if writes.is_empty() {
+            return Some((reply, inner.last_seq()));
+        }
+        // A look that shows what it takes away would bring it back.
+        inner.version += u64::from(!changes);
+        self.stats.recorded.add(writes.len() as u64);
+        let entries = writes.iter().map(|call| Entry::Call {
+            call: call.clone(),
+            pending: true,
+        });
+        let seq = inner.append(&entries.collect::<Vec<_>>());
+        inner.add_pending(writes);
+        drop(inner);
+        self.work.notify_one();
+        Some((reply, seq))
+    }
+
+    /// How many writes the present incarnation may not have run.
+    pub fn pending(&self) -> usize {
+        self.lock().pending.calls().len()
+    }
+
+    /// What the present incarnation may hold beside what can be read of it.
+    pub fn may_hold(&self) -> Master {
+        let inner = self.lock();
+        replay::may_hold(&inner.mirror, inner.pending.calls())
+    }
+
+    /// The present master may not be what the mirror is: it is to be read again.
+    pub fn doubt(&self) {
+        self.lock().doubted = true;
+    }
+
+    /// Whether there was such a doubt, once.
+    pub fn take_doubt(&self) -> bool {
+        std::mem::take(&mut self.lock().doubted)
+    }
+
+    /// The mirror's version: equal versions mean equal states.
+    pub fn version(&self) -> u64 {
+        self.lock().version
+    }
+
+    /// The master holds `state`: so does the mirror from now on. Answers in what it differed before,
+    /// in a few sentences without values.
+    pub fn adopt(&self, state: Master) -> Vec<String> {
+        let difference = self.lock().adopt(state);
+        self.work.notify_one();
+        difference
+    }
+
+    /// As [`Self::adopt`], of what the master of `incarnation` held when the mirror was at `version`.
+    pub fn adopt_if(
+        &self,
+        incarnation: u64,
+        version: u64,
+        state: Master,
+    ) -> Result<Vec<String>, Superseded> {
+        let mut inner = self.lock();
+        if inner.injecting || (inner.session.incarnation, inner.version) != (incarnation, version) {
+            return Err(Superseded);
+        }
+        let difference = inner.adopt(state);
+        drop(inner);
+        self.work.notify_one();
+        Ok(difference)
+    }
+
+    /// Works with the mirror and what calls did to it of late.
+    pub fn with_activity<T>(&self, work: impl FnOnce(&Master, &mut Activity) -> T) -> T {
+        let mut inner = self.lock();
+        let Inner {
+            mirror, activity, ..
+        } = &mut *inner;
+        work(mirror, activity)
+    }
+}
+
+/// Whether a call, if it is no multicall, takes something away that its caller registered.
+fn is_unregistration(call: &Call) -> bool {
+    master::kind(call) == master::Kind::Unregister
+}
+
+impl Inner {
+    /// Applies `call`. `standing_in`: whether it changes anything, if no master notifies nodes of it.
+    fn apply(
+        &mut self,
+        now: Instant,
+        call: &Call,
+        standing_in: Option<bool>,
+        news: &Notify,
+    ) -> Reply {
+        let mut noticed = Noticed::new(standing_in.is_some());
+        noticed.displaced = self.activity.displaced_by(&self.mirror, call);
+        let reply = self.mirror.apply_telling(call, &mut noticed);
+        self.version += u64::from(standing_in.unwrap_or(true));
+        let registered = |node: &str| self.mirror.api_of(node).is_some();
+        if self.activity.applied(now, call, noticed, registered) {
+            news.notify_one();
+        }
+        reply
+    }
+
+    fn adopt(&mut self, state: Master) -> Vec<String> {
+        if self.mirror == state {
+            return Vec::new();
+        }
+        let difference = replay::difference(&self.mirror, &state);
+        let (pid, uri) = self.identity.clone();
+        self.mirror = state;
+        self.mirror.set_identity(pid, uri);
+        self.version += 1;
+        self.changed_unrecorded();
+        difference
+    }
+
+    fn add_pending(&mut self, writes: Vec<Call>) {
+        if self.pending.extend(writes).is_err() {
+            // Should the present incarnation come back, it is brought to the mirror's state as one that
+            // was succeeded.
+            self.next_incarnation();
+        }
+    }
+
+    fn next_incarnation(&mut self) {
+        self.pending.clear();
+        let seq = self.seq();
+        self.update_session(|session| {
+            session.incarnation += 1;
+            session.delivered = seq;
+        });
+    }
+
+    fn update_session(&mut self, change: impl FnOnce(&mut Session)) {
+        change(&mut self.session);
+        let entry = Entry::Session(self.session.clone());
+        self.append(&[entry]);
+    }
+
+    fn token(&self) -> Token {
+        Token::new(&self.session.mark, self.session.incarnation)
+    }
+
+    /// The mirror has changed otherwise than by journaled calls: a whole checkpoint is due.
+    fn changed_unrecorded(&mut self) {
+        self.whole.unrecorded = self.version;
+    }
+
+    /// Number of the journal's last record.
+    fn seq(&self) -> u64 {
+        self.last_seq().unwrap_or_default()
+    }
+
+    /// The same; none without a journal.
+    fn last_seq(&self) -> Option<u64> {
+        self.store.as_ref().map(Store::seq)
+    }
+
+    /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.
+    fn append(&mut self, entries: &[Entry]) -> Option<u64> {
+        let store = self.store.as_mut()?;
+        if entries.is_empty() {
+            return None;
+        }
+        match store.append(entries) {
+            Ok(seq) => Some(seq),
+            Err(error) => {
+                tracing::debug!(%error, "append");
+                None
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,137 @@
+//! What the checkpointer does with mirror and journal, and how others wait for it.
+
+use super::{Inner, Ledger};
+use crate::checkpoint::{
+    format::Checkpoint,
+    store::{Store, StoreError},
+};
+
+/// How far whole checkpoints have come, in versions of the mirror.
+#[derive(Debug, Default)]
+pub(super) struct Whole {
+    /// After the last change that is in no journal.
+    pub(super) unrecorded: u64,
+    /// In the last checkpoint that was taken,
+    taken: u64,
+    /// and in the last that was written.
+    written: u64,
+    /// Why the last one could not be written.
+    failure: Option<String>,
+}
+
+impl Whole {
+    fn is_due(&self) -> bool {
+        self.unrecorded > self.written
+    }
+}
+
+impl Ledger {
+    /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
+    pub async fn durable(&self, seq: u64) {
+        let mut durable = self.durable.subscribe();
+        // The sender lives as long as we do.
+        let _ = durable.wait_for(|reached| *reached >= seq).await;
+    }
+
+    /// The journal up to `seq` is as safe as it will get.
+    pub fn set_durable(&self, seq: u64) {
+        raise(&self.durable, seq);
+    }
+
+    /// What to wait for by [`Self::attempted`] until the mirror is in the file as it is now. None: it is,
+    /// or nobody knows when it can be.
+    pub fn unwritten(&self) -> Option<u64> {
+        let inner = self.lock();
+        let store = inner.store.as_ref();
+        let works = store.is_some_and(|store| store.unprotected().is_none());
+        let whole = &inner.whole;
+        (works && whole.failure.is_none() && whole.is_due()).then_some(whole.unrecorded)
+    }
+
+    /// Returns when a whole checkpoint of this version of the mirror, or a later one, has been written,
+    /// or could not be.
+    pub async fn attempted(&self, version: u64) {
+        let mut attempted = self.attempted.subscribe();
+        // The sender lives as long as we do.
+        let _ = attempted.wait_for(|reached| *reached >= version).await;
+    }
+
+    /// What became of the whole checkpoint that was taken last.
+    pub fn set_attempted(&self, result: Result<(), &StoreError>) {
+        let mut inner = self.lock();
+        let whole = &mut inner.whole;
+        let taken = whole.taken;
+        if result.is_ok() {
+            whole.written = taken;
+        }
+        whole.failure = result.err().map(ToString::to_string);
+        drop(inner);
+        raise(&self.attempted, taken);
+    }
+
+    /// Works on the store, if there is one, with the means to take the checkpoint that belongs to
+    /// this very moment.
+    pub fn with_store<T>(
+        &self,
+        work: impl FnOnce(&mut Store, &mut dyn FnMut() -> Checkpoint) -> T,
+    ) -> Option<T> {
+        let mut inner = self.lock();
+        let mut store = inner.store.take()?;
+        let seq = store.seq();
+        let result = work(&mut store, &mut || {
+            inner.whole.taken = inner.version;
+            Checkpoint {
+                seq,
+                ..inner.checkpoint()
+            }
+        });
+        inner.store = Some(store);
+        Some(result)
+    }
+
+    /// There is a store now, which holds nothing yet.
+    pub fn set_store(&self, store: Store) {
+        self.lock().store = Some(store);
+    }
+
+    /// What a checkpoint written now holds.
+    pub fn checkpoint(&self) -> Checkpoint {
+        self.lock().checkpoint()
+    }
+
+    /// Whether the mirror changed otherwise than by journaled calls since the last checkpoint.
+    pub fn checkpoint_due(&self) -> bool {
+        self.lock().whole.is_due()
+    }
+
+    /// Why the state is not recorded; none if all is well.
+    pub fn unprotected(&self) -> Option<String> {
+        let inner = self.lock();
+        let Some(store) = &inner.store else {
+            return Some("the checkpoint could not be opened".to_owned());
+        };
+        // The journal alone does not hold everything then.
+        let failure = inner.whole.failure.as_deref();
+        let failure = failure.filter(|_| inner.whole.is_due());
+        store.unprotected().or(failure).map(str::to_owned)
+    }
+}
+
+impl Inner {
+    pub(super) fn checkpoint(&self) -> Checkpoint {
+        Checkpoint {
+            seq: self.seq(),
+            session: self.session.clone(),
+            pending: self.pending.calls().to_vec(),
+            snapshot: self.mirror.snapshot(),
+        }
+    }
+}
+
+fn raise(to: &tokio::sync::watch::Sender<u64>, value: u64) {
+    to.send_if_modified(|reached| {
+        let more = value > *reached;
+        *reached = value.max(*reached);
+        more
+    });
+}

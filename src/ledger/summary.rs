@@ -1,0 +1,58 @@
+//! Replies in the log.
+
+use super::Inner;
+use crate::{
+    replay::Answered,
+    xmlrpc::{Reply, Value},
+};
+
+/// Limit on a reply in a log line, in bytes.
+const LOGGED_REPLY: usize = 300;
+
+/// A reply for the log. Values of parameters are nobody's business there.
+pub(super) fn summary(method: &str, reply: &Reply) -> String {
+    let text = match reply {
+        Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
+            let said = answer.get(..2).unwrap_or_default();
+            format!("{said:?} and a value")
+        }
+        reply => format!("{reply:?}"),
+    };
+    cut(&text).to_owned()
+}
+
+fn cut(text: &str) -> &str {
+    let end = (0..=LOGGED_REPLY)
+        .rev()
+        .find(|end| text.is_char_boundary(*end))
+        .unwrap_or(0);
+    text.get(..end.min(text.len())).unwrap_or(text)
+}
+
+impl Inner {
+    pub(super) fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
+        let method = answered.call.method.as_str();
+        if self.diverged.insert(method.to_owned()) {
+            let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
+            tracing::warn!(
+                method,
+                mirror,
+                master,
+                "the mirror's reply differs from the master's; the mirror is made anew from the \
+                 master if their states can differ (said once for each method)"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_replies_are_cut_at_a_character() {
+        let text = "ä".repeat(LOGGED_REPLY);
+        assert_eq!(cut(&text).len(), LOGGED_REPLY);
+        assert_eq!(cut("short"), "short");
+    }
+}

@@ -1,0 +1,359 @@
+use super::activity::NOTICE_MEMORY;
+use super::*;
+use crate::{checkpoint::store::StoreError, xmlrpc::Value};
+
+fn ledger() -> Ledger {
+    let stats = Box::leak(Box::default());
+    Ledger::new(
+        Master::default(),
+        Session::default(),
+        Vec::new(),
+        None,
+        stats,
+    )
+}
+
+fn pending(ledger: &Ledger) -> Vec<Call> {
+    ledger.lock().pending.calls().to_vec()
+}
+
+fn call(method: &str, params: &[&str]) -> Call {
+    Call::new(
+        method,
+        params.iter().map(|text| Value::from(*text)).collect(),
+    )
+}
+
+fn publish(topic: &str) -> Call {
+    call(
+        "registerPublisher",
+        &["/n", topic, "std_msgs/String", "http://n:1/"],
+    )
+}
+
+fn answered(call: &Call, mirror: &mut Master) -> Reply {
+    mirror.apply(call).reply
+}
+
+#[test]
+fn a_reply_of_a_master_that_was_succeeded_does_not_count() {
+    let ledger = ledger();
+    ledger.succeed();
+    let publish = publish("/t");
+    let reply = answered(&publish, &mut Master::default());
+    let now = Instant::now();
+    assert!(ledger.record(now, 1, &[(&publish, &reply)]).is_ok());
+    ledger.succeed();
+    let late = self::publish("/late");
+    assert!(ledger.record(now, 1, &[(&late, &reply)]).is_err());
+    assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
+}
+
+#[test]
+fn a_master_that_answers_otherwise_than_the_mirror_casts_doubt() {
+    let ledger = ledger();
+    let publish = publish("/t");
+    let now = Instant::now();
+    let right = answered(&publish, &mut Master::default());
+    let recorded = ledger.record(now, 0, &[(&publish, &right)]).unwrap();
+    assert!(!recorded.doubtful);
+    let strange: Value = vec![
+        Value::from(1),
+        "Registered".into(),
+        vec!["http://s:1/"].into(),
+    ]
+    .into();
+    let recorded = ledger
+        .record(now, 0, &[(&publish, &Reply::Value(strange))])
+        .unwrap();
+    assert!(recorded.doubtful);
+    assert_eq!(ledger.stats.divergences.value(), 1);
+}
+
+#[test]
+fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let set = |value: i32| Call::new("setParam", vec!["/n".into(), "/a".into(), value.into()]);
+    let answer = |call: &Call| ledger.stand_in(now, call).unwrap().0;
+    assert_eq!(answer(&set(1)), answered(&set(1), &mut Master::default()));
+    answer(&set(2));
+    // What changes nothing needs no master, and what is refused never ran.
+    answer(&set(2));
+    answer(&call("deleteParam", &["/n", "/b"]));
+    answer(&call("setParam", &["/n", "/"]));
+    assert_eq!(pending(&ledger), [set(1), set(2)]);
+    assert_eq!(ledger.checkpoint().pending, [set(1), set(2)]);
+    ledger.delivered();
+    assert_eq!(pending(&ledger), []);
+    let multicall = Call::multicall([set(3), call("getPid", &["/n"]), set(3), set(4)]);
+    answer(&multicall);
+    assert_eq!(pending(&ledger), [set(3), set(3), set(4)]);
+    let before = ledger.token();
+    assert_ne!(ledger.succeed(), before);
+    assert_eq!(pending(&ledger), []);
+}
+
+#[test]
+fn too_many_pending_writes_make_another_incarnation_of_their_master() {
+    let ledger = ledger();
+    let before = ledger.token();
+    let set = |value: i32| Call::new("setParam", vec!["/n".into(), "/a".into(), value.into()]);
+    let many = Call::multicall((0..20_000).map(set));
+    assert!(ledger.stand_in(Instant::now(), &many).is_some());
+    assert_eq!(pending(&ledger), []);
+    assert_ne!(ledger.token(), before);
+}
+
+#[test]
+fn a_mirror_that_is_being_injected_takes_no_write() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let basis = ledger.begin_injection();
+    assert_eq!((basis.version, basis.pending), (ledger.version(), vec![]));
+    let bye = call("unregisterPublisher", &["/n", "/a", "http://n:1/"]);
+    assert_eq!(ledger.stand_in(now, &bye), None);
+    let publish = publish("/t");
+    let reply = answered(&publish, &mut Master::default());
+    assert!(ledger.record(now, 0, &[(&publish, &reply)]).is_err());
+    ledger.end_injection();
+    assert!(ledger.stand_in(now, &bye).is_some());
+}
+
+/// What is in flight when a master goes away may be run when it is back, also if it changes nothing now.
+#[test]
+fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let set = call("setParam", &["/n", "/a", "1"]);
+    ledger.abandon_batch();
+    assert!(!ledger.resume());
+    ledger.settled();
+    assert!(ledger.stand_in(now, &set).is_some());
+    assert!(!ledger.resume());
+    ledger.delivered();
+    assert!(ledger.resume());
+    assert_eq!(
+        ledger.stand_in(now, &set),
+        None,
+        "the mirror changed before the gate opened"
+    );
+    ledger.end_injection();
+    assert!(ledger.stand_in(now, &set).is_some());
+    ledger.abandon_batch();
+    ledger.succeed();
+    assert!(ledger.resume());
+}
+
+/// A registration that it takes back may be on its way to a master that takes its time.
+#[test]
+fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    ledger.stand_in(now, &watch);
+    let bye = call("unregisterPublisher", &["/n", "/gone", "http://n:1/"]);
+    assert!(ledger.answer_idle(now, &watch).is_some());
+    for calls in [vec![bye.clone()], vec![watch.clone(), bye.clone()]] {
+        assert_eq!(ledger.answer_idle(now, &Call::multicall(calls)), None);
+    }
+    assert_eq!(ledger.answer_idle(now, &bye), None);
+}
+
+/// What loggers say all the time takes no room, and does not outdate an injection that is made ready.
+#[test]
+fn what_changes_nothing_leaves_no_trace() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    assert_eq!(ledger.answer_idle(now, &watch), None);
+    ledger.stand_in(now, &watch);
+    let (version, pending_before) = (ledger.version(), pending(&ledger));
+    // There is no journal that it could have a place in.
+    let expected = Some((answered(&watch, &mut Master::default()), None));
+    assert_eq!(ledger.answer_idle(now, &watch), expected);
+    assert_eq!(ledger.stand_in(now, &watch), expected);
+    assert_eq!(
+        (ledger.version(), pending(&ledger)),
+        (version, pending_before)
+    );
+}
+
+#[test]
+fn what_the_master_refuses_and_the_mirror_would_do_casts_doubt() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), 1.into()]);
+    let reply = answered(&set, &mut Master::default());
+    ledger.record(now, 0, &[(&set, &reply)]).unwrap();
+    let delete = call("deleteParam", &["/n", "/a"]);
+    let refusal = answered(&delete, &mut Master::default());
+    let recorded = ledger.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    assert!(recorded.doubtful && ledger.checkpoint_due());
+    assert_eq!(ledger.stats.divergences.value(), 1);
+    let recorded = ledger.record(now, 0, &[(&delete, &refusal)]).unwrap();
+    assert!(!recorded.doubtful, "it is gone from both");
+}
+
+#[test]
+fn a_write_behind_a_subscription_is_no_divergence() {
+    let ledger = ledger();
+    let set = |key: &str| Call::new("setParam", vec!["/n".into(), key.into(), 1.into()]);
+    let subscribe = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
+    let call = Call::multicall([set("/a/x"), subscribe, set("/a/y")]);
+    let reply = answered(&call, &mut Master::default());
+    let recorded = ledger
+        .record(Instant::now(), 0, &[(&call, &reply)])
+        .unwrap();
+    assert!(!recorded.doubtful);
+}
+
+/// Also what the mirror knows nothing of, for the master that comes back may know it.
+#[test]
+fn what_takes_nothing_away_is_pending_within_limits() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let bye = |number: usize| {
+        call(
+            "unregisterPublisher",
+            &["/n", &format!("/t{number}"), "http://n:1/"],
+        )
+    };
+    for _ in 0..3 {
+        ledger.stand_in(now, &bye(0));
+    }
+    assert_eq!(pending(&ledger), [bye(0)]);
+    for number in 0..2 * IDLE_PENDING {
+        ledger.stand_in(now, &bye(number));
+    }
+    assert_eq!(pending(&ledger).len(), IDLE_PENDING);
+    let publish = publish("/late");
+    let reply = ledger.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
+    ledger.record(now, 0, &[(&publish, &reply)]).unwrap();
+    let last = call("unregisterPublisher", &["/n", "/late", "http://n:1/"]);
+    ledger.stand_in(now, &last);
+    assert_eq!(pending(&ledger).last(), Some(&last));
+}
+
+#[test]
+fn who_the_master_is_outlasts_a_resync() {
+    let ledger = ledger();
+    ledger.set_identity(42, "http://us:1/".to_owned());
+    let get_pid = call("getPid", &["/n"]);
+    let before = ledger.answer(&get_pid);
+    let mut other = Master::default();
+    other.apply(&publish("/t"));
+    assert_ne!(ledger.adopt(other), Vec::<String>::new());
+    assert_eq!(ledger.answer(&get_pid), before);
+}
+
+/// A short call asks for what would take all the memory of a computer.
+#[test]
+fn reads_are_answered_together_within_limits() {
+    let ledger = ledger();
+    let now = Instant::now();
+    let text = Value::String("x".repeat(1 << 20));
+    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), text]);
+    for call in [&set, &publish("/t")] {
+        let reply = ledger.with_mirror(|mirror| answered(call, &mut mirror.clone()));
+        ledger.record(now, 0, &[(call, &reply)]).unwrap();
+    }
+    let read = || call("getParam", &["/n", "/"]);
+    let reads = |count| (0..count).map(|_| read());
+    let bye = || call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
+    let many = Call::multicall(reads(100_000));
+    let nested = Call::multicall([read(), many.clone()]);
+    let unregistering = Call::multicall([bye()].into_iter().chain(reads(100_000)));
+    assert_eq!(ledger.answer(&many), None);
+    assert_eq!(ledger.answer(&nested), None);
+    assert_eq!(ledger.stand_in(now, &unregistering), None);
+    assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
+    assert!(ledger.answer(&read()).is_some());
+    assert!(ledger.answer(&Call::multicall(reads(60))).is_some());
+    let unregistering = Call::multicall([bye()].into_iter().chain(reads(60)));
+    assert!(ledger.stand_in(now, &unregistering).is_some());
+}
+
+#[test]
+fn a_look_counts_if_nothing_came_between() {
+    let ledger = ledger();
+    ledger.succeed();
+    let held = || {
+        let mut held = Master::default();
+        held.apply(&publish("/t"));
+        held
+    };
+    let (incarnation, version) = (ledger.incarnation(), ledger.version());
+    ledger.stand_in(
+        Instant::now(),
+        &call("unregisterPublisher", &["/n", "/t", "http://n:1/"]),
+    );
+    assert!(ledger.adopt_if(incarnation, version, held()).is_err());
+    let version = ledger.version();
+    ledger.succeed();
+    assert!(ledger.adopt_if(incarnation, version, held()).is_err());
+    assert!(ledger.with_mirror(Master::is_empty));
+    assert!(ledger.adopt_if(incarnation + 1, version, held()).is_ok());
+    assert!(!ledger.with_mirror(Master::is_empty));
+}
+
+/// What is in no journal is waited for only while there is a file to write it to.
+#[tokio::test]
+async fn what_was_adopted_is_waited_for_until_a_checkpoint_was_attempted() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = |name: &str| Store::open(&folder.path().join(name)).unwrap().0;
+    let mut master = Master::default();
+    let mut adopted = |ledger: &Ledger| {
+        master.apply(&publish(&format!("/t{}", ledger.version())));
+        ledger.adopt(master.clone());
+        ledger.unwritten()
+    };
+    let ledger = ledger();
+    assert_eq!(adopted(&ledger), None, "there is no file");
+    ledger.set_store(open("c"));
+    assert_eq!(adopted(&ledger), None, "it is not begun yet");
+    let checkpoint = |ledger: &Ledger| {
+        let begun = ledger.with_store(|store, checkpoint| store.begin(&checkpoint()));
+        begun.unwrap().unwrap();
+    };
+    checkpoint(&ledger);
+    ledger.set_attempted(Ok(()));
+    assert_eq!(ledger.unwritten(), None);
+
+    let first = adopted(&ledger).expect("it is in no file");
+    checkpoint(&ledger);
+    let second = adopted(&ledger).expect("it came after the checkpoint was taken");
+    ledger.set_attempted(Ok(()));
+    ledger.attempted(first).await;
+    assert_eq!(ledger.unwritten(), Some(second));
+    // The next one fails.
+    checkpoint(&ledger);
+    let error = StoreError::Stale {
+        snapshot: 0,
+        journal: 1,
+    };
+    ledger.set_attempted(Err(&error));
+    ledger.attempted(second).await;
+    assert!(ledger.checkpoint_due() && ledger.unprotected().is_some());
+    assert_eq!(ledger.unwritten(), None);
+    checkpoint(&ledger);
+    ledger.set_attempted(Ok(()));
+    assert!(!ledger.checkpoint_due() && ledger.unprotected().is_none());
+}
+
+#[test]
+fn topics_are_remembered_while_a_dead_master_may_owe_the_news() {
+    let ledger = ledger();
+    let start = Instant::now();
+    let subscribe = call(
+        "registerSubscriber",
+        &["/s", "/t", "std_msgs/String", "http://s:1/"],
+    );
+    for call in [&subscribe, &publish("/t"), &publish("/unheard")] {
+        let reply = ledger.with_mirror(|mirror| answered(call, &mut mirror.clone()));
+        ledger.record(start, 0, &[(call, &reply)]).unwrap();
+    }
+    let owed = |now| ledger.with_activity(|_, activity| activity.take_owed(now).topics);
+    assert_eq!(owed(start + NOTICE_MEMORY), Vec::<String>::new());
+    assert_eq!(owed(start + NOTICE_MEMORY / 2), ["/t"]);
+}

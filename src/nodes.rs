@@ -1,0 +1,288 @@
+//! What is known of the nodes beyond their registrations, and the watch over it.
+
+pub mod client;
+pub mod health_check;
+pub mod notifications;
+
+use std::{
+    collections::HashSet,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use tokio::sync::Notify;
+
+use self::{client::Sign, health_check::Outcome, notifications::Notifications};
+use crate::{
+    gate::State,
+    health::{Repeats, Unreachable},
+    ledger::{
+        Ledger,
+        activity::{Change, Notification, Owed},
+    },
+    proxy::Proxy,
+    wait,
+    xmlrpc::Call,
+};
+
+/// A node is asked for its process id so long after it last registered something: starting nodes
+/// have better to do.
+const ACQUAINTANCE: Duration = Duration::from_secs(2);
+/// How often it is looked whether a node is to be asked.
+const ROUND: Duration = Duration::from_millis(500);
+/// How long the master must have been away before what it may have owed its nodes is told by us: most
+/// that only closed an idle connection are back by then.
+const OWED_AFTER: Duration = Duration::from_millis(50);
+
+/// What is known of the nodes beyond their registrations.
+#[derive(Debug, Default)]
+pub struct Nodes {
+    /// Notifications under way.
+    pub(super) notifications: Notifications,
+    suspects: Mutex<Unreachable>,
+    /// Recoveries whose census is not over.
+    censuses: AtomicUsize,
+    /// Nodes that are being asked, or are about to be, and have not answered yet.
+    pub(super) unanswered: AtomicUsize,
+    changed: Notify,
+}
+
+impl Nodes {
+    fn lock(&self) -> MutexGuard<'_, Unreachable> {
+        self.suspects.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether the node at `api` is a suspect.
+    pub fn is_suspect(&self, api: &str) -> bool {
+        self.lock().contains(api)
+    }
+
+    /// The names of the suspects.
+    pub fn suspects(&self, ledger: &Ledger) -> Vec<String> {
+        // No lock is held while the other one is taken.
+        let suspects = self.lock().clone();
+        let mut names: Vec<String> = ledger.with_mirror(|mirror| {
+            let nodes = mirror.nodes().filter(|(_, api)| suspects.contains(api));
+            nodes.map(|(name, _)| name.to_owned()).collect()
+        });
+        names.sort();
+        names
+    }
+
+    /// The node at `api` did not answer.
+    pub(super) fn suspect(&self, proxy: &Arc<Proxy>, api: &str) {
+        let now = Instant::now();
+        if !self.lock().add(api, now) {
+            return;
+        }
+        tracing::debug!(api, "a node does not answer");
+        self.changed.notify_one();
+        if self.update_telling(proxy) {
+            // What changed before, the master may be about to tell this very node first.
+            proxy
+                .ledger
+                .with_activity(|_, activity| activity.repeat_changes(now));
+            proxy.ledger.news.notify_one();
+        }
+    }
+
+    /// The node at `api` has answered, or is no more. Answers whether it was a suspect.
+    pub(super) fn clear(&self, proxy: &Proxy, api: &str) -> bool {
+        let was = self.lock().remove(api);
+        if was {
+            self.update_telling(proxy);
+        }
+        was
+    }
+
+    /// We tell changes beside the master as long as somebody is suspect, or may be. Answers whether that begins.
+    fn update_telling(&self, proxy: &Proxy) -> bool {
+        // One lock around the other, here and nowhere else: the last word is the latest.
+        let suspects = self.lock();
+        let telling = !suspects.is_empty() || self.censuses.load(Ordering::Relaxed) > 0;
+        proxy
+            .ledger
+            .with_activity(|_, activity| activity.set_telling(telling))
+            && telling
+    }
+
+    /// We tell changes beside the master until the result is dropped: nobody knows yet who is suspect.
+    pub(super) fn begin_census(proxy: &Arc<Proxy>) -> CensusUnderWay {
+        proxy.nodes.censuses.fetch_add(1, Ordering::Relaxed);
+        proxy.nodes.update_telling(proxy);
+        CensusUnderWay(proxy.clone())
+    }
+}
+
+/// The census of a recovery.
+pub(super) struct CensusUnderWay(Arc<Proxy>);
+
+impl Drop for CensusUnderWay {
+    fn drop(&mut self) {
+        self.0.nodes.censuses.fetch_sub(1, Ordering::Relaxed);
+        self.0.nodes.update_telling(&self.0);
+    }
+}
+
+/// Watches over the nodes for as long as it is polled: sends notifications, asks suspects again, gets
+/// acquainted with new nodes, and takes the census that is due.
+pub async fn watch(proxy: Arc<Proxy>) {
+    let mut round = tokio::time::interval(ROUND);
+    let mut reaping = proxy
+        .config
+        .reap_interval
+        .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
+    let mut repeats = Repeats::<Change>::default();
+    let mut gate = proxy.gate.clone();
+    // When to tell what the master that is away may have owed, and whether it has been told.
+    let (mut owed_at, mut owed_told) = (None, false);
+    loop {
+        let next = proxy.nodes.lock().next().map(Into::into);
+        tokio::select! {
+            () = proxy.ledger.news.notified() => empty_outbox(&proxy, &mut repeats),
+            () = gate.changed() => match gate.look() {
+                State::StandingIn if !owed_told => {
+                    owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
+                }
+                State::Open { .. } => (owed_at, owed_told) = (None, false),
+                _ => {}
+            },
+            () = wait::until(owed_at) => {
+                (owed_at, owed_told) = (None, true);
+                tell_owed(&proxy, Instant::now());
+            }
+            () = wait::until(next) => ask_suspects(&proxy),
+            () = wait::until(repeats.next().map(Into::into)) => {
+                let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
+                let holding_up = unanswered || !proxy.nodes.lock().is_empty();
+                for change in repeats.due(Instant::now(), holding_up) {
+                    tell(&proxy, change);
+                }
+            }
+            // A suspect that is new may be due before the others.
+            () = proxy.nodes.changed.notified() => {}
+            _ = round.tick() => get_acquainted(&proxy),
+            () = wait::tick(&mut reaping) => {
+                if proxy.gate.is_open() {
+                    tokio::spawn(reap(proxy.clone()));
+                }
+            }
+        }
+    }
+}
+
+fn empty_outbox(proxy: &Arc<Proxy>, repeats: &mut Repeats<Change>) {
+    let outbox = proxy
+        .ledger
+        .with_activity(|_, activity| activity.take_outbox());
+    for (api, call) in outbox.calls {
+        notifications::send(proxy, &api, Notification::Call(call));
+    }
+    for displaced in outbox.displaced {
+        notifications::shut_down(proxy, displaced);
+    }
+    for change in outbox.changes {
+        repeats.changed(change, Instant::now());
+    }
+}
+
+/// Tells what a master that went away at `outage` may not have told before. The topics of it.
+pub(super) fn tell_owed(proxy: &Arc<Proxy>, outage: Instant) -> Vec<String> {
+    let Owed {
+        mut topics,
+        params,
+        displaced,
+    } = proxy
+        .ledger
+        .with_activity(|_, activity| activity.take_owed(outage));
+    topics.retain(|topic| notifications::tell_subscribers(proxy, topic));
+    for (api, key) in params {
+        notifications::send(proxy, &api, Notification::Param(key));
+    }
+    for displaced in displaced {
+        notifications::shut_down(proxy, displaced);
+    }
+    topics
+}
+
+fn tell(proxy: &Arc<Proxy>, change: Change) {
+    match change {
+        Change::Param(api, key) => notifications::send(proxy, &api, Notification::Param(key)),
+        Change::Topic(topic) => {
+            notifications::tell_subscribers(proxy, &topic);
+        }
+    }
+}
+
+fn ask_suspects(proxy: &Arc<Proxy>) {
+    let registered = proxy.ledger.with_mirror(|mirror| {
+        let apis = mirror.nodes().map(|(_, api)| api.to_owned());
+        apis.collect::<HashSet<_>>()
+    });
+    let due = {
+        let mut suspects = proxy.nodes.lock();
+        suspects.retain(|api| registered.contains(api));
+        suspects.due(Instant::now())
+    };
+    proxy.nodes.update_telling(proxy);
+    for api in due {
+        let proxy = proxy.clone();
+        tokio::spawn(async move {
+            let outcome = health_check::visit(&proxy, api).await;
+            if outcome.sign != Sign::Silent {
+                say(&outcome, "a suspect answers again");
+            }
+        });
+    }
+}
+
+fn say(outcome: &Outcome, what: &str) {
+    let Outcome {
+        removed, mended, ..
+    } = outcome;
+    let names = &outcome.names;
+    tracing::info!(?names, ?removed, ?mended, "{what}");
+}
+
+/// Asks nodes that have registered lately for their process ids: another one at the same port will
+/// be another node.
+fn get_acquainted(proxy: &Arc<Proxy>) {
+    let Some(before) = Instant::now().checked_sub(ACQUAINTANCE) else {
+        return;
+    };
+    let new = proxy.ledger.with_activity(|mirror, activity| {
+        let new = activity.take_strangers(before).into_iter();
+        let new = new.filter_map(|name| {
+            let api = mirror.api_of(&name)?.to_owned();
+            let registered = activity.last_calls(&name).registered;
+            Some((name, api, registered))
+        });
+        new.collect::<Vec<_>>()
+    });
+    for (name, api, registered) in new {
+        let proxy = proxy.clone();
+        tokio::spawn(async move {
+            let permit = health_check::permit().await;
+            let call = Call::new("getPid", vec![crate::master::CALLER_ID.into()]);
+            let answer = client::ask_for(&api, &call, proxy.config.census_timeout).await;
+            drop(permit);
+            if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
+                proxy.ledger.with_activity(|_, activity| {
+                    activity.remember_pid(&name, &api, registered, pid);
+                });
+            }
+        });
+    }
+}
+
+/// The standing census.
+async fn reap(proxy: Arc<Proxy>) {
+    let outcome = health_check::census(&proxy).await;
+    if !outcome.removed.is_empty() || !outcome.mended.is_empty() {
+        let (removed, mended) = (outcome.removed, outcome.mended);
+        tracing::info!(?removed, ?mended, "standing census");
+    }
+}

@@ -1,0 +1,117 @@
+//! Talking to a node at its own port.
+
+use std::time::Duration;
+
+use hyper::header::HeaderValue;
+use tokio::{net::TcpStream, time::timeout};
+
+use crate::{
+    health::Claims,
+    master::CALLER_ID,
+    resolver,
+    ros_env::MasterUri,
+    upstream::Connection,
+    xmlrpc::{Call, Reply, Value},
+};
+
+/// Largest reply that is taken from a node, in bytes.
+const MAX_REPLY: usize = 16 << 20;
+
+/// What a node said to a question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sign {
+    /// It answered.
+    Alive,
+    /// Its port refuses: the process is gone.
+    Dead,
+    /// No answer in time, or none that makes sense. That is no proof of death.
+    Silent,
+}
+
+/// Makes `call` to the node at `api` and waits for a sign of life for at most `limit`.
+pub async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
+    ask_for(api, call, limit).await.0
+}
+
+/// As [`ask`], with the value that the node returned.
+pub async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
+    let Ok(address) = MasterUri::parse(api) else {
+        return (Sign::Silent, None);
+    };
+    let question = async {
+        let mut connection = match connect(&address).await {
+            Ok(connection) => connection,
+            Err(sign) => return (sign, None),
+        };
+        put(&mut connection, call).await
+    };
+    timeout(limit, question)
+        .await
+        .unwrap_or((Sign::Silent, None))
+}
+
+/// What a node says of itself.
+#[derive(Debug)]
+pub struct Interview {
+    /// Whether it lives.
+    pub sign: Sign,
+    /// Its process id.
+    pub pid: Option<i32>,
+    /// What it publishes and subscribes, if it can be asked.
+    pub claims: Option<Claims>,
+}
+
+/// Asks the node at `api` for its process id, which must come within `limit`, and if it lives for
+/// what it publishes and subscribes, with as much time again. `getName` would tell more, but roscpp
+/// has none.
+pub async fn interview(api: &str, limit: Duration) -> Interview {
+    let ask = |method: &str| Call::new(method, vec![CALLER_ID.into()]);
+    let (sign, pid) = ask_for(api, &ask("getPid"), limit).await;
+    let mut interview = Interview {
+        sign,
+        pid: pid.as_ref().and_then(Value::as_int),
+        claims: None,
+    };
+    if sign == Sign::Alive {
+        let (publications, subscriptions) = (ask("getPublications"), ask("getSubscriptions"));
+        let answers = tokio::join!(
+            ask_for(api, &publications, limit),
+            ask_for(api, &subscriptions, limit)
+        );
+        if let ((_, Some(publications)), (_, Some(subscriptions))) = answers {
+            interview.claims = Claims::read(&publications, &subscriptions);
+        }
+    }
+    interview
+}
+
+async fn connect(address: &MasterUri) -> Result<Connection, Sign> {
+    let found = resolver::addresses(&address.host, address.port).await;
+    let mut refused = false;
+    for socket in found.map_err(|_| Sign::Silent)? {
+        match TcpStream::connect(socket).await {
+            Ok(stream) => {
+                let name = HeaderValue::from_static("to-a-node");
+                let connection = Connection::over(stream, address, name, MAX_REPLY);
+                return connection.await.map_err(|_| Sign::Silent);
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,
+            // Where one of its addresses cannot be reached, it may live there.
+            Err(_) => return Err(Sign::Silent),
+        }
+    }
+    Err(if refused { Sign::Dead } else { Sign::Silent })
+}
+
+async fn put(connection: &mut Connection, call: &Call) -> (Sign, Option<Value>) {
+    match connection.call(call).await {
+        Ok(Reply::Value(Value::Array(answer))) => {
+            let mut answer = answer.into_iter();
+            let success = answer.next() == Some(Value::Int(1));
+            (Sign::Alive, answer.nth(1).filter(|_| success))
+        }
+        // A method that it does not have.
+        Ok(Reply::Fault { .. }) => (Sign::Alive, None),
+        Ok(Reply::Value(_)) | Err(_) => (Sign::Silent, None),
+    }
+}

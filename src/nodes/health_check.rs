@@ -1,0 +1,409 @@
+//! The census: which nodes still live, whether they are the ones that registered, and in what the
+//! mirror differs from what they say.
+//!
+//! Nothing here may hold up a call: a roscpp node that is itself waiting for its registration
+//! cannot answer us before that call is through.
+
+use std::{
+    collections::BTreeSet,
+    sync::{Arc, atomic::Ordering},
+    time::{Duration, Instant},
+};
+
+use tokio::{
+    sync::{Semaphore, SemaphorePermit},
+    task::JoinSet,
+};
+
+use super::{
+    Nodes,
+    client::{self, Interview, Sign},
+    notifications,
+};
+use crate::{
+    gate::State,
+    health::{Mending, Name, Registration, Verdict, judge},
+    ledger::activity::Activity,
+    master::{self, CALLER_ID, Kind, Master},
+    proxy::Proxy,
+    replay::Token,
+    ros_env::MasterUri,
+    write_queue::batch::{self, Condition},
+    xmlrpc::{Call, Reply},
+};
+use crate::{
+    nodes,
+    status::report::{self, Outcome as Recovered},
+};
+
+/// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
+const AT_ONCE: usize = 64;
+/// Pause before a node is asked again about what is to be taken from it.
+const SECOND_QUESTION: Duration = Duration::from_millis(1200);
+/// Most questions to a node whose answers keep changing.
+const QUESTIONS: u32 = 4;
+
+static PERMITS: Semaphore = Semaphore::const_new(AT_ONCE);
+
+/// The right to ask a node.
+pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
+    // Never closed.
+    PERMITS.acquire().await.ok()
+}
+
+/// What a census found.
+#[derive(Debug, Default)]
+pub struct Census {
+    /// Nodes that are dead and have been taken out, through the master, so that others are told.
+    pub removed: Vec<String>,
+    /// Registrations that were added or taken back, because the node itself says so.
+    pub mended: Vec<String>,
+}
+
+/// What a visit to one port came to.
+#[derive(Debug)]
+pub(crate) struct Outcome {
+    pub(crate) sign: Sign,
+    /// Who was registered there.
+    pub(crate) names: Vec<String>,
+    pub(crate) removed: Vec<String>,
+    pub(crate) mended: Vec<String>,
+}
+
+/// What follows a recovery that took place since `outage`, beside traffic: who was not notified
+/// is told, and the census is taken.
+pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Recovered) {
+    let under_way = Nodes::begin_census(&proxy);
+    // As if somebody did not answer, until the questions have been put.
+    let waiting = Waiting::new(&proxy);
+    let mut gate = proxy.gate.clone();
+    gate.wait_for(|state| matches!(state, State::Open { .. }))
+        .await;
+    let start = Instant::now();
+    let incarnation = proxy.ledger.incarnation();
+    // Queued calls first: what nodes say in them is newer than what they say to us.
+    barrier(&proxy).await;
+    let mut healed = match outcome {
+        // A master that lives on notifies nodes itself.
+        Recovered::Adopted => Vec::new(),
+        Recovered::Reconciled => {
+            // It may tell now what it knew before.
+            proxy
+                .ledger
+                .with_activity(|_, activity| activity.tell_again());
+            nodes::tell_owed(&proxy, outage)
+        }
+        _ => nodes::tell_owed(&proxy, outage),
+    };
+    healed.sort();
+    let visits = begin_visits(&proxy);
+    drop(waiting);
+    let census = collect(visits).await;
+    drop(under_way);
+    if proxy.ledger.incarnation() != incarnation {
+        // The next recovery reports.
+        return;
+    }
+    let suspects = proxy.nodes.suspects(&proxy.ledger);
+    let census_ms = report::ms(start.elapsed());
+    if let Some(report) = proxy
+        .board
+        .add_to_report(census, census_ms, healed, suspects)
+    {
+        report.log("recovery is complete");
+    }
+}
+
+/// Returns when the writes that are queued now have been answered.
+async fn barrier(proxy: &Proxy) {
+    let last = Call::new("getPid", vec![CALLER_ID.into()]);
+    // Its answer does not matter.
+    proxy.write_queue.call(last, Kind::Mutate).await;
+}
+
+/// Asks every node, all at the same time.
+pub async fn census(proxy: &Arc<Proxy>) -> Census {
+    collect(begin_visits(proxy)).await
+}
+
+fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<Outcome> {
+    let apis: BTreeSet<String> = proxy.ledger.with_mirror(|mirror| {
+        let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
+        let apis = nodes.map(|(_, api)| api.to_owned());
+        // What nobody can call, the master cannot either.
+        apis.filter(|api| MasterUri::parse(api).is_ok()).collect()
+    });
+    let mut visits = JoinSet::new();
+    for api in apis {
+        visits.spawn(visit(proxy, api));
+    }
+    visits
+}
+
+async fn collect(mut visits: JoinSet<Outcome>) -> Census {
+    let mut census = Census::default();
+    while let Some(outcome) = visits.join_next().await {
+        if let Ok(outcome) = outcome {
+            census.removed.extend(outcome.removed);
+            census.mended.extend(outcome.mended);
+        }
+    }
+    census.removed.sort();
+    census.mended.sort();
+    census
+}
+
+/// Who is registered at `api`.
+pub(crate) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<Name> {
+    let nodes = mirror.nodes().filter(|(_, at)| *at == api);
+    let names = nodes.map(|(node, _)| {
+        let pid = activity.pid_of(node, api);
+        Name {
+            node: node.to_owned(),
+            known_pid: pid.map(|(pid, _)| pid),
+            registered_since: pid.is_some_and(|(_, since)| since),
+            registered: activity.last_calls(node).registered,
+        }
+    });
+    names.collect()
+}
+
+/// Asks the node behind `api` until its answers allow a verdict.
+pub(crate) fn visit(
+    proxy: &Arc<Proxy>,
+    api: String,
+) -> impl Future<Output = Outcome> + Send + 'static {
+    let (proxy, waiting) = (proxy.clone(), Waiting::new(proxy));
+    async move { converse(&proxy, &api, waiting).await }
+}
+
+async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> Outcome {
+    let mut waiting = Some(waiting);
+    let mut outcome = Outcome {
+        sign: Sign::Silent,
+        names: Vec::new(),
+        removed: Vec::new(),
+        mended: Vec::new(),
+    };
+    let mut before = Findings::default();
+    for question in 0..QUESTIONS {
+        if question > 0 {
+            tokio::time::sleep(SECOND_QUESTION).await;
+        }
+        let asked = Asked::new(proxy, api);
+        if asked.names.is_empty() {
+            proxy.nodes.clear(proxy, api);
+            break;
+        }
+        let permit = permit().await;
+        let interview = client::interview(api, proxy.config.census_timeout).await;
+        drop(permit);
+        outcome.sign = interview.sign;
+        outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
+        match interview.sign {
+            Sign::Silent => {
+                proxy.nodes.suspect(proxy, api);
+                break;
+            }
+            Sign::Dead => {
+                for name in &asked.names {
+                    if remove(proxy, name, api).await {
+                        outcome.removed.push(name.node.clone());
+                    }
+                }
+                proxy.nodes.clear(proxy, api);
+                break;
+            }
+            Sign::Alive => {
+                if proxy.nodes.clear(proxy, api) {
+                    // Whatever was to be told meanwhile.
+                    notifications::tell_all(proxy, api);
+                }
+            }
+        }
+        drop(waiting.take());
+        let findings = asked.findings(proxy, api, &interview);
+        findings.act(proxy, api, &before, &mut outcome).await;
+        if findings.is_settled() {
+            break;
+        }
+        before = findings;
+    }
+    outcome
+}
+
+/// Counts a question for as long as it has no answer.
+struct Waiting(Arc<Proxy>);
+
+impl Waiting {
+    fn new(proxy: &Arc<Proxy>) -> Self {
+        proxy.nodes.unanswered.fetch_add(1, Ordering::Relaxed);
+        Self(proxy.clone())
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.0.nodes.unanswered.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// The names at a port before the question, with the numbers of their last last_calls.
+struct Asked {
+    names: Vec<Name>,
+    unregistered: Vec<u64>,
+}
+
+/// What an answer means.
+#[derive(Default)]
+struct Findings {
+    strangers: Vec<Name>,
+    mendings: Vec<(Condition, Verdict, Mending)>,
+}
+
+impl Asked {
+    fn new(proxy: &Proxy, api: &str) -> Self {
+        proxy.ledger.with_activity(|mirror, activity| {
+            let names = names_at(mirror, activity, api);
+            let last = names.iter().map(|name| activity.last_calls(&name.node));
+            Self {
+                unregistered: last.map(|last_calls| last_calls.unregistered).collect(),
+                names,
+            }
+        })
+    }
+
+    /// The verdict, for nodes that have registered nothing since the question.
+    fn findings(&self, proxy: &Proxy, api: &str, interview: &Interview) -> Findings {
+        let Interview { pid, claims, .. } = interview;
+        let mut findings = Findings::default();
+        proxy.ledger.with_activity(|mirror, activity| {
+            let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
+            let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
+            for ((name, unregistered), verdict) in judged {
+                let last_calls = activity.last_calls(&name.node);
+                if mirror.api_of(&name.node) != Some(api)
+                    || last_calls.registered != name.registered
+                {
+                    continue;
+                }
+                if verdict == Verdict::Stranger {
+                    findings.strangers.push(name.clone());
+                    continue;
+                }
+                if let Some(pid) = *pid {
+                    activity.remember_pid(&name.node, api, name.registered, pid);
+                }
+                // Of two who may be meant, neither is mended.
+                let sure = verdict == Verdict::Itself || self.names.len() == 1;
+                if let Some(claims) = claims
+                    && sure
+                    && last_calls.unregistered == *unregistered
+                {
+                    let mending = Mending::new(mirror, &name.node, claims);
+                    let condition = Condition {
+                        node: name.node.clone(),
+                        last_calls,
+                    };
+                    findings.mendings.push((condition, verdict, mending));
+                }
+            }
+        });
+        findings
+    }
+}
+
+impl Findings {
+    fn is_settled(&self) -> bool {
+        let mut mendings = self.mendings.iter();
+        self.strangers.is_empty() && mendings.all(|(_, _, mending)| mending.is_empty())
+    }
+
+    /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
+    /// first: what we register for a node counts as its own deed, and ends what else was found.
+    async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut Outcome) {
+        for name in &self.strangers {
+            let mut earlier = before.strangers.iter();
+            let again =
+                earlier.any(|found| found.node == name.node && found.registered == name.registered);
+            if again && remove(proxy, name, api).await {
+                outcome.removed.push(name.node.clone());
+            }
+        }
+        for (condition, verdict, mending) in &self.mendings {
+            let node = &condition.node;
+            let mut found = before.mendings.iter();
+            let found = found.find(|(found, _, _)| found.node == *node);
+            let confirmed = |list: fn(&Mending) -> &Vec<Registration>, one: &Registration| {
+                found.is_some_and(|(_, _, mending)| list(mending).iter().any(|it| it.is_same(one)))
+            };
+            let certain = *verdict == Verdict::Itself;
+            for one in &mending.extra {
+                if confirmed(|mending| &mending.extra, one) {
+                    let call = one.unregister(node, api);
+                    mend(proxy, one, condition, call, Kind::Unregister, outcome).await;
+                }
+            }
+            for one in &mending.missing {
+                if certain || confirmed(|mending| &mending.missing, one) {
+                    let call = one.register(node, api);
+                    mend(proxy, one, condition, call, Kind::Mutate, outcome).await;
+                }
+            }
+        }
+    }
+}
+
+/// Makes a call for a node, unless the node itself has done the contrary by the time at which it travels.
+async fn mend(
+    proxy: &Proxy,
+    one: &Registration,
+    condition: &Condition,
+    call: Call,
+    kind: Kind,
+    outcome: &mut Outcome,
+) {
+    // In a multicall it goes alone: it must not displace anybody.
+    let alone = Call::multicall([call]);
+    let reply = proxy
+        .write_queue
+        .call_if(alone, kind, condition.clone())
+        .await;
+    let Some(reply) = reply else { return };
+    if is_done(&reply) {
+        let sign = if kind == Kind::Mutate { '+' } else { '-' };
+        outcome
+            .mended
+            .push(format!("{sign} {}", one.describe(&condition.node)));
+    }
+}
+
+/// Whether the one entry of a multicall was answered with success: a node may claim a type that no
+/// master takes.
+fn is_done(reply: &Reply) -> bool {
+    let replies = batch::unpack(reply, 1).unwrap_or_default();
+    replies.iter().any(master::is_success)
+}
+
+/// Unregisters a node as it would have done itself. Not if it has another address by now, or has
+/// registered something since it was asked: then it has come back.
+async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
+    // What it has on its way to the master comes first.
+    barrier(proxy).await;
+    let found = proxy.ledger.with_activity(|mirror, activity| {
+        let last_calls = activity.last_calls(&name.node);
+        let same =
+            mirror.api_of(&name.node) == Some(api) && last_calls.registered == name.registered;
+        same.then(|| (mirror.unregister_calls(&name.node), last_calls))
+    });
+    let Some((calls, last_calls)) = found.filter(|(calls, _)| !calls.is_empty()) else {
+        return false;
+    };
+    let node = name.node.clone();
+    let (call, condition) = (Call::multicall(calls), Condition { node, last_calls });
+    let reply = proxy
+        .write_queue
+        .call_if(call, Kind::Unregister, condition)
+        .await;
+    reply.is_some()
+}

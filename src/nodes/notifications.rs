@@ -1,0 +1,243 @@
+//! Notifications to nodes that the master would send, has not sent, or will send late.
+//!
+//! Each node gets its own in order, one at a time, and one that does not answer delays nobody else.
+//! A node does nothing with a list of publishers that it knows already; a stale one could make it
+//! drop links. So what is repeated is read from the mirror at the moment at which it is sent, and one
+//! that has become stale on its way is followed by another.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    pin::pin,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+
+use tokio::sync::Semaphore;
+
+use super::client::{self, Sign};
+use crate::{
+    health::Claims,
+    ledger::activity::{Displaced, Notification},
+    master::{self, Master},
+    proxy::Proxy,
+    xmlrpc::{Call, Value},
+};
+
+/// Nodes that are notified at the same time. Each takes a file descriptor.
+const AT_ONCE: usize = 64;
+/// A node that takes longer gives its place to the next one: living nodes answer within milliseconds.
+const PROMPT: Duration = Duration::from_millis(10);
+/// Nodes beside those that are still waited for. The packets to some computer vanish, and it had many.
+const SLOW: usize = 128;
+/// A node that takes its notifications so much slower than they come gets the latest of each.
+const QUEUE_MAX: usize = 256;
+/// Pauses before a node that is to shut down and does not answer is asked again.
+const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
+
+/// The notifications under way.
+#[derive(Debug)]
+pub struct Notifications {
+    /// What each address is still to be told; an entry for each that is being told something.
+    pending: Mutex<HashMap<String, VecDeque<Notification>>>,
+    permits: Semaphore,
+    slow: Semaphore,
+}
+
+impl Default for Notifications {
+    fn default() -> Self {
+        Self {
+            pending: Mutex::default(),
+            permits: Semaphore::new(AT_ONCE),
+            slow: Semaphore::new(SLOW),
+        }
+    }
+}
+
+impl Notifications {
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, VecDeque<Notification>>> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Tells every subscriber of `topic` its publishers. Answers whether there are subscribers.
+pub fn tell_subscribers(proxy: &Arc<Proxy>, topic: &str) -> bool {
+    let subscribers = proxy
+        .ledger
+        .with_mirror(|mirror| mirror.subscribers_of(topic));
+    for api in &subscribers {
+        send(proxy, api, Notification::Topic(topic.to_owned()));
+    }
+    !subscribers.is_empty()
+}
+
+/// Tells the node at `api` of every topic and every parameter that it subscribes.
+pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
+    let notifications = proxy.ledger.with_mirror(|mirror| {
+        let names = mirror.nodes().filter(|(_, at)| *at == api);
+        let notifications = names.flat_map(|(name, _)| {
+            let topics = mirror.subscriptions(name).map(str::to_owned);
+            // What is not set, and may never have been, is nothing to tell.
+            let keys = mirror.param_subscriptions(name);
+            let keys = keys.filter(|key| mirror.is_set(key)).map(Arc::from);
+            topics
+                .map(Notification::Topic)
+                .chain(keys.map(Notification::Param))
+        });
+        notifications.collect::<Vec<_>>()
+    });
+    for notification in notifications {
+        send(proxy, api, notification);
+    }
+}
+
+/// Notifies the node at `api`, unless it is unreachable: those are told everything as soon as they
+/// answer. Who does not take a notification becomes unreachable.
+pub fn send(proxy: &Arc<Proxy>, api: &str, notification: Notification) {
+    if proxy.nodes.is_suspect(api) {
+        return;
+    }
+    let mut pending = proxy.nodes.notifications.lock();
+    if let Some(queue) = pending.get_mut(api) {
+        add(queue, notification);
+        return;
+    }
+    pending.insert(api.to_owned(), VecDeque::from([notification]));
+    drop(pending);
+    tokio::spawn(deliver(proxy.clone(), api.to_owned()));
+}
+
+fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
+    let repeated = !matches!(notification, Notification::Call(_));
+    if repeated && queue.contains(&notification) {
+        return;
+    }
+    queue.push_back(notification);
+    if queue.len() > QUEUE_MAX {
+        let all = std::mem::take(queue);
+        for notification in all.into_iter().filter_map(latest) {
+            if !queue.contains(&notification) {
+                queue.push_back(notification);
+            }
+        }
+    }
+}
+
+/// What stands for a notification and all others like it.
+fn latest(notification: Notification) -> Option<Notification> {
+    let Notification::Call(call) = notification else {
+        return Some(notification);
+    };
+    let subject = call.params.get(1).and_then(Value::as_str)?;
+    Some(match call.method.as_str() {
+        "publisherUpdate" => Notification::Topic(subject.to_owned()),
+        _ => Notification::Param(subject.into()),
+    })
+}
+
+async fn deliver(proxy: Arc<Proxy>, api: String) {
+    let notifications = &proxy.nodes.notifications;
+    loop {
+        let notification = {
+            let mut pending = notifications.lock();
+            match pending.get_mut(&api).and_then(VecDeque::pop_front) {
+                Some(notification) => notification,
+                None => {
+                    pending.remove(&api);
+                    return;
+                }
+            }
+        };
+        let compose = || {
+            proxy
+                .ledger
+                .with_mirror(|mirror| compose(mirror, &api, &notification))
+        };
+        // Never closed.
+        let permit = notifications.permits.acquire().await.ok();
+        let Some(call) = compose() else { continue };
+        proxy.stats.notifications.count();
+        let mut asked = pin!(client::ask(&api, &call, proxy.config.census_timeout));
+        let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
+            Ok(sign) => sign,
+            Err(_) => {
+                let _room = notifications.slow.try_acquire().ok().or(permit);
+                asked.await
+            }
+        };
+        if sign != Sign::Alive {
+            notifications.lock().remove(&api);
+            proxy.nodes.suspect(&proxy, &api);
+            return;
+        }
+        if compose().is_some_and(|now| now != call)
+            && let Some(queue) = notifications.lock().get_mut(&api)
+        {
+            add(queue, notification);
+        }
+    }
+}
+
+/// What is to be said to the node at `api` now; none if it does not concern that node any more.
+fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Arc<Call>> {
+    match notification {
+        Notification::Call(call) => Some(call.clone()),
+        Notification::Topic(topic) => mirror
+            .subscribes(api, topic)
+            .then(|| mirror.publisher_update(topic).into()),
+        Notification::Param(key) => match mirror.subscribes_param(api, key) {
+            true => mirror.param_update(key).map(Arc::new),
+            false => None,
+        },
+    }
+}
+
+/// Tells a node whose name another one has taken to shut down, as a master does, but never another node
+/// that has its address by now.
+pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
+    let proxy = proxy.clone();
+    tokio::spawn(async move {
+        for seconds in SHUTDOWN_PAUSES {
+            tokio::time::sleep(Duration::from_secs(seconds)).await;
+            if is_taken(&proxy, &displaced.api) {
+                return;
+            }
+            // Never closed.
+            let permit = proxy.nodes.notifications.permits.acquire().await;
+            let interview = client::interview(&displaced.api, proxy.config.census_timeout).await;
+            match interview.sign {
+                Sign::Dead => return,
+                Sign::Silent => continue,
+                Sign::Alive => {}
+            }
+            let Displaced { node, api, .. } = &displaced;
+            if is_itself(&displaced, interview.pid, interview.claims.as_ref())
+                && !is_taken(&proxy, api)
+            {
+                tracing::info!(
+                    node,
+                    api,
+                    "telling a node to shut down: another has its name"
+                );
+                proxy.stats.notifications.count();
+                client::ask(api, &master::shutdown(node), proxy.config.census_timeout).await;
+            }
+            drop(permit);
+            return;
+        }
+    });
+}
+
+/// Whether a node is registered at this address.
+fn is_taken(proxy: &Proxy, api: &str) -> bool {
+    proxy
+        .ledger
+        .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
+}
+
+/// Whether the node behind the address is the one that was displaced. Without evidence it is not.
+fn is_itself(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
+    match (displaced.pid, pid) {
+        (Some(known), Some(pid)) => known == pid,
+        _ => claims.is_some_and(|claims| claims.shares(&displaced.topics)),
+    }
+}

@@ -1,0 +1,395 @@
+//! Which of a call's mutations a master has executed, and whether a mirror agrees.
+
+use crate::master::multicall::{self, Entry};
+use crate::master::{Master, api};
+use crate::xmlrpc::{Call, Reply, Value};
+
+/// A mutating call, taken out of multicalls, that a master has answered.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Answered {
+    /// The call.
+    pub call: Call,
+    /// The master's answer.
+    pub reply: Reply,
+    /// Whether the master has changed its state by it.
+    pub executed: bool,
+}
+
+impl Answered {
+    /// How the answer of a mirror of that master to the same call compares. `live`: parameters may
+    /// have been written later in the same request. The value that `subscribeParam` answers may then
+    /// hold them already, for rosmaster writes the dictionary itself, when all has been run; what could not
+    /// be written may have been replaced by then.
+    pub fn compare(&self, mirror: &Reply, live: bool) -> Agreement {
+        let same = match (&self.reply, mirror) {
+            (Reply::Value(Value::Array(master)), mirror)
+                if live && self.call.method == "subscribeParam" =>
+            {
+                match mirror {
+                    Reply::Value(Value::Array(mirror)) => master.first() == mirror.first(),
+                    Reply::Fault { text, .. } => is_write_error(text) && self.executed,
+                    Reply::Value(_) => false,
+                }
+            }
+            (master, mirror) => master == mirror,
+        };
+        match (same, executed(&self.call.method, mirror)) {
+            (true, _) => Agreement::Same,
+            (false, Some(false)) if !self.executed => Agreement::OtherWords,
+            (false, _) => Agreement::Diverged,
+        }
+    }
+}
+
+/// How two answers compare.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Agreement {
+    /// They are equal.
+    Same,
+    /// Both refuse, and say so differently: no state has changed.
+    OtherWords,
+    /// One of the two states is not what it should be.
+    Diverged,
+}
+
+/// The mutating calls, taken out of multicalls, that a master has answered.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Accepted {
+    /// The calls in the order of their execution.
+    pub calls: Vec<Answered>,
+    /// Whether that is known for certain. If not, the master's state has to be read again.
+    pub certain: bool,
+}
+
+/// Which mutating calls within `call` the master has answered, given its `reply`.
+///
+/// A call has been executed if its answer's code is 1, and in the few cases where rosmaster changes
+/// its state and answers an error: a `setParam` whose callbacks cannot be worked out, a
+/// `subscribeParam` of what cannot be returned.
+///
+/// A multicall that fails as a whole has run up to the entry at fault. Of such a one this gives what
+/// `mirror`, the state before the call, would have accepted, and says that it is not certain.
+pub fn accepted(mirror: &Master, call: &Call, reply: &Reply) -> Accepted {
+    let mut walk = Walk {
+        mirror,
+        model: None,
+        modelled: 0,
+        accepted: Accepted {
+            calls: Vec::new(),
+            certain: true,
+        },
+    };
+    walk.call(&call.method, &call.params, reply, multicall::DEEPEST);
+    walk.accepted
+}
+
+struct Walk<'a> {
+    mirror: &'a Master,
+    /// The mirror after the first `modelled` calls of `accepted`, once somebody has to know.
+    model: Option<Master>,
+    modelled: usize,
+    accepted: Accepted,
+}
+
+impl Walk<'_> {
+    fn call(&mut self, method: &str, params: &[Value], reply: &Reply, levels: usize) {
+        if method == multicall::METHOD {
+            return match levels.checked_sub(1) {
+                Some(levels) => self.multicall(params, reply, levels),
+                None => self.accepted.certain = false,
+            };
+        }
+        if !api::method(method).is_some_and(|method| method.kind.mutates()) {
+            return;
+        }
+        match executed(method, reply) {
+            Some(executed) => self.accepted.calls.push(Answered {
+                call: Call::new(method, params.to_vec()),
+                reply: reply.clone(),
+                executed,
+            }),
+            None => self.accepted.certain = false,
+        }
+    }
+
+    fn multicall(&mut self, params: &[Value], reply: &Reply, levels: usize) {
+        let Ok(entries) = multicall::entries(params) else {
+            return;
+        };
+        let results = match reply {
+            Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
+            Reply::Fault { .. } => return self.simulate(params, levels),
+            // No rosmaster answers so: what has become of it only a look can show.
+            Reply::Value(_) => {
+                self.accepted.certain = false;
+                return;
+            }
+        };
+        for (element, result) in entries.iter().zip(results) {
+            if let Entry::Call { method, params } = Entry::new(element) {
+                match multicall::entry_reply(result) {
+                    Some(reply) => self.call(method, &params, &reply, levels),
+                    None => self.accepted.certain = false,
+                }
+            }
+        }
+    }
+
+    /// Runs the entries in the mirror, because the master's reply does not say how they went.
+    fn simulate(&mut self, params: &[Value], levels: usize) {
+        let before = self.accepted.calls.len();
+        self.run(params, levels);
+        if self.accepted.calls.len() > before {
+            self.accepted.certain = false;
+        }
+    }
+
+    /// What the mirror answers to a call after those that have been accepted. There may be many
+    /// multicalls to simulate: the model goes on from one to the next.
+    fn foretell(&mut self, call: &Call) -> Reply {
+        let model = self.model.get_or_insert_with(|| self.mirror.clone());
+        for answered in self.accepted.calls.iter().skip(self.modelled) {
+            model.apply_telling(&answered.call, &mut ());
+        }
+        self.modelled = self.accepted.calls.len();
+        model.apply_telling(call, &mut ())
+    }
+
+    fn run(&mut self, params: &[Value], levels: usize) {
+        let Ok(entries) = multicall::entries(params) else {
+            return;
+        };
+        for element in entries.iter() {
+            match Entry::new(element) {
+                Entry::Malformed(_) => return,
+                Entry::Refused(_) => {}
+                Entry::Call { method, params } if method == multicall::METHOD => {
+                    if let Some(levels) = levels.checked_sub(1) {
+                        self.run(&params, levels);
+                    }
+                }
+                Entry::Call { method, params } => {
+                    let Some(kind) = api::method(method).map(|method| method.kind) else {
+                        continue;
+                    };
+                    if !kind.mutates() {
+                        continue;
+                    }
+                    let call = Call::new(method, params.to_vec());
+                    let reply = self.foretell(&call);
+                    if executed(method, &reply) == Some(true) {
+                        self.modelled += 1;
+                        self.accepted.calls.push(Answered {
+                            call,
+                            reply,
+                            executed: true,
+                        });
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Whether a mutating call has been executed, by its answer; none if it does not say.
+///
+/// rosmaster has changed its state and answers an error
+///
+/// * to `setParam`, when it fails in working out the callbacks (a struct with slashes in its keys),
+/// * to `subscribeParam` of a nil, and of anything that holds a value that it cannot write.
+fn executed(method: &str, reply: &Reply) -> Option<bool> {
+    let answer = match reply {
+        Reply::Value(Value::Array(answer)) => answer.as_slice(),
+        Reply::Fault { text, .. } if method == "subscribeParam" && is_write_error(text) => {
+            return Some(true);
+        }
+        _ => return None,
+    };
+    let [Value::Int(code), Value::String(message), _] = answer else {
+        return None;
+    };
+    Some(match (code, method) {
+        (1, _) => true,
+        (_, "setParam") => {
+            message.starts_with("Internal failure: ")
+                || (message.starts_with("Error: invalid arguments: ")
+                    && !message.contains("cannot set root of parameter tree"))
+        }
+        (_, "subscribeParam") => message == "Internal error (None value returned)",
+        _ => false,
+    })
+}
+
+/// Whether a fault is about writing the reply and not about reading the call.
+pub(super) fn is_write_error(text: &str) -> bool {
+    [
+        "TypeError",
+        "OverflowError",
+        "RecursionError",
+        "RuntimeError",
+    ]
+    .iter()
+    .any(|class| {
+        text.strip_prefix("<class '")
+            .is_some_and(|text| text.starts_with(class))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::xmlrpc::Struct;
+
+    #[test]
+    fn a_refusal_is_compared_too() {
+        let answer = |code: i32, text: &str, value: Value| {
+            Reply::Value(vec![Value::from(code), text.into(), value].into())
+        };
+        let delete = Call::new("deleteParam", vec!["/n".into(), "/a".into()]);
+        let refused = answer(-1, "parameter [/a] is not set", 0.into());
+        let done = answer(1, "parameter /a deleted", 0.into());
+        let of = accepted(&Master::default(), &delete, &refused)
+            .calls
+            .remove(0);
+        assert_eq!(of.compare(&refused, false), Agreement::Same);
+        assert_eq!(of.compare(&done, false), Agreement::Diverged);
+        let other = answer(-1, "no such parameter", 0.into());
+        assert_eq!(of.compare(&other, false), Agreement::OtherWords);
+    }
+
+    #[test]
+    fn what_is_written_behind_a_subscription_may_be_seen_by_it() {
+        let answer =
+            |value: i32| Reply::Value(vec![Value::from(1), "".into(), value.into()].into());
+        let params = vec!["/n".into(), "http://n/".into(), "/a".into()];
+        let subscribe = Call::new("subscribeParam", params);
+        let of = accepted(&Master::default(), &subscribe, &answer(2))
+            .calls
+            .remove(0);
+        assert_eq!(of.compare(&answer(1), true), Agreement::Same);
+        assert_eq!(of.compare(&answer(1), false), Agreement::Diverged);
+        // What could not have been written has been replaced.
+        let fault = |class: &str| Reply::Fault {
+            code: 1,
+            text: format!("<class '{class}'>:cannot marshal it"),
+        };
+        assert_eq!(of.compare(&fault("TypeError"), true), Agreement::Same);
+        assert_eq!(of.compare(&fault("TypeError"), false), Agreement::Diverged);
+        assert_eq!(of.compare(&fault("Exception"), true), Agreement::Diverged);
+    }
+
+    fn set(key: &str, value: impl Into<Value>) -> Call {
+        Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
+    }
+
+    fn watched(keys: &[&str]) -> Master {
+        let mut master = Master::default();
+        for key in keys {
+            let params = vec!["/n".into(), "http://n/".into(), (*key).into()];
+            master.apply(&Call::new("subscribeParam", params));
+        }
+        master
+    }
+
+    /// The calls that have been executed.
+    fn executed(accepted: Accepted) -> Vec<Call> {
+        let executed = accepted.calls.into_iter().filter(|of| of.executed);
+        executed.map(|of| of.call).collect()
+    }
+
+    /// What is accepted of `call`, by what the model itself answers.
+    fn of(master: &Master, call: &Call) -> Accepted {
+        let reply = master.clone().apply(call).reply;
+        accepted(master, call, &reply)
+    }
+
+    #[test]
+    fn a_refused_call_is_not_accepted_and_a_read_never() {
+        let master = Master::default();
+        assert_eq!(executed(of(&master, &set("/a", 1))), [set("/a", 1)]);
+        assert_eq!(executed(of(&master, &set("/", 1))), []);
+        assert_eq!(executed(of(&master, &set("/a", Value::Nil))), []);
+        let read = Call::new("getParamNames", vec!["/n".into()]);
+        assert_eq!(
+            of(&master, &Call::multicall([read.clone(), read])).calls,
+            []
+        );
+    }
+
+    #[test]
+    fn entries_are_judged_one_by_one() {
+        let inner = Call::multicall([set("/b", 2), set("/", 3)]);
+        let call = Call::multicall([set("/a", 1), set("", 1), inner]);
+        let found = of(&Master::default(), &call);
+        assert!(found.certain);
+        assert_eq!(executed(found), [set("/a", 1), set("/b", 2)]);
+    }
+
+    #[test]
+    fn what_came_before_a_malformed_entry_has_run() {
+        let mut call = Call::multicall([set("/a", 1), set("/b", 2)]);
+        if let Some(Value::Array(entries)) = call.params.first_mut() {
+            entries.insert(1, Value::Int(0));
+        }
+        let found = of(&Master::default(), &call);
+        assert_eq!(found.calls.len(), 1);
+        assert!(!found.certain);
+    }
+
+    /// The model of the mirror is not made anew for each: that would take hours.
+    #[test]
+    fn many_multicalls_that_fail_inside_a_long_one_take_no_longer_than_their_entries() {
+        let count = 20_000;
+        let sets = (0..count).map(|index| set(&format!("/p{index}"), 1));
+        let fails = (0..count).map(|index| {
+            let mut call = Call::multicall([set("/q", index), set("/", index)]);
+            if let Some(Value::Array(entries)) = call.params.first_mut() {
+                entries.push(Value::Int(5));
+            }
+            call
+        });
+        let found = of(&Master::default(), &Call::multicall(sets.chain(fails)));
+        assert!(!found.certain);
+        assert_eq!(executed(found).len(), 40_000);
+    }
+
+    #[test]
+    fn nothing_is_made_of_a_reply_that_is_none_to_a_multicall() {
+        let call = Call::multicall([set("/a", 1)]);
+        for value in [Value::Int(1), Value::Array(vec![])] {
+            let found = accepted(&Master::default(), &call, &Reply::Value(value));
+            assert_eq!((found.calls, found.certain), (vec![], false));
+        }
+    }
+
+    #[test]
+    fn a_set_param_whose_callbacks_fail_has_run() {
+        let master = watched(&["/k/x/y"]);
+        let call = set(
+            "/k",
+            Value::Struct(Struct::from([("x/y".to_owned(), 1.into())])),
+        );
+        let mut after = master.clone();
+        let Reply::Value(Value::Array(answer)) = after.apply(&call).reply else {
+            panic!()
+        };
+        assert_eq!(answer[..2], [0.into(), "Internal failure: 'x'".into()]);
+        assert_ne!(master, after);
+        assert_eq!(of(&master, &call).calls.len(), 1);
+    }
+
+    #[test]
+    fn a_subscription_to_what_cannot_be_returned_has_run() {
+        let mut master = Master::default();
+        master.apply(&set("/p", Value::Array(vec![Value::Nil])));
+        master.apply(&set(
+            "/n",
+            Value::Struct(Struct::from([("x".to_owned(), Value::Nil)])),
+        ));
+        for key in ["/p", "/n/x"] {
+            let params = vec!["/n".into(), "http://n/".into(), key.into()];
+            let found = of(&master, &Call::new("subscribeParam", params));
+            assert_eq!((found.calls.len(), found.certain), (1, true), "{key}");
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! The differences between two states, as lines of text.
+
+use indexmap::IndexMap;
+
+use crate::master::Master;
+use crate::xmlrpc::{Struct, Value};
+
+/// Most sentences given.
+const MOST: usize = 20;
+
+/// What differs between `mirror` and `master`, as at most 20 short sentences. None if and only if
+/// the two are equal. Names keys, nodes and addresses, never the value of a parameter.
+pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
+    let mut words = Words(Vec::new());
+    let (a, b) = (&mirror.registry, &master.registry);
+    words.map("the node", &a.nodes, &b.nodes, |words, caller_id, a, b| {
+        if a.api != b.api {
+            words.say(|| {
+                format!(
+                    "the node `{caller_id}` is at {} in the mirror and at {} in the master",
+                    a.api, b.api
+                )
+            });
+        } else if a != b {
+            words.say(|| format!("the node `{caller_id}` is known for other registrations"));
+        }
+    });
+    for (what, a, b) in [
+        ("publishers", &a.publishers, &b.publishers),
+        ("subscribers", &a.subscribers, &b.subscribers),
+        (
+            "parameter subscribers",
+            &a.param_subscribers,
+            &b.param_subscribers,
+        ),
+    ] {
+        words.map(&format!("{what} of"), a, b, |words, key, a, b| {
+            for node in a.iter().filter(|node| !b.contains(node)) {
+                words.say(|| format!("`{node}` is among the {what} of `{key}` only in the mirror"));
+            }
+            for node in b.iter().filter(|node| !a.contains(node)) {
+                words.say(|| format!("`{node}` is among the {what} of `{key}` only in the master"));
+            }
+            if a != b {
+                words.say(|| format!("the {what} of `{key}` are others or in another order"));
+            }
+        });
+        words.order(what, a, b);
+    }
+    words.map("the service", &a.services, &b.services, |words, service, a, b| {
+        if a != b {
+            words.say(|| format!(
+                "the service `{service}` is from `{}` at {} in the mirror and from `{}` at {} in the master",
+                a.node, a.api, b.node, b.api
+            ));
+        }
+    });
+    words.order("services", &a.services, &b.services);
+    if a.had_services != b.had_services {
+        words.say(|| "only one of both has ever had a service".to_owned());
+    }
+    let (a, b) = (&mirror.topic_types, &master.topic_types);
+    words.map("the type of", a, b, |words, topic, a, b| {
+        if a != b {
+            words.say(|| {
+                format!("the type of `{topic}` is {a} in the mirror and {b} in the master")
+            });
+        }
+    });
+    words.order("topic types", a, b);
+    words.params("", mirror.params(), master.params());
+    words.0
+}
+
+struct Words(Vec<String>);
+
+impl Words {
+    fn say(&mut self, sentence: impl FnOnce() -> String) {
+        if self.0.len() < MOST {
+            self.0.push(sentence());
+        }
+    }
+
+    fn map<T>(
+        &mut self,
+        what: &str,
+        a: &IndexMap<String, T>,
+        b: &IndexMap<String, T>,
+        mut both: impl FnMut(&mut Self, &str, &T, &T),
+    ) {
+        for (key, value) in a {
+            match b.get(key) {
+                Some(other) => both(self, key, value, other),
+                None => self.say(|| format!("{what} `{key}` is only in the mirror")),
+            }
+        }
+        for key in b.keys().filter(|key| !a.contains_key(*key)) {
+            self.say(|| format!("{what} `{key}` is only in the master"));
+        }
+    }
+
+    fn order<T>(&mut self, what: &str, a: &IndexMap<String, T>, b: &IndexMap<String, T>) {
+        if a.len() == b.len() && a.keys().all(|key| b.contains_key(key)) && !a.keys().eq(b.keys()) {
+            self.say(|| format!("the {what} are in another order"));
+        }
+    }
+
+    fn params(&mut self, path: &str, a: &Struct, b: &Struct) {
+        if a.iter().eq(b) {
+            return;
+        }
+        for (key, value) in a {
+            match (value, b.get(key)) {
+                (Value::Struct(value), Some(Value::Struct(other))) => {
+                    self.params(&format!("{path}/{key}"), value, other);
+                }
+                (value, Some(other)) if value == other => {}
+                (_, Some(_)) => {
+                    self.say(|| format!("the parameter `{path}/{key}` has another value"))
+                }
+                (_, None) => {
+                    self.say(|| format!("the parameter `{path}/{key}` is only in the mirror"))
+                }
+            }
+        }
+        for key in b.keys().filter(|key| !a.contains_key(*key)) {
+            self.say(|| format!("the parameter `{path}/{key}` is only in the master"));
+        }
+        if a.len() == b.len() && a.keys().all(|key| b.contains_key(key)) && !a.keys().eq(b.keys()) {
+            self.say(|| format!("the parameters below `{path}/` are in another order"));
+        }
+    }
+}

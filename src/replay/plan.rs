@@ -1,0 +1,339 @@
+//! Bringing a new master to a state: one call, and what it must answer.
+
+use std::fmt;
+
+use bytes::Bytes;
+
+use super::Token;
+use super::inspect::lookup;
+use super::restore::{self, Restore};
+use crate::master::{CALLER_ID, Master, multicall, python};
+use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};
+
+/// Most mismatches that are told apart.
+const MOST_MISMATCHES: usize = 20;
+
+/// One multicall that brings a master to a state, reads it back and leaves a token.
+///
+/// # Order
+///
+/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, who are not told then.
+/// 2. Publishers, before there is anybody to be told of them. Types of topics that have neither
+///    publishers nor subscribers left, and those that the natural order of calls would put too late
+///    in `getTopicTypes`, are brought in silently: a subscription by a helper, undone at once. These
+///    are the fewest that give the order.
+/// 3. Services, each after the nodes that it was taken from.
+/// 4. Subscribers, then subscribers of parameters.
+/// 5. Reads of everything, for [`Plan::verify`]. Of addresses only those that the master had before:
+///    a registration that was answered with success has the address that it was made with, and a
+///    question for each would cost a tenth of the injection.
+/// 6. The token: a master that bears it has been brought to the state as a whole.
+///
+/// On an empty master no callback is sent at all, and every read is answered afterwards as it was
+/// before.
+///
+/// # A master that is not empty
+///
+/// What it holds is newer, and stays: a node that is there under another address is left out, so
+/// that the master bumps nobody, and so is a service that has a provider. Parameters are merged, and
+/// ours win. Where the new master has subscribers of a topic that lacks several publishers, they
+/// are taken out first and put back before the last publisher: they are told once, with the complete
+/// list, while every partial list would make a roscpp node drop its live connections.
+///
+/// # Memory
+///
+/// Call and answer are text from the start. As values those of a thousand nodes take ten times as much,
+/// and the C library keeps most of what was once taken for so many small pieces.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    request: Bytes,
+    /// What the request must be answered with.
+    answer: Bytes,
+    expected: Master,
+    skipped: Vec<Skipped>,
+}
+
+/// Something of the state that is not brought into a master.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Skipped {
+    /// A node that is there under another address.
+    Node {
+        /// The node.
+        caller_id: String,
+        /// Its address in the state.
+        api: String,
+        /// Its address in the new master, which stays.
+        found_api: String,
+    },
+    /// A service that has a provider.
+    Service {
+        /// The service.
+        service: String,
+        /// The provider in the state.
+        caller_id: String,
+        /// The provider in the new master, which stays.
+        found: String,
+    },
+    /// The reference of a node by a service that another node took over.
+    Reference {
+        /// The node.
+        caller_id: String,
+        /// The service.
+        service: String,
+    },
+    /// The type `*` of a topic without publishers that has subscribers in the new master.
+    Type {
+        /// The topic.
+        topic: String,
+    },
+    /// A parameter that the master would take and could not return, alone or in one reply with the
+    /// whole tree.
+    Param {
+        /// The parameter.
+        key: String,
+    },
+    /// A registration whose key no name leads to.
+    Unnameable {
+        /// The key.
+        key: String,
+        /// The node.
+        caller_id: String,
+    },
+}
+
+impl fmt::Display for Skipped {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Node {
+                caller_id,
+                api,
+                found_api,
+            } => write!(
+                f,
+                "the node `{caller_id}` at {api}: the new master has it at {found_api}"
+            ),
+            Self::Service {
+                service,
+                caller_id,
+                found,
+            } => write!(
+                f,
+                "the service `{service}` of `{caller_id}`: the new master has it from `{found}`"
+            ),
+            Self::Reference { caller_id, service } => write!(
+                f,
+                "the reference of `{caller_id}` by the service `{service}` that it lost: the new \
+                 master has that service"
+            ),
+            Self::Type { topic } => write!(
+                f,
+                "the type `*` of the topic `{topic}`: its subscribers would be told"
+            ),
+            Self::Param { key } => write!(
+                f,
+                "the parameter `{key}`: rosmaster could not return it, or not in one reply with all others"
+            ),
+            Self::Unnameable { key, caller_id } => {
+                write!(f, "`{key}` of `{caller_id}`: no name leads to it")
+            }
+        }
+    }
+}
+
+/// An answer that is not what the model predicted. Holds no values.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Mismatch {
+    /// The call as a whole was answered with a fault, or with another number of results.
+    Whole {
+        /// The fault's text, or what is wrong with the results.
+        text: String,
+    },
+    /// One entry.
+    Entry {
+        /// The method.
+        method: String,
+        /// Topic, service, parameter or node, if the method has one.
+        subject: Option<String>,
+        /// The caller id.
+        caller_id: String,
+    },
+}
+
+impl fmt::Display for Mismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Whole { text } => write!(f, "the injection as a whole was answered: {text}"),
+            Self::Entry {
+                method,
+                subject: None,
+                ..
+            } => {
+                write!(f, "{method} was answered otherwise than predicted")
+            }
+            Self::Entry {
+                method,
+                subject: Some(subject),
+                caller_id,
+            } => write!(
+                f,
+                "{method} of `{subject}` by `{caller_id}` was answered otherwise than predicted"
+            ),
+        }
+    }
+}
+
+impl Plan {
+    /// The plan that brings a master that holds `found` to `target` and leaves `token`.
+    ///
+    /// Tokens that `target` or `found` hold themselves are not brought over.
+    pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
+        Self::write(target, found, None, token)
+    }
+
+    /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token
+    /// `before` by `token`: everything is taken out, subscribers first, and brought in anew. No node
+    /// is called back by it.
+    pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
+        Self::write(target, found, Some(before), token)
+    }
+
+    fn write(target: &Master, found: &Master, before: Option<&Token>, token: &Token) -> Self {
+        let mut request = ListWriter::request(multicall::METHOD);
+        let mut answer = ListWriter::answer();
+        let mut write = |call: Call, predicted: Reply| {
+            request.push(&call.into_entry());
+            answer.push(&multicall::reply_entry(predicted));
+        };
+        // Tokens are no part of the mirror. They subscribe to what is not set.
+        let aside = |call: Call| {
+            let predicted = Master::default().apply(&call).reply;
+            (call, predicted)
+        };
+        let mut emptied = None;
+        if let Some(before) = before {
+            let (call, predicted) = aside(before.remove());
+            write(call, predicted);
+            let mut model = found.clone();
+            for call in restore::removal(found, target) {
+                let predicted = model.apply(&call).reply;
+                write(call, predicted);
+            }
+            emptied = Some(model);
+        }
+        let Restore {
+            mut model, skipped, ..
+        } = Restore::run(target, emptied.as_ref().unwrap_or(found), &mut write);
+        for call in reads(&model, found) {
+            let predicted = model.apply(&call).reply;
+            write(call, predicted);
+        }
+        for call in token.leave() {
+            let (call, predicted) = aside(call);
+            write(call, predicted);
+        }
+        Self {
+            request: request.finish().into(),
+            answer: answer.finish().into(),
+            expected: model,
+            skipped,
+        }
+    }
+
+    /// The body of the multicall to send.
+    pub fn request(&self) -> &Bytes {
+        &self.request
+    }
+
+    /// The body that a rosmaster answers with if it answers each entry as the model predicted.
+    pub fn answer(&self) -> &Bytes {
+        &self.answer
+    }
+
+    /// What the master holds afterwards, the token apart.
+    pub fn expected(&self) -> &Master {
+        &self.expected
+    }
+
+    /// What of the target is not brought over.
+    pub fn skipped(&self) -> &[Skipped] {
+        &self.skipped
+    }
+
+    /// Whether every entry was answered as the model predicted. Not needed for a reply that is
+    /// [`Self::answer`] to the byte.
+    ///
+    /// # Errors
+    ///
+    /// The entries that were not, up to 20 of them.
+    pub fn verify(&self, reply: &Reply) -> Result<(), Vec<Mismatch>> {
+        let whole = |text: String| Err(vec![Mismatch::Whole { text }]);
+        let (call, predicted) = match self.decode() {
+            Ok(both) => both,
+            Err(error) => {
+                return whole(format!(
+                    "otherwise than predicted, which was no XML: {error}"
+                ));
+            }
+        };
+        let (results, predicted) = match (reply, &predicted) {
+            (Reply::Value(Value::Array(results)), Reply::Value(Value::Array(predicted)))
+                if results.len() == predicted.len() =>
+            {
+                (results, predicted)
+            }
+            (Reply::Fault { text, .. }, _) => return whole(text.clone()),
+            _ => return whole("another number of results than of calls".to_owned()),
+        };
+        let entries = call.params.first().and_then(Value::as_array);
+        let mismatches: Vec<_> = (results.iter().zip(predicted))
+            .zip(entries.unwrap_or_default())
+            .filter(|((result, predicted), _)| result != predicted)
+            .map(|(_, entry)| mismatch(entry))
+            .take(MOST_MISMATCHES)
+            .collect();
+        if mismatches.is_empty() {
+            Ok(())
+        } else {
+            Err(mismatches)
+        }
+    }
+
+    /// Request and answer as values.
+    fn decode(&self) -> Result<(Call, Reply), DecodeError> {
+        let call = xmlrpc::decode_call(&self.request)?;
+        Ok((call, xmlrpc::decode_reply(&self.answer)?))
+    }
+}
+
+/// Reads that show everything a master in the target state can show, but for addresses that it was
+/// given in the same call.
+fn reads(model: &Master, found: &Master) -> Vec<Call> {
+    let own = |method| Call::new(method, vec![CALLER_ID.into()]);
+    let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
+    // A single value that cannot be returned would fault the whole multicall.
+    if python::is_writable(model.params()) {
+        calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
+    }
+    let nodes = found.registry.nodes.keys();
+    calls.extend(nodes.filter_map(|node| lookup("lookupNode", node)));
+    let services = found.registry.services.keys();
+    calls.extend(services.filter_map(|service| lookup("lookupService", service)));
+    calls
+}
+
+fn mismatch(entry: &Value) -> Mismatch {
+    let member = |name| entry.as_struct().and_then(|members| members.get(name));
+    let text = |value: Option<&Value>| value.and_then(Value::as_str).map(str::to_owned);
+    let params = member("params")
+        .and_then(Value::as_array)
+        .unwrap_or_default();
+    let method = text(member("methodName")).unwrap_or_default();
+    let subject = if method == "subscribeParam" { 2 } else { 1 };
+    Mismatch::Entry {
+        subject: text(params.get(subject)),
+        caller_id: text(params.first()).unwrap_or_default(),
+        method,
+    }
+}

@@ -1,0 +1,320 @@
+//! What a master that was out of reach is to hold when it is reached again.
+
+use super::{Token, restore};
+use crate::master::{Master, multicall, names};
+use crate::xmlrpc::{Call, Value};
+
+/// What counts where a master of the present incarnation and the mirror differ.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Authority {
+    /// The mirror only where it has answered writes since the master was last known to equal it:
+    /// all other differences were made past us, and are newer.
+    PendingWrites,
+    /// The mirror wherever it knows something. Nobody knows when the two were equal last.
+    Mirror,
+}
+
+/// The state that `held`, what a master of the present incarnation holds, and `mirror` come to.
+/// `pending` are the writes that the mirror has answered and the master may not have run; one that it
+/// has run may be among them, for running it twice leads to the same state.
+pub fn reconcile(mirror: &Master, held: &Master, pending: &[Call], authority: Authority) -> Master {
+    let mut theirs = held.clone();
+    for call in pending {
+        theirs.apply_telling(call, &mut ());
+    }
+    if authority == Authority::PendingWrites || theirs == *mirror {
+        return theirs;
+    }
+    let mut target = mirror.clone();
+    for call in additions(mirror, &theirs) {
+        target.apply_telling(&call, &mut ());
+    }
+    target
+}
+
+/// What a master of the present incarnation may hold beside what can be read of it: the subscriptions of
+/// parameters that `mirror` has, and those that a pending write takes away.
+pub fn may_hold(mirror: &Master, pending: &[Call]) -> Master {
+    let mut master = mirror.clone();
+    for call in pending {
+        let text = |index: usize| call.params.get(index).and_then(Value::as_str);
+        // One that has moved on has taken nothing along.
+        let known = text(0).and_then(|caller_id| mirror.api_of(caller_id));
+        if call.method == "unsubscribeParam" && known.is_none_or(|known| text(1) == Some(known)) {
+            let call = Call::new("subscribeParam", call.params.clone());
+            master.apply_telling(&call, &mut ());
+        }
+    }
+    master
+}
+
+/// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another
+/// address adds nothing.
+fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
+    let mut calls = Vec::new();
+    let tree = restore::merged(mirror.params(), master.params());
+    if !tree.iter().eq(mirror.params()) {
+        let params = vec![names::CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+        calls.push(Call::new("setParam", params));
+    }
+    let api = |caller_id: &str| {
+        let api = master.api_of(caller_id)?;
+        let known = mirror.api_of(caller_id);
+        (known.is_none_or(|known| known == api) && !Token::is_ours(caller_id)).then_some(api)
+    };
+    let (ours, theirs) = (&mirror.registry, &master.registry);
+    for (method, ours, theirs) in [
+        ("registerPublisher", &ours.publishers, &theirs.publishers),
+        ("registerSubscriber", &ours.subscribers, &theirs.subscribers),
+    ] {
+        for (topic, callers) in theirs {
+            let known = ours.get(topic).map_or(&[][..], Vec::as_slice);
+            for caller_id in callers.iter().filter(|caller| !known.contains(caller)) {
+                let topic_type = mirror.type_of(topic).or_else(|| master.type_of(topic));
+                let name = names::name_for(topic, caller_id);
+                if let (Some(api), Some(name)) = (api(caller_id), name) {
+                    let words = [caller_id, name.as_str(), topic_type.unwrap_or("*"), api];
+                    calls.push(Call::new(method, words.map(Value::from).into()));
+                }
+            }
+        }
+    }
+    for (service, entry) in &theirs.services {
+        let name = names::name_for(service, &entry.node);
+        if !ours.services.contains_key(service)
+            && let (Some(api), Some(name)) = (api(&entry.node), name)
+        {
+            let words = [entry.node.as_str(), name.as_str(), entry.api.as_str(), api];
+            calls.push(Call::new("registerService", words.map(Value::from).into()));
+        }
+    }
+    calls
+}
+
+impl Master {
+    /// Whether `call` would change the state: false only if every write in it, one after the other, is
+    /// known to leave the state as it is. Unregistrations of what is not there change nothing.
+    pub fn would_change(&self, call: &Call) -> bool {
+        if call.method == multicall::METHOD {
+            let entries = call.entries();
+            return entries.is_empty() || entries.iter().any(|entry| self.would_change(entry));
+        }
+        !self.is_settled(call).unwrap_or(false)
+    }
+
+    /// Whether the state already is what `call` leads to; none if that is not known.
+    fn is_settled(&self, call: &Call) -> Option<bool> {
+        let text = |index: usize| call.params.get(index)?.as_str();
+        let caller_id = text(0)?;
+        let name = |index| Some(names::resolve(text(index)?, caller_id));
+        let key = |index| Some(names::param_key(&name(index)?));
+        // The node as it is registered at the address that the call gives.
+        let node = |index| {
+            let node = self.registry.nodes.get(caller_id);
+            node.filter(|node| Some(node.api.as_str()) == text(index))
+        };
+        let provides = |service: &str| {
+            let entry = self.registry.services.get(service);
+            entry.is_some_and(|of| of.node == caller_id && Some(of.api.as_str()) == text(2))
+        };
+        Some(match call.method.as_str() {
+            "registerPublisher" => {
+                let (topic, topic_type) = (name(1)?, text(2)?);
+                let same_type = topic_type == "*" || self.type_of(&topic) == Some(topic_type);
+                same_type && node(3)?.publications.contains(&topic)
+            }
+            "registerSubscriber" => {
+                let (topic, topic_type) = (name(1)?, text(2)?);
+                let typed = topic_type == "*" || self.type_of(&topic).is_some();
+                typed && node(3)?.subscriptions.contains(&topic)
+            }
+            "registerService" => {
+                let service = name(1)?;
+                node(3)?.services.contains(&service) && provides(&service)
+            }
+            "subscribeParam" => node(1)?.param_subscriptions.contains(&key(2)?),
+            "unregisterPublisher" => {
+                let topic = name(1)?;
+                !node(2).is_some_and(|node| node.publications.contains(&topic))
+            }
+            "unregisterSubscriber" => {
+                let topic = name(1)?;
+                !node(2).is_some_and(|node| node.subscriptions.contains(&topic))
+            }
+            "unregisterService" => !provides(&name(1)?),
+            "unsubscribeParam" => {
+                let key = key(2)?;
+                !node(1).is_some_and(|node| node.param_subscriptions.contains(&key))
+            }
+            "setParam" => {
+                let value = call.params.get(2)?;
+                // Another order of a struct's members is another state.
+                let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
+                plain && self.params.get(&key(1)?).as_ref() == Some(value)
+            }
+            "deleteParam" => !self.is_set(&name(1)?),
+            // Reads.
+            _ => true,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(method: &str, params: &[&str]) -> Call {
+        Call::new(
+            method,
+            params.iter().map(|text| Value::from(*text)).collect(),
+        )
+    }
+
+    fn set(key: &str, value: i32) -> Call {
+        Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
+    }
+
+    fn publish(node: &str, topic: &str) -> Call {
+        let api = format!("http:/{node}:1/");
+        call("registerPublisher", &[node, topic, "x/Y", &api])
+    }
+
+    fn after(calls: &[Call]) -> Master {
+        let mut master = Master::default();
+        for call in calls {
+            master.apply(call);
+        }
+        master
+    }
+
+    #[test]
+    fn what_was_written_past_us_is_kept_where_nothing_pending_is_newer() {
+        let base = [set("/old", 1), set("/both", 1), publish("/n", "/t")];
+        let gone = call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
+        let pending = [set("/both", 2), gone.clone()];
+        let mirror = after(&[&base[..], &pending].concat());
+        let past_us = [set("/old", 3), set("/both", 3), publish("/new", "/t")];
+        let held = after(&[&base[..], &past_us].concat());
+        let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
+        let expected = [&base[..], &past_us, &pending].concat();
+        assert_eq!(target, after(&expected));
+        // Also if the master has run some of it.
+        let held = after(&[&base[..], &past_us, &pending[..1]].concat());
+        let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
+        assert_eq!(target, after(&expected));
+    }
+
+    #[test]
+    fn the_mirror_wins_for_all_that_it_knows_and_takes_over_the_rest() {
+        let base = [set("/a", 1), publish("/n", "/t")];
+        let mirror = after(&base);
+        let moved = call("registerPublisher", &["/n", "/t", "x/Y", "http://n:2/"]);
+        let offer = call(
+            "registerService",
+            &["/m", "/s", "rosrpc://m:2", "http://m:1/"],
+        );
+        let listen = call("registerSubscriber", &["/m", "/t", "*", "http://m:1/"]);
+        let held = [
+            set("/a", 2),
+            set("/b", 2),
+            moved,
+            offer.clone(),
+            listen.clone(),
+        ];
+        let target = reconcile(&mirror, &after(&held), &[], Authority::Mirror);
+        let expected = [&base[..], &[set("/b", 2), listen, offer]].concat();
+        assert_eq!(target, after(&expected));
+        let target = reconcile(&mirror, &Master::default(), &[], Authority::Mirror);
+        assert_eq!(target, mirror);
+    }
+
+    #[test]
+    fn what_the_mirror_no_longer_has_is_not_taken_over_again() {
+        let offer = call(
+            "registerService",
+            &["/n", "/s", "rosrpc://n:2", "http://n:1/"],
+        );
+        let gone = call("unregisterService", &["/n", "/s", "rosrpc://n:2"]);
+        let held = after(std::slice::from_ref(&offer));
+        let mirror = after(&[offer, gone.clone()]);
+        let target = reconcile(&mirror, &held, &[gone], Authority::Mirror);
+        assert_eq!(target, mirror);
+    }
+
+    #[test]
+    fn what_no_look_shows_and_a_pending_write_takes_away_may_be_there() {
+        let watch = |api: &str| call("subscribeParam", &["/n", api, "/k"]);
+        let gone = |api: &str| call("unsubscribeParam", &["/n", api, "/k"]);
+        let mirror = after(&[watch("http://n:1/"), gone("http://n:1/")]);
+        let held = may_hold(&mirror, &[gone("http://n:1/")]);
+        assert_eq!(held, after(&[watch("http://n:1/")]));
+        let target = reconcile(
+            &mirror,
+            &held,
+            &[gone("http://n:1/")],
+            Authority::PendingWrites,
+        );
+        assert_eq!(target, mirror);
+        let moved = after(&[watch("http://n:2/")]);
+        assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
+    }
+
+    /// Whatever is said to change nothing leaves an equal state.
+    #[test]
+    fn what_changes_nothing_is_told_from_what_does() {
+        let watch = call("subscribeParam", &["/n", "http://n:1/", "k"]);
+        let offer = call(
+            "registerService",
+            &["/n", "s", "rosrpc://n:2", "http://n:1/"],
+        );
+        let listen = call("registerSubscriber", &["/n", "t", "x/Y", "http://n:1/"]);
+        let state = [set("/k", 1), publish("/n", "/t"), watch, offer, listen];
+        let master = after(&state);
+        for call in &state {
+            assert!(!master.would_change(call), "{call:?}");
+            assert!(Master::default().would_change(call), "{call:?}");
+        }
+        assert!(!master.would_change(&Call::multicall(state.clone())));
+        let tree = Call::new(
+            "setParam",
+            vec!["/n".into(), "/k".into(), Value::Array(vec![])],
+        );
+        for change in [
+            set("/k", 2),
+            tree,
+            publish("/m", "/t"),
+            call("registerPublisher", &["/n", "/t", "x/Z", "http://n:1/"]),
+            call("registerPublisher", &["/n", "/t", "x/Y", "http://n:2/"]),
+            call("subscribeParam", &["/n", "http://n:2/", "k"]),
+            call(
+                "registerService",
+                &["/n", "s", "rosrpc://n:3", "http://n:1/"],
+            ),
+            call("unregisterPublisher", &["/n", "/t", "http://n:1/"]),
+            call("unregisterSubscriber", &["/n", "t", "http://n:1/"]),
+            call("unregisterService", &["/n", "s", "rosrpc://n:2"]),
+            call("unsubscribeParam", &["/n", "http://n:1/", "k"]),
+            call("deleteParam", &["/n", "k"]),
+        ] {
+            assert!(master.would_change(&change), "{change:?}");
+            let mut changed = master.clone();
+            changed.apply(&change);
+            assert_ne!(changed, master, "{change:?}");
+            assert!(
+                !changed.would_change(&change) || change.params.len() == 3,
+                "{change:?}"
+            );
+        }
+        for idle in [
+            call("unregisterPublisher", &["/m", "/t", "http://m:1/"]),
+            call("unregisterPublisher", &["/n", "/t", "http://n:2/"]),
+            call("unregisterService", &["/n", "s", "rosrpc://n:3"]),
+            call("deleteParam", &["/n", "/other"]),
+        ] {
+            assert!(!master.would_change(&idle), "{idle:?}");
+            let mut same = master.clone();
+            same.apply(&idle);
+            assert_eq!(same, master, "{idle:?}");
+        }
+    }
+}

@@ -1,0 +1,443 @@
+//! The calls of an injection, each tried on the model of the new master as it is written.
+
+use std::collections::HashMap;
+
+use super::Token;
+use super::plan::Skipped;
+use super::token::{HELPER, NO_API};
+use crate::master::names::{self, CALLER_ID};
+use crate::master::{Master, python};
+use crate::xmlrpc::{Call, Reply, Struct, Value};
+
+/// Gives the calls that change state, each with its answer, to `write`; the model of the master after
+/// them.
+pub(super) struct Restore<'a, W> {
+    write: W,
+    /// How many calls there were.
+    count: usize,
+    pub(super) model: Master,
+    pub(super) skipped: Vec<Skipped>,
+    target: &'a Master,
+    found: &'a Master,
+    /// How many of the target's topic types are in.
+    types_in: usize,
+}
+
+impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
+    /// Brings a model of `found` to `target`.
+    pub(super) fn run(target: &'a Master, found: &'a Master, write: W) -> Self {
+        let mut restore = Self {
+            write,
+            count: 0,
+            model: found.clone(),
+            skipped: Vec::new(),
+            target,
+            found,
+            types_in: 0,
+        };
+        restore.params();
+        restore.nodes();
+        restore.publishers();
+        restore.services();
+        restore.had_services();
+        restore.star_types();
+        restore.subscribers();
+        restore.types_before(target.topic_types.len());
+        restore.param_subscribers();
+        restore
+    }
+
+    fn push(&mut self, method: &str, params: Vec<Value>) {
+        let call = Call::new(method, params);
+        let predicted = self.model.apply(&call).reply;
+        self.count += 1;
+        (self.write)(call, predicted);
+    }
+
+    fn params(&mut self) {
+        let found = self.found.params();
+        let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
+        let whole = both.as_ref().unwrap_or_else(|| self.target.params());
+        if whole.iter().eq(found) {
+            // Even if it holds what a master cannot return: that stays where it is.
+            return;
+        }
+        let (tree, left_out) = python::writable(whole);
+        let keys = left_out.into_iter();
+        self.skipped.extend(keys.map(|key| Skipped::Param { key }));
+        if !tree.iter().eq(found) {
+            let params = vec![CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+            self.push("setParam", params);
+        }
+    }
+
+    /// Notes the nodes that are left out.
+    fn nodes(&mut self) {
+        for (caller_id, api) in self.target.nodes() {
+            if let Some(found_api) = self.found.api_of(caller_id)
+                && found_api != api
+                && !Token::is_ours(caller_id)
+            {
+                self.skipped.push(Skipped::Node {
+                    caller_id: caller_id.to_owned(),
+                    api: api.to_owned(),
+                    found_api: found_api.to_owned(),
+                });
+            }
+        }
+    }
+
+    /// The address under which a node's registrations are brought in, unless it is left out.
+    fn api(&self, caller_id: &str) -> Option<&'a str> {
+        let api = self.target.api_of(caller_id)?;
+        let free = self
+            .found
+            .api_of(caller_id)
+            .is_none_or(|found| found == api);
+        (free && !Token::is_ours(caller_id)).then_some(api)
+    }
+
+    /// Of `callers`, those who are brought in and not there yet: caller id, name for `key`, address.
+    fn missing(
+        &mut self,
+        key: &'a str,
+        callers: &'a [String],
+        there: Option<&Vec<String>>,
+        name_for: fn(&str, &str) -> Option<String>,
+    ) -> Vec<(&'a str, String, &'a str)> {
+        let mut missing = Vec::with_capacity(callers.len());
+        for caller_id in callers {
+            let Some(api) = self.api(caller_id) else {
+                continue;
+            };
+            if there.is_some_and(|there| there.contains(caller_id)) {
+                continue;
+            }
+            match name_for(key, caller_id) {
+                Some(name) => missing.push((caller_id.as_str(), name, api)),
+                None => self.skip_unnameable(key, caller_id),
+            }
+        }
+        missing
+    }
+
+    fn skip_unnameable(&mut self, key: &str, caller_id: &str) {
+        let skipped = Skipped::Unnameable {
+            key: key.to_owned(),
+            caller_id: caller_id.to_owned(),
+        };
+        if !self.skipped.contains(&skipped) {
+            self.skipped.push(skipped);
+        }
+    }
+
+    /// The type to register a topic with. One that the new master knows already stays.
+    fn topic_type(&self, topic: &str) -> &'a str {
+        let known = self.found.type_of(topic).filter(|known| *known != "*");
+        known.or_else(|| self.target.type_of(topic)).unwrap_or("*")
+    }
+
+    fn publishers(&mut self) {
+        let (target, found) = (self.target, self.found);
+        for (topic, callers) in &target.registry.publishers {
+            let there = found.registry.publishers.get(topic);
+            let mut missing = self.missing(topic, callers, there, names::name_for);
+            if missing.is_empty() {
+                continue;
+            }
+            self.types_up_to(topic);
+            let topic_type = self.topic_type(topic);
+            let mut put_back = Vec::new();
+            if missing.len() > 1 {
+                put_back = self.take_out_subscribers(topic);
+            }
+            let last = missing.pop();
+            for (caller_id, name, api) in missing {
+                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
+                self.push("registerPublisher", params);
+            }
+            for (caller_id, name, api) in put_back {
+                let params = vec![caller_id.into(), name.into(), "*".into(), api.into()];
+                self.push("registerSubscriber", params);
+            }
+            if let Some((caller_id, name, api)) = last {
+                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
+                self.push("registerPublisher", params);
+            }
+        }
+    }
+
+    /// Unregisters the new master's own subscribers of a topic, so that they are not told of each
+    /// publisher on its own.
+    fn take_out_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
+        let found = self.found;
+        let subscribers = found
+            .registry
+            .subscribers
+            .get(topic)
+            .map_or(&[][..], Vec::as_slice);
+        let mut out = Vec::new();
+        for caller_id in subscribers {
+            let name = names::name_for(topic, caller_id);
+            if let (Some(name), Some(api)) = (name, found.api_of(caller_id)) {
+                let params = vec![caller_id.as_str().into(), name.as_str().into(), api.into()];
+                self.push("unregisterSubscriber", params);
+                out.push((caller_id.as_str(), name, api));
+            }
+        }
+        out
+    }
+
+    fn services(&mut self) {
+        let target = self.target;
+        let mut losers: HashMap<&str, Vec<&str>> = HashMap::new();
+        for (caller_id, node) in &target.registry.nodes {
+            for service in target.taken_over(caller_id, node) {
+                losers.entry(service).or_default().push(caller_id);
+            }
+        }
+        for (service, entry) in &target.registry.services {
+            let losers = losers.remove(service.as_str()).unwrap_or_default();
+            if self.leave_service(service, &losers) {
+                continue;
+            }
+            let owner = self.api(&entry.node);
+            let name = names::name_for(service, &entry.node);
+            match (owner, name) {
+                (Some(api), Some(name)) => {
+                    self.lose(service, &losers);
+                    let caller_id = entry.node.as_str().into();
+                    let params = vec![
+                        caller_id,
+                        name.into(),
+                        entry.api.as_str().into(),
+                        api.into(),
+                    ];
+                    self.push("registerService", params);
+                }
+                (owner, _) => {
+                    if owner.is_some() {
+                        self.skip_unnameable(service, &entry.node);
+                    }
+                    self.lose_to_nobody(service, &losers);
+                }
+            }
+        }
+        for (caller_id, node) in &target.registry.nodes {
+            for service in target.taken_over(caller_id, node) {
+                if let Some(losers) = losers.remove(service.as_str())
+                    && !self.leave_service(service, &losers)
+                {
+                    self.lose_to_nobody(service, &losers);
+                }
+            }
+        }
+    }
+
+    /// A master that has ever had a service answers an `unregisterService` with another message.
+    fn had_services(&mut self) {
+        if self.target.registry.had_services
+            && !self.model.registry.had_services
+            && let Some((helper, name)) = self.helper("/rosrescue")
+        {
+            self.take_and_give_up(helper, name);
+        }
+    }
+
+    fn take_and_give_up(&mut self, helper: String, service: String) {
+        let mut params = vec![helper.into(), service.into(), NO_API.into()];
+        let unregister = params.clone();
+        params.push(NO_API.into());
+        self.push("registerService", params);
+        self.push("unregisterService", unregister);
+    }
+
+    /// Whether a service has a provider in the new master. Then it and who lost it are left out.
+    fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
+        let Some(found) = self.found.registry.services.get(service) else {
+            return false;
+        };
+        let entry = self.target.registry.services.get(service);
+        if let Some(entry) = entry.filter(|entry| *entry != found)
+            && self.api(&entry.node).is_some()
+        {
+            self.skipped.push(Skipped::Service {
+                service: service.to_owned(),
+                caller_id: entry.node.clone(),
+                found: found.node.clone(),
+            });
+        }
+        for caller_id in losers {
+            let node = self.found.registry.nodes.get(*caller_id);
+            let there = node.is_some_and(|node| node.services.contains(service));
+            if self.api(caller_id).is_some() && !there {
+                self.skipped.push(Skipped::Reference {
+                    caller_id: (*caller_id).to_owned(),
+                    service: service.to_owned(),
+                });
+            }
+        }
+        true
+    }
+
+    /// Registers a service for the nodes that it was taken from.
+    fn lose(&mut self, service: &str, losers: &[&str]) {
+        for caller_id in losers {
+            let Some(api) = self.api(caller_id) else {
+                continue;
+            };
+            match names::name_for(service, caller_id) {
+                Some(name) => {
+                    let params = vec![(*caller_id).into(), name.into(), NO_API.into(), api.into()];
+                    self.push("registerService", params);
+                }
+                None => self.skip_unnameable(service, caller_id),
+            }
+        }
+    }
+
+    /// The same where nobody provides the service any more: a helper takes it and gives it up.
+    fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
+        let before = self.count;
+        let Some((helper, name)) = self.helper(service) else {
+            for caller_id in losers {
+                self.skip_unnameable(service, caller_id);
+            }
+            return;
+        };
+        self.lose(service, losers);
+        if self.count > before {
+            self.take_and_give_up(helper, name);
+        }
+    }
+
+    fn subscribers(&mut self) {
+        let (target, found) = (self.target, self.found);
+        for (topic, callers) in &target.registry.subscribers {
+            let there = found.registry.subscribers.get(topic);
+            let missing = self.missing(topic, callers, there, names::name_for);
+            if missing.is_empty() {
+                continue;
+            }
+            self.types_up_to(topic);
+            let topic_type = self.topic_type(topic);
+            for (caller_id, name, api) in missing {
+                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
+                self.push("registerSubscriber", params);
+            }
+        }
+    }
+
+    fn param_subscribers(&mut self) {
+        let (target, found) = (self.target, self.found);
+        for (key, callers) in &target.registry.param_subscribers {
+            let there = found.registry.param_subscribers.get(key);
+            for (caller_id, name, api) in self.missing(key, callers, there, names::param_name_for) {
+                self.push(
+                    "subscribeParam",
+                    vec![caller_id.into(), api.into(), name.into()],
+                );
+            }
+        }
+    }
+
+    /// Brings in the types that stand before that of a topic about to be registered. Where the new
+    /// master has types of its own, the order is lost already.
+    fn types_up_to(&mut self, topic: &str) {
+        if self.found.topic_types.is_empty()
+            && !self.model.topic_types.contains_key(topic)
+            && let Some(index) = self.target.topic_types.get_index_of(topic)
+        {
+            self.types_before(index);
+        }
+    }
+
+    /// Types `*` of topics without publishers can only come from a publisher, and before there are
+    /// subscribers who would be told of it.
+    fn star_types(&mut self) {
+        let target = self.target;
+        for (topic, topic_type) in &target.topic_types {
+            if topic_type == "*" && !self.model.topic_types.contains_key(topic) {
+                self.types_up_to(topic);
+                self.bring_type(topic, topic_type);
+            }
+        }
+    }
+
+    /// Brings in the first `end` of the target's types.
+    fn types_before(&mut self, end: usize) {
+        let target = self.target;
+        let types = target.topic_types.iter().take(end).skip(self.types_in);
+        for (topic, topic_type) in types {
+            self.bring_type(topic, topic_type);
+        }
+        self.types_in = self.types_in.max(end);
+    }
+
+    /// A caller id that is no node's, and the name by which it says `key`.
+    fn helper(&self, key: &str) -> Option<(String, String)> {
+        let is_node = |caller_id: &str| {
+            let nodes = [self.target, self.found].map(|master| &master.registry.nodes);
+            nodes.iter().any(|nodes| nodes.contains_key(caller_id))
+        };
+        names::reach(key, HELPER, |caller_id| !is_node(caller_id))
+    }
+
+    fn bring_type(&mut self, topic: &str, topic_type: &str) {
+        if self.model.topic_types.contains_key(topic) {
+            return;
+        }
+        let Some((helper, name)) = self.helper(topic) else {
+            return self.skip_unnameable(topic, HELPER);
+        };
+        let (register, unregister) = if topic_type != "*" {
+            ("registerSubscriber", "unregisterSubscriber")
+        } else if !self.model.registry.subscribers.contains_key(topic) {
+            ("registerPublisher", "unregisterPublisher")
+        } else {
+            let skipped = Skipped::Type {
+                topic: topic.to_owned(),
+            };
+            // A second attempt comes at the end.
+            if !self.skipped.contains(&skipped) {
+                self.skipped.push(skipped);
+            }
+            return;
+        };
+        let out = vec![helper.as_str().into(), name.as_str().into(), NO_API.into()];
+        let params = vec![helper.into(), name.into(), topic_type.into(), NO_API.into()];
+        self.push(register, params);
+        self.push(unregister, out);
+    }
+}
+
+/// The calls that empty a master that holds `found`, for one that is to hold `target` exactly: what
+/// would be told comes before nobody is left to be told of it. Parameters stay if they are right.
+pub(super) fn removal(found: &Master, target: &Master) -> Vec<Call> {
+    let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
+    let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
+    let (publishers, mut first): (Vec<_>, Vec<_>) =
+        calls.partition(|call| call.method == "unregisterPublisher");
+    if !found.params().iter().eq(target.params()) {
+        let nothing = Value::Struct(Struct::new());
+        let params = vec![CALLER_ID.into(), "/".into(), nothing];
+        first.push(Call::new("setParam", params));
+    }
+    first.extend(publishers);
+    first
+}
+
+/// `ours` over `theirs`, namespace by namespace.
+pub(super) fn merged(ours: &Struct, theirs: &Struct) -> Struct {
+    let mut tree = ours.clone();
+    for (key, value) in theirs {
+        match (tree.get_mut(key), value) {
+            (Some(Value::Struct(inner)), Value::Struct(theirs)) => *inner = merged(inner, theirs),
+            (Some(_), _) => {}
+            (None, value) => {
+                tree.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    tree
+}

@@ -1,0 +1,160 @@
+//! The incarnation token: what we leave in a master to know this very process again.
+
+use crate::{
+    master,
+    xmlrpc::{Call, Reply},
+};
+
+/// The namespace of tokens. Without a leading slash no node's name and no parameter that
+/// `getParam('/')` shows can be in it.
+const NAMESPACE: &str = "rosrescue/";
+/// The caller id of registrations that are undone at once.
+pub(super) const HELPER: &str = "rosrescue/injection";
+/// An address that rosmaster takes and never connects to: `xmlrpc.client` refuses its scheme.
+pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
+
+/// Two parameter subscriptions by caller ids that nobody else has: one bears the session's id, the
+/// other the id and the number of the incarnation. A master with the first and not the second was
+/// ours once and has been succeeded since.
+///
+/// Each makes a node reference that `lookupNode` finds and no other read shows: no registration, no
+/// parameter, no topic type. The subscribed key is outside the tree that starts at `/`, so no
+/// `setParam` or `deleteParam` below `/`, not even one of `/` itself, ever queues a callback to it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Token {
+    session: String,
+    name: String,
+}
+
+/// Which token a master bears.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Bears {
+    /// That of the incarnation asked for: it has been brought to the state as a whole.
+    Present,
+    /// That of an earlier incarnation of the same session.
+    Earlier,
+    /// None of this session.
+    Nothing,
+}
+
+impl Token {
+    /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII
+    /// notifications, digits and `-` become `_`.
+    pub fn new(id: &str, number: u64) -> Self {
+        let safe = |c: char| {
+            if c.is_ascii_alphanumeric() || c == '-' {
+                c
+            } else {
+                '_'
+            }
+        };
+        let id: String = id.chars().map(safe).collect();
+        Self {
+            name: format!("{NAMESPACE}{id}/{number}"),
+            session: format!("{NAMESPACE}{id}"),
+        }
+    }
+
+    /// The calls that leave it, in order: a master that bears the number has all of it.
+    pub fn leave(&self) -> [Call; 2] {
+        [&self.session, &self.name].map(|name| subscription("subscribeParam", name))
+    }
+
+    /// The call that takes the number away.
+    pub fn remove(&self) -> Call {
+        subscription("unsubscribeParam", &self.name)
+    }
+
+    /// The call that looks for the number: answered with code 1 if it is there.
+    pub fn lookup(&self) -> Call {
+        lookup(&self.name)
+    }
+
+    /// The call that looks for the session.
+    pub(super) fn lookup_session(&self) -> Call {
+        lookup(&self.session)
+    }
+
+    /// Whether the reply to [`Self::lookup`] says that the token is there.
+    pub fn is_found(reply: &Reply) -> bool {
+        master::is_success(reply)
+    }
+
+    /// Whether a caller id is that of a token.
+    pub fn is_ours(caller_id: &str) -> bool {
+        caller_id.starts_with(NAMESPACE)
+    }
+}
+
+fn subscription(method: &'static str, name: &str) -> Call {
+    Call::new(method, vec![name.into(), NO_API.into(), "~".into()])
+}
+
+fn lookup(name: &str) -> Call {
+    Call::new("lookupNode", vec![name.into(), "~".into()])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{master::Master, xmlrpc::Value};
+
+    fn reads() -> Vec<Call> {
+        let none = ["getSystemState", "getTopicTypes", "getParamNames"];
+        let mut calls: Vec<Call> = none.map(|name| Call::new(name, vec!["/x".into()])).into();
+        calls.push(Call::new("getParam", vec!["/x".into(), "/".into()]));
+        calls.push(Call::new(
+            "getPublishedTopics",
+            vec!["/x".into(), "".into()],
+        ));
+        calls
+    }
+
+    #[test]
+    fn only_its_own_lookup_finds_a_token() {
+        let token = Token::new("boot 7/3", 2);
+        let mut master = Master::default();
+        let before: Vec<_> = reads().iter().map(|call| master.apply(call)).collect();
+        assert!(!Token::is_found(&master.apply(&token.lookup()).reply));
+        for call in token.leave() {
+            master.apply(&call);
+        }
+        let after: Vec<_> = reads().iter().map(|call| master.apply(call)).collect();
+        assert_eq!(before, after);
+        assert!(Token::is_found(&master.apply(&token.lookup()).reply));
+        for other in [Token::new("other", 2), Token::new("boot 7/3", 1)] {
+            assert!(!Token::is_found(&master.apply(&other.lookup()).reply));
+        }
+        assert!(Token::is_found(
+            &master.apply(&token.lookup_session()).reply
+        ));
+        master.apply(&token.remove());
+        assert!(!Token::is_found(&master.apply(&token.lookup()).reply));
+        assert!(Token::is_found(
+            &master.apply(&token.lookup_session()).reply
+        ));
+    }
+
+    #[test]
+    fn no_parameter_below_the_root_calls_a_token_back() {
+        let mut master = Master::default();
+        for call in Token::new("a", 1).leave() {
+            master.apply(&call);
+        }
+        let tree = Value::Struct([("rosrescue".to_owned(), Value::Int(1))].into());
+        for (key, value) in [
+            ("/", tree),
+            ("/rosrescue/a", 1.into()),
+            ("rosrescue/a/b", 1.into()),
+        ] {
+            let outcome =
+                master.apply(&Call::new("setParam", vec!["/x".into(), key.into(), value]));
+            assert_eq!(outcome.notices, []);
+        }
+        let outcome = master.apply(&Call::new(
+            "deleteParam",
+            vec!["/x".into(), "/rosrescue".into()],
+        ));
+        assert_eq!(outcome.notices, []);
+    }
+}

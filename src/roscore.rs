@@ -1,0 +1,170 @@
+//! What roscore does besides running a master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
+
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::{Duration, Instant},
+};
+
+use tokio_util::sync::CancellationToken;
+
+use crate::nodes::client::{self, Sign};
+use crate::{
+    master::Kind,
+    process::{self, Rosout},
+    proxy::Proxy,
+    xmlrpc::{Call, Reply, Value},
+};
+
+/// The caller id under which roscore's parameters are set; it leaves no trace in the master.
+const CALLER_ID: &str = "/rosrescue";
+/// How long `rosversion` may take: it is a Python program.
+const VERSION_TIME: Duration = Duration::from_secs(20);
+/// Pause before a rosout that has ended is started again, as roslaunch's respawn has it. It doubles
+/// with each one that did not live for [`LONGEST_RESPAWN`].
+const RESPAWN: Duration = Duration::from_secs(1);
+/// The longest of these pauses.
+const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
+/// The node that rosout is.
+const ROSOUT: &str = "/rosout";
+
+fn set(key: &str, value: &str) -> Call {
+    Call::new("setParam", vec![CALLER_ID.into(), key.into(), value.into()])
+}
+
+fn has(proxy: &Proxy, key: &str) -> bool {
+    let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
+    let yes = Value::Bool(true);
+    matches!(proxy.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
+}
+
+fn run_id(proxy: &Proxy) -> Call {
+    set("/run_id", &proxy.ledger.session().id)
+}
+
+/// Gives a new session its run id before there is a master: it is injected with the rest, so that
+/// no roslaunch ever sees a master without one. Not if there may be a master that has one.
+pub fn seed_run_id(proxy: &Proxy) {
+    if !has(proxy, "/run_id") {
+        proxy.ledger.seed(&run_id(proxy));
+    }
+}
+
+/// Does the rest once the master is there, until `stop`; then ends rosout.
+pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
+    let duties = async {
+        // They take their time: while the master starts, too.
+        let versions = tokio::join!(
+            version(&proxy, "/rosversion", "roslaunch"),
+            version(&proxy, "/rosdistro", "-d"),
+            proxy.board.first_opening(),
+        );
+        let missing = Some(run_id(&proxy)).filter(|_| !has(&proxy, "/run_id"));
+        let calls: Vec<_> = [missing, versions.0, versions.1]
+            .into_iter()
+            .flatten()
+            .collect();
+        if !calls.is_empty() {
+            proxy
+                .write_queue
+                .call(Call::multicall(calls), Kind::Mutate)
+                .await;
+        }
+    };
+    let rosout = async {
+        proxy.board.first_opening().await;
+        if rosout {
+            keep_rosout(&proxy).await;
+        }
+    };
+    tokio::select! {
+        ((), ()) = async { tokio::join!(duties, rosout) } => {}
+        () = stop.cancelled() => {}
+    }
+    stop.cancelled().await;
+    // Only now nobody starts another one. It still takes itself out of the master.
+    end_rosout(&proxy).await;
+}
+
+/// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
+async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
+    if has(proxy, key) {
+        return None;
+    }
+    let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
+    if version.is_none() {
+        tracing::warn!(key, "not set: `rosversion {argument}` gave no answer");
+    }
+    version.map(|version| set(key, &version))
+}
+
+/// Keeps a rosout running: ours, or one that is there already.
+async fn keep_rosout(proxy: &Proxy) {
+    let Some(rosout) = Rosout::find(&proxy.config.checkpoint) else {
+        tracing::warn!("no rosout is installed (apt-get install rosout): /rosout is not collected");
+        return;
+    };
+    let mut pause = RESPAWN;
+    loop {
+        let start = Instant::now();
+        match living_rosout(proxy).await.or_else(|| rosout.left_behind()) {
+            Some(pid) => {
+                proxy.rosout.store(pid, Ordering::Relaxed);
+                while process::is_alive(pid) {
+                    tokio::time::sleep(RESPAWN).await;
+                }
+            }
+            None => match rosout.spawn(&proxy.uri) {
+                Ok(mut child) => {
+                    let pid = child.id().unwrap_or_default();
+                    proxy.rosout.store(pid, Ordering::Relaxed);
+                    tracing::info!(pid, "started rosout");
+                    let how = child.wait().await.map(process::describe);
+                    let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
+                    tracing::warn!(pid, how, last_words, "rosout has ended");
+                }
+                Err(error) => tracing::warn!(%error, "cannot start rosout"),
+            },
+        }
+        proxy.rosout.store(0, Ordering::Relaxed);
+        if start.elapsed() >= LONGEST_RESPAWN {
+            pause = RESPAWN;
+        }
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(LONGEST_RESPAWN);
+    }
+}
+
+/// The process id of the registered rosout, if it answers.
+async fn living_rosout(proxy: &Proxy) -> Option<u32> {
+    let api = proxy
+        .ledger
+        .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
+    let call = Call::new("getPid", vec![CALLER_ID.into()]);
+    match client::ask_for(&api, &call, proxy.config.census_timeout).await {
+        (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
+        _ => None,
+    }
+}
+
+/// By then a process that was started shows its command line.
+const STARTED: Duration = Duration::from_millis(500);
+
+/// Ends rosout in order.
+async fn end_rosout(proxy: &Proxy) {
+    let pid = match proxy.rosout.load(Ordering::Relaxed) {
+        // One may have been left to us, and not have been found yet.
+        0 => Rosout::find(&proxy.config.checkpoint).and_then(|rosout| rosout.left_behind()),
+        pid => Some(pid),
+    };
+    let Some(pid) = pid else { return };
+    // A process that has just been started has no command line for a moment.
+    let named = async {
+        while process::is_alive(pid) && !process::runs(pid, "rosout") {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    let _ = tokio::time::timeout(STARTED, named).await;
+    if process::runs(pid, "rosout") {
+        process::stop(pid, || !process::runs(pid, "rosout")).await;
+    }
+}

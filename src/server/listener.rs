@@ -1,0 +1,221 @@
+//! Sockets that nodes connect to, and the connections on them.
+
+use std::{
+    io,
+    net::{self, IpAddr, Ipv6Addr, SocketAddr},
+    sync::Arc,
+    time::Duration,
+};
+
+use hyper::service::service_fn;
+use hyper_util::rt::TokioIo;
+use socket2::{Domain, Protocol, SockRef, Socket, TcpKeepalive, Type};
+use thiserror::Error;
+use tokio::{
+    net::{TcpListener, TcpStream},
+    sync::{Notify, Semaphore},
+};
+use tokio_util::{sync::CancellationToken, task::TaskTracker};
+
+use super::{
+    deadlines::{Deadlines, Timed},
+    service,
+};
+use crate::proxy::Proxy;
+
+/// Connections that the kernel holds for us while we are busy, or not there for a moment.
+const BACKLOG: i32 = 1024;
+/// What a connection buffers of what it reads, in bytes; hyper keeps so much of it in idle times. A
+/// head must fit into it.
+const BUFFER: usize = 16 << 10;
+/// Pause after a failed accept, such as one without a free file descriptor.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
+/// After this time without a sign of life a peer is asked for one, so that connections of computers
+/// that vanished do not pile up.
+const KEEPALIVE: Duration = Duration::from_secs(60);
+
+/// An address that cannot be served.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ListenError {
+    /// Somebody else has the port.
+    #[error(
+        "port {} is in use at {}: another master or rosrescue runs there; stop it, or choose \
+         another port with {option}",
+        address.port(), address.ip()
+    )]
+    InUse {
+        /// The address.
+        address: SocketAddr,
+        /// The option that chooses it.
+        option: &'static str,
+    },
+    /// Any other reason.
+    #[error("cannot listen at {address}: {source}; choose another one with {option}")]
+    Other {
+        /// The address.
+        address: SocketAddr,
+        /// The option that chooses what is wrong with it.
+        option: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// Listens at all of `addresses`, without blocking. All but the first are left out if the computer lacks their address
+/// family. With port 0 they share one free port. `option`, which
+/// chooses the port, is named in errors.
+pub fn bind(
+    addresses: &[SocketAddr],
+    option: &'static str,
+) -> Result<Vec<net::TcpListener>, ListenError> {
+    let mut listeners: Vec<net::TcpListener> = Vec::new();
+    let mut port = None;
+    for address in addresses {
+        let address = SocketAddr::new(address.ip(), port.unwrap_or_else(|| address.port()));
+        match bind_one(address) {
+            Ok(listener) => {
+                port = listener.local_addr().ok().map(|bound| bound.port());
+                listeners.push(listener);
+            }
+            Err(source) if source.kind() == io::ErrorKind::AddrInUse => {
+                return Err(ListenError::InUse { address, option });
+            }
+            Err(error) if !listeners.is_empty() => {
+                tracing::debug!(%address, %error, "not served");
+            }
+            Err(source) => {
+                // Some ports are for root only; all else is about the address.
+                let option = match source.kind() {
+                    io::ErrorKind::PermissionDenied => option,
+                    _ => "--listen",
+                };
+                return Err(ListenError::Other {
+                    address,
+                    option,
+                    source,
+                });
+            }
+        }
+    }
+    Ok(listeners)
+}
+
+fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
+    let socket = Socket::new(
+        Domain::for_address(address),
+        Type::STREAM,
+        Some(Protocol::TCP),
+    )?;
+    socket.set_reuse_address(true)?;
+    if address.is_ipv6() {
+        socket.set_only_v6(true)?;
+    }
+    socket.set_nonblocking(true)?;
+    socket.bind(&address.into())?;
+    socket.listen(BACKLOG)?;
+    Ok(socket.into())
+}
+
+/// Serves `listener` until `stop`; connections that are under way may end in order.
+pub async fn run(
+    listener: TcpListener,
+    proxy: Arc<Proxy>,
+    permits: Arc<Semaphore>,
+    connections: TaskTracker,
+    stop: CancellationToken,
+) {
+    let mut failed = false;
+    loop {
+        // The permit comes second: a listener that nobody connects to needs none.
+        let accepted = async {
+            let accepted = listener.accept().await?;
+            // Never closed.
+            let permit = permits.clone().acquire_owned().await;
+            io::Result::Ok((accepted, permit))
+        };
+        let accepted = tokio::select! {
+            accepted = accepted => accepted,
+            () = stop.cancelled() => return,
+        };
+        match accepted {
+            Ok(((stream, peer), permit)) => {
+                failed = false;
+                let connection = serve(stream, peer, proxy.clone(), stop.clone());
+                connections.spawn(async move {
+                    connection.await;
+                    drop(permit);
+                });
+            }
+            Err(error) => {
+                if !std::mem::replace(&mut failed, true) {
+                    tracing::warn!(%error, "cannot accept connections; it is tried again and again");
+                }
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: CancellationToken) {
+    let keepalive = TcpKeepalive::new()
+        .with_time(KEEPALIVE)
+        .with_interval(KEEPALIVE / 4);
+    let _ = SockRef::from(&stream).set_tcp_keepalive(&keepalive);
+    let _ = stream.set_nodelay(true);
+    let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
+    let clients = proxy.clone();
+    let _present = clients.clients.enter(peer);
+    let deadlines = Deadlines::default();
+    let close = Arc::new(Notify::new());
+    let timed = Timed::new(stream, deadlines.clone(), &clients.idle, close.clone());
+    let service = |request| {
+        // On the heap: idle connections do not keep space for it.
+        Box::pin(service::serve(
+            proxy.clone(),
+            peer,
+            deadlines.clone(),
+            request,
+        ))
+    };
+    let connection = hyper::server::conn::http1::Builder::new()
+        .title_case_headers(true)
+        .half_close(true)
+        .max_buf_size(BUFFER)
+        .serve_connection(TokioIo::new(timed), service_fn(service));
+    let mut connection = std::pin::pin!(connection);
+    let ended = loop {
+        tokio::select! {
+            // A request that has come goes first.
+            biased;
+            ended = &mut connection => break ended,
+            () = close.notified() => {
+                if deadlines.is_idle() {
+                    tracing::debug!(%peer, "closed, having been idle for longest");
+                    return;
+                }
+            }
+            () = stop.cancelled() => {
+                connection.as_mut().graceful_shutdown();
+                break connection.await;
+            }
+        }
+    };
+    if let Err(error) = ended {
+        tracing::debug!(%peer, %error, "connection");
+    }
+}
+
+/// This computer's address on the network, if it has one: that of the route to the outside. No
+/// packet is sent for it.
+pub fn local_address() -> Option<IpAddr> {
+    let routed = |from: SocketAddr, to: SocketAddr| {
+        let socket = net::UdpSocket::bind(from).ok()?;
+        socket.connect(to).ok()?;
+        Some(socket.local_addr().ok()?.ip())
+    };
+    // Addresses that are set apart for documentation: they are routed as any other.
+    let v4 = routed(([0, 0, 0, 0], 0).into(), ([192, 0, 2, 1], 9).into());
+    let documentation = Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 1);
+    v4.or_else(|| routed((Ipv6Addr::UNSPECIFIED, 0).into(), (documentation, 9).into()))
+}

@@ -1,0 +1,182 @@
+//! What a recovery did, and how long each part of it took.
+
+use std::{
+    fmt,
+    time::{Duration, Instant},
+};
+
+use serde::Serialize;
+use tracing::field::debug;
+
+use crate::recovery::examine::Examination;
+use crate::{clock, master::Counts};
+
+/// How the present master came to hold the state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// An empty master, and nothing to bring to it: a session begins.
+    Begun,
+    /// A new incarnation was brought to the mirror's state.
+    Injected,
+    /// The mirror took over what a running master holds.
+    Adopted,
+    /// It is the same incarnation as before, and was brought to the mirror's state again.
+    Reconciled,
+    /// It is the same incarnation as before.
+    Resumed,
+}
+
+impl Outcome {
+    /// Whether the master is not the incarnation that was served before.
+    pub fn is_new(self) -> bool {
+        !matches!(self, Self::Reconciled | Self::Resumed)
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Begun => "a new master is served",
+            Self::Injected => "the master has been restored",
+            Self::Adopted => "a running master has been taken over",
+            Self::Reconciled => "the same master goes on, and knows what was written meanwhile",
+            Self::Resumed => "the same master goes on",
+        })
+    }
+}
+
+/// Durations in milliseconds.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Phases {
+    /// From the shut gate to the master's open port.
+    pub absence_ms: f64,
+    /// The look at what the master holds.
+    pub look_ms: f64,
+    /// Injection and reading back.
+    pub injection_ms: f64,
+    /// From the shut gate to the open gate.
+    pub total_ms: f64,
+}
+
+/// One recovery.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Why the gate was shut.
+    pub cause: &'static str,
+    /// When the gate was shut: seconds since 1970 by the wall clock, for comparison with logs.
+    pub detected_at: f64,
+    /// How the master came to hold the state.
+    pub outcome: Outcome,
+    /// The master's process id, as it says.
+    pub master_pid: i32,
+    /// How long it took.
+    pub phases: Phases,
+    /// From the open gate to the end of the census, in milliseconds; none while it lasts.
+    pub census_ms: Option<f64>,
+    /// What the master holds now.
+    pub restored: Counts,
+    /// What was not injected, and why.
+    pub skipped: Vec<String>,
+    /// Where the master, read back, differs from what was injected. Should be empty.
+    pub mismatches: Vec<String>,
+    /// Nodes that were found dead and taken out.
+    pub removed: Vec<String>,
+    /// Registrations that were added (`+`) or taken back (`-`), because the node itself says so.
+    pub mended: Vec<String>,
+    /// Nodes that did not answer and were kept.
+    pub suspects: Vec<String>,
+    /// Topics whose subscribers were sent the full list of publishers.
+    pub healed: Vec<String>,
+}
+
+impl Report {
+    /// Logs all of it in one line, but what is empty.
+    pub(crate) fn log(&self, message: &str) {
+        let some = |list: &Vec<String>| (!list.is_empty()).then(|| debug(list.clone()));
+        let Phases {
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+        } = self.phases;
+        tracing::info!(
+            cause = self.cause,
+            absence_ms,
+            look_ms,
+            injection_ms,
+            total_ms,
+            census_ms = self.census_ms,
+            master_pid = self.master_pid,
+            skipped = some(&self.skipped),
+            mismatches = some(&self.mismatches),
+            removed = some(&self.removed),
+            mended = some(&self.mended),
+            healed = some(&self.healed),
+            suspects = some(&self.suspects),
+            "{message}: {}",
+            self.restored
+        );
+    }
+}
+
+/// A duration in milliseconds, to a hundredth.
+pub(crate) fn ms(duration: Duration) -> f64 {
+    (duration.as_secs_f64() * 1e5).round() / 1e2
+}
+
+/// The time since which calls have not passed.
+#[derive(Clone, Copy, Debug)]
+pub struct Outage {
+    /// Why.
+    pub cause: &'static str,
+    /// Since when.
+    pub since: Instant,
+    wall: f64,
+    port_open: Option<Instant>,
+}
+
+impl Outage {
+    /// An outage that begins now.
+    pub fn begin(now: Instant, cause: &'static str) -> Self {
+        Self {
+            cause,
+            since: now,
+            wall: clock::wall_time(),
+            port_open: None,
+        }
+    }
+
+    /// The master's port is open again.
+    pub fn port_open(&mut self, now: Instant) {
+        self.port_open = Some(now);
+    }
+
+    /// The report of an outage that ends now with `examination`.
+    pub fn report(&self, now: Instant, examination: Examination) -> Report {
+        let total = now.duration_since(self.since);
+        let absence = self
+            .port_open
+            .map_or(total, |open| open.duration_since(self.since));
+        Report {
+            cause: self.cause,
+            detected_at: self.wall,
+            outcome: examination.outcome,
+            master_pid: examination.pid,
+            phases: Phases {
+                absence_ms: ms(absence),
+                look_ms: ms(examination.look),
+                injection_ms: ms(examination.injection),
+                total_ms: ms(total),
+            },
+            census_ms: None,
+            restored: examination.counts,
+            skipped: examination.skipped,
+            mismatches: examination.mismatches,
+            removed: Vec::new(),
+            mended: Vec::new(),
+            suspects: Vec::new(),
+            healed: Vec::new(),
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! Looks at a master over a connection.
+
+use thiserror::Error;
+
+use super::{CallError, Connection};
+use crate::xmlrpc::Call;
+use crate::{
+    master::Master,
+    replay::{Inspection, NotAMaster, Token},
+};
+
+/// A look that showed nothing.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum InspectError {
+    /// The connection failed.
+    #[error(transparent)]
+    Call(#[from] CallError),
+    /// What answers is no master.
+    #[error(transparent)]
+    NotAMaster(#[from] NotAMaster),
+}
+
+/// The first look; without the parameters if the master cannot return one of them.
+pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspection, InspectError> {
+    let whole = look(connection, &Inspection::call(token)).await;
+    match whole {
+        Err(InspectError::NotAMaster(
+            NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
+        )) => look(connection, &Inspection::call_without_params(token)).await,
+        Err(error) if is_broken_document(&error) => {
+            let rest = look(connection, &Inspection::call_without_params(token)).await;
+            // A server that speaks no XML-RPC may have closed the connection.
+            rest.map_err(|_| error)
+        }
+        whole => whole,
+    }
+}
+
+async fn look(connection: &mut Connection, call: &Call) -> Result<Inspection, InspectError> {
+    Ok(Inspection::decode(&connection.call(call).await?)?)
+}
+
+/// Whether a parameter may have broken the document: a master does not escape a date's text.
+fn is_broken_document(error: &InspectError) -> bool {
+    matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
+}
+
+/// The second look, and with it the state that the master holds.
+pub async fn second(
+    first: Inspection,
+    connection: &mut Connection,
+    previous: &Master,
+) -> Result<Master, InspectError> {
+    if !first.has_params() {
+        tracing::warn!(
+            "the master holds a parameter that it can never return, and with it none of the others: \
+             the mirror keeps what it knows of them. Delete it, or set it to numbers of 32 bits and \
+             dates without markup"
+        );
+    }
+    let second = match first.second_call(previous) {
+        Some(call) => Some(connection.call(&call).await?),
+        None => None,
+    };
+    Ok(first.into_master(second.as_ref(), previous)?)
+}

@@ -1,0 +1,93 @@
+//! The write queue: writes go to the master one batch at a time, so that the journal's order is the
+//! order in which the master ran them. Those that queue up meanwhile go together. While the master is
+//! away the mirror answers them, in the same order.
+
+pub mod batch;
+mod outdated;
+mod round_trip;
+mod worker;
+
+use std::sync::Arc;
+
+use tokio::{
+    sync::{Notify, mpsc, oneshot, watch},
+    time::Instant,
+};
+
+use self::batch::{Answer, Condition, Item};
+pub use self::worker::Worker;
+use crate::{
+    master::Kind,
+    xmlrpc::{self, Call, Reply},
+};
+
+/// Calls between the clients and the queue. The worker never lets them wait.
+const CHANNEL: usize = 64;
+
+/// The way into the queue.
+#[derive(Clone, Debug)]
+pub struct WriteQueue {
+    items: mpsc::Sender<Item>,
+    lost: Arc<Notify>,
+    sent: watch::Receiver<Option<Instant>>,
+}
+
+impl WriteQueue {
+    /// Puts a call in the queue.
+    pub(super) async fn submit(&self, item: Item) {
+        // The worker is gone only when rosrescue stops; the answer's sender is dropped then.
+        let _ = self.items.send(item).await;
+    }
+
+    /// When the batch was sent that the master has not answered yet, if there is one.
+    pub(super) fn unanswered_since(&self) -> Option<Instant> {
+        *self.sent.borrow()
+    }
+
+    /// Makes a call of rosrescue's own, recorded as any other. None if nobody answers.
+    pub async fn call(&self, call: Call, kind: Kind) -> Option<Reply> {
+        self.call_own(call, kind, None).await
+    }
+
+    /// As [`Self::call`]; the call is dropped, too, if `condition` no longer holds when it is its turn.
+    pub async fn call_if(&self, call: Call, kind: Kind, condition: Condition) -> Option<Reply> {
+        self.call_own(call, kind, Some(condition)).await
+    }
+
+    async fn call_own(
+        &self,
+        call: Call,
+        kind: Kind,
+        condition: Option<Condition>,
+    ) -> Option<Reply> {
+        let (answer, answered) = oneshot::channel();
+        let item = Item {
+            raw: None,
+            call: Some(Arc::new(call)),
+            kind,
+            answer,
+            condition,
+        };
+        self.items.send(item).await.ok()?;
+        match answered.await.ok()? {
+            Answer::Made(reply) => Some(reply),
+            Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
+            Answer::Close => None,
+        }
+    }
+
+    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until
+    /// the gate has changed. Called by the gate's only writer.
+    pub async fn lost(&self) {
+        self.lost.notified().await;
+    }
+}
+
+/// Makes a write queue; the second part is to be run.
+pub fn write_queue() -> (WriteQueue, Worker) {
+    let (items, rx) = mpsc::channel(CHANNEL);
+    let lost = Arc::new(Notify::new());
+    let (tell_sent, sent) = watch::channel(None);
+    let worker = Worker::new(rx, lost.clone(), tell_sent);
+    (WriteQueue { items, lost, sent }, worker)
+}

@@ -1,0 +1,106 @@
+//! One request of the write queue to the master and its reply.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use thiserror::Error;
+
+use crate::{
+    master::Master,
+    proxy::Proxy,
+    upstream::{
+        CallError, Connection, Head, RawReply,
+        inspect::{self, InspectError},
+        pool::{VerifyError, verified},
+    },
+};
+
+/// What a round trip ends in.
+pub(super) struct Done {
+    /// The connection, if it can be used again, and the incarnation that it reaches.
+    pub(super) connection: Option<(u64, Connection)>,
+    pub(super) result: Result<Outcome, RoundTripError>,
+}
+
+/// What it was made for.
+pub(super) enum Outcome {
+    Reply(RawReply),
+    /// What the master holds.
+    Held(Box<Master>),
+}
+
+/// Why a round trip failed.
+#[derive(Debug, Error)]
+pub(super) enum RoundTripError {
+    /// There was no connection to the right incarnation.
+    #[error(transparent)]
+    Connect(#[from] VerifyError),
+    /// The calls got no reply.
+    #[error(transparent)]
+    Call(#[from] CallError),
+    /// The look at the master failed.
+    #[error(transparent)]
+    Look(#[from] InspectError),
+}
+
+impl RoundTripError {
+    /// Whether the master may have run what was sent.
+    pub(super) fn may_have_run(&self) -> bool {
+        matches!(self, Self::Call(error) if !matches!(error, CallError::NotSent(_)))
+    }
+}
+
+/// Sends `request`, or without one looks at what the master holds. The future owns what it needs, so
+/// that dropping it ends the connection.
+pub(super) async fn round_trip(
+    proxy: Arc<Proxy>,
+    incarnation: u64,
+    connection: Option<(u64, Connection)>,
+    request: Option<(Head, Bytes)>,
+) -> Done {
+    let connected = match connection {
+        Some((_, connection)) => Ok(connection),
+        None => connect(&proxy).await,
+    };
+    let mut connection = match connected {
+        Ok(connection) => connection,
+        Err(error) => {
+            return Done {
+                connection: None,
+                result: Err(error.into()),
+            };
+        }
+    };
+    let result = match request {
+        Some((head, body)) => {
+            let reply = connection.forward(&head, body).await;
+            reply.map(Outcome::Reply).map_err(Into::into)
+        }
+        None => {
+            let held = held(&proxy, &mut connection).await;
+            held.map(|held| Outcome::Held(held.into()))
+                .map_err(Into::into)
+        }
+    };
+    let usable = match &result {
+        Ok(Outcome::Reply(reply)) => reply.leaves_connection_usable(),
+        Ok(Outcome::Held(_)) => true,
+        Err(_) => false,
+    };
+    Done {
+        connection: usable.then_some((incarnation, connection)),
+        result,
+    }
+}
+
+async fn connect(proxy: &Proxy) -> Result<Connection, VerifyError> {
+    let connection = proxy.upstream.connect_for_writes().await?;
+    verified(connection, &proxy.ledger.token()).await
+}
+
+/// What the master behind `connection` holds.
+async fn held(proxy: &Proxy, connection: &mut Connection) -> Result<Master, InspectError> {
+    let previous = proxy.ledger.with_mirror(Clone::clone);
+    let first = inspect::first(connection, &proxy.ledger.token()).await?;
+    inspect::second(first, connection, &previous).await
+}

@@ -1,0 +1,423 @@
+//! Drains the write queue, one batch at a time.
+
+use std::{
+    collections::VecDeque,
+    pin::Pin,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use tokio::sync::{Notify, mpsc, watch};
+
+use super::batch::{self, Answer, Item};
+use super::{
+    outdated::is_outdated,
+    round_trip::{Done, Outcome, RoundTripError, round_trip},
+};
+use crate::{
+    cli::Sync,
+    gate::State,
+    master::{self, Master},
+    proxy::Proxy,
+    upstream::{Connection, RawReply, inspect::InspectError},
+    wait,
+    xmlrpc::{self, Call, Reply},
+};
+
+/// Pause before a batch that was not sent is tried again while the gate stays open.
+const RETRY_PAUSE: Duration = Duration::from_millis(20);
+/// Pause before a master that could not be looked at is looked at again.
+const LOOK_PAUSE: Duration = Duration::from_secs(1);
+/// How long a batch may go on when the gate has shut, before the mirror answers it: a master that is
+/// killed closes its connections within milliseconds, and one that only closed an idle one answers.
+const GRACE: Duration = Duration::from_millis(5);
+
+/// A batch on its way to the master, or a look if it has no items.
+struct InFlight {
+    incarnation: u64,
+    /// Of the mirror, when it was sent.
+    version: u64,
+    items: Vec<Item>,
+    sent: tokio::time::Instant,
+    done: Pin<Box<dyn Future<Output = Done> + Send>>,
+}
+
+/// Drains the write queue.
+pub struct Worker {
+    items: mpsc::Receiver<Item>,
+    queue: VecDeque<Item>,
+    connection: Option<(u64, Connection)>,
+    in_flight: Option<InFlight>,
+    /// Until when the batch in flight may go on behind a shut gate.
+    grace: Option<tokio::time::Instant>,
+    /// A batch was lost, and the gate has not changed since.
+    lost: bool,
+    tell_lost: Arc<Notify>,
+    tell_sent: watch::Sender<Option<tokio::time::Instant>>,
+    /// The one that was open last.
+    incarnation: u64,
+    resync_due: bool,
+    /// When a resync is due that could not be made before.
+    resync_at: Option<tokio::time::Instant>,
+    retry_at: Option<tokio::time::Instant>,
+    /// Calls that we do not understand, answered with success: the answers wait until the mirror
+    /// has been made anew, and knows what the calls did.
+    opaque: Opaque,
+}
+
+#[derive(Default)]
+struct Opaque {
+    incarnation: u64,
+    answers: Vec<(Item, Answer)>,
+    /// The journal's last record of them.
+    seq: Option<u64>,
+}
+
+impl Worker {
+    pub(super) fn new(
+        items: mpsc::Receiver<Item>,
+        tell_lost: Arc<Notify>,
+        tell_sent: watch::Sender<Option<tokio::time::Instant>>,
+    ) -> Self {
+        Self {
+            items,
+            queue: VecDeque::new(),
+            connection: None,
+            in_flight: None,
+            grace: None,
+            lost: false,
+            tell_lost,
+            tell_sent,
+            incarnation: 0,
+            resync_due: false,
+            resync_at: None,
+            retry_at: None,
+            opaque: Opaque::default(),
+        }
+    }
+
+    /// Runs until every [`WriteQueue`](super::WriteQueue) is gone.
+    pub async fn run(mut self, proxy: Arc<Proxy>) {
+        let mut gate = proxy.gate.clone();
+        let mut resync = proxy.config.resync_interval.map(tokio::time::interval);
+        loop {
+            let mut changed = false;
+            tokio::select! {
+                item = self.items.recv() => match item {
+                    Some(item) => self.queue.push_back(item),
+                    None => return,
+                },
+                () = gate.changed() => changed = true,
+                done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
+                    // A look that takes longer than the interval must leave time for calls.
+                    if matches!(done.result, Ok(Outcome::Held(_))) && let Some(resync) = &mut resync {
+                        resync.reset();
+                    }
+                    self.done(&proxy, done);
+                }
+                () = wait::until(self.retry_at) => self.retry_at = None,
+                () = wait::until(self.grace) => {}
+                () = wait::tick(&mut resync) => {
+                    self.resync_due |= self.in_flight.as_ref().is_none_or(|batch| !batch.items.is_empty());
+                }
+                () = wait::until(self.resync_at) => {
+                    self.resync_at = None;
+                    self.resync_due = true;
+                }
+            }
+            while let Ok(item) = self.items.try_recv() {
+                self.queue.push_back(item);
+            }
+            // Answered already, or sent away.
+            self.queue.retain(|item| !item.answer.is_closed());
+            // Whatever woke us: nobody is told of a change once it has been looked at.
+            let (state, unseen) = gate.look_changed();
+            if changed || unseen {
+                (self.retry_at, self.lost) = (None, false);
+            }
+            match state {
+                State::Open { incarnation } => self.send(&proxy, incarnation),
+                State::StandingIn => self.stand_in(&proxy),
+                State::Injecting | State::Unknown => self.grace = None,
+            }
+            self.tell_sent
+                .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));
+        }
+    }
+
+    /// Sends the next batch, if none is in flight and something is to be sent.
+    fn send(&mut self, proxy: &Arc<Proxy>, incarnation: u64) {
+        self.grace = None;
+        if let Some(batch) = self
+            .in_flight
+            .take_if(|batch| batch.incarnation != incarnation)
+        {
+            // Its master has been succeeded, and the new one never saw these calls.
+            self.take_back(batch.items);
+        }
+        if self.opaque.incarnation != incarnation {
+            let opaque = std::mem::take(&mut self.opaque).answers;
+            self.take_back(opaque.into_iter().map(|(item, _)| item).collect());
+        }
+        if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
+            // What was doubted is gone.
+            self.resync_due = false;
+        }
+        self.resync_due |= proxy.ledger.take_doubt();
+        if self.in_flight.is_some() || self.retry_at.is_some() || self.lost {
+            return;
+        }
+        while let Some(own) = self.queue.front()
+            && is_outdated(proxy, own)
+            && let Some(own) = self.queue.pop_front()
+        {
+            let _ = own.answer.send(Answer::Close);
+        }
+        let items = match self.resync_due {
+            true => Vec::new(),
+            false => batch::pack(&mut self.queue),
+        };
+        if items.is_empty() && !self.resync_due {
+            return;
+        }
+        self.resync_due = false;
+        self.resync_at = None;
+        let connection = self
+            .connection
+            .take()
+            .filter(|(of, connection)| *of == incarnation && !connection.is_closed());
+        proxy.stats.batches.count();
+        let request = (!items.is_empty()).then(|| batch::outbound(&items));
+        let done = round_trip(proxy.clone(), incarnation, connection, request);
+        self.in_flight = Some(InFlight {
+            incarnation,
+            version: proxy.ledger.version(),
+            items,
+            sent: tokio::time::Instant::now(),
+            done: Box::pin(done),
+        });
+    }
+
+    fn done(&mut self, proxy: &Arc<Proxy>, done: Done) {
+        let Some(InFlight {
+            incarnation,
+            version,
+            items,
+            ..
+        }) = self.in_flight.take()
+        else {
+            return;
+        };
+        self.connection = done.connection;
+        match done.result {
+            Ok(Outcome::Held(state)) => self.resync(proxy, incarnation, version, *state),
+            Ok(Outcome::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
+            Err(error) => self.failed(proxy, items, &error),
+        }
+    }
+
+    fn resync(&mut self, proxy: &Arc<Proxy>, incarnation: u64, version: u64, state: Master) {
+        let Ok(difference) = proxy.ledger.adopt_if(incarnation, version, state) else {
+            // The gate was shut meanwhile, and the mirror has taken what this look does not show.
+            self.resync_due = true;
+            return;
+        };
+        if !difference.is_empty() {
+            tracing::warn!(
+                ?difference,
+                "the master differed from the mirror, which was made anew from it"
+            );
+        }
+        self.answer_opaque(proxy);
+    }
+
+    fn answer_opaque(&mut self, proxy: &Arc<Proxy>) {
+        let Opaque { answers, seq, .. } = std::mem::take(&mut self.opaque);
+        answer(proxy, seq, proxy.ledger.unwritten(), answers);
+    }
+
+    fn failed(&mut self, proxy: &Arc<Proxy>, items: Vec<Item>, error: &RoundTripError) {
+        tracing::debug!(%error, calls = items.len(), "a batch failed");
+        let now = tokio::time::Instant::now();
+        if items.is_empty() {
+            self.retry_at = Some(now + RETRY_PAUSE);
+            match error {
+                RoundTripError::Connect(_) => self.resync_due = true,
+                _ => self.resync_at = Some(now + LOOK_PAUSE),
+            }
+            if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
+                // It lives and shows nothing: a client need not wait for that.
+                self.answer_opaque(proxy);
+            }
+            return;
+        }
+        self.take_back(items);
+        if error.may_have_run() {
+            proxy.ledger.abandon_batch();
+            // Whether it has run shows only when the master is seen again. Until then the mirror answers.
+            self.lost = true;
+            self.tell_lost.notify_one();
+        } else {
+            self.retry_at = Some(now + RETRY_PAUSE);
+        }
+    }
+
+    fn take_back(&mut self, items: Vec<Item>) {
+        for item in items.into_iter().rev() {
+            self.queue.push_front(item);
+        }
+    }
+
+    /// Records what the master answered, and only then answers the clients.
+    fn deliver(&mut self, proxy: &Arc<Proxy>, incarnation: u64, items: Vec<Item>, raw: RawReply) {
+        let reply = xmlrpc::decode_reply(&raw.body)
+            .ok()
+            .filter(|_| raw.status.is_success());
+        let mut opaque = false;
+        let replies = match (items.as_slice(), reply) {
+            ([item], Some(reply)) => {
+                opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
+                vec![reply]
+            }
+            // What we cannot read may have changed anything, and only a look shows what. A subscription
+            // of parameters no look shows: it is recorded as if it had gone as predicted.
+            ([item], None) if raw.status.is_success() => {
+                opaque = true;
+                let call = item.call.as_deref().filter(|call| subscribes_params(call));
+                call.map(|call| proxy.ledger.predict(call))
+                    .into_iter()
+                    .collect()
+            }
+            ([_], None) => Vec::new(),
+            (_, Some(reply)) => match batch::unpack(&reply, items.len()) {
+                Some(replies) => replies,
+                None => return self.undeliverable(items),
+            },
+            (_, None) => return self.undeliverable(items),
+        };
+        let answered: Vec<_> = items
+            .iter()
+            .zip(&replies)
+            .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply)))
+            .collect();
+        let Ok(recorded) = proxy.ledger.record(Instant::now(), incarnation, &answered) else {
+            return self.take_back(items);
+        };
+        self.resync_due |= recorded.doubtful || opaque;
+        if opaque {
+            // Others may be held already: after a look that failed calls are sent before the next one.
+            self.opaque.incarnation = incarnation;
+            self.opaque.seq = self.opaque.seq.max(recorded.seq);
+            let answers = items
+                .into_iter()
+                .map(|item| (item, Answer::Raw(raw.clone())));
+            self.opaque.answers.extend(answers);
+            return;
+        }
+        let answers = match items.len() {
+            1 => items
+                .into_iter()
+                .map(|item| (item, Answer::Raw(raw.clone())))
+                .collect(),
+            _ => items
+                .into_iter()
+                .zip(replies.into_iter().map(Answer::Made))
+                .collect(),
+        };
+        answer(proxy, recorded.seq, None, answers);
+    }
+
+    /// A batch was answered as a whole by something else than its results.
+    fn undeliverable(&mut self, items: Vec<Item>) {
+        tracing::warn!(
+            calls = items.len(),
+            "the master did not answer each call of a multicall"
+        );
+        self.resync_due = true;
+        for item in items {
+            let _ = item.answer.send(Answer::Close);
+        }
+    }
+
+    /// Answers from the mirror what is in the queue, and before it what was in flight. What only a master
+    /// can answer waits.
+    fn stand_in(&mut self, proxy: &Arc<Proxy>) {
+        let now = tokio::time::Instant::now();
+        if self.in_flight.is_some() && now < *self.grace.get_or_insert(now + GRACE) {
+            return;
+        }
+        self.grace = None;
+        if self.in_flight.is_some() {
+            proxy.ledger.abandon_batch();
+        }
+        // Its end is what a master that comes back waits for: no call of it is running any more.
+        self.connection = None;
+        if let Some(batch) = self
+            .in_flight
+            .take()
+            .filter(|batch| !batch.items.is_empty())
+        {
+            let calls: Vec<_> = batch.items.iter().map(Item::describe).collect();
+            tracing::info!(?calls, "in flight when the master went away");
+            self.take_back(batch.items);
+        }
+        let (mut last, mut answers) = (None, Vec::new());
+        let mut waiting = VecDeque::new();
+        for item in self.queue.drain(..) {
+            if is_outdated(proxy, &item) {
+                let _ = item.answer.send(Answer::Close);
+                continue;
+            }
+            let call = item
+                .call
+                .as_deref()
+                .filter(|call| master::is_answerable(call));
+            match call.and_then(|call| proxy.ledger.stand_in(Instant::now(), call)) {
+                Some((reply, seq)) => {
+                    proxy.stats.stood_in.count();
+                    last = last.max(seq);
+                    answers.push((item, Answer::Made(reply)));
+                }
+                None => waiting.push_back(item),
+            }
+        }
+        self.queue = waiting;
+        answer(proxy, last, None, answers);
+    }
+}
+
+/// Sends answers when what they tell of is safe: the journal up to `seq` is on the disk, if `--sync` wants
+/// that, and the mirror of this version in a whole checkpoint.
+fn answer(
+    proxy: &Arc<Proxy>,
+    seq: Option<u64>,
+    version: Option<u64>,
+    answers: Vec<(Item, Answer)>,
+) {
+    let seq = seq.filter(|_| proxy.config.sync == Sync::Always);
+    let send = move || {
+        for (item, answer) in answers {
+            let _ = item.answer.send(answer);
+        }
+    };
+    if (seq, version) == (None, None) {
+        return send();
+    }
+    let proxy = proxy.clone();
+    tokio::spawn(async move {
+        if let Some(seq) = seq {
+            proxy.ledger.durable(seq).await;
+        }
+        if let Some(version) = version {
+            proxy.ledger.attempted(version).await;
+        }
+        send();
+    });
+}
+
+/// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.
+fn subscribes_params(call: &Call) -> bool {
+    let entries = call.entries();
+    let mut calls = entries.iter().chain([call]);
+    calls.any(|call| call.method == "subscribeParam")
+}
