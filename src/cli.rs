@@ -118,8 +118,8 @@ pub struct CommonArgs {
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = Restore::Auto)]
     pub restore: Restore,
     /// When the journal is forced to the disk; it survives kill -9 in any case
-    #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = Sync::Interval)]
-    pub sync: Sync,
+    #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = SyncPolicy::Interval)]
+    pub sync: SyncPolicy,
     /// How often `--sync interval` does so, in milliseconds
     #[arg(
         long,
@@ -166,15 +166,16 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub probe_count: u32,
-    /// Time in which a node must answer the census after a recovery, in milliseconds
+    /// Time in which a node must answer a notification or the health check, in milliseconds
     #[arg(
         long,
-        env = "ROSRESCUE_CENSUS_TIMEOUT",
+        alias = "census-timeout",
+        env = "ROSRESCUE_NODE_TIMEOUT",
         value_name = "MS",
         default_value_t = 3000
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
-    pub census_timeout: u64,
+    pub node_timeout: u64,
     /// How often every node is asked whether it lives, so that one that was killed does not stay
     /// registered for ever, in seconds; 0 for only after a recovery, as ROS has it
     #[arg(
@@ -258,7 +259,7 @@ impl ValueEnum for Restore {
 
 /// When the journal is forced to the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Sync {
+pub enum SyncPolicy {
     /// Before a call is answered: survives a power cut whole
     Always,
     /// Every --sync-interval: a power cut may cost that much

@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use crate::{
     checkpoint::session::Restore,
-    cli::{CommonArgs, CoreArgs, ProxyArgs, Sync},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, SyncPolicy},
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
 };
@@ -85,8 +85,8 @@ pub struct Config {
     /// When to restore it at start.
     pub restore: Restore,
     /// When the journal is forced to the disk.
-    pub sync: Sync,
-    /// Pause between two such times with [`Sync::Interval`].
+    pub sync: SyncPolicy,
+    /// Pause between two such times with [`SyncPolicy::Interval`].
     pub sync_interval: Duration,
     /// How long a call that only a master can answer waits for one.
     pub hold: Duration,
@@ -94,9 +94,9 @@ pub struct Config {
     pub probing: Probing,
     /// How long the master may take to answer a probe.
     pub probe_timeout: Duration,
-    /// How long a node may take to answer the census.
-    pub census_timeout: Duration,
-    /// Pause between two censuses while all is well, if there are to be any.
+    /// How long a node may take to answer the health check.
+    pub node_timeout: Duration,
+    /// Pause between two health checks while all is well, if there are to be any.
     pub reap_interval: Option<Duration>,
     /// Pause between two comparisons of the mirror with the master, if there are to be any.
     pub resync_interval: Option<Duration>,
@@ -255,7 +255,7 @@ impl Config {
                 count: args.probe_count,
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
-            census_timeout: Duration::from_millis(args.census_timeout),
+            node_timeout: Duration::from_millis(args.node_timeout),
             reap_interval: Some(seconds(
                 "--reap-dead-nodes",
                 args.reap_dead_nodes,

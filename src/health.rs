@@ -199,7 +199,7 @@ impl Registration {
 
 /// In what the mirror differs from what a node says.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Mending {
+pub struct Reconciliation {
     /// What the node has and the mirror lacks.
     pub missing: Vec<Registration>,
     /// What the mirror has and the node lacks. To be believed only if it stays so: a node may
@@ -207,10 +207,10 @@ pub struct Mending {
     pub extra: Vec<Registration>,
 }
 
-impl Mending {
+impl Reconciliation {
     /// The difference for `node`. Services are left alone: nodes cannot be asked for theirs.
     pub fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
-        let mut mending = Self::default();
+        let mut reconciliation = Self::default();
         let publications: Vec<&str> = mirror.publications(node).collect();
         let subscriptions: Vec<&str> = mirror.subscriptions(node).collect();
         for (publishes, held, said) in [
@@ -220,7 +220,7 @@ impl Mending {
             let missing = said
                 .iter()
                 .filter(|(topic, _)| !held.contains(&topic.as_str()));
-            mending
+            reconciliation
                 .missing
                 .extend(missing.map(|(topic, topic_type)| Registration {
                     publishes,
@@ -231,13 +231,13 @@ impl Mending {
             let extra = held
                 .iter()
                 .filter(|topic| master::is_plain_topic(topic) && !said.contains_key(**topic));
-            mending.extra.extend(extra.map(|topic| Registration {
+            reconciliation.extra.extend(extra.map(|topic| Registration {
                 publishes,
                 topic: (*topic).to_owned(),
                 topic_type: mirror.type_of(topic).unwrap_or("*").to_owned(),
             }));
         }
-        mending
+        reconciliation
     }
 
     /// Whether there is nothing to mend.

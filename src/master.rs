@@ -23,7 +23,7 @@ mod tell;
 mod tests;
 mod updates;
 
-pub use api::{Outcome, is_success};
+pub use api::{Applied, is_success};
 pub use kind::{Kind, is_answerable, kind, writes};
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};

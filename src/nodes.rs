@@ -15,7 +15,7 @@ use std::{
 
 use tokio::sync::Notify;
 
-use self::{client::Sign, health_check::Outcome, notifications::Notifications};
+use self::{client::Sign, health_check::CheckResult, notifications::Notifications};
 use crate::{
     gate::State,
     health::{Repeats, Unreachable},
@@ -42,9 +42,9 @@ const OWED_AFTER: Duration = Duration::from_millis(50);
 pub struct Nodes {
     /// Notifications under way.
     pub(super) notifications: Notifications,
-    suspects: Mutex<Unreachable>,
-    /// Recoveries whose census is not over.
-    censuses: AtomicUsize,
+    unreachable: Mutex<Unreachable>,
+    /// Recoveries whose health check is not over.
+    checks: AtomicUsize,
     /// Nodes that are being asked, or are about to be, and have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
@@ -52,20 +52,22 @@ pub struct Nodes {
 
 impl Nodes {
     fn lock(&self) -> MutexGuard<'_, Unreachable> {
-        self.suspects.lock().unwrap_or_else(PoisonError::into_inner)
+        self.unreachable
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the node at `api` is a suspect.
-    pub fn is_suspect(&self, api: &str) -> bool {
+    /// Whether the node at `api` is unreachable.
+    pub fn is_unreachable(&self, api: &str) -> bool {
         self.lock().contains(api)
     }
 
-    /// The names of the suspects.
-    pub fn suspects(&self, ledger: &Ledger) -> Vec<String> {
+    /// The names of the nodes that are unreachable.
+    pub fn unreachable(&self, ledger: &Ledger) -> Vec<String> {
         // No lock is held while the other one is taken.
-        let suspects = self.lock().clone();
+        let unreachable = self.lock().clone();
         let mut names: Vec<String> = ledger.with_mirror(|mirror| {
-            let nodes = mirror.nodes().filter(|(_, api)| suspects.contains(api));
+            let nodes = mirror.nodes().filter(|(_, api)| unreachable.contains(api));
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
         names.sort();
@@ -73,7 +75,7 @@ impl Nodes {
     }
 
     /// The node at `api` did not answer.
-    pub(super) fn suspect(&self, proxy: &Arc<Proxy>, api: &str) {
+    pub(super) fn mark_unreachable(&self, proxy: &Arc<Proxy>, api: &str) {
         let now = Instant::now();
         if !self.lock().add(api, now) {
             return;
@@ -89,7 +91,7 @@ impl Nodes {
         }
     }
 
-    /// The node at `api` has answered, or is no more. Answers whether it was a suspect.
+    /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
     pub(super) fn clear(&self, proxy: &Proxy, api: &str) -> bool {
         let was = self.lock().remove(api);
         if was {
@@ -101,8 +103,8 @@ impl Nodes {
     /// We tell changes beside the master as long as somebody is suspect, or may be. Answers whether that begins.
     fn update_telling(&self, proxy: &Proxy) -> bool {
         // One lock around the other, here and nowhere else: the last word is the latest.
-        let suspects = self.lock();
-        let telling = !suspects.is_empty() || self.censuses.load(Ordering::Relaxed) > 0;
+        let unreachable = self.lock();
+        let telling = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         proxy
             .ledger
             .with_activity(|_, activity| activity.set_telling(telling))
@@ -110,25 +112,25 @@ impl Nodes {
     }
 
     /// We tell changes beside the master until the result is dropped: nobody knows yet who is suspect.
-    pub(super) fn begin_census(proxy: &Arc<Proxy>) -> CensusUnderWay {
-        proxy.nodes.censuses.fetch_add(1, Ordering::Relaxed);
+    pub(super) fn begin_check(proxy: &Arc<Proxy>) -> CheckUnderWay {
+        proxy.nodes.checks.fetch_add(1, Ordering::Relaxed);
         proxy.nodes.update_telling(proxy);
-        CensusUnderWay(proxy.clone())
+        CheckUnderWay(proxy.clone())
     }
 }
 
-/// The census of a recovery.
-pub(super) struct CensusUnderWay(Arc<Proxy>);
+/// The health check of a recovery.
+pub(super) struct CheckUnderWay(Arc<Proxy>);
 
-impl Drop for CensusUnderWay {
+impl Drop for CheckUnderWay {
     fn drop(&mut self) {
-        self.0.nodes.censuses.fetch_sub(1, Ordering::Relaxed);
+        self.0.nodes.checks.fetch_sub(1, Ordering::Relaxed);
         self.0.nodes.update_telling(&self.0);
     }
 }
 
-/// Watches over the nodes for as long as it is polled: sends notifications, asks suspects again, gets
-/// acquainted with new nodes, and takes the census that is due.
+/// Watches over the nodes for as long as it is polled: sends notifications, asks unreachable nodes again, gets
+/// acquainted with new nodes, and takes the health check that is due.
 pub async fn watch(proxy: Arc<Proxy>) {
     let mut round = tokio::time::interval(ROUND);
     let mut reaping = proxy
@@ -154,7 +156,7 @@ pub async fn watch(proxy: Arc<Proxy>) {
                 (owed_at, owed_told) = (None, true);
                 tell_owed(&proxy, Instant::now());
             }
-            () = wait::until(next) => ask_suspects(&proxy),
+            () = wait::until(next) => ask_unreachable(&proxy),
             () = wait::until(repeats.next().map(Into::into)) => {
                 let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
                 let holding_up = unanswered || !proxy.nodes.lock().is_empty();
@@ -162,7 +164,7 @@ pub async fn watch(proxy: Arc<Proxy>) {
                     tell(&proxy, change);
                 }
             }
-            // A suspect that is new may be due before the others.
+            // An unreachable node that is new may be due before the others.
             () = proxy.nodes.changed.notified() => {}
             _ = round.tick() => get_acquainted(&proxy),
             () = wait::tick(&mut reaping) => {
@@ -217,15 +219,15 @@ fn tell(proxy: &Arc<Proxy>, change: Change) {
     }
 }
 
-fn ask_suspects(proxy: &Arc<Proxy>) {
+fn ask_unreachable(proxy: &Arc<Proxy>) {
     let registered = proxy.ledger.with_mirror(|mirror| {
         let apis = mirror.nodes().map(|(_, api)| api.to_owned());
         apis.collect::<HashSet<_>>()
     });
     let due = {
-        let mut suspects = proxy.nodes.lock();
-        suspects.retain(|api| registered.contains(api));
-        suspects.due(Instant::now())
+        let mut unreachable = proxy.nodes.lock();
+        unreachable.retain(|api| registered.contains(api));
+        unreachable.due(Instant::now())
     };
     proxy.nodes.update_telling(proxy);
     for api in due {
@@ -233,18 +235,20 @@ fn ask_suspects(proxy: &Arc<Proxy>) {
         tokio::spawn(async move {
             let outcome = health_check::visit(&proxy, api).await;
             if outcome.sign != Sign::Silent {
-                say(&outcome, "a suspect answers again");
+                say(&outcome, "an unreachable node answers again");
             }
         });
     }
 }
 
-fn say(outcome: &Outcome, what: &str) {
-    let Outcome {
-        removed, mended, ..
+fn say(outcome: &CheckResult, what: &str) {
+    let CheckResult {
+        removed,
+        reconciled,
+        ..
     } = outcome;
     let names = &outcome.names;
-    tracing::info!(?names, ?removed, ?mended, "{what}");
+    tracing::info!(?names, ?removed, ?reconciled, "{what}");
 }
 
 /// Asks nodes that have registered lately for their process ids: another one at the same port will
@@ -267,7 +271,7 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
         tokio::spawn(async move {
             let permit = health_check::permit().await;
             let call = Call::new("getPid", vec![crate::master::CALLER_ID.into()]);
-            let answer = client::ask_for(&api, &call, proxy.config.census_timeout).await;
+            let answer = client::ask_for(&api, &call, proxy.config.node_timeout).await;
             drop(permit);
             if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
                 proxy.ledger.with_activity(|_, activity| {
@@ -278,11 +282,11 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
     }
 }
 
-/// The standing census.
+/// The regular health check.
 async fn reap(proxy: Arc<Proxy>) {
-    let outcome = health_check::census(&proxy).await;
-    if !outcome.removed.is_empty() || !outcome.mended.is_empty() {
-        let (removed, mended) = (outcome.removed, outcome.mended);
-        tracing::info!(?removed, ?mended, "standing census");
+    let outcome = health_check::check_all(&proxy).await;
+    if !outcome.removed.is_empty() || !outcome.reconciled.is_empty() {
+        let (removed, reconciled) = (outcome.removed, outcome.reconciled);
+        tracing::info!(?removed, ?reconciled, "health check");
     }
 }

@@ -140,7 +140,7 @@ async fn living_rosout(proxy: &Proxy) -> Option<u32> {
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
     let call = Call::new("getPid", vec![CALLER_ID.into()]);
-    match client::ask_for(&api, &call, proxy.config.census_timeout).await {
+    match client::ask_for(&api, &call, proxy.config.node_timeout).await {
         (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }

@@ -16,7 +16,7 @@ use crate::{
     clock,
     gate::State,
     master::{Counts, Master},
-    nodes::health_check::Census,
+    nodes::health_check::HealthCheck,
     proxy::Proxy,
     server::clients::Client,
 };
@@ -135,21 +135,21 @@ impl Board {
         inner.report = Some(report);
     }
 
-    /// What census and healing found after the last recovery. Answers with the whole report.
+    /// What health check and reconciliation found after the last recovery. Answers with the whole report.
     pub fn add_to_report(
         &self,
-        census: Census,
-        census_ms: f64,
-        healed: Vec<String>,
-        suspects: Vec<String>,
+        check: HealthCheck,
+        health_check_ms: f64,
+        notified: Vec<String>,
+        unreachable: Vec<String>,
     ) -> Option<Report> {
         let mut inner = self.lock();
         let report = inner.report.as_mut()?;
-        report.census_ms = Some(census_ms);
-        report.removed = census.removed;
-        report.mended = census.mended;
-        report.suspects = suspects;
-        report.healed = healed;
+        report.health_check_ms = Some(health_check_ms);
+        report.removed = check.removed;
+        report.reconciled = check.reconciled;
+        report.unreachable = unreachable;
+        report.notified = notified;
         Some(report.clone())
     }
 
@@ -196,7 +196,7 @@ pub struct Status {
     /// What the mirror holds.
     pub state: Counts,
     /// Nodes that do not answer now and are not known to be dead.
-    pub suspects: Vec<String>,
+    pub unreachable: Vec<String>,
     /// Masters examined since the start.
     pub recoveries: u64,
     /// The last one.
@@ -216,7 +216,7 @@ impl Status {
             .map(|(name, _, value)| (name.to_owned(), value.into()));
         let unprotected = proxy.ledger.unprotected();
         let state = proxy.ledger.with_mirror(Master::counts);
-        let suspects = proxy.nodes.suspects(&proxy.ledger);
+        let unreachable = proxy.nodes.unreachable(&proxy.ledger);
         let pending_writes = proxy.ledger.pending();
         let state_of_gate = proxy.gate.state();
         let stands_in = matches!(state_of_gate, State::StandingIn | State::Injecting);
@@ -236,7 +236,7 @@ impl Status {
             guarded: inner.guarded.is_guarded(),
             guarded_by: inner.guarded.to_string(),
             state,
-            suspects,
+            unreachable,
             recoveries: inner.recoveries,
             last_recovery: inner.report.clone(),
             clients: proxy.clients.list(),
@@ -272,8 +272,8 @@ impl fmt::Display for Status {
         writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
         writeln!(f, "guarded by      {}", self.guarded_by)?;
         writeln!(f, "state           {}", self.state)?;
-        if !self.suspects.is_empty() {
-            writeln!(f, "suspect         {}", self.suspects.join(", "))?;
+        if !self.unreachable.is_empty() {
+            writeln!(f, "unreachable     {}", self.unreachable.join(", "))?;
         }
         if let Some(report) = &self.last_recovery {
             writeln!(
@@ -286,9 +286,9 @@ impl fmt::Display for Status {
                 ("not injected", &report.skipped),
                 ("differs", &report.mismatches),
                 ("removed", &report.removed),
-                ("mended", &report.mended),
-                ("suspect", &report.suspects),
-                ("healed", &report.healed),
+                ("reconciled", &report.reconciled),
+                ("unreachable", &report.unreachable),
+                ("notified", &report.notified),
             ] {
                 if !names.is_empty() {
                     writeln!(f, "  {what:<14}{}", names.join(", "))?;

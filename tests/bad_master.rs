@@ -1,4 +1,4 @@
-//! A master, or a node that is asked by the census, that answers garbage: the client gets the master's own
+//! A master, or a node that is asked by the health check, that answers garbage: the client gets the master's own
 //! bytes where they are HTTP. A master whose answer is not HTTP, or breaks off, counts as away: the mirror
 //! answers, and the next master that can takes what it has answered.
 
@@ -355,7 +355,7 @@ fn something_that_is_no_master_at_all() {
     }
 }
 
-/// A node's own port that answers nothing, or everything, harms no one (the census asks it).
+/// A node's own port that answers nothing, or everything, harms no one (the health check asks it).
 #[test]
 fn nodes_that_answer_garbage_to_the_census() {
     let mut robot = Robot::start(Mode::Proxy);
@@ -381,5 +381,5 @@ fn nodes_that_answer_garbage_to_the_census() {
     }));
     silent.release();
     let (before, now) = (before.without_node("/garbage"), robot.settled_state());
-    before.assert_same(&now.without_node("/garbage"), "after the census");
+    before.assert_same(&now.without_node("/garbage"), "after the health check");
 }

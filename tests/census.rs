@@ -20,7 +20,7 @@ use support::{
     http_request, names, params, status,
 };
 
-/// Waits for the report of a recovery whose census is over, and checks what every report has.
+/// Waits for the report of a recovery whose health check is over, and checks what every report has.
 #[track_caller]
 fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) {
     let mut last = serde_json::Value::Null;
@@ -37,9 +37,9 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
         "skipped",
         "mismatches",
         "removed",
-        "mended",
-        "suspects",
-        "healed",
+        "reconciled",
+        "unreachable",
+        "notified",
     ] {
         assert!(!last[field].is_null(), "no `{field}` in {last:#}");
     }
@@ -138,7 +138,7 @@ fn take_port(node: FakeNode, name: &str) -> FakeNode {
 
 #[test]
 fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--census-timeout", "300"]);
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
     silent.subscribe(&client, "/topic", "std_msgs/String");
@@ -147,18 +147,18 @@ fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
     let before = robot.settled_state();
     silent.hold();
     robot.crash_master();
-    let suspects = || names(&status(&client)["suspects"]);
-    eventually("it is suspect", || suspects() == ["/silent"]);
+    let unreachable = || names(&status(&client)["unreachable"]);
+    eventually("it is suspect", || unreachable() == ["/silent"]);
     report(&robot, "who is suspect", |report| {
-        names(&report["suspects"]) == ["/silent"]
+        names(&report["unreachable"]) == ["/silent"]
     });
-    before.assert_same(&robot.state(), "a suspect is kept");
+    before.assert_same(&robot.state(), "an unreachable node is kept");
     // The master has tried in vain, or is still trying, to tell it of this.
     let late = FakeNode::start("/late");
     late.publish(&client, "/topic", "std_msgs/String");
     client.set_param("/gain", 2);
     silent.release();
-    eventually("it is no suspect any more", || suspects().is_empty());
+    eventually("it is no suspect any more", || unreachable().is_empty());
     eventually("it knows the publisher", || {
         silent.updates("/topic").last() == Some(&vec![late.api.clone()])
     });
@@ -170,7 +170,7 @@ fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
 
 #[test]
 fn a_suspect_that_dies_is_taken_out() {
-    let mut robot = Robot::start_with(Mode::Proxy, &["--census-timeout", "300"]);
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
     silent.publish(&client, "/topic", "std_msgs/String");
@@ -178,12 +178,12 @@ fn a_suspect_that_dies_is_taken_out() {
     silent.hold();
     robot.crash_master();
     eventually("it is suspect", || {
-        names(&status(&client)["suspects"]) == ["/silent"]
+        names(&status(&client)["unreachable"]) == ["/silent"]
     });
     drop(silent);
     robot.await_state(&after, "when the suspect has died");
     eventually("nobody is suspect", || {
-        names(&status(&client)["suspects"]).is_empty()
+        names(&status(&client)["unreachable"]).is_empty()
     });
 }
 
@@ -202,7 +202,7 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
         now.is_ok_and(|now| now == with)
     }));
     talker.kill();
-    robot.await_state(&after, "after the standing census");
+    robot.await_state(&after, "after the regular health check");
     eventually("the listener is told", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });
@@ -224,7 +224,7 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
 #[test]
 fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
     // The injection takes longer than `--hold`.
-    let options = ["--hold", "1", "--census-timeout", "1500"];
+    let options = ["--hold", "1", "--node-timeout", "1500"];
     let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
     let client = robot.client();
     client.set_param("/gain", 7);
@@ -272,12 +272,12 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
     assert!(!node.said("done").contains(&"subscribe".to_owned()));
     robot.await_recovery(dead);
     held.join().unwrap();
-    report(&robot, "that the census is over", |report| {
-        report["master_pid"] != dead && report["census_ms"].is_number()
+    report(&robot, "that the health check is over", |report| {
+        report["master_pid"] != dead && report["health_check_ms"].is_number()
     });
     let last = status(&client)["last_recovery"].clone();
     assert_eq!(names(&last["removed"]), Vec::<String>::new());
-    assert_eq!(names(&last["suspects"]), Vec::<String>::new());
+    assert_eq!(names(&last["unreachable"]), Vec::<String>::new());
     assert!(answers("getPid"));
     eventually("everything has got through", || {
         let mut done = node.said("done");

@@ -156,7 +156,7 @@ impl Patient {
     }
 }
 
-/// Whether it is what the census asks.
+/// Whether it is what the health check asks.
 fn is_question(call: &Heard) -> bool {
     ["getPid", "getPublications", "getSubscriptions"].contains(&call.method.as_str())
 }

@@ -102,7 +102,7 @@ fn when_the_outage_begins(mode: Mode) {
     let client = robot.client();
     let present = FakeNode::start("/present");
     present.publish(&client, "/present/topic", "std_msgs/String");
-    // The census asks the nodes whether they are alive.
+    // The health check asks the nodes whether they are alive.
     let nodes: Vec<_> = (0..CROWD)
         .map(|number| FakeNode::start(&format!("/client{number}")))
         .collect();

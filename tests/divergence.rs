@@ -194,7 +194,7 @@ fn an_injection_whose_reply_was_lost_is_a_recovery() {
     assert_eq!(client.param("/swallowed"), Some(1.into()));
     let report = eventually_some("a report", || {
         let report = status(&client)["last_recovery"].clone();
-        (!report["census_ms"].is_null()).then_some(report)
+        (!report["health_check_ms"].is_null()).then_some(report)
     });
     assert_eq!(report["outcome"], "injected", "{report}");
 }

@@ -113,11 +113,11 @@ fn what_living_nodes_say_is_mended() {
         let listener = robot.node(library, "listener", &[]);
         let server = robot.node(library, "server", &[]);
         listener.wait_messages("/talker", 5);
-        // The census of this one gets to know who is who.
+        // The health check of this one gets to know who is who.
         robot.crash_master();
         let before = robot.settled_state();
-        eventually("the census is over", || {
-            status(&client)["last_recovery"]["census_ms"].is_number()
+        eventually("the health check is over", || {
+            status(&client)["last_recovery"]["health_check_ms"].is_number()
         });
         let api = |node: &str| {
             let api = client.ok("lookupNode", params!["/test", node]);
@@ -149,15 +149,15 @@ fn what_living_nodes_say_is_mended() {
         });
         let after = robot.settled_state();
         let after = after.without_type("/ghost").without_type("/haunted");
-        before.assert_same(&after, "when the registrations have been mended");
-        let mended = [
+        before.assert_same(&after, "when the registrations have been reconciled");
+        let reconciled = [
             "+ /listener subscribes /chatter",
             "+ /talker publishes /chatter",
             "- /listener subscribes /haunted",
             "- /talker publishes /ghost",
         ];
         eventually("the report says so", || {
-            names(&status(&client)["last_recovery"]["mended"]) == mended
+            names(&status(&client)["last_recovery"]["reconciled"]) == reconciled
         });
         let late = robot.node(library, "listener", &["__name:=late"]);
         late.wait_messages("/talker", 5);
@@ -204,6 +204,6 @@ fn nodes_that_answer_nonsense_are_left_alone() {
         last.as_ref() == Some(&before)
     });
     if !same {
-        before.assert_same(&last.unwrap(), "after the census");
+        before.assert_same(&last.unwrap(), "after the health check");
     }
 }

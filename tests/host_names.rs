@@ -33,12 +33,12 @@ fn kill_master(client: &Client) -> u32 {
     dead
 }
 
-/// Waits for the report of the recovery after the death of `dead`, with its census.
+/// Waits for the report of the recovery after the death of `dead`, with its health check.
 fn report(client: &Client, dead: u32) -> serde_json::Value {
     let mut last = serde_json::Value::Null;
     eventually("the recovery is complete", || {
         last = status(client)["last_recovery"].clone();
-        last["master_pid"] != dead && last["census_ms"].is_number()
+        last["master_pid"] != dead && last["health_check_ms"].is_number()
     });
     last
 }
@@ -84,7 +84,7 @@ fn names_that_resolve_slowly_delay_nobody() {
         assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     }
     eventually("the slow ones are suspect, and only they", || {
-        names(&status(&client)["suspects"]).len() == 40
+        names(&status(&client)["unreachable"]).len() == 40
     });
     let second = FakeNode::start("/second");
     let start = Instant::now();
@@ -141,10 +141,10 @@ fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     let report = report(&client, dead);
     assert_eq!(names(&report["removed"]), Vec::<String>::new());
-    let mut suspects: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
-    suspects.sort();
-    assert_eq!(names(&report["suspects"]), suspects);
-    assert_eq!(names(&status(&client)["suspects"]), suspects);
+    let mut unreachable: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
+    unreachable.sort();
+    assert_eq!(names(&report["unreachable"]), unreachable);
+    assert_eq!(names(&status(&client)["unreachable"]), unreachable);
     let state = State::read(&Client::new(port));
     assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
 
@@ -156,8 +156,8 @@ fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
         found.updates("/chatter").last() == Some(&all)
     });
     eventually("it is suspect no more, and the others are", || {
-        let suspects = names(&status(&client)["suspects"]);
-        suspects.len() == COUNT - 1 && !suspects.contains(&found.name)
+        let unreachable = names(&status(&client)["unreachable"]);
+        unreachable.len() == COUNT - 1 && !unreachable.contains(&found.name)
     });
     for node in nobody.iter().chain([&living]) {
         assert_eq!(node.heard("shutdown").len(), 0);
@@ -193,7 +193,7 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
     publisher.publish(&client, "/chatter", "std_msgs/String");
     let recovered = report(&client, dead);
     assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
-    assert_eq!(names(&recovered["suspects"]), Vec::<String>::new());
+    assert_eq!(names(&recovered["unreachable"]), Vec::<String>::new());
     let all = vec![publisher.api.clone()];
     eventually("it is told at the new address", || {
         second.updates("/chatter").last() == Some(&all)
@@ -204,12 +204,12 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
     // It moves while it is suspect.
     second.hold();
     let dead = kill_master(&client);
-    assert_eq!(names(&report(&client, dead)["suspects"]), ["/mover"]);
+    assert_eq!(names(&report(&client, dead)["unreachable"]), ["/mover"]);
     let third = start(3);
     third.claim_subscription("/chatter", Some("std_msgs/String"));
     server.set("mover.test", host(3));
     eventually("it is suspect no more", || {
-        names(&status(&client)["suspects"]).is_empty()
+        names(&status(&client)["unreachable"]).is_empty()
     });
     eventually("it is told all at the new address", || {
         third.updates("/chatter").last() == Some(&all)

@@ -64,9 +64,9 @@ fn a_thousand_nodes_take_less_than_64_mib_through_three_recoveries() {
     let mut peaks = vec![peak(&robot)];
     for _ in 0..3 {
         robot.crash_master();
-        eventually("the census is over", || {
+        eventually("the health check is over", || {
             let status = robot.status().expect("a status page");
-            status["last_recovery"]["census_ms"].is_number()
+            status["last_recovery"]["health_check_ms"].is_number()
         });
         let status = robot.status().expect("a status page");
         let (report, state) = (&status["last_recovery"], &status["state"]);

@@ -123,7 +123,7 @@ fn no_node_hears_of_the_injection() {
         let (params, updates) = (heard("paramUpdate"), heard("publisherUpdate"));
         robot.crash_master();
         before.assert_same(&robot.state(), "after the crash");
-        // The census may tell a subscriber the whole truth again, but never a part of it.
+        // The health check may tell a subscriber the whole truth again, but never a part of it.
         let all: Vec<_> = nodes.iter().map(|node| node.api.clone()).collect();
         let quiet = holds(Duration::from_secs(2), || {
             nodes.iter().zip(&updates).all(|(node, updates)| {

@@ -159,7 +159,12 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
         robot
             .rescue
             .wait_line("all of the recovery in one line", |line| {
-                let phases = ["absence_ms=", "look_ms=", "injection_ms=", "census_ms="];
+                let phases = [
+                    "absence_ms=",
+                    "look_ms=",
+                    "injection_ms=",
+                    "health_check_ms=",
+                ];
                 line.contains("recovery is complete: ")
                     && line.contains("cause=\"")
                     && phases.iter().all(|phase| line.contains(phase))

@@ -311,9 +311,9 @@ fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
     node.claim_publication("/topic", Some("std_msgs/String"));
     robot.revive_master();
     robot.await_recovery(dead);
-    eventually("the census is over", || {
+    eventually("the health check is over", || {
         let report = status(&client)["last_recovery"].clone();
-        !report["census_ms"].is_null()
+        !report["health_check_ms"].is_null()
     });
     let told = &subscriber.updates("/topic")[updates..];
     assert!(

@@ -128,7 +128,7 @@ fn twenty_of_forty_are_unreachable(mode: Mode) {
     };
     let at_once = tell(5);
     eventually("the unreachable ones are suspect", || {
-        names(&status(&client)["suspects"]).len() == usize::from(UNREACHABLE)
+        names(&status(&client)["unreachable"]).len() == usize::from(UNREACHABLE)
     });
     let later = tell(5);
     let (median, most) = summary(&at_once);
@@ -199,7 +199,7 @@ fn a_node_that_can_be_reached_again_is_whole() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
-    let rescue = setup.args(["--census-timeout", "1000"]).start();
+    let rescue = setup.args(["--node-timeout", "1000"]).start();
     let client = rescue.client();
     let port = rescue.port();
     let nodes = [(2, Library::Rospy), (3, Library::Roscpp)].map(|(host, library)| {
@@ -218,8 +218,10 @@ fn a_node_that_can_be_reached_again_is_whole() {
     support::signal(dead, rustix::process::Signal::KILL);
     let publisher = FakeNode::start("/publisher");
     publisher.publish(&client, "/chatter", "std_msgs/String");
-    let suspects = || names(&status(&client)["suspects"]);
-    eventually("both are suspect", || suspects() == ["/roscpp", "/rospy"]);
+    let unreachable = || names(&status(&client)["unreachable"]);
+    eventually("both are suspect", || {
+        unreachable() == ["/roscpp", "/rospy"]
+    });
     let knows = |node: &Node| {
         let updates = node.updates("/chatter");
         updates.last() == Some(&vec![publisher.api.clone()])
@@ -230,5 +232,5 @@ fn a_node_that_can_be_reached_again_is_whole() {
         net.mend(host);
     }
     eventually("both know the publisher", || nodes.iter().all(knows));
-    eventually("nobody is suspect any more", || suspects().is_empty());
+    eventually("nobody is suspect any more", || unreachable().is_empty());
 }

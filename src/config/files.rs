@@ -2,10 +2,10 @@
 
 use super::Config;
 
-/// Clients do not get these: census and notifications open up to 320 at a time.
+/// Clients do not get these: health check and notifications open up to 320 at a time.
 const RESERVED: u64 = 320;
 /// Where there are few, clients get one in so many. The checkpoint, the connections to the master and
-/// its process take some 30 of the others; census and notifications do with what is left, and try again.
+/// its process take some 30 of the others; health check and notifications do with what is left, and try again.
 const SHARE: u64 = 4;
 /// Connections that clients may always hold, if they are to.
 const FEWEST: u64 = 16;

@@ -151,20 +151,20 @@ fn the_difference_is_what_one_side_lacks() {
     }
     publish(&mut master, "/other", "/new", "http://o:1/");
     let said = claims(&["/both", "/new"], &["/both"]);
-    let mending = Mending::new(&master, "/a", &said);
+    let reconciliation = Reconciliation::new(&master, "/a", &said);
     let words =
         |of: &[Registration]| -> Vec<String> { of.iter().map(|one| one.describe("/a")).collect() };
-    assert_eq!(words(&mending.missing), ["/a publishes /new"]);
+    assert_eq!(words(&reconciliation.missing), ["/a publishes /new"]);
     assert_eq!(
-        words(&mending.extra),
+        words(&reconciliation.extra),
         ["/a publishes /gone", "/a subscribes /gone"]
     );
-    for one in &mending.missing {
+    for one in &reconciliation.missing {
         master.apply(&one.register("/a", "http://n:1/"));
     }
-    for one in &mending.extra {
+    for one in &reconciliation.extra {
         master.apply(&one.unregister("/a", "http://n:1/"));
     }
-    assert!(Mending::new(&master, "/a", &said).is_empty());
+    assert!(Reconciliation::new(&master, "/a", &said).is_empty());
     assert_eq!(master.publishers_of("/new"), ["http://o:1/", "http://n:1/"]);
 }

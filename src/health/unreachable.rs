@@ -7,19 +7,19 @@ use std::{
 
 use super::backoff::Backoff;
 
-/// Pause before a suspect is asked for the first time again.
+/// Pause before an unreachable node is asked for the first time again.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
-/// The addresses that are suspect, and when each is to be asked again.
+/// The addresses that are unreachable, and when each is to be asked again.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Unreachable {
     of: BTreeMap<String, Backoff>,
 }
 
 impl Unreachable {
-    /// The node at `api` did not answer just now. Answers whether it was no suspect before.
+    /// The node at `api` did not answer just now. Answers whether that is new.
     pub fn add(&mut self, api: &str, now: Instant) -> bool {
         if self.of.contains_key(api) {
             return false;
@@ -29,7 +29,7 @@ impl Unreachable {
         true
     }
 
-    /// The node at `api` has answered, or is no more. Answers whether it was a suspect.
+    /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
     pub fn remove(&mut self, api: &str) -> bool {
         self.of.remove(api).is_some()
     }
@@ -39,7 +39,7 @@ impl Unreachable {
         self.of.retain(|api, _| registered(api));
     }
 
-    /// Whether the node at `api` is a suspect.
+    /// Whether the node at `api` is unreachable.
     pub fn contains(&self, api: &str) -> bool {
         self.of.contains_key(api)
     }
@@ -72,28 +72,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn suspects_are_asked_with_growing_pauses() {
+    fn unreachable_nodes_are_asked_with_growing_pauses() {
         let start = Instant::now();
-        let mut suspects = Unreachable::default();
-        assert!(suspects.add("a", start) && !suspects.add("a", start));
+        let mut unreachable = Unreachable::default();
+        assert!(unreachable.add("a", start) && !unreachable.add("a", start));
         let mut asked = Vec::new();
         while asked.len() < 9 {
-            let next = suspects.next().unwrap();
-            assert_eq!(suspects.due(next), ["a"]);
+            let next = unreachable.next().unwrap();
+            assert_eq!(unreachable.due(next), ["a"]);
             asked.push((next - start).as_secs());
         }
         assert_eq!(asked, [1, 3, 7, 15, 31, 63, 123, 183, 243]);
-        assert_eq!(suspects.due(start), Vec::<String>::new());
-        assert!(suspects.remove("a") && suspects.is_empty());
-        assert_eq!(suspects.next(), None);
+        assert_eq!(unreachable.due(start), Vec::<String>::new());
+        assert!(unreachable.remove("a") && unreachable.is_empty());
+        assert_eq!(unreachable.next(), None);
     }
 
     #[test]
-    fn who_is_not_registered_any_more_is_no_suspect() {
-        let mut suspects = Unreachable::default();
-        suspects.add("a", Instant::now());
-        suspects.add("b", Instant::now());
-        suspects.retain(|api| api == "b");
-        assert!(!suspects.contains("a") && suspects.contains("b"));
+    fn who_is_not_registered_any_more_is_not_unreachable() {
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", Instant::now());
+        unreachable.add("b", Instant::now());
+        unreachable.retain(|api| api == "b");
+        assert!(!unreachable.contains("a") && unreachable.contains("b"));
     }
 }

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use crate::proxy::Proxy;
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
-    cli::Sync,
+    cli::SyncPolicy,
 };
 
 /// Longest time between two checks of the file: tampering is noticed well within a second.
@@ -44,7 +44,7 @@ pub async fn run(proxy: Arc<Proxy>, stop: CancellationToken) {
             () = tokio::time::sleep(LOOK) => {}
         }
         checkpointer.round(true).await;
-        if checkpointer.proxy.config.sync != Sync::Always {
+        if checkpointer.proxy.config.sync != SyncPolicy::Always {
             tokio::select! {
                 () = stop.cancelled() => return,
                 () = checkpointer.pause() => {}
@@ -82,7 +82,7 @@ impl Checkpointer {
         if self.proxy.ledger.with_store(|_, _| ()).is_none() {
             self.open_again().await;
         }
-        self.sync(sync && self.proxy.config.sync != Sync::Never)
+        self.sync(sync && self.proxy.config.sync != SyncPolicy::Never)
             .await;
         // Also of what the next lines repair at once.
         self.say_protection();
@@ -170,7 +170,7 @@ impl Checkpointer {
             }
             _ => {
                 self.compacted_at = Some(Instant::now());
-                if self.proxy.config.sync == Sync::Always {
+                if self.proxy.config.sync == SyncPolicy::Always {
                     // The new file's name is not on the disk yet.
                     self.sync(true).await;
                 }

@@ -91,7 +91,7 @@ pub(crate) fn method(name: &str) -> Option<&'static Method> {
 
 /// What a call answers, and which callbacks the master sends because of it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Outcome {
+pub struct Applied {
     /// The answer.
     pub reply: Reply,
     /// The callbacks, in the order in which the master queues them. Those to one address are sent
@@ -106,10 +106,10 @@ impl Master {
     /// (nested and malformed too) and unknown methods. `shutdown` is answered and changes nothing.
     /// The one method whose answer depends on the network, `param_update_task` (a slip of
     /// rosmaster's), is answered as if its callback had been taken, and sends none.
-    pub fn apply(&mut self, call: &Call) -> Outcome {
+    pub fn apply(&mut self, call: &Call) -> Applied {
         let mut notices = Vec::new();
         let reply = self.apply_telling(call, &mut notices);
-        Outcome { reply, notices }
+        Applied { reply, notices }
     }
 
     /// Like [`Master::apply`], with the callbacks told to `notices`, which copies as much as it needs.

@@ -1,4 +1,4 @@
-//! The census: which nodes still live, whether they are the ones that registered, and in what the
+//! The health check: which nodes still live, whether they are the ones that registered, and in what the
 //! mirror differs from what they say.
 //!
 //! Nothing here may hold up a call: a roscpp node that is itself waiting for its registration
@@ -22,7 +22,7 @@ use super::{
 };
 use crate::{
     gate::State,
-    health::{Mending, Name, Registration, Verdict, judge},
+    health::{Name, Reconciliation, Registration, Verdict, judge},
     ledger::activity::Activity,
     master::{self, CALLER_ID, Kind, Master},
     proxy::Proxy,
@@ -33,7 +33,7 @@ use crate::{
 };
 use crate::{
     nodes,
-    status::report::{self, Outcome as Recovered},
+    status::report::{self, Outcome},
 };
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
@@ -51,29 +51,29 @@ pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
     PERMITS.acquire().await.ok()
 }
 
-/// What a census found.
+/// What a health check found.
 #[derive(Debug, Default)]
-pub struct Census {
+pub struct HealthCheck {
     /// Nodes that are dead and have been taken out, through the master, so that others are told.
     pub removed: Vec<String>,
     /// Registrations that were added or taken back, because the node itself says so.
-    pub mended: Vec<String>,
+    pub reconciled: Vec<String>,
 }
 
 /// What a visit to one port came to.
 #[derive(Debug)]
-pub(crate) struct Outcome {
+pub(crate) struct CheckResult {
     pub(crate) sign: Sign,
     /// Who was registered there.
     pub(crate) names: Vec<String>,
     pub(crate) removed: Vec<String>,
-    pub(crate) mended: Vec<String>,
+    pub(crate) reconciled: Vec<String>,
 }
 
 /// What follows a recovery that took place since `outage`, beside traffic: who was not notified
-/// is told, and the census is taken.
-pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Recovered) {
-    let under_way = Nodes::begin_census(&proxy);
+/// is told, and the health check is taken.
+pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Outcome) {
+    let under_way = Nodes::begin_check(&proxy);
     // As if somebody did not answer, until the questions have been put.
     let waiting = Waiting::new(&proxy);
     let mut gate = proxy.gate.clone();
@@ -83,10 +83,10 @@ pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
     let incarnation = proxy.ledger.incarnation();
     // Queued calls first: what nodes say in them is newer than what they say to us.
     barrier(&proxy).await;
-    let mut healed = match outcome {
+    let mut notified = match outcome {
         // A master that lives on notifies nodes itself.
-        Recovered::Adopted => Vec::new(),
-        Recovered::Reconciled => {
+        Outcome::Adopted => Vec::new(),
+        Outcome::Reconciled => {
             // It may tell now what it knew before.
             proxy
                 .ledger
@@ -95,20 +95,20 @@ pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: 
         }
         _ => nodes::tell_owed(&proxy, outage),
     };
-    healed.sort();
+    notified.sort();
     let visits = begin_visits(&proxy);
     drop(waiting);
-    let census = collect(visits).await;
+    let check = collect(visits).await;
     drop(under_way);
     if proxy.ledger.incarnation() != incarnation {
         // The next recovery reports.
         return;
     }
-    let suspects = proxy.nodes.suspects(&proxy.ledger);
-    let census_ms = report::ms(start.elapsed());
+    let unreachable = proxy.nodes.unreachable(&proxy.ledger);
+    let health_check_ms = report::ms(start.elapsed());
     if let Some(report) = proxy
         .board
-        .add_to_report(census, census_ms, healed, suspects)
+        .add_to_report(check, health_check_ms, notified, unreachable)
     {
         report.log("recovery is complete");
     }
@@ -122,11 +122,11 @@ async fn barrier(proxy: &Proxy) {
 }
 
 /// Asks every node, all at the same time.
-pub async fn census(proxy: &Arc<Proxy>) -> Census {
+pub async fn check_all(proxy: &Arc<Proxy>) -> HealthCheck {
     collect(begin_visits(proxy)).await
 }
 
-fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<Outcome> {
+fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<CheckResult> {
     let apis: BTreeSet<String> = proxy.ledger.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
         let apis = nodes.map(|(_, api)| api.to_owned());
@@ -140,17 +140,17 @@ fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<Outcome> {
     visits
 }
 
-async fn collect(mut visits: JoinSet<Outcome>) -> Census {
-    let mut census = Census::default();
+async fn collect(mut visits: JoinSet<CheckResult>) -> HealthCheck {
+    let mut check = HealthCheck::default();
     while let Some(outcome) = visits.join_next().await {
         if let Ok(outcome) = outcome {
-            census.removed.extend(outcome.removed);
-            census.mended.extend(outcome.mended);
+            check.removed.extend(outcome.removed);
+            check.reconciled.extend(outcome.reconciled);
         }
     }
-    census.removed.sort();
-    census.mended.sort();
-    census
+    check.removed.sort();
+    check.reconciled.sort();
+    check
 }
 
 /// Who is registered at `api`.
@@ -172,18 +172,18 @@ pub(crate) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<N
 pub(crate) fn visit(
     proxy: &Arc<Proxy>,
     api: String,
-) -> impl Future<Output = Outcome> + Send + 'static {
+) -> impl Future<Output = CheckResult> + Send + 'static {
     let (proxy, waiting) = (proxy.clone(), Waiting::new(proxy));
     async move { converse(&proxy, &api, waiting).await }
 }
 
-async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> Outcome {
+async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
-    let mut outcome = Outcome {
+    let mut outcome = CheckResult {
         sign: Sign::Silent,
         names: Vec::new(),
         removed: Vec::new(),
-        mended: Vec::new(),
+        reconciled: Vec::new(),
     };
     let mut before = Findings::default();
     for question in 0..QUESTIONS {
@@ -196,13 +196,13 @@ async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> Outcome {
             break;
         }
         let permit = permit().await;
-        let interview = client::interview(api, proxy.config.census_timeout).await;
+        let interview = client::interview(api, proxy.config.node_timeout).await;
         drop(permit);
         outcome.sign = interview.sign;
         outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
         match interview.sign {
             Sign::Silent => {
-                proxy.nodes.suspect(proxy, api);
+                proxy.nodes.mark_unreachable(proxy, api);
                 break;
             }
             Sign::Dead => {
@@ -258,7 +258,7 @@ struct Asked {
 #[derive(Default)]
 struct Findings {
     strangers: Vec<Name>,
-    mendings: Vec<(Condition, Verdict, Mending)>,
+    reconciliations: Vec<(Condition, Verdict, Reconciliation)>,
 }
 
 impl Asked {
@@ -294,18 +294,20 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // Of two who may be meant, neither is mended.
+                // Of two who may be meant, neither is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
                     && last_calls.unregistered == *unregistered
                 {
-                    let mending = Mending::new(mirror, &name.node, claims);
+                    let reconciliation = Reconciliation::new(mirror, &name.node, claims);
                     let condition = Condition {
                         node: name.node.clone(),
                         last_calls,
                     };
-                    findings.mendings.push((condition, verdict, mending));
+                    findings
+                        .reconciliations
+                        .push((condition, verdict, reconciliation));
                 }
             }
         });
@@ -315,13 +317,14 @@ impl Asked {
 
 impl Findings {
     fn is_settled(&self) -> bool {
-        let mut mendings = self.mendings.iter();
-        self.strangers.is_empty() && mendings.all(|(_, _, mending)| mending.is_empty())
+        let mut reconciliations = self.reconciliations.iter();
+        self.strangers.is_empty()
+            && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
     /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
     /// first: what we register for a node counts as its own deed, and ends what else was found.
-    async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut Outcome) {
+    async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.strangers {
             let mut earlier = before.strangers.iter();
             let again =
@@ -330,24 +333,27 @@ impl Findings {
                 outcome.removed.push(name.node.clone());
             }
         }
-        for (condition, verdict, mending) in &self.mendings {
+        for (condition, verdict, reconciliation) in &self.reconciliations {
             let node = &condition.node;
-            let mut found = before.mendings.iter();
+            let mut found = before.reconciliations.iter();
             let found = found.find(|(found, _, _)| found.node == *node);
-            let confirmed = |list: fn(&Mending) -> &Vec<Registration>, one: &Registration| {
-                found.is_some_and(|(_, _, mending)| list(mending).iter().any(|it| it.is_same(one)))
+            let confirmed = |list: fn(&Reconciliation) -> &Vec<Registration>,
+                             one: &Registration| {
+                found.is_some_and(|(_, _, reconciliation)| {
+                    list(reconciliation).iter().any(|it| it.is_same(one))
+                })
             };
             let certain = *verdict == Verdict::Itself;
-            for one in &mending.extra {
-                if confirmed(|mending| &mending.extra, one) {
+            for one in &reconciliation.extra {
+                if confirmed(|reconciliation| &reconciliation.extra, one) {
                     let call = one.unregister(node, api);
-                    mend(proxy, one, condition, call, Kind::Unregister, outcome).await;
+                    reconcile(proxy, one, condition, call, Kind::Unregister, outcome).await;
                 }
             }
-            for one in &mending.missing {
-                if certain || confirmed(|mending| &mending.missing, one) {
+            for one in &reconciliation.missing {
+                if certain || confirmed(|reconciliation| &reconciliation.missing, one) {
                     let call = one.register(node, api);
-                    mend(proxy, one, condition, call, Kind::Mutate, outcome).await;
+                    reconcile(proxy, one, condition, call, Kind::Mutate, outcome).await;
                 }
             }
         }
@@ -355,13 +361,13 @@ impl Findings {
 }
 
 /// Makes a call for a node, unless the node itself has done the contrary by the time at which it travels.
-async fn mend(
+async fn reconcile(
     proxy: &Proxy,
     one: &Registration,
     condition: &Condition,
     call: Call,
     kind: Kind,
-    outcome: &mut Outcome,
+    outcome: &mut CheckResult,
 ) {
     // In a multicall it goes alone: it must not displace anybody.
     let alone = Call::multicall([call]);
@@ -373,7 +379,7 @@ async fn mend(
     if is_done(&reply) {
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
         outcome
-            .mended
+            .reconciled
             .push(format!("{sign} {}", one.describe(&condition.node)));
     }
 }

@@ -93,7 +93,7 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
 /// Notifies the node at `api`, unless it is unreachable: those are told everything as soon as they
 /// answer. Who does not take a notification becomes unreachable.
 pub fn send(proxy: &Arc<Proxy>, api: &str, notification: Notification) {
-    if proxy.nodes.is_suspect(api) {
+    if proxy.nodes.is_unreachable(api) {
         return;
     }
     let mut pending = proxy.nodes.notifications.lock();
@@ -156,7 +156,7 @@ async fn deliver(proxy: Arc<Proxy>, api: String) {
         let permit = notifications.permits.acquire().await.ok();
         let Some(call) = compose() else { continue };
         proxy.stats.notifications.count();
-        let mut asked = pin!(client::ask(&api, &call, proxy.config.census_timeout));
+        let mut asked = pin!(client::ask(&api, &call, proxy.config.node_timeout));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
             Err(_) => {
@@ -166,7 +166,7 @@ async fn deliver(proxy: Arc<Proxy>, api: String) {
         };
         if sign != Sign::Alive {
             notifications.lock().remove(&api);
-            proxy.nodes.suspect(&proxy, &api);
+            proxy.nodes.mark_unreachable(&proxy, &api);
             return;
         }
         if compose().is_some_and(|now| now != call)
@@ -203,7 +203,7 @@ pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
             }
             // Never closed.
             let permit = proxy.nodes.notifications.permits.acquire().await;
-            let interview = client::interview(&displaced.api, proxy.config.census_timeout).await;
+            let interview = client::interview(&displaced.api, proxy.config.node_timeout).await;
             match interview.sign {
                 Sign::Dead => return,
                 Sign::Silent => continue,
@@ -219,7 +219,7 @@ pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
                     "telling a node to shut down: another has its name"
                 );
                 proxy.stats.notifications.count();
-                client::ask(api, &master::shutdown(node), proxy.config.census_timeout).await;
+                client::ask(api, &master::shutdown(node), proxy.config.node_timeout).await;
             }
             drop(permit);
             return;

@@ -13,7 +13,7 @@ use crate::{
 const REPEAT: Duration = Duration::from_secs(10);
 
 impl Driver {
-    /// Reports what an examination came to; census and healing add to the report when they end.
+    /// Reports what an examination came to; health check and reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.begins() && examination.outcome == Outcome::Injected {
             // Nothing but what the session begins with.

@@ -124,12 +124,12 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
     let counts = status.state;
     add("nodes", "gauge", "nodes registered", counts.nodes as f64);
     add("params", "gauge", "parameters set", counts.params as f64);
-    let suspects = status.suspects.len();
+    let unreachable = status.unreachable.len();
     add(
-        "suspects",
+        "unreachable_nodes",
         "gauge",
         "nodes that do not answer and are not known to be dead",
-        suspects as f64,
+        unreachable as f64,
     );
     if let Some(report) = &status.last_recovery {
         let seconds = report.phases.total_ms / 1e3;

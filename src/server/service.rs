@@ -23,7 +23,7 @@ use super::{
     deadlines::Deadlines,
 };
 use crate::{
-    cli::Sync,
+    cli::SyncPolicy,
     master::{self, Kind},
     xmlrpc::{self, Call, Reply, Value},
 };
@@ -342,7 +342,7 @@ async fn answer_idle(proxy: &Proxy, call: Option<&Call>) -> Option<HttpReply> {
     let call = call.filter(|call| master::is_answerable(call))?;
     let (reply, seq) = proxy.ledger.answer_idle(Instant::now(), call)?;
     // What made it idle may not be on the disk yet.
-    if let Some(seq) = seq.filter(|_| proxy.config.sync == Sync::Always) {
+    if let Some(seq) = seq.filter(|_| proxy.config.sync == SyncPolicy::Always) {
         proxy.ledger.durable(seq).await;
     }
     proxy.stats.stood_in.count();

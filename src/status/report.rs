@@ -72,8 +72,8 @@ pub struct Report {
     pub master_pid: i32,
     /// How long it took.
     pub phases: Phases,
-    /// From the open gate to the end of the census, in milliseconds; none while it lasts.
-    pub census_ms: Option<f64>,
+    /// From the open gate to the end of the health check, in milliseconds; none while it lasts.
+    pub health_check_ms: Option<f64>,
     /// What the master holds now.
     pub restored: Counts,
     /// What was not injected, and why.
@@ -83,11 +83,11 @@ pub struct Report {
     /// Nodes that were found dead and taken out.
     pub removed: Vec<String>,
     /// Registrations that were added (`+`) or taken back (`-`), because the node itself says so.
-    pub mended: Vec<String>,
+    pub reconciled: Vec<String>,
     /// Nodes that did not answer and were kept.
-    pub suspects: Vec<String>,
+    pub unreachable: Vec<String>,
     /// Topics whose subscribers were sent the full list of publishers.
-    pub healed: Vec<String>,
+    pub notified: Vec<String>,
 }
 
 impl Report {
@@ -106,14 +106,14 @@ impl Report {
             look_ms,
             injection_ms,
             total_ms,
-            census_ms = self.census_ms,
+            health_check_ms = self.health_check_ms,
             master_pid = self.master_pid,
             skipped = some(&self.skipped),
             mismatches = some(&self.mismatches),
             removed = some(&self.removed),
-            mended = some(&self.mended),
-            healed = some(&self.healed),
-            suspects = some(&self.suspects),
+            reconciled = some(&self.reconciled),
+            notified = some(&self.notified),
+            unreachable = some(&self.unreachable),
             "{message}: {}",
             self.restored
         );
@@ -169,14 +169,14 @@ impl Outage {
                 injection_ms: ms(examination.injection),
                 total_ms: ms(total),
             },
-            census_ms: None,
+            health_check_ms: None,
             restored: examination.counts,
             skipped: examination.skipped,
             mismatches: examination.mismatches,
             removed: Vec::new(),
-            mended: Vec::new(),
-            suspects: Vec::new(),
-            healed: Vec::new(),
+            reconciled: Vec::new(),
+            unreachable: Vec::new(),
+            notified: Vec::new(),
         }
     }
 }

@@ -19,11 +19,11 @@ use crate::{
 pub(super) struct Done {
     /// The connection, if it can be used again, and the incarnation that it reaches.
     pub(super) connection: Option<(u64, Connection)>,
-    pub(super) result: Result<Outcome, RoundTripError>,
+    pub(super) result: Result<Received, RoundTripError>,
 }
 
 /// What it was made for.
-pub(super) enum Outcome {
+pub(super) enum Received {
     Reply(RawReply),
     /// What the master holds.
     Held(Box<Master>),
@@ -74,17 +74,17 @@ pub(super) async fn round_trip(
     let result = match request {
         Some((head, body)) => {
             let reply = connection.forward(&head, body).await;
-            reply.map(Outcome::Reply).map_err(Into::into)
+            reply.map(Received::Reply).map_err(Into::into)
         }
         None => {
             let held = held(&proxy, &mut connection).await;
-            held.map(|held| Outcome::Held(held.into()))
+            held.map(|held| Received::Held(held.into()))
                 .map_err(Into::into)
         }
     };
     let usable = match &result {
-        Ok(Outcome::Reply(reply)) => reply.leaves_connection_usable(),
-        Ok(Outcome::Held(_)) => true,
+        Ok(Received::Reply(reply)) => reply.leaves_connection_usable(),
+        Ok(Received::Held(_)) => true,
         Err(_) => false,
     };
     Done {

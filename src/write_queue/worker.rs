@@ -12,10 +12,10 @@ use tokio::sync::{Notify, mpsc, watch};
 use super::batch::{self, Answer, Item};
 use super::{
     outdated::is_outdated,
-    round_trip::{Done, Outcome, RoundTripError, round_trip},
+    round_trip::{Done, Received, RoundTripError, round_trip},
 };
 use crate::{
-    cli::Sync,
+    cli::SyncPolicy,
     gate::State,
     master::{self, Master},
     proxy::Proxy,
@@ -110,7 +110,7 @@ impl Worker {
                 () = gate.changed() => changed = true,
                 done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
                     // A look that takes longer than the interval must leave time for calls.
-                    if matches!(done.result, Ok(Outcome::Held(_))) && let Some(resync) = &mut resync {
+                    if matches!(done.result, Ok(Received::Held(_))) && let Some(resync) = &mut resync {
                         resync.reset();
                     }
                     self.done(&proxy, done);
@@ -210,8 +210,8 @@ impl Worker {
         };
         self.connection = done.connection;
         match done.result {
-            Ok(Outcome::Held(state)) => self.resync(proxy, incarnation, version, *state),
-            Ok(Outcome::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
+            Ok(Received::Held(state)) => self.resync(proxy, incarnation, version, *state),
+            Ok(Received::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
             Err(error) => self.failed(proxy, items, &error),
         }
     }
@@ -394,7 +394,7 @@ fn answer(
     version: Option<u64>,
     answers: Vec<(Item, Answer)>,
 ) {
-    let seq = seq.filter(|_| proxy.config.sync == Sync::Always);
+    let seq = seq.filter(|_| proxy.config.sync == SyncPolicy::Always);
     let send = move || {
         for (item, answer) in answers {
             let _ = item.answer.send(answer);

@@ -23,7 +23,7 @@ pub(crate) fn patience() -> Duration {
     })
 }
 
-/// What the census asks.
+/// What the health check asks.
 const QUESTIONS: [&str; 3] = ["getPid", "getPublications", "getSubscriptions"];
 
 /// A listening node.

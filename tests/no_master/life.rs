@@ -187,7 +187,7 @@ fn nodes_live_without_a_master(mode: Mode, away: Duration) {
     mirror.assert_same(&robot.state(), "in the new master");
     before.assert_whole();
     during.assert_whole();
-    // A census and everything that a new master may say too much come within seconds.
+    // A health check and everything that a new master may say too much come within seconds.
     assert!(holds(Duration::from_secs(5), || witness
         .heard("shutdown")
         .is_empty()));
