@@ -9,11 +9,7 @@ use std::{
 
 use hyper::header::{HeaderValue, InvalidHeaderValue};
 use thiserror::Error;
-use tokio::{
-    net::TcpListener,
-    sync::{Notify, Semaphore},
-    task::JoinSet,
-};
+use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
@@ -24,25 +20,27 @@ use crate::{
     },
     clock,
     config::{Config, MasterConfig},
-    gate,
+    gate::{self, State},
     guardian::handover::Sockets,
     ledger::{Ledger, checkpointer},
+    lifecycle::Supervision,
     master::Master,
     nodes::{self, Nodes},
     process::{ProcessError, Rosmaster},
-    proxy::Proxy,
-    recovery::{Driver, master_process::MasterProcess},
+    recovery::{Driver, examine::Examiner, master_process::MasterProcess},
     ros_env::MasterUri,
-    roscore,
-    server::{clients::Clients, idle::Idle, listener},
+    roscore::{self, Roscore},
+    server::{Server, calls::Calls, clients::Clients, idle::Idle, listener, pages::Pages},
     status::{Board, stats::Stats},
     upstream::{Upstream, pool::Pool},
-    write_queue::{self, Worker},
+    write_queue,
     xmlrpc::Call,
 };
 
 mod life;
 mod notify;
+
+use self::notify::Told;
 
 /// So many bodies of the largest size may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
@@ -101,7 +99,7 @@ pub async fn run(
     }
     let Sockets { listeners, guard } = sockets;
     let listeners = listeners.into_iter().map(TcpListener::from_std);
-    let listeners = listeners.collect::<io::Result<_>>()?;
+    let listeners = listeners.collect::<io::Result<Vec<_>>>()?;
     let supervised = match &config.master {
         MasterConfig::Supervised(supervised) => Some((
             supervised.clone(),
@@ -130,11 +128,7 @@ pub async fn run(
     let port = last.map(|uri| uri.port);
     let process = supervised.map(|(_, rosmaster)| MasterProcess::new(rosmaster, port));
     let left = process.as_ref().is_some_and(MasterProcess::is_left);
-    let (gate_tx, gate) = gate::gate();
-    let (write_queue, worker) = write_queue::write_queue();
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
-    // Counted for as long as the process lives.
-    let stats: &'static Stats = Box::leak(Box::default());
     let Beginning {
         mirror,
         session,
@@ -143,40 +137,81 @@ pub async fn run(
         restored,
         story,
     } = beginning;
-    let proxy = Arc::new(Proxy {
-        uri,
-        names,
-        looped: Notify::new(),
-        gate,
-        slow: Notify::new(),
-        write_queue,
-        pool: Pool::new(config.master_connections),
-        upstream: Upstream::new(
-            address,
-            HeaderValue::from_str(&instance)?,
-            config.probe_timeout,
-            config.probing.count,
-        ),
-        instance,
-        ledger: Ledger::new(mirror, session, pending, store, stats),
-        clients: Clients::default(),
-        idle: Idle::among(config.max_connections),
-        bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
+    // Counted for as long as the process lives.
+    let stats: &'static Stats = Box::leak(Box::default());
+    let (gate_tx, gate) = gate::gate();
+    let (board, slow, looped) = (Arc::new(Board::default()), Arc::default(), Arc::default());
+    let ledger = Arc::new(Ledger::new(
+        mirror,
+        session,
+        pending,
+        store,
+        config.sync,
         stats,
-        rosout: AtomicU32::new(0),
-        board: Board::default(),
-        nodes: Nodes::default(),
-        config,
-    });
+    ));
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
-    proxy.ledger.set_identity(pid, proxy.uri.clone());
-    notify::start(guard, &proxy, stop.clone());
+    ledger.set_identity(pid, uri.clone());
+    let upstream = Arc::new(Upstream::new(
+        address,
+        HeaderValue::from_str(&instance)?,
+        config.probe_timeout,
+        config.probing.count,
+    ));
+    let (write_queue, worker) = write_queue::write_queue(
+        ledger.clone(),
+        upstream.clone(),
+        gate.clone(),
+        stats,
+        config.resync_interval,
+    );
+    let nodes = Arc::new(Nodes::new(
+        ledger.clone(),
+        gate.clone(),
+        write_queue.clone(),
+        stats,
+        config.node_timeout,
+    ));
+    let supervision = match process {
+        Some(_) => Supervision::Ours,
+        None => Supervision::Theirs,
+    };
+    let driver = Driver::new(
+        Examiner {
+            ledger: ledger.clone(),
+            upstream: upstream.clone(),
+            gate: gate_tx,
+            supervision,
+            probing: config.probing,
+            probe_timeout: config.probe_timeout,
+            stats,
+        },
+        write_queue.clone(),
+        Arc::clone(&slow),
+        nodes.clone(),
+        board.clone(),
+        process,
+    );
+    let told = Told {
+        board: board.clone(),
+        ledger: ledger.clone(),
+        gate: gate.clone(),
+    };
+    notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
+        let roscore = Roscore {
+            ledger: ledger.clone(),
+            write_queue: write_queue.clone(),
+            gate: gate.clone(),
+            uri: uri.clone(),
+            checkpoint: config.checkpoint.clone(),
+            node_timeout: config.node_timeout,
+            rosout: AtomicU32::new(0),
+        };
         if !left {
-            roscore::seed_run_id(&proxy);
+            roscore::seed_run_id(&roscore);
         }
-        tokio::spawn(roscore::run(proxy.clone(), rosout, stop.clone()))
+        tokio::spawn(roscore::run(roscore, rosout, stop.clone()))
     });
     tokio::spawn({
         let halt = halt.clone();
@@ -189,81 +224,96 @@ pub async fn run(
             halt.cancel();
         }
     });
-    proxy.board.set_open(false);
-    let driver = Driver::new(proxy.clone(), gate_tx, process, restored);
-    let process = serve(&proxy, listeners, worker, driver, &halt, || {
-        let counts = proxy.ledger.with_mirror(Master::counts);
-        say(&format!("{story}: {counts}"));
+    let clients = Arc::new(Clients::default());
+    let pool = Pool::new(
+        config.master_connections,
+        upstream.clone(),
+        ledger.clone(),
+        gate.clone(),
+    );
+    let server = Arc::new(Server {
+        names,
+        instance,
+        looped: Arc::clone(&looped),
+        clients: clients.clone(),
+        idle: Idle::among(config.max_connections),
+        max_body: config.max_body,
+        bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
+        stats,
+        calls: Calls {
+            gate: gate.clone(),
+            ledger: ledger.clone(),
+            pool: Arc::new(pool),
+            write_queue,
+            slow,
+            stats,
+            uri: uri.clone(),
+            hold: config.hold,
+        },
+        pages: Pages {
+            uri,
+            checkpoint: config.checkpoint.display().to_string(),
+            upstream: upstream.clone(),
+            gate: gate.clone(),
+            ledger: ledger.clone(),
+            nodes: nodes.clone(),
+            board,
+            clients,
+            stats,
+        },
+    });
+    let permits = Arc::new(Semaphore::new(config.max_connections));
+    let connections = TaskTracker::new();
+    let mut tasks = JoinSet::new();
+    for listener in listeners {
+        tasks.spawn(listener::run(
+            listener,
+            server.clone(),
+            permits.clone(),
+            connections.clone(),
+            halt.clone(),
+        ));
+    }
+    drop(server);
+    tasks.spawn(worker.run());
+    tasks.spawn(checkpointer::run(
+        ledger.clone(),
+        config.checkpoint,
+        config.sync_interval,
+        halt.clone(),
+    ));
+    tasks.spawn(nodes::watch(nodes, config.reap_interval));
+    let announce = async {
+        gate.clone().wait_for(State::is_open).await;
+        say(&format!("{story}: {}", ledger.with_mirror(Master::counts)));
         say("ROS Rescue enabled. Master is now fault tolerant!!");
-    })
-    .await?;
-    close(&proxy).await;
+        std::future::pending().await
+    };
+    let mut driver = tokio::spawn(driver.run(restored, halt));
+    let process = tokio::select! {
+        process = &mut driver => match process {
+            Ok(process) => process?,
+            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+        },
+        () = announce => None,
+        () = looped.notified() => return Err(RunError::Loop { master: upstream.address() }),
+    };
+    connections.close();
+    // Calls that still wait cannot be answered any more: their connections are closed.
+    let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
+    tasks.shutdown().await;
+    close(ledger).await;
     if let Some(process) = process {
         process.stop().await;
     }
     Ok(())
 }
 
-/// Runs all tasks until the stop or an error.
-async fn serve(
-    proxy: &Arc<Proxy>,
-    listeners: Vec<TcpListener>,
-    worker: Worker,
-    driver: Driver,
-    stop: &CancellationToken,
-    announce: impl Fn(),
-) -> Result<Option<MasterProcess>, RunError> {
-    let permits = Arc::new(Semaphore::new(proxy.config.max_connections));
-    let connections = TaskTracker::new();
-    let mut tasks = JoinSet::new();
-    for listener in listeners {
-        let (proxy, permits) = (proxy.clone(), permits.clone());
-        tasks.spawn(listener::run(
-            listener,
-            proxy,
-            permits,
-            connections.clone(),
-            stop.clone(),
-        ));
-    }
-    tasks.spawn(worker.run(proxy.clone()));
-    tasks.spawn(checkpointer::run(proxy.clone(), stop.clone()));
-    tasks.spawn(nodes::watch(proxy.clone()));
-    let mut driver = tokio::spawn(driver.run(stop.clone()));
-    let opening = async {
-        proxy.board.first_opening().await;
-        announce();
-        std::future::pending().await
-    };
-    let looped = async {
-        proxy.looped.notified().await;
-        RunError::Loop {
-            master: proxy.upstream.address(),
-        }
-    };
-    let process = tokio::select! {
-        process = &mut driver => match process {
-            Ok(process) => process?,
-            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
-        },
-        () = opening => None,
-        error = looped => return Err(error),
-    };
-    connections.close();
-    // Calls that still wait cannot be answered any more: their connections are closed.
-    let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
-    tasks.shutdown().await;
-    Ok(process)
-}
-
 /// Writes the closing checkpoint.
-async fn close(proxy: &Arc<Proxy>) {
-    let proxy = proxy.clone();
+async fn close(ledger: Arc<Ledger>) {
     let closed = tokio::task::spawn_blocking(move || {
-        proxy.ledger.update_session(|session| session.closed = true);
-        proxy
-            .ledger
-            .with_store(|store, checkpoint| store.close(&checkpoint()))
+        ledger.update_session(|session| session.closed = true);
+        ledger.with_store(|store, checkpoint| store.close(&checkpoint()))
     });
     match closed.await {
         Ok(Some(Err(error))) => tracing::error!(%error, "no closing checkpoint"),

@@ -21,48 +21,74 @@ pub enum State {
     Unknown,
 }
 
+impl State {
+    /// Whether calls pass to the master.
+    pub fn is_open(self) -> bool {
+        matches!(self, Self::Open { .. })
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Gate {
+    state: State,
+    /// None while it is open.
+    shut_since: Option<Instant>,
+}
+
 /// A gate that is shut, in two halves.
 pub fn gate() -> (Tx, Rx) {
-    let (tx, rx) = watch::channel(State::Unknown);
+    let (tx, rx) = watch::channel(Gate {
+        state: State::Unknown,
+        shut_since: Some(Instant::now()),
+    });
     (Tx(tx), Rx(rx))
 }
 
 /// Opens and shuts the gate.
 #[derive(Debug, Clone)]
-pub struct Tx(watch::Sender<State>);
+pub struct Tx(watch::Sender<Gate>);
 
 impl Tx {
     /// Changes the state; waiters see it at once. The same state again wakes nobody.
     pub fn set(&self, state: State) {
-        self.0.send_if_modified(|now| {
-            if *now == state {
+        self.0.send_if_modified(|gate| {
+            if gate.state == state {
                 return false;
             }
-            tracing::debug!("gate: {now:?} => {state:?}");
-            *now = state;
+            tracing::debug!("gate: {:?} => {state:?}", gate.state);
+            gate.state = state;
+            gate.shut_since = match state.is_open() {
+                true => None,
+                false => gate.shut_since.or_else(|| Some(Instant::now())),
+            };
             true
         });
     }
 
     /// The state now.
     pub fn state(&self) -> State {
-        *self.0.borrow()
+        self.0.borrow().state
     }
 }
 
 /// Looks at the gate and waits for it.
 #[derive(Clone, Debug)]
-pub struct Rx(watch::Receiver<State>);
+pub struct Rx(watch::Receiver<Gate>);
 
 impl Rx {
     /// The state now.
     pub fn state(&self) -> State {
-        *self.0.borrow()
+        self.0.borrow().state
     }
 
     /// Whether calls pass to the master.
     pub fn is_open(&self) -> bool {
-        matches!(self.state(), State::Open { .. })
+        self.state().is_open()
+    }
+
+    /// Since when no call has passed; none while calls pass.
+    pub fn shut_since(&self) -> Option<Instant> {
+        self.0.borrow().shut_since
     }
 
     /// Returns when the state has changed since the last look by this method or by
@@ -76,13 +102,13 @@ impl Rx {
     /// As [`Self::look`], and whether the state has changed since the last look or since
     /// [`Self::changed`] returned.
     pub fn look_changed(&mut self) -> (State, bool) {
-        let state = self.0.borrow_and_update();
-        (*state, state.has_changed())
+        let gate = self.0.borrow_and_update();
+        (gate.state, gate.has_changed())
     }
 
     /// The state now, and the point from which [`Self::changed`] looks for changes.
     pub fn look(&mut self) -> State {
-        *self.0.borrow_and_update()
+        self.0.borrow_and_update().state
     }
 
     /// Returns when the state is one that `is_it` says yes to. Cancel safe.
@@ -99,13 +125,12 @@ impl Rx {
     /// Returns when no call has passed for `time` in one piece, counted from now at the earliest.
     /// Never returns while the gate is open. Cancel safe, but the count starts anew.
     pub async fn shut_for(&mut self, time: Duration) {
-        let is_open = |state| matches!(state, State::Open { .. });
         loop {
-            self.wait_for(|state| !is_open(state)).await;
+            self.wait_for(|state| !state.is_open()).await;
             let deadline = Instant::now() + time;
             tokio::select! {
                 () = tokio::time::sleep_until(deadline) => return,
-                _ = self.wait_for(is_open) => {}
+                _ = self.wait_for(State::is_open) => {}
             }
         }
     }

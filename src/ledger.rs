@@ -20,14 +20,15 @@ use tokio::sync::{Notify, watch};
 
 use self::activity::{Activity, Noticed};
 use self::{durability::Whole, pending::PendingWrites};
-use crate::status::stats::Stats;
 use crate::{
     checkpoint::{
         format::{Entry, Session},
         store::Store,
     },
+    cli::SyncPolicy,
     master::{self, Master},
     replay::{self, Agreement, Answered, Token},
+    status::stats::Stats,
     xmlrpc::{Call, Reply},
 };
 
@@ -66,6 +67,7 @@ pub struct Basis {
 /// The mirror, the journal and what belongs to them.
 pub struct Ledger {
     inner: Mutex<Inner>,
+    sync: SyncPolicy,
     stats: &'static Stats,
     durable: watch::Sender<u64>,
     /// The mirror's version in the last whole checkpoint that was attempted.
@@ -94,16 +96,19 @@ struct Inner {
     doubted: bool,
     /// The present incarnation may still run a batch that nobody waits for any more.
     abandoned: bool,
+    /// The incarnation that was served last.
+    served: Option<u64>,
 }
 
 impl Ledger {
     /// A ledger of `mirror`, recorded in `store`. `pending`: writes that the incarnation of `session` may not
-    /// have run.
+    /// have run. `sync`: when a record has to be on the disk.
     pub fn new(
         mirror: Master,
         session: Session,
         pending: Vec<Call>,
         store: Option<Store>,
+        sync: SyncPolicy,
         stats: &'static Stats,
     ) -> Self {
         let mut inner = Inner {
@@ -119,10 +124,12 @@ impl Ledger {
             injecting: false,
             doubted: false,
             abandoned: false,
+            served: None,
         };
         inner.add_pending(pending);
         Self {
             inner: Mutex::new(inner),
+            sync,
             stats,
             durable: watch::channel(0).0,
             attempted: watch::channel(0).0,
@@ -165,9 +172,14 @@ impl Ledger {
 
     /// Tells the mirror what getPid and getUri answer.
     pub fn set_identity(&self, pid: i32, uri: String) {
+        self.lock().set_identity((pid, uri));
+    }
+
+    /// Tells the mirror what getPid answers from now on.
+    pub fn set_master_pid(&self, pid: i32) {
         let mut inner = self.lock();
-        inner.mirror.set_identity(pid, uri.clone());
-        inner.identity = (pid, uri);
+        let (_, uri) = inner.identity.clone();
+        inner.set_identity((pid, uri));
     }
 
     /// The session as it is recorded.
@@ -383,14 +395,18 @@ impl Inner {
         reply
     }
 
+    fn set_identity(&mut self, identity: (i32, String)) {
+        self.mirror.set_identity(identity.0, identity.1.clone());
+        self.identity = identity;
+    }
+
     fn adopt(&mut self, state: Master) -> Vec<String> {
         if self.mirror == state {
             return Vec::new();
         }
         let difference = replay::difference(&self.mirror, &state);
-        let (pid, uri) = self.identity.clone();
         self.mirror = state;
-        self.mirror.set_identity(pid, uri);
+        self.set_identity(self.identity.clone());
         self.version += 1;
         self.changed_unrecorded();
         difference

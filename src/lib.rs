@@ -47,7 +47,6 @@ pub mod lifecycle;
 pub mod master;
 pub mod nodes;
 pub mod process;
-pub mod proxy;
 pub mod recovery;
 pub mod replay;
 pub mod resolver;

@@ -54,6 +54,12 @@ pub struct Lifecycle {
     supervision: Supervision,
     probing: Probing,
     phase: Phase,
+    /// A master has served since the start.
+    served: bool,
+    /// The mirror comes from a checkpoint whose session goes on.
+    restored: bool,
+    /// The mirror is known to be a master's state.
+    known: bool,
     /// When our child was spawned, or we were, if it was left to us; none while it is gone.
     child: Option<Instant>,
     /// Since when no master has been connected.
@@ -85,6 +91,9 @@ impl Lifecycle {
             supervision,
             probing,
             phase: Phase::Seeking,
+            served: false,
+            restored: false,
+            known: false,
             child: None,
             seeking_since: None,
             deaths: VecDeque::new(),
@@ -116,9 +125,19 @@ impl Lifecycle {
         self.total_deaths
     }
 
-    /// The master that is examined has answered: if it ends now, that is a death of its own.
-    pub fn answered(&mut self) {
-        self.dying = false;
+    /// Whether the mirror may stand in while the gate is shut: it is known to be a master's state.
+    pub fn may_stand_in(&self) -> bool {
+        self.known
+    }
+
+    /// Whether a master has served since the start.
+    pub fn has_served(&self) -> bool {
+        self.served
+    }
+
+    /// Whether a session begins that no master has served yet.
+    pub fn begins(&self) -> bool {
+        !self.served && !self.restored
     }
 
     /// Takes in what happened at `now`; answers what is to be done, in order.
@@ -127,7 +146,11 @@ impl Lifecycle {
             return Vec::new();
         }
         match input {
-            Input::Start { left } => self.start(now, left),
+            Input::Start { left, restored } => self.start(now, left, restored),
+            Input::Answered => {
+                self.dying = false;
+                Vec::new()
+            }
             Input::Connected => {
                 self.phase = Phase::Examining;
                 self.timer = None;
@@ -176,6 +199,7 @@ impl Lifecycle {
                 let died = std::mem::take(&mut self.lost) && new;
                 self.dying = false;
                 self.phase = Phase::Serving;
+                (self.served, self.known) = (true, true);
                 self.seeking_since = None;
                 self.serving_since = Some(now);
                 self.missed = 0;
@@ -195,7 +219,8 @@ impl Lifecycle {
                 self.seeking_since = Some(now);
                 vec![Action::Connect]
             }
-            Input::SpawnFailed => {
+            Input::SpawnFailed { pending: false } if self.begins() => vec![Action::GiveUp],
+            Input::SpawnFailed { .. } => {
                 let pause = pause_after(self.failed_spawns).max(self.pause_before_spawn());
                 self.failed_spawns += 1;
                 self.timer = Some((now + pause, Timer::Spawn));
@@ -228,8 +253,11 @@ impl Lifecycle {
         }
     }
 
-    fn start(&mut self, now: Instant, left: bool) -> Vec<Action> {
+    fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
+        self.restored = restored;
+        // A master of ours begins with nothing but what we give it; what an earlier one holds must be seen.
+        self.known = restored || (self.supervision == Supervision::Ours && !left);
         if self.supervision == Supervision::Ours && !left {
             return vec![Action::Spawn];
         }

@@ -17,14 +17,15 @@ use tokio::sync::Notify;
 
 use self::{client::Sign, health_check::CheckResult, notifications::Notifications};
 use crate::{
-    gate::State,
+    gate::{self, State},
     health::{Repeats, Unreachable},
     ledger::{
         Ledger,
         activity::{Change, Notification, Owed},
     },
-    proxy::Proxy,
+    status::{report::HealthCheck, stats::Stats},
     wait,
+    write_queue::WriteQueue,
     xmlrpc::Call,
 };
 
@@ -38,8 +39,13 @@ const ROUND: Duration = Duration::from_millis(500);
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
 /// What is known of the nodes beyond their registrations.
-#[derive(Debug, Default)]
 pub struct Nodes {
+    ledger: Arc<Ledger>,
+    gate: gate::Rx,
+    write_queue: WriteQueue,
+    stats: &'static Stats,
+    /// How long a node may take to answer.
+    timeout: Duration,
     /// Notifications under way.
     pub(super) notifications: Notifications,
     unreachable: Mutex<Unreachable>,
@@ -51,6 +57,28 @@ pub struct Nodes {
 }
 
 impl Nodes {
+    /// Of the nodes that `ledger` knows. `timeout`: how long one may take to answer.
+    pub fn new(
+        ledger: Arc<Ledger>,
+        gate: gate::Rx,
+        write_queue: WriteQueue,
+        stats: &'static Stats,
+        timeout: Duration,
+    ) -> Self {
+        Self {
+            ledger,
+            gate,
+            write_queue,
+            stats,
+            timeout,
+            notifications: Notifications::default(),
+            unreachable: Mutex::default(),
+            checks: AtomicUsize::new(0),
+            unanswered: AtomicUsize::new(0),
+            changed: Notify::new(),
+        }
+    }
+
     fn lock(&self) -> MutexGuard<'_, Unreachable> {
         self.unreachable
             .lock()
@@ -63,10 +91,10 @@ impl Nodes {
     }
 
     /// The names of the nodes that are unreachable.
-    pub fn unreachable(&self, ledger: &Ledger) -> Vec<String> {
+    pub fn unreachable(&self) -> Vec<String> {
         // No lock is held while the other one is taken.
         let unreachable = self.lock().clone();
-        let mut names: Vec<String> = ledger.with_mirror(|mirror| {
+        let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| unreachable.contains(api));
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
@@ -75,76 +103,72 @@ impl Nodes {
     }
 
     /// The node at `api` did not answer.
-    pub(super) fn mark_unreachable(&self, proxy: &Arc<Proxy>, api: &str) {
+    pub(super) fn mark_unreachable(&self, api: &str) {
         let now = Instant::now();
         if !self.lock().add(api, now) {
             return;
         }
         tracing::debug!(api, "a node does not answer");
         self.changed.notify_one();
-        if self.update_telling(proxy) {
+        if self.update_telling() {
             // What changed before, the master may be about to tell this very node first.
-            proxy
-                .ledger
+            self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
-            proxy.ledger.news.notify_one();
+            self.ledger.news.notify_one();
         }
     }
 
     /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
-    pub(super) fn clear(&self, proxy: &Proxy, api: &str) -> bool {
+    pub(super) fn clear(&self, api: &str) -> bool {
         let was = self.lock().remove(api);
         if was {
-            self.update_telling(proxy);
+            self.update_telling();
         }
         was
     }
 
-    /// We tell changes beside the master as long as somebody is suspect, or may be. Answers whether that begins.
-    fn update_telling(&self, proxy: &Proxy) -> bool {
+    /// We tell changes beside the master as long as somebody is unreachable, or may be. Answers whether that begins.
+    fn update_telling(&self) -> bool {
         // One lock around the other, here and nowhere else: the last word is the latest.
         let unreachable = self.lock();
         let telling = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
-        proxy
-            .ledger
+        self.ledger
             .with_activity(|_, activity| activity.set_telling(telling))
             && telling
     }
 
-    /// We tell changes beside the master until the result is dropped: nobody knows yet who is suspect.
-    pub(super) fn begin_check(proxy: &Arc<Proxy>) -> CheckUnderWay {
-        proxy.nodes.checks.fetch_add(1, Ordering::Relaxed);
-        proxy.nodes.update_telling(proxy);
-        CheckUnderWay(proxy.clone())
+    /// We tell changes beside the master until the result is dropped: nobody knows yet who is unreachable.
+    pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
+        nodes.checks.fetch_add(1, Ordering::Relaxed);
+        nodes.update_telling();
+        CheckUnderWay(nodes.clone())
     }
 }
 
 /// The health check of a recovery.
-pub(super) struct CheckUnderWay(Arc<Proxy>);
+pub(super) struct CheckUnderWay(Arc<Nodes>);
 
 impl Drop for CheckUnderWay {
     fn drop(&mut self) {
-        self.0.nodes.checks.fetch_sub(1, Ordering::Relaxed);
-        self.0.nodes.update_telling(&self.0);
+        self.0.checks.fetch_sub(1, Ordering::Relaxed);
+        self.0.update_telling();
     }
 }
 
 /// Watches over the nodes for as long as it is polled: sends notifications, asks unreachable nodes again, gets
-/// acquainted with new nodes, and takes the health check that is due.
-pub async fn watch(proxy: Arc<Proxy>) {
+/// acquainted with new nodes, and makes the health check that is due.
+pub async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut round = tokio::time::interval(ROUND);
-    let mut reaping = proxy
-        .config
-        .reap_interval
+    let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
     let mut repeats = Repeats::<Change>::default();
-    let mut gate = proxy.gate.clone();
+    let mut gate = nodes.gate.clone();
     // When to tell what the master that is away may have owed, and whether it has been told.
     let (mut owed_at, mut owed_told) = (None, false);
     loop {
-        let next = proxy.nodes.lock().next().map(Into::into);
+        let next = nodes.lock().next().map(Into::into);
         tokio::select! {
-            () = proxy.ledger.news.notified() => empty_outbox(&proxy, &mut repeats),
+            () = nodes.ledger.news.notified() => empty_outbox(&nodes, &mut repeats),
             () = gate.changed() => match gate.look() {
                 State::StandingIn if !owed_told => {
                     owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
@@ -154,37 +178,37 @@ pub async fn watch(proxy: Arc<Proxy>) {
             },
             () = wait::until(owed_at) => {
                 (owed_at, owed_told) = (None, true);
-                tell_owed(&proxy, Instant::now());
+                tell_owed(&nodes, Instant::now());
             }
-            () = wait::until(next) => ask_unreachable(&proxy),
+            () = wait::until(next) => ask_unreachable(&nodes),
             () = wait::until(repeats.next().map(Into::into)) => {
-                let unanswered = proxy.nodes.unanswered.load(Ordering::Relaxed) > 0;
-                let holding_up = unanswered || !proxy.nodes.lock().is_empty();
+                let unanswered = nodes.unanswered.load(Ordering::Relaxed) > 0;
+                let holding_up = unanswered || !nodes.lock().is_empty();
                 for change in repeats.due(Instant::now(), holding_up) {
-                    tell(&proxy, change);
+                    tell(&nodes, change);
                 }
             }
             // An unreachable node that is new may be due before the others.
-            () = proxy.nodes.changed.notified() => {}
-            _ = round.tick() => get_acquainted(&proxy),
+            () = nodes.changed.notified() => {}
+            _ = round.tick() => get_acquainted(&nodes),
             () = wait::tick(&mut reaping) => {
-                if proxy.gate.is_open() {
-                    tokio::spawn(reap(proxy.clone()));
+                if nodes.gate.is_open() {
+                    tokio::spawn(reap(nodes.clone()));
                 }
             }
         }
     }
 }
 
-fn empty_outbox(proxy: &Arc<Proxy>, repeats: &mut Repeats<Change>) {
-    let outbox = proxy
+fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
+    let outbox = nodes
         .ledger
         .with_activity(|_, activity| activity.take_outbox());
     for (api, call) in outbox.calls {
-        notifications::send(proxy, &api, Notification::Call(call));
+        notifications::send(nodes, &api, Notification::Call(call));
     }
     for displaced in outbox.displaced {
-        notifications::shut_down(proxy, displaced);
+        notifications::shut_down(nodes, displaced);
     }
     for change in outbox.changes {
         repeats.changed(change, Instant::now());
@@ -192,48 +216,48 @@ fn empty_outbox(proxy: &Arc<Proxy>, repeats: &mut Repeats<Change>) {
 }
 
 /// Tells what a master that went away at `outage` may not have told before. The topics of it.
-pub(super) fn tell_owed(proxy: &Arc<Proxy>, outage: Instant) -> Vec<String> {
+pub(super) fn tell_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let Owed {
         mut topics,
         params,
         displaced,
-    } = proxy
+    } = nodes
         .ledger
         .with_activity(|_, activity| activity.take_owed(outage));
-    topics.retain(|topic| notifications::tell_subscribers(proxy, topic));
+    topics.retain(|topic| notifications::tell_subscribers(nodes, topic));
     for (api, key) in params {
-        notifications::send(proxy, &api, Notification::Param(key));
+        notifications::send(nodes, &api, Notification::Param(key));
     }
     for displaced in displaced {
-        notifications::shut_down(proxy, displaced);
+        notifications::shut_down(nodes, displaced);
     }
     topics
 }
 
-fn tell(proxy: &Arc<Proxy>, change: Change) {
+fn tell(nodes: &Arc<Nodes>, change: Change) {
     match change {
-        Change::Param(api, key) => notifications::send(proxy, &api, Notification::Param(key)),
+        Change::Param(api, key) => notifications::send(nodes, &api, Notification::Param(key)),
         Change::Topic(topic) => {
-            notifications::tell_subscribers(proxy, &topic);
+            notifications::tell_subscribers(nodes, &topic);
         }
     }
 }
 
-fn ask_unreachable(proxy: &Arc<Proxy>) {
-    let registered = proxy.ledger.with_mirror(|mirror| {
+fn ask_unreachable(nodes: &Arc<Nodes>) {
+    let registered = nodes.ledger.with_mirror(|mirror| {
         let apis = mirror.nodes().map(|(_, api)| api.to_owned());
         apis.collect::<HashSet<_>>()
     });
     let due = {
-        let mut unreachable = proxy.nodes.lock();
+        let mut unreachable = nodes.lock();
         unreachable.retain(|api| registered.contains(api));
         unreachable.due(Instant::now())
     };
-    proxy.nodes.update_telling(proxy);
+    nodes.update_telling();
     for api in due {
-        let proxy = proxy.clone();
+        let nodes = nodes.clone();
         tokio::spawn(async move {
-            let outcome = health_check::visit(&proxy, api).await;
+            let outcome = health_check::visit(&nodes, api).await;
             if outcome.sign != Sign::Silent {
                 say(&outcome, "an unreachable node answers again");
             }
@@ -253,11 +277,11 @@ fn say(outcome: &CheckResult, what: &str) {
 
 /// Asks nodes that have registered lately for their process ids: another one at the same port will
 /// be another node.
-fn get_acquainted(proxy: &Arc<Proxy>) {
+fn get_acquainted(nodes: &Arc<Nodes>) {
     let Some(before) = Instant::now().checked_sub(ACQUAINTANCE) else {
         return;
     };
-    let new = proxy.ledger.with_activity(|mirror, activity| {
+    let new = nodes.ledger.with_activity(|mirror, activity| {
         let new = activity.take_strangers(before).into_iter();
         let new = new.filter_map(|name| {
             let api = mirror.api_of(&name)?.to_owned();
@@ -267,14 +291,14 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
         new.collect::<Vec<_>>()
     });
     for (name, api, registered) in new {
-        let proxy = proxy.clone();
+        let nodes = nodes.clone();
         tokio::spawn(async move {
             let permit = health_check::permit().await;
             let call = Call::new("getPid", vec![crate::master::CALLER_ID.into()]);
-            let answer = client::ask_for(&api, &call, proxy.config.node_timeout).await;
+            let answer = client::ask_for(&api, &call, nodes.timeout).await;
             drop(permit);
             if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
-                proxy.ledger.with_activity(|_, activity| {
+                nodes.ledger.with_activity(|_, activity| {
                     activity.remember_pid(&name, &api, registered, pid);
                 });
             }
@@ -283,10 +307,13 @@ fn get_acquainted(proxy: &Arc<Proxy>) {
 }
 
 /// The regular health check.
-async fn reap(proxy: Arc<Proxy>) {
-    let outcome = health_check::check_all(&proxy).await;
-    if !outcome.removed.is_empty() || !outcome.reconciled.is_empty() {
-        let (removed, reconciled) = (outcome.removed, outcome.reconciled);
+async fn reap(nodes: Arc<Nodes>) {
+    let HealthCheck {
+        removed,
+        reconciled,
+        ..
+    } = health_check::check_all(&nodes).await;
+    if !removed.is_empty() || !reconciled.is_empty() {
         tracing::info!(?removed, ?reconciled, "health check");
     }
 }

@@ -6,33 +6,28 @@ mod reporting;
 mod stall_probe;
 mod thread_exit;
 
-use std::{
-    pin::Pin,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
-    time::Instant,
-};
+use std::{pin::Pin, sync::Arc, time::Instant};
 
-use tokio::task::JoinHandle;
+use tokio::{sync::Notify, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
 
 use self::{
-    examine::{Examination, ExamineError, Known, Prepared},
+    examine::{Examination, ExamineError, Examiner, Manner, Prepared},
     master_process::MasterProcess,
+    reporting::Outage,
 };
-use crate::status::report::{Outage, Outcome};
 use crate::{
-    gate::{State, Tx},
+    gate::State,
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    nodes::Nodes,
     process::{self, ProcessError},
-    proxy::Proxy,
+    status::{Board, report::Outcome},
     upstream::{
         ConnectError, Connection,
         pool::{VerifyError, connect_verified},
     },
     wait,
+    write_queue::WriteQueue,
 };
 
 /// What a step under way ends in. Steps exclude one another.
@@ -48,10 +43,15 @@ type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Carries out what the lifecycle decides.
 pub struct Driver {
-    proxy: Arc<Proxy>,
-    gate: Tx,
+    examiner: Examiner,
+    write_queue: WriteQueue,
+    slow: Arc<Notify>,
+    nodes: Arc<Nodes>,
+    board: Arc<Board>,
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
+    /// Why the last master could not be started.
+    spawn_error: Option<ProcessError>,
     connection: Option<Connection>,
     /// Resolves when the connection to the master ends.
     ended: Option<Ended>,
@@ -60,92 +60,103 @@ pub struct Driver {
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
     prepared: Option<JoinHandle<Prepared>>,
-    /// Whether the master is being brought to the mirror's state.
-    injecting: Arc<AtomicBool>,
     outage: Outage,
-    /// The incarnation that was served last.
-    served: Option<u64>,
-    /// The mirror is known to be a master's state, so that it may stand in.
-    known: bool,
-    /// The mirror comes from a checkpoint whose session goes on.
-    restored: bool,
     said: Option<(String, Instant)>,
 }
 
 impl Driver {
-    /// A driver for `proxy` and its gate. With `process` it starts masters itself. `restored`: the
-    /// mirror comes from a checkpoint whose session goes on.
+    /// A driver that examines masters by `examiner`, and starts them itself with `process`. `slow` is notified
+    /// when a master has not answered a call for longer than it should take.
     pub fn new(
-        proxy: Arc<Proxy>,
-        gate: Tx,
+        examiner: Examiner,
+        write_queue: WriteQueue,
+        slow: Arc<Notify>,
+        nodes: Arc<Nodes>,
+        board: Arc<Board>,
         process: Option<MasterProcess>,
-        restored: bool,
     ) -> Self {
         let supervision = match process {
             Some(_) => Supervision::Ours,
             None => Supervision::Theirs,
         };
-        // A master of ours begins with nothing but what we give it; what an earlier one holds must be
-        // seen.
-        let begins = process.as_ref().is_some_and(|process| !process.is_left());
         Self {
-            lifecycle: Lifecycle::new(supervision, proxy.config.probing),
-            proxy,
-            gate,
+            lifecycle: Lifecycle::new(supervision, examiner.probing),
+            examiner,
+            write_queue,
+            slow,
+            nodes,
+            board,
             process,
+            spawn_error: None,
             connection: None,
             ended: None,
             thread_ended: None,
             step: None,
             probe_deadline: None,
             prepared: None,
-            injecting: Arc::default(),
             outage: Outage::begin(Instant::now(), "start"),
-            served: None,
-            known: restored || begins,
-            restored,
             said: None,
         }
     }
 
-    /// Watches the master until `stop`. An error: no master can be started at all.
+    /// Watches the master until `stop`. `restored`: the mirror comes from a checkpoint whose session goes on.
+    ///
+    /// # Errors
+    ///
+    /// If no master can be started at all.
     pub async fn run(
         mut self,
+        restored: bool,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, ProcessError> {
-        if self.known {
-            self.keep_shut();
-        }
         let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
-        let mut input = Input::Start { left };
+        let mut input = Input::Start { left, restored };
         loop {
             self.note_death(input);
             let actions = self.lifecycle.on(Instant::now(), input);
-            self.proxy.board.set_deaths(self.lifecycle.deaths());
+            let deaths = self.lifecycle.deaths();
+            self.board.update(|facts| facts.deaths = deaths);
+            if matches!(input, Input::Start { .. }) {
+                self.keep_shut();
+            }
+            let mut next = None;
             for action in actions {
                 tracing::debug!(?input, ?action, "lifecycle");
-                self.carry_out(action)?;
+                if action == Action::GiveUp
+                    && let Some(error) = self.spawn_error.take()
+                {
+                    return Err(error);
+                }
+                next = self.carry_out(action).or(next);
+            }
+            if matches!(input, Input::SpawnFailed { .. })
+                && let Some(error) = self.spawn_error.take()
+            {
+                self.say(format!("cannot start a master: {error}"));
             }
             if input == Input::Stop {
                 return Ok(self.process);
             }
-            input = match self.process.as_mut().and_then(MasterProcess::take_news) {
-                Some(news) => news,
+            input = match next {
+                Some(input) => input,
                 None => self.next_input(&stop).await,
             };
         }
     }
 
-    /// A master that dies while it is brought to the state had answered before.
+    /// What was under way with the master is over.
     fn note_death(&mut self, input: Input) {
-        let died = matches!(
+        if !matches!(
             input,
-            Input::ConnectionLost | Input::Exited | Input::Unreachable
-        );
-        if died && self.injecting.swap(false, Ordering::Relaxed) {
-            tracing::warn!("the master died while it was brought to the mirror's state");
-            self.lifecycle.answered();
+            Input::ConnectionLost | Input::Exited | Input::Unreachable | Input::NotAMaster
+        ) {
+            return;
         }
+        if self.examiner.gate.state() == State::Injecting && input != Input::NotAMaster {
+            tracing::warn!("the master died while it was brought to the mirror's state");
+            self.lifecycle.on(Instant::now(), Input::Answered);
+        }
+        self.disconnect();
     }
 
     async fn next_input(&mut self, stop: &CancellationToken) -> Input {
@@ -158,29 +169,25 @@ impl Driver {
                 biased;
                 () = stop.cancelled() => return Input::Stop,
                 () = wait::for_some(self.ended.as_mut()) => {
-                    if !matches!(self.gate.state(), State::Open { .. }) {
-                        let master = self.proxy.upstream.address();
+                    if !self.examiner.gate.state().is_open() {
+                        let master = self.examiner.upstream.address();
                         self.say_waiting(&format!("{master} closes the connection unasked"));
                     }
-                    self.disconnect();
                     return Input::ConnectionLost;
                 }
                 () = wait::for_some(self.thread_ended.as_mut()) => {
                     self.thread_ended = None;
                     return Input::ThreadEnded;
                 }
-                () = exited(&mut self.process) => {
-                    self.disconnect();
-                    return Input::Exited;
-                }
+                () = exited(&mut self.process) => return Input::Exited,
                 done = wait::for_some(self.step.as_mut()) => {
                     self.step = None;
                     if let Some(input) = self.done(done) {
                         return input;
                     }
                 }
-                () = self.proxy.write_queue.lost() => return Input::BatchLost,
-                () = self.proxy.slow.notified() => return Input::Slow,
+                () = self.write_queue.lost() => return Input::BatchLost,
+                () = self.slow.notified() => return Input::Slow,
                 () = wait::until(self.probe_deadline) => {
                     self.probe_deadline = None;
                     return Input::ProbeMissed;
@@ -190,59 +197,55 @@ impl Driver {
         }
     }
 
-    fn carry_out(&mut self, action: Action) -> Result<(), ProcessError> {
+    /// Does it; answers with what it came to, if that is known at once.
+    fn carry_out(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
                 self.disconnect();
                 // Whatever comes of it: the one before may have gone to a master that died then.
-                let proxy = &self.proxy;
-                self.prepared.get_or_insert_with(|| examine::prepare(proxy));
-                let proxy = self.proxy.clone();
+                let ledger = &self.examiner.ledger;
+                self.prepared
+                    .get_or_insert_with(|| examine::prepare(ledger.clone()));
+                let upstream = self.examiner.upstream.clone();
                 self.step = Some(Box::pin(async move {
-                    match proxy.upstream.connect().await {
+                    match upstream.connect().await {
                         Ok(connection) => Done::Connected(connection),
                         Err(error) => Done::NotConnected(error),
                     }
                 }));
             }
             Action::Examine => {
-                let Some(mut connection) = self.connection.take() else {
-                    return Ok(());
-                };
-                let (proxy, gate) = (self.proxy.clone(), self.gate.clone());
+                let mut connection = self.connection.take()?;
+                let examiner = self.examiner.clone();
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
-                let incarnation = self.proxy.ledger.incarnation();
-                let manner = examine::Manner {
-                    known: match (self.served, new) {
-                        (None, _) => Known::Nothing,
-                        (_, Some(pid)) => Known::New { pid },
-                        (served, None) if served == Some(incarnation) => Known::ServedIfPresent,
-                        _ => Known::InjectedIfPresent,
-                    },
+                let manner = Manner {
+                    known: examiner.known(new),
                     prepared: self.prepared.take(),
-                    injecting: self.injecting.clone(),
                 };
                 self.step = Some(Box::pin(async move {
-                    let examined = examine::examine(&proxy, &gate, &mut connection, manner);
-                    let examined = examined.await;
+                    let examined = examiner.examine(&mut connection, manner).await;
                     Done::Examined(connection, examined)
                 }));
             }
             Action::Probe => {
                 // A probe that was missed goes on: its answer counts whenever it comes.
                 self.probe_deadline =
-                    Some(tokio::time::Instant::now() + self.proxy.config.probe_timeout);
+                    Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
                 if self.step.is_none() {
-                    let proxy = self.proxy.clone();
+                    let Examiner {
+                        upstream, ledger, ..
+                    } = self.examiner.clone();
                     self.step = Some(Box::pin(async move {
-                        let fresh = connect_verified(&proxy.upstream, &proxy.ledger.token()).await;
+                        let fresh = connect_verified(&upstream, &ledger.token()).await;
                         Done::Probed(fresh)
                     }));
                 }
             }
             Action::ShutGate(cause) => self.shut_gate(cause),
             Action::OpenGate => self.open_gate(),
-            Action::Spawn => self.spawn()?,
+            Action::Spawn => return self.spawn(),
+            // Its caller has done it.
+            Action::GiveUp => {}
             Action::Kill => {
                 self.disconnect();
                 if let Some(process) = &self.process {
@@ -250,7 +253,7 @@ impl Driver {
                 }
             }
             Action::ReportCrashLoop(deaths) => {
-                self.proxy.board.set_crash_loop(true);
+                self.board.update(|facts| facts.crash_loop = true);
                 match self.process.as_ref().map(MasterProcess::last_words) {
                     Some(last_words) => tracing::error!(
                         deaths,
@@ -266,11 +269,11 @@ impl Driver {
                 }
             }
             Action::ReportCalm => {
-                self.proxy.board.set_crash_loop(false);
+                self.board.update(|facts| facts.crash_loop = false);
                 tracing::info!("the crash loop is over: the master lives");
             }
         }
-        Ok(())
+        None
     }
 
     fn done(&mut self, done: Done) -> Option<Input> {
@@ -291,20 +294,18 @@ impl Driver {
                 let outcome = examination.outcome;
                 if outcome == Outcome::Resumed {
                     // Somebody may have written past us.
-                    self.proxy.ledger.doubt();
+                    self.examiner.ledger.doubt();
                 } else {
                     self.thread_ended = thread_of(&connection, examination.pid);
                 }
                 self.connection = Some(connection);
-                self.injecting.store(false, Ordering::Relaxed);
                 self.report(examination);
                 Some(Input::Examined {
                     new: outcome.is_new(),
                 })
             }
             Done::Examined(_, Err(error)) => {
-                self.disconnect();
-                let master = self.proxy.upstream.address();
+                let master = self.examiner.upstream.address();
                 let input = error.as_input();
                 if input == Input::NotAMaster {
                     self.say(format!(
@@ -318,10 +319,7 @@ impl Driver {
                 Some(input)
             }
             // Another incarnation is there, and nobody has closed the connection to the one before.
-            Done::Probed(Err(VerifyError::OtherIncarnation)) => {
-                self.disconnect();
-                Some(Input::ConnectionLost)
-            }
+            Done::Probed(Err(VerifyError::OtherIncarnation)) => Some(Input::ConnectionLost),
             // Missed. If the master has just died, the connection before tells of it.
             Done::Probed(Err(_)) => None,
             Done::Probed(Ok(fresh)) => {
@@ -342,7 +340,7 @@ impl Driver {
 
     fn disconnect(&mut self) {
         // An injection that was under way has failed.
-        if !matches!(self.gate.state(), State::Open { .. }) {
+        if !self.examiner.gate.state().is_open() {
             self.keep_shut();
         }
         self.connection = None;
@@ -351,10 +349,10 @@ impl Driver {
         self.probe_deadline = None;
     }
 
-    /// Lets nothing pass; the mirror stands in if it is known.
+    /// Lets nothing pass; the mirror stands in if it may.
     fn keep_shut(&self) {
-        self.proxy.ledger.end_injection();
-        self.gate.set(match self.known {
+        self.examiner.ledger.end_injection();
+        self.examiner.gate.set(match self.lifecycle.may_stand_in() {
             true => State::StandingIn,
             false => State::Unknown,
         });
@@ -370,39 +368,25 @@ impl Driver {
             self.disconnect();
         }
         tracing::warn!(cause = cause.as_str(), "standing in for the master");
-        self.proxy.board.set_open(false);
         // What was prepared before is of another time.
         self.prepared = None;
     }
 
     fn open_gate(&mut self) {
-        self.known = true;
         self.said = None;
-        self.proxy.ledger.end_injection();
-        let incarnation = self.proxy.ledger.incarnation();
-        self.served = Some(incarnation);
-        self.gate.set(State::Open { incarnation });
-        self.proxy.board.set_open(true);
+        self.examiner.open_gate();
     }
 
-    /// Whether a session begins that no master has served yet.
-    fn begins(&self) -> bool {
-        self.served.is_none() && !self.restored
-    }
-
-    fn spawn(&mut self) -> Result<(), ProcessError> {
-        // There is nothing to protect yet: better to say what is wrong than to try for ever.
-        let is_fatal = self.begins() && self.proxy.ledger.pending() == 0;
-        let Some(process) = &mut self.process else {
-            return Ok(());
-        };
-        match process.spawn(&self.proxy) {
-            Ok(()) => Ok(()),
-            Err(error) if is_fatal => Err(error),
+    fn spawn(&mut self) -> Option<Input> {
+        let Examiner {
+            ledger, upstream, ..
+        } = &self.examiner;
+        match self.process.as_mut()?.spawn(ledger, upstream) {
+            Ok(()) => Some(Input::Spawned),
             Err(error) => {
-                process.report_failure();
-                self.say(format!("cannot start a master: {error}"));
-                Ok(())
+                let pending = ledger.pending() > 0;
+                self.spawn_error = Some(error);
+                Some(Input::SpawnFailed { pending })
             }
         }
     }

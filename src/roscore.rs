@@ -1,7 +1,11 @@
 //! What roscore does besides running a master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
 
 use std::{
-    sync::{Arc, atomic::Ordering},
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -9,9 +13,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::nodes::client::{self, Sign};
 use crate::{
+    gate,
+    ledger::Ledger,
     master::Kind,
     process::{self, Rosout},
-    proxy::Proxy,
+    write_queue::WriteQueue,
     xmlrpc::{Call, Reply, Value},
 };
 
@@ -27,53 +33,71 @@ const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 /// The node that rosout is.
 const ROSOUT: &str = "/rosout";
 
+/// What its duties need.
+pub struct Roscore {
+    /// Whether the parameters are set already.
+    pub ledger: Arc<Ledger>,
+    /// The way to the master.
+    pub write_queue: WriteQueue,
+    /// Whether calls pass to it.
+    pub gate: gate::Rx,
+    /// Our own address.
+    pub uri: String,
+    /// The checkpoint's path, which tells our rosout from others.
+    pub checkpoint: PathBuf,
+    /// How long a node may take to answer.
+    pub node_timeout: Duration,
+    /// Process id of rosout, if we run it; else 0.
+    pub rosout: AtomicU32,
+}
+
 fn set(key: &str, value: &str) -> Call {
     Call::new("setParam", vec![CALLER_ID.into(), key.into(), value.into()])
 }
 
-fn has(proxy: &Proxy, key: &str) -> bool {
+fn has(roscore: &Roscore, key: &str) -> bool {
     let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
     let yes = Value::Bool(true);
-    matches!(proxy.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
+    matches!(roscore.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
 }
 
-fn run_id(proxy: &Proxy) -> Call {
-    set("/run_id", &proxy.ledger.session().id)
+fn run_id(roscore: &Roscore) -> Call {
+    set("/run_id", &roscore.ledger.session().id)
 }
 
 /// Gives a new session its run id before there is a master: it is injected with the rest, so that
 /// no roslaunch ever sees a master without one. Not if there may be a master that has one.
-pub fn seed_run_id(proxy: &Proxy) {
-    if !has(proxy, "/run_id") {
-        proxy.ledger.seed(&run_id(proxy));
+pub fn seed_run_id(roscore: &Roscore) {
+    if !has(roscore, "/run_id") {
+        roscore.ledger.seed(&run_id(roscore));
     }
 }
 
 /// Does the rest once the master is there, until `stop`; then ends rosout.
-pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
+pub async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
     let duties = async {
         // They take their time: while the master starts, too.
         let versions = tokio::join!(
-            version(&proxy, "/rosversion", "roslaunch"),
-            version(&proxy, "/rosdistro", "-d"),
-            proxy.board.first_opening(),
+            version(&roscore, "/rosversion", "roslaunch"),
+            version(&roscore, "/rosdistro", "-d"),
+            first_opening(&roscore),
         );
-        let missing = Some(run_id(&proxy)).filter(|_| !has(&proxy, "/run_id"));
+        let missing = Some(run_id(&roscore)).filter(|_| !has(&roscore, "/run_id"));
         let calls: Vec<_> = [missing, versions.0, versions.1]
             .into_iter()
             .flatten()
             .collect();
         if !calls.is_empty() {
-            proxy
+            roscore
                 .write_queue
                 .call(Call::multicall(calls), Kind::Mutate)
                 .await;
         }
     };
     let rosout = async {
-        proxy.board.first_opening().await;
+        first_opening(&roscore).await;
         if rosout {
-            keep_rosout(&proxy).await;
+            keep_rosout(&roscore).await;
         }
     };
     tokio::select! {
@@ -82,12 +106,17 @@ pub async fn run(proxy: Arc<Proxy>, rosout: bool, stop: CancellationToken) {
     }
     stop.cancelled().await;
     // Only now nobody starts another one. It still takes itself out of the master.
-    end_rosout(&proxy).await;
+    end_rosout(&roscore).await;
+}
+
+/// Returns when calls have passed to a master for the first time.
+async fn first_opening(roscore: &Roscore) {
+    roscore.gate.clone().wait_for(gate::State::is_open).await;
 }
 
 /// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
-async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
-    if has(proxy, key) {
+async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Call> {
+    if has(roscore, key) {
         return None;
     }
     let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
@@ -98,25 +127,28 @@ async fn version(proxy: &Proxy, key: &str, argument: &str) -> Option<Call> {
 }
 
 /// Keeps a rosout running: ours, or one that is there already.
-async fn keep_rosout(proxy: &Proxy) {
-    let Some(rosout) = Rosout::find(&proxy.config.checkpoint) else {
+async fn keep_rosout(roscore: &Roscore) {
+    let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!("no rosout is installed (apt-get install rosout): /rosout is not collected");
         return;
     };
     let mut pause = RESPAWN;
     loop {
         let start = Instant::now();
-        match living_rosout(proxy).await.or_else(|| rosout.left_behind()) {
+        match living_rosout(roscore)
+            .await
+            .or_else(|| rosout.left_behind())
+        {
             Some(pid) => {
-                proxy.rosout.store(pid, Ordering::Relaxed);
+                roscore.rosout.store(pid, Ordering::Relaxed);
                 while process::is_alive(pid) {
                     tokio::time::sleep(RESPAWN).await;
                 }
             }
-            None => match rosout.spawn(&proxy.uri) {
+            None => match rosout.spawn(&roscore.uri) {
                 Ok(mut child) => {
                     let pid = child.id().unwrap_or_default();
-                    proxy.rosout.store(pid, Ordering::Relaxed);
+                    roscore.rosout.store(pid, Ordering::Relaxed);
                     tracing::info!(pid, "started rosout");
                     let how = child.wait().await.map(process::describe);
                     let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
@@ -125,7 +157,7 @@ async fn keep_rosout(proxy: &Proxy) {
                 Err(error) => tracing::warn!(%error, "cannot start rosout"),
             },
         }
-        proxy.rosout.store(0, Ordering::Relaxed);
+        roscore.rosout.store(0, Ordering::Relaxed);
         if start.elapsed() >= LONGEST_RESPAWN {
             pause = RESPAWN;
         }
@@ -135,12 +167,12 @@ async fn keep_rosout(proxy: &Proxy) {
 }
 
 /// The process id of the registered rosout, if it answers.
-async fn living_rosout(proxy: &Proxy) -> Option<u32> {
-    let api = proxy
+async fn living_rosout(roscore: &Roscore) -> Option<u32> {
+    let api = roscore
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
     let call = Call::new("getPid", vec![CALLER_ID.into()]);
-    match client::ask_for(&api, &call, proxy.config.node_timeout).await {
+    match client::ask_for(&api, &call, roscore.node_timeout).await {
         (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }
@@ -150,10 +182,10 @@ async fn living_rosout(proxy: &Proxy) -> Option<u32> {
 const STARTED: Duration = Duration::from_millis(500);
 
 /// Ends rosout in order.
-async fn end_rosout(proxy: &Proxy) {
-    let pid = match proxy.rosout.load(Ordering::Relaxed) {
+async fn end_rosout(roscore: &Roscore) {
+    let pid = match roscore.rosout.load(Ordering::Relaxed) {
         // One may have been left to us, and not have been found yet.
-        0 => Rosout::find(&proxy.config.checkpoint).and_then(|rosout| rosout.left_behind()),
+        0 => Rosout::find(&roscore.checkpoint).and_then(|rosout| rosout.left_behind()),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };

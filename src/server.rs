@@ -2,9 +2,42 @@
 
 pub mod admission;
 pub mod body;
+pub mod calls;
 pub mod clients;
 pub mod deadlines;
 pub mod idle;
 pub mod listener;
 pub mod pages;
+pub mod replies;
 pub mod service;
+
+use std::sync::Arc;
+
+use tokio::sync::{Notify, Semaphore};
+
+use self::{calls::Calls, clients::Clients, idle::Idle, pages::Pages};
+use crate::status::stats::Stats;
+
+/// What a request meets, whatever it asks for.
+pub struct Server {
+    /// Names of this computer, for the checks on `Host` and `Origin`.
+    pub names: Vec<String>,
+    /// Tells this process from every other; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
+    pub instance: String,
+    /// Notified when a request of our own came back to us: the master's address is our own.
+    pub looped: Arc<Notify>,
+    /// Who is connected.
+    pub clients: Arc<Clients>,
+    /// Those of them without a request.
+    pub idle: Idle,
+    /// Largest body, in bytes.
+    pub max_body: usize,
+    /// Memory for large bodies, in KiB.
+    pub bodies: Semaphore,
+    /// What is counted.
+    pub stats: &'static Stats,
+    /// Answers calls.
+    pub calls: Calls,
+    /// Answers people and monitors.
+    pub pages: Pages,
+}

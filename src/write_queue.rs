@@ -7,7 +7,7 @@ mod outdated;
 mod round_trip;
 mod worker;
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use tokio::{
     sync::{Notify, mpsc, oneshot, watch},
@@ -17,7 +17,11 @@ use tokio::{
 use self::batch::{Answer, Condition, Item};
 pub use self::worker::Worker;
 use crate::{
+    gate,
+    ledger::Ledger,
     master::Kind,
+    status::stats::Stats,
+    upstream::Upstream,
     xmlrpc::{self, Call, Reply},
 };
 
@@ -34,13 +38,13 @@ pub struct WriteQueue {
 
 impl WriteQueue {
     /// Puts a call in the queue.
-    pub(super) async fn submit(&self, item: Item) {
+    pub(crate) async fn submit(&self, item: Item) {
         // The worker is gone only when rosrescue stops; the answer's sender is dropped then.
         let _ = self.items.send(item).await;
     }
 
     /// When the batch was sent that the master has not answered yet, if there is one.
-    pub(super) fn unanswered_since(&self) -> Option<Instant> {
+    pub(crate) fn unanswered_since(&self) -> Option<Instant> {
         *self.sent.borrow()
     }
 
@@ -83,11 +87,34 @@ impl WriteQueue {
     }
 }
 
-/// Makes a write queue; the second part is to be run.
-pub fn write_queue() -> (WriteQueue, Worker) {
+/// Makes a write queue; the second part is to be run. `resync_interval`: how often the master is compared
+/// with the mirror, if it is to be.
+pub fn write_queue(
+    ledger: Arc<Ledger>,
+    upstream: Arc<Upstream>,
+    gate: gate::Rx,
+    stats: &'static Stats,
+    resync_interval: Option<Duration>,
+) -> (WriteQueue, Worker) {
     let (items, rx) = mpsc::channel(CHANNEL);
     let lost = Arc::new(Notify::new());
     let (tell_sent, sent) = watch::channel(None);
-    let worker = Worker::new(rx, lost.clone(), tell_sent);
+    let link = Link { ledger, upstream };
+    let worker = Worker::new(
+        rx,
+        link,
+        gate,
+        stats,
+        resync_interval,
+        lost.clone(),
+        tell_sent,
+    );
     (WriteQueue { items, lost, sent }, worker)
+}
+
+/// What a batch travels with.
+#[derive(Clone)]
+struct Link {
+    ledger: Arc<Ledger>,
+    upstream: Arc<Upstream>,
 }

@@ -11,40 +11,62 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    gate::State,
+    gate::{self, State},
     guardian::handover::{self, Guard},
-    proxy::Proxy,
-    status::Guarded,
+    ledger::Ledger,
+    status::{Board, Guarded},
 };
 
 /// How often systemd may be told another status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Begins to tell them. `stop` is told as the begin of the end.
-pub(super) fn start(guard: Guard, proxy: &Arc<Proxy>, stop: CancellationToken) {
-    match guard {
-        Guard::Nobody => proxy.board.set_guarded(Guarded::Nobody),
-        Guard::Systemd => proxy.board.set_guarded(Guarded::Systemd),
+pub(super) fn start(guard: Guard, told: Told, stop: CancellationToken) {
+    let guarded = match guard {
+        Guard::Nobody => Guarded::Nobody,
+        Guard::Systemd => Guarded::Systemd,
         Guard::Guardian { pid, link } => {
-            proxy.board.set_guarded(Guarded::Guardian(pid));
-            tokio::spawn(follow_guardian(pid, link, proxy.clone()));
+            tokio::spawn(follow_guardian(pid, link, told.clone()));
+            Guarded::Guardian(pid)
         }
-    }
+    };
+    told.board.update(|facts| facts.guarded = guarded);
     if std::env::var_os("NOTIFY_SOCKET").is_some() {
-        tokio::spawn(report_ready(proxy.clone()));
-        tokio::spawn(report_status(proxy.clone(), stop));
+        tokio::spawn(report_ready(told.clone()));
+        tokio::spawn(report_status(told, stop));
+    }
+}
+
+/// What they are told.
+#[derive(Clone)]
+pub(super) struct Told {
+    pub(super) board: Arc<Board>,
+    pub(super) ledger: Arc<Ledger>,
+    pub(super) gate: gate::Rx,
+}
+
+impl Told {
+    fn line(&self) -> String {
+        let unprotected = self.ledger.unprotected();
+        self.board.read().line(self.gate.is_open(), unprotected)
+    }
+
+    /// Returns when calls are answered, by a master or by the mirror.
+    async fn answers(&self) {
+        let mut gate = self.gate.clone();
+        gate.wait_for(|state| state != State::Unknown).await;
     }
 }
 
 /// Tells the guardian when calls are answered, and people when the guardian is gone.
-async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
+async fn follow_guardian(pid: u32, link: StdLink, told: Told) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
     let Ok(mut link) = link else { return };
     let (mut from, mut to) = link.split();
     let served = async {
-        answers(&proxy).await;
+        told.answers().await;
         // If nobody takes it the other half tells.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
@@ -56,7 +78,8 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
         _ = &mut ended => {}
         () = served => drop(ended.await),
     }
-    proxy.board.set_guarded(Guarded::NoLonger(pid));
+    told.board
+        .update(|facts| facts.guarded = Guarded::NoLonger(pid));
     tracing::warn!(
         pid,
         "unguarded: the guardian process has ended; all goes on, but if rosrescue dies now, \
@@ -65,21 +88,15 @@ async fn follow_guardian(pid: u32, link: StdLink, proxy: Arc<Proxy>) {
     );
 }
 
-/// Returns when calls are answered, by a master or by the mirror.
-async fn answers(proxy: &Proxy) {
-    let mut gate = proxy.gate.clone();
-    gate.wait_for(|state| state != State::Unknown).await;
-}
-
-async fn report_ready(proxy: Arc<Proxy>) {
-    answers(&proxy).await;
-    let line = proxy.board.line(proxy.ledger.unprotected());
+async fn report_ready(told: Told) {
+    told.answers().await;
+    let line = told.line();
     send(&[NotifyState::Ready, NotifyState::Status(&line)]);
 }
 
 /// Tells systemd the state in a line, and feeds its watchdog. That takes a timer and a thread of the
 /// runtime, and the locks of the board and of the mirror: what calls need, too.
-async fn report_status(proxy: Arc<Proxy>, stop: CancellationToken) {
+async fn report_status(told: Told, stop: CancellationToken) {
     // Twice as often as necessary, as systemd asks for.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));
@@ -97,7 +114,7 @@ async fn report_status(proxy: Arc<Proxy>, stop: CancellationToken) {
                 Instant::now()
             }
         };
-        let line = proxy.board.line(proxy.ledger.unprotected());
+        let line = told.line();
         if !stopping && line != last {
             send(&[NotifyState::Status(&line)]);
             last = line;

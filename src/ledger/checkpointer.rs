@@ -4,13 +4,14 @@
 //! did is in no journal.
 
 use std::{
+    path::PathBuf,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use tokio_util::sync::CancellationToken;
 
-use crate::proxy::Proxy;
+use super::Ledger;
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
     cli::SyncPolicy,
@@ -25,26 +26,34 @@ const QUIET: Duration = Duration::from_secs(2);
 /// but not more often than this: a memory card wears out.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// Keeps the checkpoint until `stop`.
-pub async fn run(proxy: Arc<Proxy>, stop: CancellationToken) {
+/// Keeps the checkpoint of `ledger` at `path` until `stop`, and forces it to the disk every `sync_interval`,
+/// unless the ledger's policy has it otherwise.
+pub async fn run(
+    ledger: Arc<Ledger>,
+    path: PathBuf,
+    sync_interval: Duration,
+    stop: CancellationToken,
+) {
     let mut checkpointer = Checkpointer {
         seq: 0,
         recorded_at: Instant::now(),
         compacted_at: None,
         failed_at: None,
         // Logged when the checkpoint was opened.
-        said: proxy.ledger.unprotected(),
-        proxy,
+        said: ledger.unprotected(),
+        sync: ledger.sync,
+        ledger,
+        path,
+        sync_interval,
     };
     loop {
-        let proxy = &checkpointer.proxy;
         tokio::select! {
             () = stop.cancelled() => return,
-            () = proxy.ledger.work.notified() => {}
+            () = checkpointer.ledger.work.notified() => {}
             () = tokio::time::sleep(LOOK) => {}
         }
         checkpointer.round(true).await;
-        if checkpointer.proxy.config.sync != SyncPolicy::Always {
+        if checkpointer.sync != SyncPolicy::Always {
             tokio::select! {
                 () = stop.cancelled() => return,
                 () = checkpointer.pause() => {}
@@ -54,7 +63,10 @@ pub async fn run(proxy: Arc<Proxy>, stop: CancellationToken) {
 }
 
 struct Checkpointer {
-    proxy: Arc<Proxy>,
+    ledger: Arc<Ledger>,
+    path: PathBuf,
+    sync: SyncPolicy,
+    sync_interval: Duration,
     /// The journal's last record at the last round.
     seq: u64,
     recorded_at: Instant,
@@ -67,7 +79,7 @@ struct Checkpointer {
 impl Checkpointer {
     /// Until the next sync, however long that is: the file is looked at all the same.
     async fn pause(&mut self) {
-        let end = Instant::now() + self.proxy.config.sync_interval;
+        let end = Instant::now() + self.sync_interval;
         loop {
             let rest = end.saturating_duration_since(Instant::now());
             tokio::time::sleep(rest.min(LOOK)).await;
@@ -79,11 +91,10 @@ impl Checkpointer {
     }
 
     async fn round(&mut self, sync: bool) {
-        if self.proxy.ledger.with_store(|_, _| ()).is_none() {
+        if self.ledger.with_store(|_, _| ()).is_none() {
             self.open_again().await;
         }
-        self.sync(sync && self.proxy.config.sync != SyncPolicy::Never)
-            .await;
+        self.sync(sync && self.sync != SyncPolicy::Never).await;
         // Also of what the next lines repair at once.
         self.say_protection();
         if self.compaction_is_due() {
@@ -94,7 +105,7 @@ impl Checkpointer {
 
     /// Checks the file and, if it `syncs`, brings it to the disk.
     async fn sync(&self, syncs: bool) {
-        let ledger = &self.proxy.ledger;
+        let ledger = &self.ledger;
         let jobs = ledger.with_store(|store, _| {
             let check = store.check_job();
             (check, syncs.then(|| store.sync_job()).flatten())
@@ -124,8 +135,8 @@ impl Checkpointer {
 
     fn compaction_is_due(&mut self) -> bool {
         let now = Instant::now();
-        let due = self.proxy.ledger.checkpoint_due();
-        let state = self.proxy.ledger.with_store(|store, _| {
+        let due = self.ledger.checkpoint_due();
+        let state = self.ledger.with_store(|store, _| {
             (
                 store.unprotected().is_some(),
                 store.wants_compaction(),
@@ -152,7 +163,7 @@ impl Checkpointer {
     }
 
     async fn compact(&mut self) {
-        let ledger = &self.proxy.ledger;
+        let ledger = &self.ledger;
         let begun = ledger.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
         let finished = match begun {
             None => return,
@@ -170,11 +181,11 @@ impl Checkpointer {
             }
             _ => {
                 self.compacted_at = Some(Instant::now());
-                if self.proxy.config.sync == SyncPolicy::Always {
+                if self.sync == SyncPolicy::Always {
                     // The new file's name is not on the disk yet.
                     self.sync(true).await;
                 }
-                self.proxy.ledger.set_attempted(Ok(()));
+                self.ledger.set_attempted(Ok(()));
             }
         }
     }
@@ -182,24 +193,24 @@ impl Checkpointer {
     /// The checkpoint could not be opened at the start: perhaps now. Nothing of it is read, what the
     /// memory holds is newer; but it is kept, since nobody has seen what it holds.
     async fn open_again(&self) {
-        let path = self.proxy.config.checkpoint.clone();
+        let path = self.path.clone();
         let opened = tokio::task::spawn_blocking(move || Store::open_over(&path)).await;
         if let Ok(Ok(store)) = opened {
-            self.proxy.ledger.set_store(store);
+            self.ledger.set_store(store);
         }
     }
 
     /// Says, once, that the state is no longer recorded, and that it is again.
     fn say_protection(&mut self) {
-        let path = self.proxy.config.checkpoint.display();
-        let kept = self.proxy.ledger.with_store(|store, _| store.take_kept());
+        let path = self.path.display();
+        let kept = self.ledger.with_store(|store, _| store.take_kept());
         if let Some(kept) = kept.flatten() {
             tracing::warn!(
                 checkpoint = %path, kept = %kept.display(),
                 "what was at the checkpoint's path is kept under another name"
             );
         }
-        let unprotected = self.proxy.ledger.unprotected();
+        let unprotected = self.ledger.unprotected();
         match (&unprotected, &self.said) {
             (Some(reason), None) => tracing::error!(
                 checkpoint = %path, reason,

@@ -5,6 +5,7 @@ use crate::checkpoint::{
     format::Checkpoint,
     store::{Store, StoreError},
 };
+use crate::cli::SyncPolicy;
 
 /// How far whole checkpoints have come, in versions of the mirror.
 #[derive(Debug, Default)]
@@ -26,6 +27,12 @@ impl Whole {
 }
 
 impl Ledger {
+    /// The record that has to be on the disk before a call whose last record is `seq` is answered; none if
+    /// the policy wants none.
+    pub fn to_await(&self, seq: Option<u64>) -> Option<u64> {
+        seq.filter(|_| self.sync == SyncPolicy::Always)
+    }
+
     /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
     pub async fn durable(&self, seq: u64) {
         let mut durable = self.durable.subscribe();

@@ -44,6 +44,21 @@ impl Ledger {
         }
     }
 
+    /// The present incarnation is served from now on: its number. The mirror may change again.
+    pub fn serve(&self) -> u64 {
+        let mut inner = self.lock();
+        inner.injecting = false;
+        let incarnation = inner.session.incarnation;
+        inner.served = Some(incarnation);
+        incarnation
+    }
+
+    /// Whether the present incarnation has been served; none if none ever was.
+    pub fn has_served_present(&self) -> Option<bool> {
+        let inner = self.lock();
+        inner.served.map(|of| of == inner.session.incarnation)
+    }
+
     /// The mirror may change again.
     pub fn end_injection(&self) {
         self.lock().injecting = false;

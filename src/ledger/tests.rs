@@ -9,6 +9,7 @@ fn ledger() -> Ledger {
         Session::default(),
         Vec::new(),
         None,
+        SyncPolicy::Interval,
         stats,
     )
 }

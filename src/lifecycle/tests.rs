@@ -54,9 +54,21 @@ impl Script {
         let mut script = Self::new(supervision);
         match supervision {
             Supervision::Ours => script
-                .feed(Input::Start { left: false }, &[Action::Spawn])
+                .feed(
+                    Input::Start {
+                        left: false,
+                        restored: false,
+                    },
+                    &[Action::Spawn],
+                )
                 .feed(Input::Spawned, &[Action::Connect]),
-            Supervision::Theirs => script.feed(Input::Start { left: false }, &[Action::Connect]),
+            Supervision::Theirs => script.feed(
+                Input::Start {
+                    left: false,
+                    restored: false,
+                },
+                &[Action::Connect],
+            ),
         };
         script.serve(true);
         script
@@ -144,7 +156,13 @@ fn an_idle_connection_that_the_master_closed_is_no_death() {
 fn a_master_that_was_left_is_taken_over_and_replaced_when_it_ends() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(
+            Input::Start {
+                left: true,
+                restored: false,
+            },
+            &[Action::Connect],
+        )
         .feed(Input::Refused, &[])
         .wake(Duration::from_millis(1), &[Action::Connect])
         .serve(false)
@@ -157,7 +175,13 @@ fn a_master_that_was_left_is_taken_over_and_replaced_when_it_ends() {
 fn a_master_that_was_left_hanging_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(
+            Input::Start {
+                left: true,
+                restored: false,
+            },
+            &[Action::Connect],
+        )
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::Unreachable, &[Action::Kill])
         .feed(Input::Exited, &[Action::Spawn]);
@@ -168,7 +192,13 @@ fn a_master_that_was_left_hanging_is_killed() {
 fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { left: true }, &[Action::Connect])
+        .feed(
+            Input::Start {
+                left: true,
+                restored: false,
+            },
+            &[Action::Connect],
+        )
         .feed(Input::Unreachable, &[]);
     script.now += START_LIMIT + Duration::from_secs(1);
     script
@@ -177,7 +207,13 @@ fn a_master_that_was_left_and_takes_no_connection_is_killed() {
         .feed(Input::Exited, &[Action::Spawn]);
     // Those of others are waited for.
     let mut script = Script::new(Supervision::Theirs);
-    script.feed(Input::Start { left: false }, &[Action::Connect]);
+    script.feed(
+        Input::Start {
+            left: false,
+            restored: false,
+        },
+        &[Action::Connect],
+    );
     script.now += START_LIMIT * 2;
     script.feed(Input::Unreachable, &[]);
 }
@@ -188,7 +224,13 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
     for answer in [Input::NotAMaster, Input::ConnectionLost] {
         let mut script = Script::new(Supervision::Ours);
         script
-            .feed(Input::Start { left: false }, &[Action::Spawn])
+            .feed(
+                Input::Start {
+                    left: false,
+                    restored: false,
+                },
+                &[Action::Spawn],
+            )
             .feed(Input::Spawned, &[Action::Connect])
             .feed(Input::Connected, &[Action::Examine])
             .feed(answer, &[]);
@@ -200,7 +242,13 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
             .feed(Input::Exited, &[Action::Spawn]);
         // Those of others are never given up.
         let mut script = Script::new(Supervision::Theirs);
-        script.feed(Input::Start { left: false }, &[Action::Connect]);
+        script.feed(
+            Input::Start {
+                left: false,
+                restored: false,
+            },
+            &[Action::Connect],
+        );
         script.now += START_LIMIT * 2;
         script.feed(Input::Connected, &[Action::Examine]);
         let actions = script.machine.on(script.now, answer);
@@ -261,7 +309,13 @@ fn a_hung_external_master_is_asked_again_and_never_killed() {
 fn a_child_that_never_listens_is_killed() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { left: false }, &[Action::Spawn])
+        .feed(
+            Input::Start {
+                left: false,
+                restored: false,
+            },
+            &[Action::Spawn],
+        )
         .feed(Input::Spawned, &[Action::Connect]);
     script.now += START_LIMIT + Duration::from_secs(1);
     script
@@ -273,7 +327,13 @@ fn a_child_that_never_listens_is_killed() {
 fn a_master_that_dies_while_it_is_examined_is_replaced_without_a_rush() {
     let mut script = Script::new(Supervision::Ours);
     script
-        .feed(Input::Start { left: false }, &[Action::Spawn])
+        .feed(
+            Input::Start {
+                left: false,
+                restored: false,
+            },
+            &[Action::Spawn],
+        )
         .feed(Input::Spawned, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[])
@@ -315,7 +375,44 @@ fn a_master_that_is_still_dying_dies_once() {
     script
         .feed(Input::Wake, &[])
         .feed(Input::Connected, &[Action::Examine]);
-    script.machine.answered();
+    script.feed(Input::Answered, &[]);
     script.feed(Input::ConnectionLost, &[]);
     assert_eq!(script.machine.deaths(), 3, "another one had answered");
+}
+
+#[test]
+fn a_session_that_has_nothing_to_lose_ends_if_no_master_can_be_started() {
+    for (restored, pending, expected) in [
+        (false, false, &[Action::GiveUp][..]),
+        (false, true, &[]),
+        (true, false, &[]),
+    ] {
+        let mut script = Script::new(Supervision::Ours);
+        script
+            .feed(
+                Input::Start {
+                    left: false,
+                    restored,
+                },
+                &[Action::Spawn],
+            )
+            .feed(Input::SpawnFailed { pending }, expected);
+    }
+}
+
+#[test]
+fn the_mirror_stands_in_once_it_is_known_to_be_a_masters_state() {
+    for (supervision, left, restored, expected) in [
+        (Supervision::Ours, false, false, true),
+        (Supervision::Ours, true, false, false),
+        (Supervision::Theirs, false, false, false),
+        (Supervision::Theirs, false, true, true),
+    ] {
+        let mut machine = Lifecycle::new(supervision, PROBING);
+        machine.on(Instant::now(), Input::Start { left, restored });
+        assert_eq!(machine.may_stand_in(), expected);
+        machine.on(Instant::now(), Input::Connected);
+        machine.on(Instant::now(), Input::Examined { new: true });
+        assert!(machine.may_stand_in() && machine.has_served() && !machine.begins());
+    }
 }

@@ -28,7 +28,12 @@ pub enum Input {
         /// Whether a master that an earlier rosrescue spawned still runs. Its end is told as that of
         /// a child.
         left: bool,
+        /// Whether the mirror comes from a checkpoint whose session goes on.
+        restored: bool,
     },
+    /// The master that is examined has answered, and is being brought to the mirror's state: if it ends now,
+    /// that is a death of its own.
+    Answered,
     /// The connection to the master is there.
     Connected,
     /// Nothing listens at the master's address.
@@ -57,7 +62,10 @@ pub enum Input {
     /// A master was spawned.
     Spawned,
     /// No master could be spawned.
-    SpawnFailed,
+    SpawnFailed {
+        /// Whether the mirror has answered writes that no master has run yet.
+        pending: bool,
+    },
     /// The spawned master has ended.
     Exited,
     /// The time of [`Lifecycle::deadline`](super::Lifecycle::deadline) has come.
@@ -113,6 +121,9 @@ pub enum Action {
     Spawn,
     /// End the master at once.
     Kill,
+    /// End rosrescue: no master can be started, and there is no state that a later one could be given. Better
+    /// to say what is wrong than to try for ever.
+    GiveUp,
     /// Report a crash loop: the number of deaths within a minute.
     ReportCrashLoop(usize),
     /// Say that it no longer does.

@@ -20,20 +20,16 @@ use super::{
     client::{self, Interview, Sign},
     notifications,
 };
+use crate::status::report::{HealthCheck, Outcome};
 use crate::{
     gate::State,
     health::{Name, Reconciliation, Registration, Verdict, judge},
     ledger::activity::Activity,
     master::{self, CALLER_ID, Kind, Master},
-    proxy::Proxy,
     replay::Token,
     ros_env::MasterUri,
     write_queue::batch::{self, Condition},
     xmlrpc::{Call, Reply},
-};
-use crate::{
-    nodes,
-    status::report::{self, Outcome},
 };
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
@@ -51,15 +47,6 @@ pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
     PERMITS.acquire().await.ok()
 }
 
-/// What a health check found.
-#[derive(Debug, Default)]
-pub struct HealthCheck {
-    /// Nodes that are dead and have been taken out, through the master, so that others are told.
-    pub removed: Vec<String>,
-    /// Registrations that were added or taken back, because the node itself says so.
-    pub reconciled: Vec<String>,
-}
-
 /// What a visit to one port came to.
 #[derive(Debug)]
 pub(crate) struct CheckResult {
@@ -71,63 +58,61 @@ pub(crate) struct CheckResult {
 }
 
 /// What follows a recovery that took place since `outage`, beside traffic: who was not notified
-/// is told, and the health check is taken.
-pub(crate) async fn after_recovery(proxy: Arc<Proxy>, outage: Instant, outcome: Outcome) {
-    let under_way = Nodes::begin_check(&proxy);
+/// is told, and all nodes are asked. None if the next recovery has begun meanwhile.
+pub(crate) async fn after_recovery(
+    nodes: Arc<Nodes>,
+    outage: Instant,
+    outcome: Outcome,
+) -> Option<HealthCheck> {
+    let under_way = Nodes::begin_check(&nodes);
     // As if somebody did not answer, until the questions have been put.
-    let waiting = Waiting::new(&proxy);
-    let mut gate = proxy.gate.clone();
+    let waiting = Waiting::new(&nodes);
+    let mut gate = nodes.gate.clone();
     gate.wait_for(|state| matches!(state, State::Open { .. }))
         .await;
     let start = Instant::now();
-    let incarnation = proxy.ledger.incarnation();
+    let incarnation = nodes.ledger.incarnation();
     // Queued calls first: what nodes say in them is newer than what they say to us.
-    barrier(&proxy).await;
+    barrier(&nodes).await;
     let mut notified = match outcome {
         // A master that lives on notifies nodes itself.
         Outcome::Adopted => Vec::new(),
         Outcome::Reconciled => {
             // It may tell now what it knew before.
-            proxy
+            nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
-            nodes::tell_owed(&proxy, outage)
+            super::tell_owed(&nodes, outage)
         }
-        _ => nodes::tell_owed(&proxy, outage),
+        _ => super::tell_owed(&nodes, outage),
     };
     notified.sort();
-    let visits = begin_visits(&proxy);
+    let visits = begin_visits(&nodes);
     drop(waiting);
     let check = collect(visits).await;
     drop(under_way);
-    if proxy.ledger.incarnation() != incarnation {
-        // The next recovery reports.
-        return;
-    }
-    let unreachable = proxy.nodes.unreachable(&proxy.ledger);
-    let health_check_ms = report::ms(start.elapsed());
-    if let Some(report) = proxy
-        .board
-        .add_to_report(check, health_check_ms, notified, unreachable)
-    {
-        report.log("recovery is complete");
-    }
+    (nodes.ledger.incarnation() == incarnation).then(|| HealthCheck {
+        duration: start.elapsed(),
+        notified,
+        unreachable: nodes.unreachable(),
+        ..check
+    })
 }
 
 /// Returns when the writes that are queued now have been answered.
-async fn barrier(proxy: &Proxy) {
+async fn barrier(nodes: &Nodes) {
     let last = Call::new("getPid", vec![CALLER_ID.into()]);
     // Its answer does not matter.
-    proxy.write_queue.call(last, Kind::Mutate).await;
+    nodes.write_queue.call(last, Kind::Mutate).await;
 }
 
 /// Asks every node, all at the same time.
-pub async fn check_all(proxy: &Arc<Proxy>) -> HealthCheck {
-    collect(begin_visits(proxy)).await
+pub async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
+    collect(begin_visits(nodes)).await
 }
 
-fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<CheckResult> {
-    let apis: BTreeSet<String> = proxy.ledger.with_mirror(|mirror| {
+fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
+    let apis: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
         let apis = nodes.map(|(_, api)| api.to_owned());
         // What nobody can call, the master cannot either.
@@ -135,7 +120,7 @@ fn begin_visits(proxy: &Arc<Proxy>) -> JoinSet<CheckResult> {
     });
     let mut visits = JoinSet::new();
     for api in apis {
-        visits.spawn(visit(proxy, api));
+        visits.spawn(visit(nodes, api));
     }
     visits
 }
@@ -170,14 +155,14 @@ pub(crate) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<N
 
 /// Asks the node behind `api` until its answers allow a verdict.
 pub(crate) fn visit(
-    proxy: &Arc<Proxy>,
+    nodes: &Arc<Nodes>,
     api: String,
 ) -> impl Future<Output = CheckResult> + Send + 'static {
-    let (proxy, waiting) = (proxy.clone(), Waiting::new(proxy));
-    async move { converse(&proxy, &api, waiting).await }
+    let (nodes, waiting) = (nodes.clone(), Waiting::new(nodes));
+    async move { converse(&nodes, &api, waiting).await }
 }
 
-async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> CheckResult {
+async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
     let mut outcome = CheckResult {
         sign: Sign::Silent,
@@ -190,40 +175,40 @@ async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> CheckResul
         if question > 0 {
             tokio::time::sleep(SECOND_QUESTION).await;
         }
-        let asked = Asked::new(proxy, api);
+        let asked = Asked::new(nodes, api);
         if asked.names.is_empty() {
-            proxy.nodes.clear(proxy, api);
+            nodes.clear(api);
             break;
         }
         let permit = permit().await;
-        let interview = client::interview(api, proxy.config.node_timeout).await;
+        let interview = client::interview(api, nodes.timeout).await;
         drop(permit);
         outcome.sign = interview.sign;
         outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
         match interview.sign {
             Sign::Silent => {
-                proxy.nodes.mark_unreachable(proxy, api);
+                nodes.mark_unreachable(api);
                 break;
             }
             Sign::Dead => {
                 for name in &asked.names {
-                    if remove(proxy, name, api).await {
+                    if remove(nodes, name, api).await {
                         outcome.removed.push(name.node.clone());
                     }
                 }
-                proxy.nodes.clear(proxy, api);
+                nodes.clear(api);
                 break;
             }
             Sign::Alive => {
-                if proxy.nodes.clear(proxy, api) {
+                if nodes.clear(api) {
                     // Whatever was to be told meanwhile.
-                    notifications::tell_all(proxy, api);
+                    notifications::tell_all(nodes, api);
                 }
             }
         }
         drop(waiting.take());
-        let findings = asked.findings(proxy, api, &interview);
-        findings.act(proxy, api, &before, &mut outcome).await;
+        let findings = asked.findings(nodes, api, &interview);
+        findings.act(nodes, api, &before, &mut outcome).await;
         if findings.is_settled() {
             break;
         }
@@ -233,18 +218,18 @@ async fn converse(proxy: &Arc<Proxy>, api: &str, waiting: Waiting) -> CheckResul
 }
 
 /// Counts a question for as long as it has no answer.
-struct Waiting(Arc<Proxy>);
+struct Waiting(Arc<Nodes>);
 
 impl Waiting {
-    fn new(proxy: &Arc<Proxy>) -> Self {
-        proxy.nodes.unanswered.fetch_add(1, Ordering::Relaxed);
-        Self(proxy.clone())
+    fn new(nodes: &Arc<Nodes>) -> Self {
+        nodes.unanswered.fetch_add(1, Ordering::Relaxed);
+        Self(nodes.clone())
     }
 }
 
 impl Drop for Waiting {
     fn drop(&mut self) {
-        self.0.nodes.unanswered.fetch_sub(1, Ordering::Relaxed);
+        self.0.unanswered.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -262,8 +247,8 @@ struct Findings {
 }
 
 impl Asked {
-    fn new(proxy: &Proxy, api: &str) -> Self {
-        proxy.ledger.with_activity(|mirror, activity| {
+    fn new(nodes: &Nodes, api: &str) -> Self {
+        nodes.ledger.with_activity(|mirror, activity| {
             let names = names_at(mirror, activity, api);
             let last = names.iter().map(|name| activity.last_calls(&name.node));
             Self {
@@ -274,10 +259,10 @@ impl Asked {
     }
 
     /// The verdict, for nodes that have registered nothing since the question.
-    fn findings(&self, proxy: &Proxy, api: &str, interview: &Interview) -> Findings {
+    fn findings(&self, nodes: &Nodes, api: &str, interview: &Interview) -> Findings {
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();
-        proxy.ledger.with_activity(|mirror, activity| {
+        nodes.ledger.with_activity(|mirror, activity| {
             let verdicts = judge(mirror, &self.names, *pid, claims.as_ref());
             let judged = self.names.iter().zip(&self.unregistered).zip(verdicts);
             for ((name, unregistered), verdict) in judged {
@@ -324,12 +309,12 @@ impl Findings {
 
     /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
     /// first: what we register for a node counts as its own deed, and ends what else was found.
-    async fn act(&self, proxy: &Proxy, api: &str, before: &Self, outcome: &mut CheckResult) {
+    async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.strangers {
             let mut earlier = before.strangers.iter();
             let again =
                 earlier.any(|found| found.node == name.node && found.registered == name.registered);
-            if again && remove(proxy, name, api).await {
+            if again && remove(nodes, name, api).await {
                 outcome.removed.push(name.node.clone());
             }
         }
@@ -347,13 +332,13 @@ impl Findings {
             for one in &reconciliation.extra {
                 if confirmed(|reconciliation| &reconciliation.extra, one) {
                     let call = one.unregister(node, api);
-                    reconcile(proxy, one, condition, call, Kind::Unregister, outcome).await;
+                    reconcile(nodes, one, condition, call, Kind::Unregister, outcome).await;
                 }
             }
             for one in &reconciliation.missing {
                 if certain || confirmed(|reconciliation| &reconciliation.missing, one) {
                     let call = one.register(node, api);
-                    reconcile(proxy, one, condition, call, Kind::Mutate, outcome).await;
+                    reconcile(nodes, one, condition, call, Kind::Mutate, outcome).await;
                 }
             }
         }
@@ -362,7 +347,7 @@ impl Findings {
 
 /// Makes a call for a node, unless the node itself has done the contrary by the time at which it travels.
 async fn reconcile(
-    proxy: &Proxy,
+    nodes: &Nodes,
     one: &Registration,
     condition: &Condition,
     call: Call,
@@ -371,7 +356,7 @@ async fn reconcile(
 ) {
     // In a multicall it goes alone: it must not displace anybody.
     let alone = Call::multicall([call]);
-    let reply = proxy
+    let reply = nodes
         .write_queue
         .call_if(alone, kind, condition.clone())
         .await;
@@ -393,10 +378,10 @@ fn is_done(reply: &Reply) -> bool {
 
 /// Unregisters a node as it would have done itself. Not if it has another address by now, or has
 /// registered something since it was asked: then it has come back.
-async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
+async fn remove(nodes: &Nodes, name: &Name, api: &str) -> bool {
     // What it has on its way to the master comes first.
-    barrier(proxy).await;
-    let found = proxy.ledger.with_activity(|mirror, activity| {
+    barrier(nodes).await;
+    let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(&name.node);
         let same =
             mirror.api_of(&name.node) == Some(api) && last_calls.registered == name.registered;
@@ -407,7 +392,7 @@ async fn remove(proxy: &Proxy, name: &Name, api: &str) -> bool {
     };
     let node = name.node.clone();
     let (call, condition) = (Call::multicall(calls), Condition { node, last_calls });
-    let reply = proxy
+    let reply = nodes
         .write_queue
         .call_if(call, Kind::Unregister, condition)
         .await;

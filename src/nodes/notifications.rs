@@ -14,12 +14,14 @@ use std::{
 
 use tokio::sync::Semaphore;
 
-use super::client::{self, Sign};
+use super::{
+    Nodes,
+    client::{self, Sign},
+};
 use crate::{
     health::Claims,
     ledger::activity::{Displaced, Notification},
     master::{self, Master},
-    proxy::Proxy,
     xmlrpc::{Call, Value},
 };
 
@@ -60,19 +62,19 @@ impl Notifications {
 }
 
 /// Tells every subscriber of `topic` its publishers. Answers whether there are subscribers.
-pub fn tell_subscribers(proxy: &Arc<Proxy>, topic: &str) -> bool {
-    let subscribers = proxy
+pub fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
+    let subscribers = nodes
         .ledger
         .with_mirror(|mirror| mirror.subscribers_of(topic));
     for api in &subscribers {
-        send(proxy, api, Notification::Topic(topic.to_owned()));
+        send(nodes, api, Notification::Topic(topic.to_owned()));
     }
     !subscribers.is_empty()
 }
 
 /// Tells the node at `api` of every topic and every parameter that it subscribes.
-pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
-    let notifications = proxy.ledger.with_mirror(|mirror| {
+pub fn tell_all(nodes: &Arc<Nodes>, api: &str) {
+    let notifications = nodes.ledger.with_mirror(|mirror| {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
         let notifications = names.flat_map(|(name, _)| {
             let topics = mirror.subscriptions(name).map(str::to_owned);
@@ -86,24 +88,24 @@ pub fn tell_all(proxy: &Arc<Proxy>, api: &str) {
         notifications.collect::<Vec<_>>()
     });
     for notification in notifications {
-        send(proxy, api, notification);
+        send(nodes, api, notification);
     }
 }
 
 /// Notifies the node at `api`, unless it is unreachable: those are told everything as soon as they
 /// answer. Who does not take a notification becomes unreachable.
-pub fn send(proxy: &Arc<Proxy>, api: &str, notification: Notification) {
-    if proxy.nodes.is_unreachable(api) {
+pub fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
+    if nodes.is_unreachable(api) {
         return;
     }
-    let mut pending = proxy.nodes.notifications.lock();
+    let mut pending = nodes.notifications.lock();
     if let Some(queue) = pending.get_mut(api) {
         add(queue, notification);
         return;
     }
     pending.insert(api.to_owned(), VecDeque::from([notification]));
     drop(pending);
-    tokio::spawn(deliver(proxy.clone(), api.to_owned()));
+    tokio::spawn(deliver(nodes.clone(), api.to_owned()));
 }
 
 fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
@@ -134,8 +136,8 @@ fn latest(notification: Notification) -> Option<Notification> {
     })
 }
 
-async fn deliver(proxy: Arc<Proxy>, api: String) {
-    let notifications = &proxy.nodes.notifications;
+async fn deliver(nodes: Arc<Nodes>, api: String) {
+    let notifications = &nodes.notifications;
     loop {
         let notification = {
             let mut pending = notifications.lock();
@@ -148,15 +150,15 @@ async fn deliver(proxy: Arc<Proxy>, api: String) {
             }
         };
         let compose = || {
-            proxy
+            nodes
                 .ledger
                 .with_mirror(|mirror| compose(mirror, &api, &notification))
         };
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
         let Some(call) = compose() else { continue };
-        proxy.stats.notifications.count();
-        let mut asked = pin!(client::ask(&api, &call, proxy.config.node_timeout));
+        nodes.stats.notifications.count();
+        let mut asked = pin!(client::ask(&api, &call, nodes.timeout));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
             Err(_) => {
@@ -166,7 +168,7 @@ async fn deliver(proxy: Arc<Proxy>, api: String) {
         };
         if sign != Sign::Alive {
             notifications.lock().remove(&api);
-            proxy.nodes.mark_unreachable(&proxy, &api);
+            nodes.mark_unreachable(&api);
             return;
         }
         if compose().is_some_and(|now| now != call)
@@ -193,17 +195,17 @@ fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Ar
 
 /// Tells a node whose name another one has taken to shut down, as a master does, but never another node
 /// that has its address by now.
-pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
-    let proxy = proxy.clone();
+pub fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
+    let nodes = nodes.clone();
     tokio::spawn(async move {
         for seconds in SHUTDOWN_PAUSES {
             tokio::time::sleep(Duration::from_secs(seconds)).await;
-            if is_taken(&proxy, &displaced.api) {
+            if is_taken(&nodes, &displaced.api) {
                 return;
             }
             // Never closed.
-            let permit = proxy.nodes.notifications.permits.acquire().await;
-            let interview = client::interview(&displaced.api, proxy.config.node_timeout).await;
+            let permit = nodes.notifications.permits.acquire().await;
+            let interview = client::interview(&displaced.api, nodes.timeout).await;
             match interview.sign {
                 Sign::Dead => return,
                 Sign::Silent => continue,
@@ -211,15 +213,15 @@ pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
             }
             let Displaced { node, api, .. } = &displaced;
             if is_itself(&displaced, interview.pid, interview.claims.as_ref())
-                && !is_taken(&proxy, api)
+                && !is_taken(&nodes, api)
             {
                 tracing::info!(
                     node,
                     api,
                     "telling a node to shut down: another has its name"
                 );
-                proxy.stats.notifications.count();
-                client::ask(api, &master::shutdown(node), proxy.config.node_timeout).await;
+                nodes.stats.notifications.count();
+                client::ask(api, &master::shutdown(node), nodes.timeout).await;
             }
             drop(permit);
             return;
@@ -228,8 +230,8 @@ pub fn shut_down(proxy: &Arc<Proxy>, displaced: Displaced) {
 }
 
 /// Whether a node is registered at this address.
-fn is_taken(proxy: &Proxy, api: &str) -> bool {
-    proxy
+fn is_taken(nodes: &Nodes, api: &str) -> bool {
+    nodes
         .ledger
         .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
 }

@@ -2,28 +2,23 @@
 
 use std::{
     net::SocketAddr,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use super::stall_probe;
 use crate::status::report::Outcome;
 use crate::{
-    config::MasterConfig,
     gate::{State, Tx},
-    ledger::Basis,
-    lifecycle::Input,
+    ledger::{Basis, Ledger},
+    lifecycle::{Input, Probing, Supervision},
     master::{Counts, Master},
-    proxy::Proxy,
     replay::{self, Authority, Bears, Inspection, Plan, Token},
+    status::stats::Stats,
     upstream::{
-        CallError, Connection,
+        CallError, Connection, Upstream,
         inspect::{self, InspectError},
         sockets,
     },
@@ -99,8 +94,6 @@ pub struct Manner {
     pub known: Known,
     /// The injection into an empty master, made ready.
     pub prepared: Option<JoinHandle<Prepared>>,
-    /// Set as long as the master works for us.
-    pub injecting: Arc<AtomicBool>,
 }
 
 /// An injection, made ready.
@@ -114,10 +107,9 @@ pub struct Prepared {
 }
 
 /// Makes the injection into an empty master ready, beside everything else.
-pub fn prepare(proxy: &Arc<Proxy>) -> JoinHandle<Prepared> {
-    let proxy = proxy.clone();
+pub fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
     tokio::task::spawn_blocking(move || {
-        let (version, target, token) = proxy.ledger.next();
+        let (version, target, token) = ledger.next();
         let plan = Plan::new(&target, &Master::default(), &token);
         Prepared {
             complete: plan.expected() == &target,
@@ -144,77 +136,285 @@ pub enum Known {
     },
 }
 
-/// Examines the master behind `connection`.
-pub async fn examine(
-    proxy: &Arc<Proxy>,
-    tx: &Tx,
-    connection: &mut Connection,
-    manner: Manner,
-) -> Result<Examination, ExamineError> {
-    let start = Instant::now();
-    let served = matches!(manner.known, Known::ServedIfPresent);
-    let resumes =
-        |first: &Inspection| served && first.bears() == Bears::Present && proxy.ledger.resume();
-    let mut first = match manner.known {
-        Known::New { pid } => Inspection::at_new(pid),
-        _ => first_look(proxy, connection).await?,
-    };
-    let mut resumed = resumes(&first);
-    if !matches!(manner.known, Known::New { .. }) && !resumed {
-        settle(proxy, connection).await?;
-        proxy.ledger.settled();
-        first = first_look(proxy, connection).await?;
-        resumed = resumes(&first);
-    }
-    let mut examination = Examination {
-        outcome: Outcome::Resumed,
-        pid: first.pid(),
-        counts: Counts::default(),
-        skipped: Vec::new(),
-        mismatches: Vec::new(),
-        look: start.elapsed(),
-        injection: Duration::ZERO,
-    };
-    if !resumed {
-        inject(
-            proxy,
-            tx,
-            connection,
-            first,
-            manner,
-            start,
-            &mut examination,
-        )
-        .await?;
-    }
-    examination.injection = start.elapsed().saturating_sub(examination.look);
-    examination.counts = proxy.ledger.with_mirror(Master::counts);
-    Ok(examination)
+/// What is to be brought to a master, and how.
+struct Target {
+    state: Master,
+    found: Master,
+    /// The token that it bears, if everything that it holds is to be replaced.
+    replaced: Option<Token>,
 }
 
-/// Returns when the master can no longer be running a call of a connection that has been closed: what
-/// it holds counts only then.
-async fn settle(proxy: &Proxy, connection: &Connection) -> Result<(), ExamineError> {
-    let settled = async {
-        proxy.upstream.no_writers().await;
-        while may_run_a_call(connection.peer()).await {
-            tokio::time::sleep(SETTLE_PAUSE).await;
+/// Examines masters, and opens the gate to one that holds the mirror's state.
+#[derive(Clone)]
+pub struct Examiner {
+    /// Whose state a master is brought to.
+    pub ledger: Arc<Ledger>,
+    /// Where the master is.
+    pub upstream: Arc<Upstream>,
+    /// Tells everybody whether calls pass.
+    pub gate: Tx,
+    /// Who starts masters.
+    pub supervision: Supervision,
+    /// How a hung master is told from a slow one.
+    pub probing: Probing,
+    /// How long a probe may take.
+    pub probe_timeout: Duration,
+    /// What is counted.
+    pub stats: &'static Stats,
+}
+
+impl Examiner {
+    /// What is known of the master that is there now. `new`: the process id of one that has just been started,
+    /// and that nobody has spoken to.
+    pub(super) fn known(&self, new: Option<i32>) -> Known {
+        match (self.ledger.has_served_present(), new) {
+            (None, _) => Known::Nothing,
+            (_, Some(pid)) => Known::New { pid },
+            (Some(true), None) => Known::ServedIfPresent,
+            (Some(false), None) => Known::InjectedIfPresent,
         }
-    };
-    if tokio::time::timeout(SETTLE_LIMIT, settled).await.is_ok() {
-        return Ok(());
     }
-    match proxy.config.master {
-        // Replaced, like one that hangs.
-        MasterConfig::Supervised(_) => Err(ExamineError::Silent {
-            limit: SETTLE_LIMIT,
-        }),
-        MasterConfig::External(_) => {
-            tracing::warn!(
-                "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or \
-                 it does not close them; what they do from now on may be lost"
+
+    /// Lets calls pass to the present incarnation.
+    pub(super) fn open_gate(&self) {
+        let incarnation = self.ledger.serve();
+        self.gate.set(State::Open { incarnation });
+    }
+
+    /// Examines the master behind `connection`.
+    pub async fn examine(
+        &self,
+        connection: &mut Connection,
+        manner: Manner,
+    ) -> Result<Examination, ExamineError> {
+        let start = Instant::now();
+        let served = matches!(manner.known, Known::ServedIfPresent);
+        let resumes =
+            |first: &Inspection| served && first.bears() == Bears::Present && self.ledger.resume();
+        let mut first = match manner.known {
+            Known::New { pid } => Inspection::at_new(pid),
+            _ => self.first_look(connection).await?,
+        };
+        let mut resumed = resumes(&first);
+        if !matches!(manner.known, Known::New { .. }) && !resumed {
+            self.settle(connection).await?;
+            self.ledger.settled();
+            first = self.first_look(connection).await?;
+            resumed = resumes(&first);
+        }
+        let mut examination = Examination {
+            outcome: Outcome::Resumed,
+            pid: first.pid(),
+            counts: Counts::default(),
+            skipped: Vec::new(),
+            mismatches: Vec::new(),
+            look: start.elapsed(),
+            injection: Duration::ZERO,
+        };
+        if !resumed {
+            self.inject(connection, first, manner, start, &mut examination)
+                .await?;
+        }
+        examination.injection = start.elapsed().saturating_sub(examination.look);
+        examination.counts = self.ledger.with_mirror(Master::counts);
+        Ok(examination)
+    }
+
+    /// Returns when the master can no longer be running a call of a connection that has been closed: what
+    /// it holds counts only then.
+    async fn settle(&self, connection: &Connection) -> Result<(), ExamineError> {
+        let settled = async {
+            self.upstream.no_writers().await;
+            while may_run_a_call(connection.peer()).await {
+                tokio::time::sleep(SETTLE_PAUSE).await;
+            }
+        };
+        if tokio::time::timeout(SETTLE_LIMIT, settled).await.is_ok() {
+            return Ok(());
+        }
+        match self.supervision {
+            // Replaced, like one that hangs.
+            Supervision::Ours => Err(ExamineError::Silent {
+                limit: SETTLE_LIMIT,
+            }),
+            Supervision::Theirs => {
+                tracing::warn!(
+                    "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or \
+                     it does not close them; what they do from now on may be lost"
+                );
+                Ok(())
+            }
+        }
+    }
+
+    async fn inject(
+        &self,
+        connection: &mut Connection,
+        first: Inspection,
+        manner: Manner,
+        start: Instant,
+        examination: &mut Examination,
+    ) -> Result<(), ExamineError> {
+        let (bears, empty) = (first.bears(), first.is_empty());
+        let fresh = bears == Bears::Nothing && empty;
+        let ready = match manner.prepared {
+            Some(prepared) if fresh => prepared.await.ok(),
+            _ => None,
+        };
+        let found = match fresh {
+            true => Master::default(),
+            false => {
+                // What cannot be read back is taken from the mirror, of a master that was given it.
+                let previous = match bears {
+                    Bears::Nothing => Master::default(),
+                    _ => self.ledger.may_hold(),
+                };
+                self.while_alive(inspect::second(first, connection, &previous))
+                    .await?
+            }
+        };
+        examination.look = start.elapsed();
+        // From here to the open gate the mirror must not change: the master is compared with it.
+        self.gate.set(State::Injecting);
+        let Basis {
+            mirror,
+            version,
+            pending,
+        } = self.ledger.begin_injection();
+        let before = self.ledger.token();
+        // Nothing of ours to bring: a running system is taken over.
+        let takes_over = !found.is_empty() && mirror.is_empty();
+        let (state, replaced) = match bears {
+            Bears::Nothing => {
+                examination.outcome = if takes_over {
+                    Outcome::Adopted
+                } else if mirror.is_empty() {
+                    Outcome::Begun
+                } else {
+                    Outcome::Injected
+                };
+                (mirror.clone(), None)
+            }
+            // It has been succeeded since: whatever it holds is older than the mirror.
+            Bears::Earlier => {
+                examination.outcome = Outcome::Injected;
+                (mirror.clone(), Some(before))
+            }
+            Bears::Present => {
+                let (authority, outcome) = match manner.known {
+                    Known::ServedIfPresent => (Authority::PendingWrites, Outcome::Reconciled),
+                    Known::Nothing => (Authority::Mirror, Outcome::Adopted),
+                    _ => (Authority::Mirror, Outcome::Injected),
+                };
+                examination.outcome = outcome;
+                let state = replay::reconcile(&mirror, &found, &pending, authority);
+                // No look shows who subscribes parameters.
+                let hidden = |call: &crate::xmlrpc::Call| call.method.ends_with("bscribeParam");
+                if state == found && !pending.iter().any(hidden) {
+                    self.ledger.delivered();
+                    say_difference(&self.ledger.adopt(state));
+                    return Ok(());
+                }
+                (state, Some(before))
+            }
+        };
+        if state != mirror {
+            say_difference(&self.ledger.adopt(state.clone()));
+        }
+        let token = self.ledger.succeed();
+        let target = Target {
+            state,
+            found,
+            replaced,
+        };
+        let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
+        self.bring(connection, &target, &token, ready, examination)
+            .await
+    }
+
+    /// Brings the master to `target`, reads it back and leaves `token`.
+    async fn bring(
+        &self,
+        connection: &mut Connection,
+        target: &Target,
+        token: &Token,
+        ready: Option<Prepared>,
+        examination: &mut Examination,
+    ) -> Result<(), ExamineError> {
+        let Target {
+            state,
+            found,
+            replaced,
+        } = target;
+        let mut next = ready.unwrap_or_else(|| {
+            let plan = match replaced {
+                Some(before) => Plan::replace(state, found, before, token),
+                None => Plan::new(state, found, token),
+            };
+            Prepared {
+                basis: None,
+                complete: plan.expected() == state,
+                plan,
+            }
+        });
+        for round in 1..=ROUNDS {
+            let Prepared { plan, complete, .. } = next;
+            let reply = connection.predicted(plan.request().clone(), plan.answer());
+            let raw = self.while_alive(reply).await?;
+            examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
+            // The reply is long, and everybody waits: it is decoded only if it differs from the
+            // predicted one at all.
+            let verdict = match raw.body == plan.answer() {
+                true => Ok(()),
+                false => plan.verify(&raw.decode()?),
+            };
+            let Err(mismatches) = verdict else {
+                examination.mismatches.clear();
+                if !complete {
+                    self.ledger.adopt(plan.expected().clone());
+                }
+                self.ledger.delivered();
+                self.stats.injections.count();
+                // Thousands of small pieces, freed beside traffic.
+                tokio::task::spawn_blocking(move || drop(plan));
+                return Ok(());
+            };
+            examination.mismatches = mismatches.iter().map(ToString::to_string).collect();
+            tracing::error!(
+                round,
+                mismatches = ?examination.mismatches,
+                "the master differs from what was injected"
             );
-            Ok(())
+            // The truth of the master wins over what we expected of it; the rest is tried again.
+            let first = self.first_look(connection).await?;
+            let found = inspect::second(first, connection, plan.expected());
+            let found = self.while_alive(found).await?;
+            let plan = Plan::new(state, &found, token);
+            next = Prepared {
+                basis: None,
+                complete: plan.expected() == state,
+                plan,
+            };
+            if round == ROUNDS {
+                self.ledger.adopt(found);
+            }
+        }
+        Ok(())
+    }
+
+    async fn first_look(&self, connection: &mut Connection) -> Result<Inspection, ExamineError> {
+        self.while_alive(inspect::first(connection, &self.ledger.token()))
+            .await
+    }
+
+    /// Waits for what may take long, as long as the master shows signs of life.
+    async fn while_alive<T, E: Into<ExamineError>>(
+        &self,
+        work: impl Future<Output = Result<T, E>>,
+    ) -> Result<T, ExamineError> {
+        tokio::select! {
+            done = within(INJECTION_LIMIT, work) => done,
+            limit = self.silence() => Err(ExamineError::Silent { limit }),
         }
     }
 }
@@ -225,107 +425,6 @@ async fn may_run_a_call(master: SocketAddr) -> bool {
     looked.await.unwrap_or(false)
 }
 
-/// What is to be brought to a master, and how.
-struct Target {
-    state: Master,
-    found: Master,
-    /// The token that it bears, if everything that it holds is to be replaced.
-    replaced: Option<Token>,
-}
-
-async fn inject(
-    proxy: &Arc<Proxy>,
-    tx: &Tx,
-    connection: &mut Connection,
-    first: Inspection,
-    manner: Manner,
-    start: Instant,
-    examination: &mut Examination,
-) -> Result<(), ExamineError> {
-    let (bears, empty) = (first.bears(), first.is_empty());
-    let fresh = bears == Bears::Nothing && empty;
-    let ready = match manner.prepared {
-        Some(prepared) if fresh => prepared.await.ok(),
-        _ => None,
-    };
-    let found = match fresh {
-        true => Master::default(),
-        false => {
-            // What cannot be read back is taken from the mirror, of a master that was given it.
-            let previous = match bears {
-                Bears::Nothing => Master::default(),
-                _ => proxy.ledger.may_hold(),
-            };
-            while_alive(proxy, inspect::second(first, connection, &previous)).await?
-        }
-    };
-    examination.look = start.elapsed();
-    // From here to the open gate the mirror must not change: the master is compared with it.
-    tx.set(State::Injecting);
-    let Basis {
-        mirror,
-        version,
-        pending,
-    } = proxy.ledger.begin_injection();
-    let before = proxy.ledger.token();
-    // Nothing of ours to bring: a running system is taken over.
-    let takes_over = !found.is_empty() && mirror.is_empty();
-    let (state, replaced) = match bears {
-        Bears::Nothing => {
-            examination.outcome = if takes_over {
-                Outcome::Adopted
-            } else if mirror.is_empty() {
-                Outcome::Begun
-            } else {
-                Outcome::Injected
-            };
-            (mirror.clone(), None)
-        }
-        // It has been succeeded since: whatever it holds is older than the mirror.
-        Bears::Earlier => {
-            examination.outcome = Outcome::Injected;
-            (mirror.clone(), Some(before))
-        }
-        Bears::Present => {
-            let (authority, outcome) = match manner.known {
-                Known::ServedIfPresent => (Authority::PendingWrites, Outcome::Reconciled),
-                Known::Nothing => (Authority::Mirror, Outcome::Adopted),
-                _ => (Authority::Mirror, Outcome::Injected),
-            };
-            examination.outcome = outcome;
-            let state = replay::reconcile(&mirror, &found, &pending, authority);
-            // No look shows who subscribes parameters.
-            let hidden = |call: &crate::xmlrpc::Call| call.method.ends_with("bscribeParam");
-            if state == found && !pending.iter().any(hidden) {
-                proxy.ledger.delivered();
-                say_difference(&proxy.ledger.adopt(state));
-                return Ok(());
-            }
-            (state, Some(before))
-        }
-    };
-    if state != mirror {
-        say_difference(&proxy.ledger.adopt(state.clone()));
-    }
-    let token = proxy.ledger.succeed();
-    let target = Target {
-        state,
-        found,
-        replaced,
-    };
-    let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
-    bring(
-        proxy,
-        connection,
-        &target,
-        &token,
-        ready,
-        &manner.injecting,
-        examination,
-    )
-    .await
-}
-
 /// Says what the master has that the mirror did not know, or no longer.
 fn say_difference(difference: &[String]) {
     if !difference.is_empty() {
@@ -333,97 +432,6 @@ fn say_difference(difference: &[String]) {
             ?difference,
             "the master was changed past rosrescue; the mirror follows it"
         );
-    }
-}
-
-/// Brings the master to `target`, reads it back and leaves `token`.
-async fn bring(
-    proxy: &Arc<Proxy>,
-    connection: &mut Connection,
-    target: &Target,
-    token: &Token,
-    ready: Option<Prepared>,
-    injecting: &AtomicBool,
-    examination: &mut Examination,
-) -> Result<(), ExamineError> {
-    let Target {
-        state,
-        found,
-        replaced,
-    } = target;
-    let mut next = ready.unwrap_or_else(|| {
-        let plan = match replaced {
-            Some(before) => Plan::replace(state, found, before, token),
-            None => Plan::new(state, found, token),
-        };
-        Prepared {
-            basis: None,
-            complete: plan.expected() == state,
-            plan,
-        }
-    });
-    for round in 1..=ROUNDS {
-        let Prepared { plan, complete, .. } = next;
-        injecting.store(true, Ordering::Relaxed);
-        let reply = connection.predicted(plan.request().clone(), plan.answer());
-        let raw = while_alive(proxy, reply).await?;
-        injecting.store(false, Ordering::Relaxed);
-        examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
-        // The reply is long, and everybody waits: it is decoded only if it differs from the
-        // predicted one at all.
-        let verdict = match raw.body == plan.answer() {
-            true => Ok(()),
-            false => plan.verify(&raw.decode()?),
-        };
-        let Err(mismatches) = verdict else {
-            examination.mismatches.clear();
-            if !complete {
-                proxy.ledger.adopt(plan.expected().clone());
-            }
-            proxy.ledger.delivered();
-            proxy.stats.injections.count();
-            // Thousands of small pieces, freed beside traffic.
-            tokio::task::spawn_blocking(move || drop(plan));
-            return Ok(());
-        };
-        examination.mismatches = mismatches.iter().map(ToString::to_string).collect();
-        tracing::error!(
-            round,
-            mismatches = ?examination.mismatches,
-            "the master differs from what was injected"
-        );
-        // The truth of the master wins over what we expected of it; the rest is tried again.
-        let first = first_look(proxy, connection).await?;
-        let found = inspect::second(first, connection, plan.expected());
-        let found = while_alive(proxy, found).await?;
-        let plan = Plan::new(state, &found, token);
-        next = Prepared {
-            basis: None,
-            complete: plan.expected() == state,
-            plan,
-        };
-        if round == ROUNDS {
-            proxy.ledger.adopt(found);
-        }
-    }
-    Ok(())
-}
-
-async fn first_look(
-    proxy: &Proxy,
-    connection: &mut Connection,
-) -> Result<Inspection, ExamineError> {
-    while_alive(proxy, inspect::first(connection, &proxy.ledger.token())).await
-}
-
-/// Waits for what may take long, as long as the master shows signs of life.
-async fn while_alive<T, E: Into<ExamineError>>(
-    proxy: &Proxy,
-    work: impl Future<Output = Result<T, E>>,
-) -> Result<T, ExamineError> {
-    tokio::select! {
-        done = within(INJECTION_LIMIT, work) => done,
-        limit = stall_probe::silence(proxy) => Err(ExamineError::Silent { limit }),
     }
 }
 

@@ -3,10 +3,10 @@
 use tokio::sync::mpsc;
 
 use crate::{
-    lifecycle::Input,
+    ledger::Ledger,
     process::{self, ProcessError, Rosmaster},
-    proxy::Proxy,
     ros_env::MasterUri,
+    upstream::Upstream,
 };
 
 /// A child's process id, and how it ended.
@@ -24,8 +24,6 @@ pub struct MasterProcess {
     new: Option<i32>,
     /// Ends of processes.
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
-    /// What a command to spawn came to; to be fed to the lifecycle next.
-    news: Option<Input>,
 }
 
 impl MasterProcess {
@@ -38,7 +36,6 @@ impl MasterProcess {
             current: left,
             new: None,
             ends: mpsc::channel(4),
-            news: None,
         };
         if let (Some(pid), Some(port)) = (left, port) {
             tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
@@ -64,20 +61,18 @@ impl MasterProcess {
         });
     }
 
-    /// Starts a master and tells `proxy` where it is.
-    pub fn spawn(&mut self, proxy: &Proxy) -> Result<(), ProcessError> {
+    /// Starts a master, and tells where it is.
+    pub fn spawn(&mut self, ledger: &Ledger, upstream: &Upstream) -> Result<(), ProcessError> {
         let port = self.rosmaster.choose_port(self.port)?;
         let address = MasterUri {
             host: "127.0.0.1".to_owned(),
             port,
         };
         let uri = address.to_string();
-        proxy.upstream.relocate(address);
-        if proxy.ledger.session().master_uri.as_ref() != Some(&uri) {
+        upstream.relocate(address);
+        if ledger.session().master_uri.as_ref() != Some(&uri) {
             // Before it runs: a rosrescue that dies now leaves a master that the next one can find.
-            proxy
-                .ledger
-                .update_session(|session| session.master_uri = Some(uri));
+            ledger.update_session(|session| session.master_uri = Some(uri));
         }
         let mut child = self.rosmaster.spawn(port)?;
         let pid = child.id().unwrap_or_default();
@@ -91,23 +86,12 @@ impl MasterProcess {
         self.port = Some(port);
         self.current = Some(pid);
         self.new = i32::try_from(pid).ok();
-        self.news = Some(Input::Spawned);
         Ok(())
     }
 
     /// The process id of a master that was started and not asked for before.
     pub fn take_new(&mut self) -> Option<i32> {
         self.new.take()
-    }
-
-    /// The lifecycle is to hear that no master could be started.
-    pub fn report_failure(&mut self) {
-        self.news = Some(Input::SpawnFailed);
-    }
-
-    /// What the last command came to, once.
-    pub fn take_news(&mut self) -> Option<Input> {
-        self.news.take()
     }
 
     /// Returns when the master has ended. Cancel safe.

@@ -5,24 +5,80 @@ use std::time::{Duration, Instant};
 use super::{Driver, examine::Examination};
 use crate::lifecycle::Cause;
 use crate::{
+    clock,
     nodes::health_check,
-    status::report::{Outage, Outcome},
+    status::report::{Outcome, Phases, Report, ms},
 };
 
 /// A message about a state that lasts is repeated after this time.
 const REPEAT: Duration = Duration::from_secs(10);
 
+/// The time since which calls have not passed.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Outage {
+    /// Why.
+    pub cause: &'static str,
+    /// Since when.
+    pub since: Instant,
+    wall: f64,
+    port_open: Option<Instant>,
+}
+
+impl Outage {
+    /// An outage that begins now.
+    pub(super) fn begin(now: Instant, cause: &'static str) -> Self {
+        Self {
+            cause,
+            since: now,
+            wall: clock::wall_time(),
+            port_open: None,
+        }
+    }
+
+    /// The master's port is open again.
+    pub(super) fn port_open(&mut self, now: Instant) {
+        self.port_open = Some(now);
+    }
+
+    /// The report of an outage that ends now with `examination`.
+    pub(super) fn report(&self, now: Instant, examination: Examination) -> Report {
+        let total = now.duration_since(self.since);
+        let absence = self
+            .port_open
+            .map_or(total, |open| open.duration_since(self.since));
+        Report {
+            cause: self.cause,
+            detected_at: self.wall,
+            outcome: examination.outcome,
+            master_pid: examination.pid,
+            phases: Phases {
+                absence_ms: ms(absence),
+                look_ms: ms(examination.look),
+                injection_ms: ms(examination.injection),
+                total_ms: ms(total),
+            },
+            health_check_ms: None,
+            restored: examination.counts,
+            skipped: examination.skipped,
+            mismatches: examination.mismatches,
+            removed: Vec::new(),
+            reconciled: Vec::new(),
+            unreachable: Vec::new(),
+            notified: Vec::new(),
+        }
+    }
+}
+
 impl Driver {
     /// Reports what an examination came to; health check and reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
-        if self.begins() && examination.outcome == Outcome::Injected {
+        if self.lifecycle.begins() && examination.outcome == Outcome::Injected {
             // Nothing but what the session begins with.
             examination.outcome = Outcome::Begun;
         }
         let Outage { cause, since, .. } = self.outage;
         let report = self.outage.report(Instant::now(), examination);
-        let uri = self.proxy.uri.clone();
-        self.proxy.ledger.set_identity(report.master_pid, uri);
+        self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
             // Such as after each idle connection that a master with `-t` closes; or it is being
@@ -32,19 +88,28 @@ impl Driver {
         }
         report.log(&report.outcome.to_string());
         let outcome = report.outcome;
-        self.proxy.board.set_report(report);
-        if self.served.is_none() {
+        self.board.update(|facts| {
+            facts.recoveries += 1;
+            facts.last_recovery = Some(report);
+        });
+        if !self.lifecycle.has_served() {
             // What happened just before we died ourselves, nobody knows any more.
-            self.proxy.ledger.with_activity(|mirror, activity| {
+            self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
         }
         if outcome != Outcome::Resumed {
-            tokio::spawn(health_check::after_recovery(
-                self.proxy.clone(),
-                since,
-                outcome,
-            ));
+            let (nodes, board) = (self.nodes.clone(), self.board.clone());
+            tokio::spawn(async move {
+                let check = health_check::after_recovery(nodes, since, outcome).await;
+                let Some(check) = check else { return };
+                board.update(|facts| {
+                    if let Some(report) = &mut facts.last_recovery {
+                        report.add(check);
+                        report.log("recovery is complete");
+                    }
+                });
+            });
         }
     }
 

@@ -18,10 +18,10 @@ use tokio::{
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use super::{
+    Server,
     deadlines::{Deadlines, Timed},
     service,
 };
-use crate::proxy::Proxy;
 
 /// Connections that the kernel holds for us while we are busy, or not there for a moment.
 const BACKLOG: i32 = 1024;
@@ -120,7 +120,7 @@ fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
 /// Serves `listener` until `stop`; connections that are under way may end in order.
 pub async fn run(
     listener: TcpListener,
-    proxy: Arc<Proxy>,
+    server: Arc<Server>,
     permits: Arc<Semaphore>,
     connections: TaskTracker,
     stop: CancellationToken,
@@ -141,7 +141,7 @@ pub async fn run(
         match accepted {
             Ok(((stream, peer), permit)) => {
                 failed = false;
-                let connection = serve(stream, peer, proxy.clone(), stop.clone());
+                let connection = serve(stream, peer, server.clone(), stop.clone());
                 connections.spawn(async move {
                     connection.await;
                     drop(permit);
@@ -149,7 +149,7 @@ pub async fn run(
             }
             Err(error) => {
                 if !std::mem::replace(&mut failed, true) {
-                    tracing::warn!(%error, "cannot accept connections; it is tried again and again");
+                    tracing::warn!(%error, "cannot accept connections; retrying");
                 }
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
@@ -157,22 +157,22 @@ pub async fn run(
     }
 }
 
-async fn serve(stream: TcpStream, peer: SocketAddr, proxy: Arc<Proxy>, stop: CancellationToken) {
+async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: CancellationToken) {
     let keepalive = TcpKeepalive::new()
         .with_time(KEEPALIVE)
         .with_interval(KEEPALIVE / 4);
     let _ = SockRef::from(&stream).set_tcp_keepalive(&keepalive);
     let _ = stream.set_nodelay(true);
     let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
-    let clients = proxy.clone();
-    let _present = clients.clients.enter(peer);
+    let here = server.clone();
+    let _present = here.clients.enter(peer);
     let deadlines = Deadlines::default();
     let close = Arc::new(Notify::new());
-    let timed = Timed::new(stream, deadlines.clone(), &clients.idle, close.clone());
+    let timed = Timed::new(stream, deadlines.clone(), &here.idle, close.clone());
     let service = |request| {
         // On the heap: idle connections do not keep space for it.
         Box::pin(service::serve(
-            proxy.clone(),
+            server.clone(),
             peer,
             deadlines.clone(),
             request,

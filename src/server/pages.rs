@@ -8,57 +8,208 @@
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master or by the mirror, else 503 |
 
-use bytes::Bytes;
-use http_body_util::Full;
-use hyper::{
-    Response, StatusCode,
-    header::{CONTENT_TYPE, HeaderValue},
+use std::{fmt, sync::Arc};
+
+use hyper::StatusCode;
+use serde::Serialize;
+
+use super::{
+    clients::{Client, Clients},
+    replies::{HttpReply, page, text},
+};
+use crate::{
+    clock,
+    gate::{self, State},
+    ledger::Ledger,
+    master::{Counts, Master},
+    nodes::Nodes,
+    status::{Board, report::Report, stats::Stats},
+    upstream::Upstream,
 };
 
-use super::service::HttpReply;
-use crate::{proxy::Proxy, status::Status};
-
-/// The page at `path`.
-pub fn page(proxy: &Proxy, path: &str) -> HttpReply {
-    const TEXT: &str = "text/plain; charset=utf-8";
-    let status = Status::of(proxy);
-    let (code, kind, body) = match path {
-        "/" => (StatusCode::OK, TEXT, status.to_string()),
-        "/status.json" => match serde_json::to_string_pretty(&status) {
-            Ok(json) => (StatusCode::OK, "application/json", json + "\n"),
-            Err(error) => (
-                StatusCode::INTERNAL_SERVER_ERROR,
-                TEXT,
-                format!("{error}\n"),
-            ),
-        },
-        "/metrics" => (
-            StatusCode::OK,
-            "text/plain; version=0.0.4",
-            metrics(proxy, &status),
-        ),
-        "/live" => (StatusCode::OK, TEXT, "live\n".to_owned()),
-        "/ready" if status.ready => (StatusCode::OK, TEXT, "ready\n".to_owned()),
-        "/ready" => (
-            StatusCode::SERVICE_UNAVAILABLE,
-            TEXT,
-            "no master was ever seen: calls wait for one\n".to_owned(),
-        ),
-        _ => (
-            StatusCode::NOT_FOUND,
-            TEXT,
-            "no such page; there are /, /status.json, /metrics, /live and /ready\n".to_owned(),
-        ),
-    };
-    let mut reply = Response::new(Full::new(Bytes::from(body)));
-    *reply.status_mut() = code;
-    reply
-        .headers_mut()
-        .insert(CONTENT_TYPE, HeaderValue::from_static(kind));
-    reply
+/// Where the pages' content comes from.
+pub struct Pages {
+    /// What nodes use as `ROS_MASTER_URI`.
+    pub uri: String,
+    /// The checkpoint's path.
+    pub checkpoint: String,
+    /// The master's address.
+    pub upstream: Arc<Upstream>,
+    /// Whether calls pass.
+    pub gate: gate::Rx,
+    /// The mirror, and whether it is recorded.
+    pub ledger: Arc<Ledger>,
+    /// Which nodes are unreachable.
+    pub nodes: Arc<Nodes>,
+    /// Deaths and recoveries.
+    pub board: Arc<Board>,
+    /// Who is connected.
+    pub clients: Arc<Clients>,
+    /// What was counted.
+    pub stats: &'static Stats,
 }
 
-fn metrics(proxy: &Proxy, status: &Status) -> String {
+impl Pages {
+    /// The page at `path`.
+    pub fn page(&self, path: &str) -> HttpReply {
+        let status = self.status();
+        match path {
+            "/" => text(StatusCode::OK, status.to_string()),
+            "/status.json" => match serde_json::to_string_pretty(&status) {
+                Ok(json) => page(StatusCode::OK, "application/json", json + "\n"),
+                Err(error) => text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")),
+            },
+            "/metrics" => page(
+                StatusCode::OK,
+                "text/plain; version=0.0.4",
+                metrics(self.stats, &status),
+            ),
+            "/live" => text(StatusCode::OK, "live\n".to_owned()),
+            "/ready" if status.ready => text(StatusCode::OK, "ready\n".to_owned()),
+            "/ready" => text(
+                StatusCode::SERVICE_UNAVAILABLE,
+                "no master was ever seen: calls wait for one\n".to_owned(),
+            ),
+            _ => text(
+                StatusCode::NOT_FOUND,
+                "no such page; there are /, /status.json, /metrics, /live and /ready\n".to_owned(),
+            ),
+        }
+    }
+
+    fn status(&self) -> Status {
+        let counters = self.stats.list().into_iter();
+        let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
+        let gate = self.gate.state();
+        let stands_in = matches!(gate, State::StandingIn | State::Injecting);
+        let shut_since = self.gate.shut_since().filter(|_| stands_in);
+        let facts = self.board.read();
+        Status {
+            version: env!("CARGO_PKG_VERSION"),
+            uri: self.uri.clone(),
+            master: self.upstream.address().to_string(),
+            open: gate.is_open(),
+            ready: gate != State::Unknown,
+            standing_in_since: shut_since
+                .map(|since| clock::wall_time() - since.elapsed().as_secs_f64()),
+            pending_writes: self.ledger.pending(),
+            crash_loop: facts.crash_loop,
+            deaths: facts.deaths,
+            checkpoint: self.checkpoint.clone(),
+            unprotected: self.ledger.unprotected(),
+            guarded: facts.guarded.is_guarded(),
+            guarded_by: facts.guarded.to_string(),
+            state: self.ledger.with_mirror(Master::counts),
+            unreachable: self.nodes.unreachable(),
+            recoveries: facts.recoveries,
+            last_recovery: facts.last_recovery,
+            clients: self.clients.list(),
+            counters: counters.collect(),
+        }
+    }
+}
+
+/// The status at one moment.
+#[derive(Clone, Debug, Serialize)]
+struct Status {
+    /// Version of rosrescue.
+    version: &'static str,
+    /// What nodes use as `ROS_MASTER_URI`.
+    uri: String,
+    /// The real master.
+    master: String,
+    /// Whether calls pass to it.
+    open: bool,
+    /// Whether calls are answered, by it or by the mirror.
+    ready: bool,
+    /// Since when the mirror stands in for it: seconds since 1970 by the wall clock.
+    standing_in_since: Option<f64>,
+    /// Writes that the mirror has answered and the master has not run yet.
+    pending_writes: usize,
+    /// Whether it dies again and again.
+    crash_loop: bool,
+    /// Masters that have died since the start.
+    deaths: u64,
+    /// The checkpoint file.
+    checkpoint: String,
+    /// Why the state is not recorded; none if all is well.
+    unprotected: Option<String>,
+    /// Whether another process keeps the port, and starts rosrescue again, when it dies.
+    guarded: bool,
+    /// In words, which one.
+    guarded_by: String,
+    /// What the mirror holds.
+    state: Counts,
+    /// Nodes that do not answer now and are not known to be dead.
+    unreachable: Vec<String>,
+    /// Masters examined since the start.
+    recoveries: u64,
+    /// The last one.
+    last_recovery: Option<Report>,
+    /// Connections of clients, at most a thousand of them.
+    clients: Vec<Client>,
+    /// What was counted since the start.
+    counters: serde_json::Map<String, serde_json::Value>,
+}
+
+impl fmt::Display for Status {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "rosrescue {}", self.version)?;
+        writeln!(f, "ROS_MASTER_URI  {}", self.uri)?;
+        let gate = match (self.standing_in_since, self.ready) {
+            (Some(since), _) => format!(
+                "away, standing in since {}, {} pending writes",
+                clock::wall_text(since),
+                self.pending_writes
+            ),
+            (None, true) => "calls pass".to_owned(),
+            (None, false) => "not seen yet, calls wait".to_owned(),
+        };
+        writeln!(f, "master          {} ({gate})", self.master)?;
+        if self.crash_loop {
+            writeln!(
+                f,
+                "                crash loop: the master dies again and again"
+            )?;
+        }
+        let protection = self.unprotected.as_deref().map_or_else(
+            || "protected".to_owned(),
+            |reason| format!("UNPROTECTED: {reason}"),
+        );
+        writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
+        writeln!(f, "guarded by      {}", self.guarded_by)?;
+        writeln!(f, "state           {}", self.state)?;
+        if !self.unreachable.is_empty() {
+            writeln!(f, "unreachable     {}", self.unreachable.join(", "))?;
+        }
+        if let Some(report) = &self.last_recovery {
+            writeln!(
+                f,
+                "last recovery   {} ms after {}",
+                report.phases.total_ms.round(),
+                report.cause
+            )?;
+            for (what, names) in [
+                ("not injected", &report.skipped),
+                ("differs", &report.mismatches),
+                ("removed", &report.removed),
+                ("reconciled", &report.reconciled),
+                ("unreachable", &report.unreachable),
+                ("notified", &report.notified),
+            ] {
+                if !names.is_empty() {
+                    writeln!(f, "  {what:<14}{}", names.join(", "))?;
+                }
+            }
+        }
+        for (name, value) in &self.counters {
+            writeln!(f, "{name:<16}{value}")?;
+        }
+        Ok(())
+    }
+}
+
+fn metrics(stats: &Stats, status: &Status) -> String {
     use std::fmt::Write;
 
     let mut text = String::new();
@@ -69,7 +220,7 @@ fn metrics(proxy: &Proxy, status: &Status) -> String {
             "# HELP rosrescue_{name} {help}\n# TYPE rosrescue_{name} {kind}\nrosrescue_{name} {value}\n"
         );
     };
-    for (name, help, value) in proxy.stats.list() {
+    for (name, help, value) in stats.list() {
         add(&format!("{name}_total"), "counter", help, value as f64);
     }
     let flag = |truth: bool| f64::from(u8::from(truth));

@@ -1,15 +1,11 @@
 //! What a recovery did, and how long each part of it took.
 
-use std::{
-    fmt,
-    time::{Duration, Instant},
-};
+use std::{fmt, time::Duration};
 
 use serde::Serialize;
 use tracing::field::debug;
 
-use crate::recovery::examine::Examination;
-use crate::{clock, master::Counts};
+use crate::master::Counts;
 
 /// How the present master came to hold the state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -91,6 +87,15 @@ pub struct Report {
 }
 
 impl Report {
+    /// Adds what the health check found.
+    pub(crate) fn add(&mut self, check: HealthCheck) {
+        self.health_check_ms = Some(ms(check.duration));
+        self.removed = check.removed;
+        self.reconciled = check.reconciled;
+        self.unreachable = check.unreachable;
+        self.notified = check.notified;
+    }
+
     /// Logs all of it in one line, but what is empty.
     pub(crate) fn log(&self, message: &str) {
         let some = |list: &Vec<String>| (!list.is_empty()).then(|| debug(list.clone()));
@@ -125,58 +130,17 @@ pub(crate) fn ms(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1e5).round() / 1e2
 }
 
-/// The time since which calls have not passed.
-#[derive(Clone, Copy, Debug)]
-pub struct Outage {
-    /// Why.
-    pub cause: &'static str,
-    /// Since when.
-    pub since: Instant,
-    wall: f64,
-    port_open: Option<Instant>,
-}
-
-impl Outage {
-    /// An outage that begins now.
-    pub fn begin(now: Instant, cause: &'static str) -> Self {
-        Self {
-            cause,
-            since: now,
-            wall: clock::wall_time(),
-            port_open: None,
-        }
-    }
-
-    /// The master's port is open again.
-    pub fn port_open(&mut self, now: Instant) {
-        self.port_open = Some(now);
-    }
-
-    /// The report of an outage that ends now with `examination`.
-    pub fn report(&self, now: Instant, examination: Examination) -> Report {
-        let total = now.duration_since(self.since);
-        let absence = self
-            .port_open
-            .map_or(total, |open| open.duration_since(self.since));
-        Report {
-            cause: self.cause,
-            detected_at: self.wall,
-            outcome: examination.outcome,
-            master_pid: examination.pid,
-            phases: Phases {
-                absence_ms: ms(absence),
-                look_ms: ms(examination.look),
-                injection_ms: ms(examination.injection),
-                total_ms: ms(total),
-            },
-            health_check_ms: None,
-            restored: examination.counts,
-            skipped: examination.skipped,
-            mismatches: examination.mismatches,
-            removed: Vec::new(),
-            reconciled: Vec::new(),
-            unreachable: Vec::new(),
-            notified: Vec::new(),
-        }
-    }
+/// What the health check after a recovery found.
+#[derive(Debug, Default)]
+pub struct HealthCheck {
+    /// From the open gate to its end.
+    pub duration: Duration,
+    /// Nodes that are dead and have been taken out, through the master, so that others are told.
+    pub removed: Vec<String>,
+    /// Registrations that were added or taken back, because the node itself says so.
+    pub reconciled: Vec<String>,
+    /// Nodes that did not answer and were kept.
+    pub unreachable: Vec<String>,
+    /// Topics whose subscribers were sent the full list of publishers.
+    pub notified: Vec<String>,
 }

@@ -1,7 +1,7 @@
 //! The bounded set of connections on which reads travel to the master.
 
 use std::sync::{
-    Mutex, PoisonError,
+    Arc, Mutex, PoisonError,
     atomic::{AtomicUsize, Ordering},
 };
 
@@ -11,7 +11,10 @@ use tokio::sync::Semaphore;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
 use crate::replay::Token;
-use crate::{gate::State, proxy::Proxy};
+use crate::{
+    gate::{self, State},
+    ledger::Ledger,
+};
 
 /// A read that got no reply from the master.
 #[derive(Debug, Error)]
@@ -65,8 +68,10 @@ pub(crate) async fn verified(
 }
 
 /// Connections for reads: few, because a Python master serves many badly.
-#[derive(Debug)]
 pub struct Pool {
+    upstream: Arc<Upstream>,
+    ledger: Arc<Ledger>,
+    gate: gate::Rx,
     permits: Semaphore,
     /// Idle connections, with the incarnation that they reach.
     idle: Mutex<Vec<(u64, Connection)>>,
@@ -75,7 +80,6 @@ pub struct Pool {
 }
 
 /// See [`Pool::stalled`].
-#[derive(Debug)]
 pub struct Stalled<'a>(&'a Pool);
 
 impl Drop for Stalled<'_> {
@@ -85,9 +89,12 @@ impl Drop for Stalled<'_> {
 }
 
 impl Pool {
-    /// At most `size` connections.
-    pub fn new(size: usize) -> Self {
+    /// At most `size` connections to `upstream`, each verified to reach the incarnation of `ledger`.
+    pub fn new(size: usize, upstream: Arc<Upstream>, ledger: Arc<Ledger>, gate: gate::Rx) -> Self {
         Self {
+            upstream,
+            ledger,
+            gate,
             permits: Semaphore::new(size),
             idle: Mutex::new(Vec::with_capacity(size)),
             stalled: AtomicUsize::new(0),
@@ -117,34 +124,33 @@ impl Pool {
             idle.push((incarnation, connection));
         }
     }
-}
 
-/// Sends a read to the master of `incarnation`. A read may be sent twice: once more when an idle
-/// connection turns out to have been closed.
-pub async fn forward(
-    proxy: &Proxy,
-    incarnation: u64,
-    head: &Head,
-    body: &Bytes,
-) -> Result<RawReply, ReadError> {
-    let pool = &proxy.pool;
-    let attempt = async {
-        // Never closed.
-        let _permit = pool.permits.acquire().await;
-        if let Some(mut connection) = pool.take_idle(incarnation)
-            && let Ok(reply) = connection.forward(head, body.clone()).await
-        {
-            pool.put_idle(incarnation, connection, &reply);
-            return Ok(reply);
+    /// Sends a read to the master of `incarnation`. A read may be sent twice: once more when an idle
+    /// connection turns out to have been closed.
+    pub async fn forward(
+        &self,
+        incarnation: u64,
+        head: &Head,
+        body: &Bytes,
+    ) -> Result<RawReply, ReadError> {
+        let attempt = async {
+            // Never closed.
+            let _permit = self.permits.acquire().await;
+            if let Some(mut connection) = self.take_idle(incarnation)
+                && let Ok(reply) = connection.forward(head, body.clone()).await
+            {
+                self.put_idle(incarnation, connection, &reply);
+                return Ok(reply);
+            }
+            let mut connection = connect_verified(&self.upstream, &self.ledger.token()).await?;
+            let reply = connection.forward(head, body.clone()).await?;
+            self.put_idle(incarnation, connection, &reply);
+            Ok(reply)
+        };
+        let mut gate = self.gate.clone();
+        tokio::select! {
+            reply = attempt => reply,
+            _ = gate.wait_for(|state| state != (State::Open { incarnation })) => Err(ReadError::Shut),
         }
-        let mut connection = connect_verified(&proxy.upstream, &proxy.ledger.token()).await?;
-        let reply = connection.forward(head, body.clone()).await?;
-        pool.put_idle(incarnation, connection, &reply);
-        Ok(reply)
-    };
-    let mut gate = proxy.gate.clone();
-    tokio::select! {
-        reply = attempt => reply,
-        _ = gate.wait_for(|state| state != (State::Open { incarnation })) => Err(ReadError::Shut),
     }
 }

@@ -1,13 +1,11 @@
 //! One request of the write queue to the master and its reply.
 
-use std::sync::Arc;
-
 use bytes::Bytes;
 use thiserror::Error;
 
+use super::Link;
 use crate::{
     master::Master,
-    proxy::Proxy,
     upstream::{
         CallError, Connection, Head, RawReply,
         inspect::{self, InspectError},
@@ -53,14 +51,14 @@ impl RoundTripError {
 /// Sends `request`, or without one looks at what the master holds. The future owns what it needs, so
 /// that dropping it ends the connection.
 pub(super) async fn round_trip(
-    proxy: Arc<Proxy>,
+    link: Link,
     incarnation: u64,
     connection: Option<(u64, Connection)>,
     request: Option<(Head, Bytes)>,
 ) -> Done {
     let connected = match connection {
         Some((_, connection)) => Ok(connection),
-        None => connect(&proxy).await,
+        None => connect(&link).await,
     };
     let mut connection = match connected {
         Ok(connection) => connection,
@@ -77,7 +75,7 @@ pub(super) async fn round_trip(
             reply.map(Received::Reply).map_err(Into::into)
         }
         None => {
-            let held = held(&proxy, &mut connection).await;
+            let held = held(&link, &mut connection).await;
             held.map(|held| Received::Held(held.into()))
                 .map_err(Into::into)
         }
@@ -93,14 +91,14 @@ pub(super) async fn round_trip(
     }
 }
 
-async fn connect(proxy: &Proxy) -> Result<Connection, VerifyError> {
-    let connection = proxy.upstream.connect_for_writes().await?;
-    verified(connection, &proxy.ledger.token()).await
+async fn connect(link: &Link) -> Result<Connection, VerifyError> {
+    let connection = link.upstream.connect_for_writes().await?;
+    verified(connection, &link.ledger.token()).await
 }
 
 /// What the master behind `connection` holds.
-async fn held(proxy: &Proxy, connection: &mut Connection) -> Result<Master, InspectError> {
-    let previous = proxy.ledger.with_mirror(Clone::clone);
-    let first = inspect::first(connection, &proxy.ledger.token()).await?;
+async fn held(link: &Link, connection: &mut Connection) -> Result<Master, InspectError> {
+    let previous = link.ledger.with_mirror(Clone::clone);
+    let first = inspect::first(connection, &link.ledger.token()).await?;
     inspect::second(first, connection, &previous).await
 }

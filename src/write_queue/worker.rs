@@ -11,14 +11,14 @@ use tokio::sync::{Notify, mpsc, watch};
 
 use super::batch::{self, Answer, Item};
 use super::{
+    Link,
     outdated::is_outdated,
     round_trip::{Done, Received, RoundTripError, round_trip},
 };
 use crate::{
-    cli::SyncPolicy,
-    gate::State,
+    gate::{self, State},
     master::{self, Master},
-    proxy::Proxy,
+    status::stats::Stats,
     upstream::{Connection, RawReply, inspect::InspectError},
     wait,
     xmlrpc::{self, Call, Reply},
@@ -44,6 +44,10 @@ struct InFlight {
 
 /// Drains the write queue.
 pub struct Worker {
+    link: Link,
+    gate: gate::Rx,
+    stats: &'static Stats,
+    resync_interval: Option<Duration>,
     items: mpsc::Receiver<Item>,
     queue: VecDeque<Item>,
     connection: Option<(u64, Connection)>,
@@ -76,10 +80,18 @@ struct Opaque {
 impl Worker {
     pub(super) fn new(
         items: mpsc::Receiver<Item>,
+        link: Link,
+        gate: gate::Rx,
+        stats: &'static Stats,
+        resync_interval: Option<Duration>,
         tell_lost: Arc<Notify>,
         tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     ) -> Self {
         Self {
+            link,
+            gate,
+            stats,
+            resync_interval,
             items,
             queue: VecDeque::new(),
             connection: None,
@@ -97,9 +109,9 @@ impl Worker {
     }
 
     /// Runs until every [`WriteQueue`](super::WriteQueue) is gone.
-    pub async fn run(mut self, proxy: Arc<Proxy>) {
-        let mut gate = proxy.gate.clone();
-        let mut resync = proxy.config.resync_interval.map(tokio::time::interval);
+    pub async fn run(mut self) {
+        let mut gate = self.gate.clone();
+        let mut resync = self.resync_interval.map(tokio::time::interval);
         loop {
             let mut changed = false;
             tokio::select! {
@@ -113,7 +125,7 @@ impl Worker {
                     if matches!(done.result, Ok(Received::Held(_))) && let Some(resync) = &mut resync {
                         resync.reset();
                     }
-                    self.done(&proxy, done);
+                    self.done(done);
                 }
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = wait::until(self.grace) => {}
@@ -136,8 +148,8 @@ impl Worker {
                 (self.retry_at, self.lost) = (None, false);
             }
             match state {
-                State::Open { incarnation } => self.send(&proxy, incarnation),
-                State::StandingIn => self.stand_in(&proxy),
+                State::Open { incarnation } => self.send(incarnation),
+                State::StandingIn => self.stand_in(),
                 State::Injecting | State::Unknown => self.grace = None,
             }
             self.tell_sent
@@ -146,7 +158,7 @@ impl Worker {
     }
 
     /// Sends the next batch, if none is in flight and something is to be sent.
-    fn send(&mut self, proxy: &Arc<Proxy>, incarnation: u64) {
+    fn send(&mut self, incarnation: u64) {
         self.grace = None;
         if let Some(batch) = self
             .in_flight
@@ -163,12 +175,12 @@ impl Worker {
             // What was doubted is gone.
             self.resync_due = false;
         }
-        self.resync_due |= proxy.ledger.take_doubt();
+        self.resync_due |= self.link.ledger.take_doubt();
         if self.in_flight.is_some() || self.retry_at.is_some() || self.lost {
             return;
         }
         while let Some(own) = self.queue.front()
-            && is_outdated(proxy, own)
+            && is_outdated(&self.link.ledger, own)
             && let Some(own) = self.queue.pop_front()
         {
             let _ = own.answer.send(Answer::Close);
@@ -186,19 +198,19 @@ impl Worker {
             .connection
             .take()
             .filter(|(of, connection)| *of == incarnation && !connection.is_closed());
-        proxy.stats.batches.count();
+        self.stats.batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
-        let done = round_trip(proxy.clone(), incarnation, connection, request);
+        let done = round_trip(self.link.clone(), incarnation, connection, request);
         self.in_flight = Some(InFlight {
             incarnation,
-            version: proxy.ledger.version(),
+            version: self.link.ledger.version(),
             items,
             sent: tokio::time::Instant::now(),
             done: Box::pin(done),
         });
     }
 
-    fn done(&mut self, proxy: &Arc<Proxy>, done: Done) {
+    fn done(&mut self, done: Done) {
         let Some(InFlight {
             incarnation,
             version,
@@ -210,14 +222,14 @@ impl Worker {
         };
         self.connection = done.connection;
         match done.result {
-            Ok(Received::Held(state)) => self.resync(proxy, incarnation, version, *state),
-            Ok(Received::Reply(raw)) => self.deliver(proxy, incarnation, items, raw),
-            Err(error) => self.failed(proxy, items, &error),
+            Ok(Received::Held(state)) => self.resync(incarnation, version, *state),
+            Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
+            Err(error) => self.failed(items, &error),
         }
     }
 
-    fn resync(&mut self, proxy: &Arc<Proxy>, incarnation: u64, version: u64, state: Master) {
-        let Ok(difference) = proxy.ledger.adopt_if(incarnation, version, state) else {
+    fn resync(&mut self, incarnation: u64, version: u64, state: Master) {
+        let Ok(difference) = self.link.ledger.adopt_if(incarnation, version, state) else {
             // The gate was shut meanwhile, and the mirror has taken what this look does not show.
             self.resync_due = true;
             return;
@@ -228,15 +240,15 @@ impl Worker {
                 "the master differed from the mirror, which was made anew from it"
             );
         }
-        self.answer_opaque(proxy);
+        self.answer_opaque();
     }
 
-    fn answer_opaque(&mut self, proxy: &Arc<Proxy>) {
+    fn answer_opaque(&mut self) {
         let Opaque { answers, seq, .. } = std::mem::take(&mut self.opaque);
-        answer(proxy, seq, proxy.ledger.unwritten(), answers);
+        self.answer(seq, self.link.ledger.unwritten(), answers);
     }
 
-    fn failed(&mut self, proxy: &Arc<Proxy>, items: Vec<Item>, error: &RoundTripError) {
+    fn failed(&mut self, items: Vec<Item>, error: &RoundTripError) {
         tracing::debug!(%error, calls = items.len(), "a batch failed");
         let now = tokio::time::Instant::now();
         if items.is_empty() {
@@ -247,13 +259,13 @@ impl Worker {
             }
             if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
                 // It lives and shows nothing: a client need not wait for that.
-                self.answer_opaque(proxy);
+                self.answer_opaque();
             }
             return;
         }
         self.take_back(items);
         if error.may_have_run() {
-            proxy.ledger.abandon_batch();
+            self.link.ledger.abandon_batch();
             // Whether it has run shows only when the master is seen again. Until then the mirror answers.
             self.lost = true;
             self.tell_lost.notify_one();
@@ -269,7 +281,7 @@ impl Worker {
     }
 
     /// Records what the master answered, and only then answers the clients.
-    fn deliver(&mut self, proxy: &Arc<Proxy>, incarnation: u64, items: Vec<Item>, raw: RawReply) {
+    fn deliver(&mut self, incarnation: u64, items: Vec<Item>, raw: RawReply) {
         let reply = xmlrpc::decode_reply(&raw.body)
             .ok()
             .filter(|_| raw.status.is_success());
@@ -284,7 +296,7 @@ impl Worker {
             ([item], None) if raw.status.is_success() => {
                 opaque = true;
                 let call = item.call.as_deref().filter(|call| subscribes_params(call));
-                call.map(|call| proxy.ledger.predict(call))
+                call.map(|call| self.link.ledger.predict(call))
                     .into_iter()
                     .collect()
             }
@@ -300,7 +312,11 @@ impl Worker {
             .zip(&replies)
             .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply)))
             .collect();
-        let Ok(recorded) = proxy.ledger.record(Instant::now(), incarnation, &answered) else {
+        let Ok(recorded) = self
+            .link
+            .ledger
+            .record(Instant::now(), incarnation, &answered)
+        else {
             return self.take_back(items);
         };
         self.resync_due |= recorded.doubtful || opaque;
@@ -324,7 +340,7 @@ impl Worker {
                 .zip(replies.into_iter().map(Answer::Made))
                 .collect(),
         };
-        answer(proxy, recorded.seq, None, answers);
+        self.answer(recorded.seq, None, answers);
     }
 
     /// A batch was answered as a whole by something else than its results.
@@ -341,14 +357,14 @@ impl Worker {
 
     /// Answers from the mirror what is in the queue, and before it what was in flight. What only a master
     /// can answer waits.
-    fn stand_in(&mut self, proxy: &Arc<Proxy>) {
+    fn stand_in(&mut self) {
         let now = tokio::time::Instant::now();
         if self.in_flight.is_some() && now < *self.grace.get_or_insert(now + GRACE) {
             return;
         }
         self.grace = None;
         if self.in_flight.is_some() {
-            proxy.ledger.abandon_batch();
+            self.link.ledger.abandon_batch();
         }
         // Its end is what a master that comes back waits for: no call of it is running any more.
         self.connection = None;
@@ -364,7 +380,7 @@ impl Worker {
         let (mut last, mut answers) = (None, Vec::new());
         let mut waiting = VecDeque::new();
         for item in self.queue.drain(..) {
-            if is_outdated(proxy, &item) {
+            if is_outdated(&self.link.ledger, &item) {
                 let _ = item.answer.send(Answer::Close);
                 continue;
             }
@@ -372,9 +388,9 @@ impl Worker {
                 .call
                 .as_deref()
                 .filter(|call| master::is_answerable(call));
-            match call.and_then(|call| proxy.ledger.stand_in(Instant::now(), call)) {
+            match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
                 Some((reply, seq)) => {
-                    proxy.stats.stood_in.count();
+                    self.stats.stood_in.count();
                     last = last.max(seq);
                     answers.push((item, Answer::Made(reply)));
                 }
@@ -382,37 +398,32 @@ impl Worker {
             }
         }
         self.queue = waiting;
-        answer(proxy, last, None, answers);
+        self.answer(last, None, answers);
     }
-}
 
-/// Sends answers when what they tell of is safe: the journal up to `seq` is on the disk, if `--sync` wants
-/// that, and the mirror of this version in a whole checkpoint.
-fn answer(
-    proxy: &Arc<Proxy>,
-    seq: Option<u64>,
-    version: Option<u64>,
-    answers: Vec<(Item, Answer)>,
-) {
-    let seq = seq.filter(|_| proxy.config.sync == SyncPolicy::Always);
-    let send = move || {
-        for (item, answer) in answers {
-            let _ = item.answer.send(answer);
+    /// Sends answers when what they tell of is safe: the journal up to `seq` is on the disk, if `--sync` wants
+    /// that, and the mirror of this version in a whole checkpoint.
+    fn answer(&self, seq: Option<u64>, version: Option<u64>, answers: Vec<(Item, Answer)>) {
+        let seq = self.link.ledger.to_await(seq);
+        let send = move || {
+            for (item, answer) in answers {
+                let _ = item.answer.send(answer);
+            }
+        };
+        if (seq, version) == (None, None) {
+            return send();
         }
-    };
-    if (seq, version) == (None, None) {
-        return send();
+        let ledger = self.link.ledger.clone();
+        tokio::spawn(async move {
+            if let Some(seq) = seq {
+                ledger.durable(seq).await;
+            }
+            if let Some(version) = version {
+                ledger.attempted(version).await;
+            }
+            send();
+        });
     }
-    let proxy = proxy.clone();
-    tokio::spawn(async move {
-        if let Some(seq) = seq {
-            proxy.ledger.durable(seq).await;
-        }
-        if let Some(version) = version {
-            proxy.ledger.attempted(version).await;
-        }
-        send();
-    });
 }
 
 /// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.

@@ -51,7 +51,7 @@ fn a_master_that_cannot_be_spawned_is_tried_again_with_growing_pauses() {
     for _ in 0..2 {
         for pause_ms in [500, 1_000, 2_000, 4_000, 8_000, 10_000, 10_000] {
             script
-                .feed(Input::SpawnFailed, &[])
+                .feed(Input::SpawnFailed { pending: true }, &[])
                 .wake(Duration::from_millis(pause_ms), &[Action::Spawn]);
         }
         // One that can be spawned ends the row.

@@ -1,0 +1,75 @@
+//! Replies over HTTP: the master's bytes, or our own.
+
+use bytes::Bytes;
+use http_body_util::Full;
+use hyper::{
+    Response, StatusCode,
+    header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER},
+};
+
+use crate::{
+    upstream::RawReply,
+    write_queue::batch,
+    xmlrpc::{self, Call, Reply, Value},
+};
+
+/// What hyper sends.
+pub type HttpReply = Response<Full<Bytes>>;
+
+/// A master's reply out of a batch, or the mirror's, with our address for the master's own.
+pub(super) fn made(uri: &str, call: Option<&Call>, reply: &Reply) -> HttpReply {
+    let ours = call.filter(|call| batch::asks_uri(call));
+    let ours = ours.and_then(|call| batch::rewrite_uri(call, reply, uri));
+    xml(ours.as_ref().unwrap_or(reply))
+}
+
+/// A master's reply, with our address for its own.
+pub(super) fn forwarded(uri: &str, call: Option<&Call>, raw: RawReply) -> HttpReply {
+    if let Some(call) = call.filter(|call| batch::asks_uri(call))
+        && let Ok(reply) = xmlrpc::decode_reply(&raw.body)
+        && let Some(rewritten) = batch::rewrite_uri(call, &reply, uri)
+    {
+        return xml(&rewritten);
+    }
+    plain(raw)
+}
+
+fn plain(raw: RawReply) -> HttpReply {
+    let mut reply = Response::new(Full::new(raw.body));
+    *reply.status_mut() = raw.status;
+    if let Some(reason) = raw.reason {
+        reply.extensions_mut().insert(reason);
+    }
+    for name in [CONTENT_TYPE, CONTENT_ENCODING, SERVER] {
+        if let Some(value) = raw.headers.get(&name) {
+            reply.headers_mut().insert(name, value.clone());
+        }
+    }
+    reply
+}
+
+pub(super) fn xml(reply: &Reply) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(xmlrpc::encode_reply(reply))));
+    http.headers_mut()
+        .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
+    http
+}
+
+pub(super) fn no_shutdown(why: &str) -> HttpReply {
+    let reply: [Value; 3] = [(-1).into(), why.into(), 0.into()];
+    xml(&Reply::Value(reply.to_vec().into()))
+}
+
+/// A reply that is no XML-RPC.
+pub(super) fn page(status: StatusCode, kind: &'static str, text: String) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(text)));
+    *http.status_mut() = status;
+    http.headers_mut()
+        .insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    http
+}
+
+/// As [`page`], in plain text.
+pub(super) fn text(status: StatusCode, text: String) -> HttpReply {
+    page(status, "text/plain; charset=utf-8", text)
+}
