@@ -2,7 +2,6 @@
 
 use std::{
     io,
-    path::Path,
     sync::{Arc, atomic::AtomicU32},
     time::Duration,
 };
@@ -13,12 +12,7 @@ use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
-    checkpoint::{
-        format::Session,
-        session::{self, Decision, Evidence, Rebuilt},
-        store::{self, OpenError, Store},
-    },
-    clock,
+    checkpoint::store::OpenError,
     config::{Config, MasterConfig},
     gate::{self, State},
     guardian::handover::Sockets,
@@ -34,13 +28,16 @@ use crate::{
     status::{Board, stats::Stats},
     upstream::{Upstream, pool::Pool},
     write_queue,
-    xmlrpc::Call,
 };
 
 mod life;
 mod notify;
+mod startup;
 
-use self::notify::Told;
+use self::{
+    notify::Told,
+    startup::{Beginning, begin, kernel_id},
+};
 
 /// So many bodies of the largest size may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
@@ -72,18 +69,6 @@ pub enum RunError {
     /// Cannot happen with what the kernel gives as an id.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),
-}
-
-/// What was found at the start.
-struct Beginning {
-    mirror: Master,
-    session: Session,
-    /// Writes that the session's last master may not have run.
-    pending: Vec<Call>,
-    store: Option<Store>,
-    restored: bool,
-    /// In words, for the person who started us.
-    story: String,
 }
 
 /// Serves `sockets` until `stop`. `say` prints a line for the person who started us.
@@ -320,112 +305,4 @@ async fn close(ledger: Arc<Ledger>) {
         Ok(_) => tracing::info!("closed in order"),
         Err(error) => tracing::error!(%error, "no closing checkpoint"),
     }
-}
-
-/// Reads the checkpoint and decides whether its session goes on.
-async fn begin(config: &Config) -> Result<Beginning, RunError> {
-    let (mut store, loaded) = match Store::open(&config.checkpoint) {
-        Ok((store, loaded)) => (Some(store), loaded),
-        Err(error @ OpenError::Io { .. }) => {
-            // A robot without a disk still needs its master.
-            tracing::error!(
-                %error,
-                "unprotected: the checkpoint cannot be used; calls are forwarded, but a crash of \
-                 rosrescue itself would lose the state. Choose a place with --checkpoint"
-            );
-            (None, store::read(&config.checkpoint).ok().flatten())
-        }
-        Err(error) => return Err(RunError::Checkpoint(error)),
-    };
-    let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
-    let mut story = "a new session begins".to_owned();
-    let mut beginning = None;
-    let mut master_uri = None;
-    if let Some(loaded) = loaded {
-        for sentence in loaded.torn.iter() {
-            tracing::info!("checkpoint: {sentence}");
-        }
-        for sentence in &loaded.damage {
-            tracing::error!("checkpoint: {sentence}");
-        }
-        let Rebuilt {
-            mirror,
-            session,
-            pending,
-            trouble,
-        } = session::rebuild(loaded.checkpoint, loaded.records);
-        if let Some(trouble) = trouble {
-            tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
-        }
-        let session = session.unwrap_or_default();
-        let same_boot = session.boot_id == boot_id;
-        let mut evidence = Evidence {
-            same_boot,
-            closed: session.closed,
-            node_alive: false,
-        };
-        if session::depends_on_nodes(config.restore, evidence) {
-            evidence.node_alive = life::any_alive(&mirror, same_boot).await;
-        }
-        match session::decide(config.restore, evidence) {
-            Decision::Restore(why) => {
-                story = format!("restored ({why})");
-                beginning = Some((mirror, session, pending));
-            }
-            Decision::Fresh(why) => {
-                // A master that a rosrescue left behind when it crashed is taken over.
-                master_uri = session.master_uri.filter(|_| !session.closed);
-                let kept = store.as_mut().map(|store| store.set_aside("session"));
-                let kept = match kept {
-                    Some(Ok(Some(path))) => {
-                        format!("; the old checkpoint is kept as {}", path.display())
-                    }
-                    Some(Err(error)) => {
-                        tracing::error!(%error, "the old checkpoint is not kept");
-                        String::new()
-                    }
-                    _ => String::new(),
-                };
-                story = format!("a new session begins ({why}{kept})");
-            }
-        }
-    }
-    let restored = beginning.is_some();
-    let (mirror, mut session, pending) = beginning.unwrap_or_default();
-    if !restored || session.mark.is_empty() {
-        session.master_uri = master_uri;
-        session.id = kernel_id("/proc/sys/kernel/random/uuid");
-        session.mark = session.id.clone();
-        session.started = clock::wall_text(clock::wall_time());
-    }
-    session.boot_id = boot_id;
-    session.closed = false;
-    if let Some(open) = &mut store {
-        let checkpoint = crate::checkpoint::format::Checkpoint {
-            seq: open.seq(),
-            session: session.clone(),
-            snapshot: mirror.snapshot(),
-            pending: pending.clone(),
-        };
-        if let Err(error) = open.begin(&checkpoint) {
-            tracing::error!(
-                %error,
-                "unprotected: the checkpoint cannot be written; calls are forwarded, and it is \
-                 tried again every second"
-            );
-        }
-    }
-    Ok(Beginning {
-        mirror,
-        session,
-        pending,
-        store,
-        restored,
-        story,
-    })
-}
-
-/// An id from the kernel, or a constant where there is none: it is compared, not trusted.
-fn kernel_id(path: impl AsRef<Path>) -> String {
-    std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }

@@ -129,8 +129,10 @@ impl Rx {
             self.wait_for(|state| !state.is_open()).await;
             let deadline = Instant::now() + time;
             tokio::select! {
-                () = tokio::time::sleep_until(deadline) => return,
+                // On a busy computer both may have come to pass by now.
+                biased;
                 _ = self.wait_for(State::is_open) => {}
+                () = tokio::time::sleep_until(deadline) => return,
             }
         }
     }
@@ -138,6 +140,8 @@ impl Rx {
 
 #[cfg(test)]
 mod tests {
+    use std::task::{Context, Waker};
+
     use super::*;
 
     #[tokio::test]
@@ -168,5 +172,18 @@ mod tests {
         };
         tokio::join!(opener, rx.shut_for(Duration::from_secs(8)));
         assert_eq!(start.elapsed(), Duration::from_secs(7 + 60 + 8));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_gate_that_opens_in_time_is_not_taken_for_one_that_stays_shut() {
+        for _ in 0..50 {
+            let (tx, mut rx) = gate();
+            let mut shut = std::pin::pin!(rx.shut_for(Duration::from_secs(1)));
+            let mut context = Context::from_waker(Waker::noop());
+            assert!(shut.as_mut().poll(&mut context).is_pending());
+            tokio::time::advance(Duration::from_secs(2)).await;
+            tx.set(State::Open { incarnation: 1 });
+            assert!(shut.as_mut().poll(&mut context).is_pending());
+        }
     }
 }

@@ -14,6 +14,7 @@ use std::{
 };
 
 use tokio::sync::Notify;
+use tracing::Instrument;
 
 use self::{client::Sign, health_check::CheckResult, notifications::Notifications};
 use crate::{
@@ -32,8 +33,6 @@ use crate::{
 /// A node is asked for its process id so long after it last registered something: starting nodes
 /// have better to do.
 const ACQUAINTANCE: Duration = Duration::from_secs(2);
-/// How often it is looked whether a node is to be asked.
-const ROUND: Duration = Duration::from_millis(500);
 /// How long the master must have been away before what it may have owed its nodes is told by us: most
 /// that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
@@ -158,7 +157,6 @@ impl Drop for CheckUnderWay {
 /// Watches over the nodes for as long as it is polled: sends notifications, asks unreachable nodes again, gets
 /// acquainted with new nodes, and makes the health check that is due.
 pub async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
-    let mut round = tokio::time::interval(ROUND);
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
     let mut repeats = Repeats::<Change>::default();
@@ -167,6 +165,10 @@ pub async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let (mut owed_at, mut owed_told) = (None, false);
     loop {
         let next = nodes.lock().next().map(Into::into);
+        let new = nodes
+            .ledger
+            .with_activity(|_, activity| activity.next_stranger());
+        let acquaint_at = new.map(|since| (since + ACQUAINTANCE).into());
         tokio::select! {
             () = nodes.ledger.news.notified() => empty_outbox(&nodes, &mut repeats),
             () = gate.changed() => match gate.look() {
@@ -190,10 +192,11 @@ pub async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
             }
             // An unreachable node that is new may be due before the others.
             () = nodes.changed.notified() => {}
-            _ = round.tick() => get_acquainted(&nodes),
+            () = wait::until(acquaint_at) => get_acquainted(&nodes),
             () = wait::tick(&mut reaping) => {
                 if nodes.gate.is_open() {
-                    tokio::spawn(reap(nodes.clone()));
+                    let check = reap(nodes.clone());
+                    tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
                 }
             }
         }

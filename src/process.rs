@@ -138,7 +138,9 @@ impl Rosmaster {
         let serves = |pid: &u32| port.is_some_and(|port| orphan::listens(*pid, port));
         let found = all.iter().copied().find(serves);
         if found.is_none() {
-            for pid in all.into_iter().filter(|pid| runs(*pid, "rosmaster")) {
+            let name = self.program.file_name().unwrap_or_default();
+            let name = name.to_string_lossy();
+            for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
                 tracing::info!(
                     pid,
                     "ending a rosmaster that was left behind and does not serve"
@@ -257,17 +259,14 @@ fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     }
 }
 
-/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `gone` says whether
-/// it has ended.
-pub async fn stop(pid: u32, mut gone: impl FnMut() -> bool) {
+/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `ended` resolves when it
+/// has ended.
+pub async fn stop(pid: u32, ended: impl Future) {
+    let mut ended = std::pin::pin!(ended);
     for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
         signal_process(pid, signal);
-        let patience = tokio::time::Instant::now() + STOP_TIME;
-        while tokio::time::Instant::now() < patience {
-            if gone() {
-                return;
-            }
-            tokio::time::sleep(Duration::from_millis(5)).await;
+        if tokio::time::timeout(STOP_TIME, &mut ended).await.is_ok() {
+            return;
         }
         tracing::warn!(pid, ?signal, "a process did not end in time");
     }

@@ -10,6 +10,7 @@ use std::{pin::Pin, sync::Arc, time::Instant};
 
 use tokio::{sync::Notify, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
+use tracing::Instrument;
 
 use self::{
     examine::{Examination, ExamineError, Examiner, Manner, Prepared},
@@ -121,7 +122,11 @@ impl Driver {
             }
             let mut next = None;
             for action in actions {
-                tracing::debug!(?input, ?action, "lifecycle");
+                if (input, action) == (Input::Wake, Action::Connect) {
+                    tracing::trace!(?input, ?action, "lifecycle");
+                } else {
+                    tracing::debug!(?input, ?action, "lifecycle");
+                }
                 if action == Action::GiveUp
                     && let Some(error) = self.spawn_error.take()
                 {
@@ -222,10 +227,13 @@ impl Driver {
                     known: examiner.known(new),
                     prepared: self.prepared.take(),
                 };
-                self.step = Some(Box::pin(async move {
+                let master = examiner.upstream.address();
+                let span = tracing::debug_span!("recovery", %master, cause = self.outage.cause);
+                let examined = async move {
                     let examined = examiner.examine(&mut connection, manner).await;
                     Done::Examined(connection, examined)
-                }));
+                };
+                self.step = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
                 // A probe that was missed goes on: its answer counts whenever it comes.

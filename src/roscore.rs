@@ -141,9 +141,7 @@ async fn keep_rosout(roscore: &Roscore) {
         {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
-                while process::is_alive(pid) {
-                    tokio::time::sleep(RESPAWN).await;
-                }
+                process::ended(pid).await;
             }
             None => match rosout.spawn(&roscore.uri) {
                 Ok(mut child) => {
@@ -197,6 +195,6 @@ async fn end_rosout(roscore: &Roscore) {
     };
     let _ = tokio::time::timeout(STARTED, named).await;
     if process::runs(pid, "rosout") {
-        process::stop(pid, || !process::runs(pid, "rosout")).await;
+        process::stop(pid, process::ended(pid)).await;
     }
 }

@@ -176,6 +176,7 @@ impl Activity {
         noticed: Noticed,
         registered: impl Fn(&str) -> bool,
     ) -> bool {
+        let nobody_new = self.strangers.is_empty();
         self.note(now, call, LEVELS);
         if self.last_calls.len() > self.prune_at.max(NODES) {
             self.prune(registered);
@@ -211,7 +212,7 @@ impl Activity {
             self.displaced
                 .extend(noticed.displaced.into_iter().map(|it| (now, it)));
         }
-        let news = outbox.len() > before;
+        let news = outbox.len() > before || (nobody_new && !self.strangers.is_empty());
         forget(&mut self.topics, now);
         forget(&mut self.params, now);
         self.displaced.retain(|(at, _)| is_recent(*at, now));
@@ -365,6 +366,11 @@ impl Activity {
     pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
         let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
         Some((pid.pid, pid.registered != self.last_calls(node).registered))
+    }
+
+    /// When the node registered that nobody has asked for its process id for longest.
+    pub fn next_stranger(&self) -> Option<Instant> {
+        self.strangers.values().min().copied()
     }
 
     /// Nodes that last registered something at `before` or earlier, and have not been asked for

@@ -21,6 +21,8 @@ use super::{
     notifications,
 };
 use crate::status::report::{HealthCheck, Outcome};
+use tracing::Instrument;
+
 use crate::{
     gate::State,
     health::{Name, Reconciliation, Registration, Verdict, judge},
@@ -159,7 +161,8 @@ pub(crate) fn visit(
     api: String,
 ) -> impl Future<Output = CheckResult> + Send + 'static {
     let (nodes, waiting) = (nodes.clone(), Waiting::new(nodes));
-    async move { converse(&nodes, &api, waiting).await }
+    let span = tracing::debug_span!("visit", api);
+    async move { converse(&nodes, &api, waiting).await }.instrument(span)
 }
 
 async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResult {

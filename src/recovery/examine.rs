@@ -256,6 +256,7 @@ impl Examiner {
         examination: &mut Examination,
     ) -> Result<(), ExamineError> {
         let (bears, empty) = (first.bears(), first.is_empty());
+        tracing::debug!(?bears, empty, pid = first.pid(), "inspected");
         let fresh = bears == Bears::Nothing && empty;
         let ready = match manner.prepared {
             Some(prepared) if fresh => prepared.await.ok(),
@@ -359,6 +360,7 @@ impl Examiner {
         });
         for round in 1..=ROUNDS {
             let Prepared { plan, complete, .. } = next;
+            tracing::debug!(round, bytes = plan.request().len(), complete, "injecting");
             let reply = connection.predicted(plan.request().clone(), plan.answer());
             let raw = self.while_alive(reply).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
@@ -374,6 +376,7 @@ impl Examiner {
                     self.ledger.adopt(plan.expected().clone());
                 }
                 self.ledger.delivered();
+                tracing::debug!(skipped = plan.skipped().len(), "injected");
                 self.stats.injections.count();
                 // Thousands of small pieces, freed beside traffic.
                 tokio::task::spawn_blocking(move || drop(plan));

@@ -96,14 +96,17 @@ impl MasterProcess {
 
     /// Returns when the master has ended. Cancel safe.
     pub async fn exited(&mut self) {
+        let how = self.gone().await;
+        tracing::warn!(pid = self.current, how, "rosmaster has ended");
+        self.current = None;
+        self.new = None;
+    }
+
+    /// Returns when the master has ended: how. Cancel safe.
+    async fn gone(&mut self) -> String {
         loop {
             match self.ends.1.recv().await {
-                Some((pid, how)) if Some(pid) == self.current => {
-                    tracing::warn!(pid, how, "rosmaster has ended");
-                    self.current = None;
-                    self.new = None;
-                    return;
-                }
+                Some((pid, how)) if Some(pid) == self.current => return how,
                 Some(_) => {}
                 // We hold a sender.
                 None => std::future::pending().await,
@@ -123,9 +126,9 @@ impl MasterProcess {
 
     /// Ends the master in order.
     pub async fn stop(mut self) {
-        let Some(pid) = self.current else { return };
-        let ends = &mut self.ends.1;
-        process::stop(pid, || ends.try_recv().is_ok_and(|(ended, _)| ended == pid)).await;
+        if let Some(pid) = self.current {
+            process::stop(pid, self.gone()).await;
+        }
     }
 
     /// The end of what the last master wrote.

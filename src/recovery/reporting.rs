@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use tracing::Instrument;
+
 use super::{Driver, examine::Examination};
 use crate::lifecycle::Cause;
 use crate::{
@@ -100,7 +102,7 @@ impl Driver {
         }
         if outcome != Outcome::Resumed {
             let (nodes, board) = (self.nodes.clone(), self.board.clone());
-            tokio::spawn(async move {
+            let check = async move {
                 let check = health_check::after_recovery(nodes, since, outcome).await;
                 let Some(check) = check else { return };
                 board.update(|facts| {
@@ -109,7 +111,8 @@ impl Driver {
                         report.log("recovery is complete");
                     }
                 });
-            });
+            };
+            tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
         }
     }
 

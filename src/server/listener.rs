@@ -16,6 +16,7 @@ use tokio::{
     sync::{Notify, Semaphore},
 };
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
+use tracing::Instrument;
 
 use super::{
     Server,
@@ -142,10 +143,11 @@ pub async fn run(
             Ok(((stream, peer), permit)) => {
                 failed = false;
                 let connection = serve(stream, peer, server.clone(), stop.clone());
-                connections.spawn(async move {
+                let served = async move {
                     connection.await;
                     drop(permit);
-                });
+                };
+                connections.spawn(served.instrument(tracing::debug_span!("connection", %peer)));
             }
             Err(error) => {
                 if !std::mem::replace(&mut failed, true) {

@@ -8,6 +8,7 @@ use std::{
 };
 
 use tokio::sync::{Notify, mpsc, watch};
+use tracing::Instrument;
 
 use super::batch::{self, Answer, Item};
 use super::{
@@ -200,13 +201,14 @@ impl Worker {
             .filter(|(of, connection)| *of == incarnation && !connection.is_closed());
         self.stats.batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
+        let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
         self.in_flight = Some(InFlight {
             incarnation,
             version: self.link.ledger.version(),
             items,
             sent: tokio::time::Instant::now(),
-            done: Box::pin(done),
+            done: Box::pin(done.instrument(span)),
         });
     }
 

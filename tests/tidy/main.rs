@@ -265,7 +265,7 @@ fn only_the_clock_reads_the_wall_clock() {
     }
     users.sort();
     let expected = [
-        "app.rs",
+        "app/startup.rs",
         "clock.rs",
         "recovery/reporting.rs",
         "server/pages.rs",

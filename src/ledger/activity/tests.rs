@@ -62,6 +62,8 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
         master.apply_telling(&publish, &mut noticed);
         activity.applied(now, &publish, noticed, |_| true)
     };
+    // The first time a node is new, too.
+    assert!(apply(&mut activity, false));
     assert!(!apply(&mut activity, false));
     activity.set_telling(true);
     assert!(apply(&mut activity, false));
