@@ -252,12 +252,14 @@ impl Upstream {
             return Ok(());
         }
         // The kernel counts in whole seconds here.
-        let pace = self.probe_timeout.max(Duration::from_secs(1));
-        let probes = TcpKeepalive::new().with_time(pace).with_interval(pace);
+        let interval = self.probe_timeout.max(Duration::from_secs(1));
+        let probes = TcpKeepalive::new()
+            .with_time(interval)
+            .with_interval(interval);
         let socket = SockRef::from(stream);
         socket.set_tcp_keepalive(&probes)?;
         // This limit, and no count, also ends the probes.
-        socket.set_tcp_user_timeout(Some(pace * (self.probe_count + 1)))
+        socket.set_tcp_user_timeout(Some(interval * (self.probe_count + 1)))
     }
 }
 

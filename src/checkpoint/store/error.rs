@@ -127,7 +127,7 @@ pub enum StoreError {
     Busy,
     /// A generation that is no longer wanted: a later one was begun, the file was set aside, or too
     /// much was recorded while it was written.
-    #[error("the new generation of `{}` was overtaken and has been dropped; begin another", path.display())]
+    #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken {
         /// The checkpoint.
         path: PathBuf,

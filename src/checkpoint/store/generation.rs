@@ -20,13 +20,13 @@ pub(super) struct Pending {
     generation: u64,
     /// Bodies of the records since, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
-    overtaken: bool,
+    superseded: bool,
     /// Dangles when the job or its result was dropped instead of being finished.
     ticket: Weak<Ticket>,
 }
 
 /// Whether a generation is still wanted; locked while its job changes names, so that no job that
-/// was overtaken touches the files of the one that overtook it.
+/// was superseded touches the files of the one that superseded it.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
@@ -116,7 +116,7 @@ impl<S: Storage> Plan<S> {
         }?;
         let wanted = self.ticket.lock();
         if !*wanted {
-            return Err(names.overtaken());
+            return Err(names.superseded());
         }
         let mut linked = true;
         let mut previous = None;
@@ -229,7 +229,7 @@ impl<S: Storage> Store<S> {
         self.pending = Some(Pending {
             generation,
             meanwhile: Vec::new(),
-            overtaken: false,
+            superseded: false,
             ticket: Arc::downgrade(&ticket),
         });
         let unsettled = self.active.as_ref().is_some_and(|active| !active.named);
@@ -292,8 +292,8 @@ impl<S: Storage> Store<S> {
     fn switch(&mut self, pending: Option<Pending>, done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let written = done.result?;
-        let Some(pending) = pending.filter(|pending| !pending.overtaken) else {
-            return Err(self.names.overtaken());
+        let Some(pending) = pending.filter(|pending| !pending.superseded) else {
+            return Err(self.names.superseded());
         };
         let mut journal = Vec::with_capacity(pending.meanwhile.len());
         for body in pending
@@ -366,8 +366,8 @@ impl<S: Storage> Store<S> {
 
 impl Pending {
     pub(super) fn keep(&mut self, body: &[u8]) {
-        self.overtaken |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
-        if self.overtaken {
+        self.superseded |= self.meanwhile.len() + body.len() >= MEANWHILE_BYTES_MAX;
+        if self.superseded {
             self.meanwhile = Vec::new();
         } else if !body.is_empty() {
             self.meanwhile.extend_from_slice(body);

@@ -34,7 +34,7 @@ impl Names {
         self.numbered("new", generation)
     }
 
-    pub(super) fn overtaken(&self) -> StoreError {
+    pub(super) fn superseded(&self) -> StoreError {
         let path = self.path.clone();
         StoreError::Overtaken { path }
     }

@@ -105,7 +105,7 @@ fn a_compaction_that_cannot_keep_up_is_given_up_in_bounded_memory() {
 }
 
 #[test]
-fn a_job_that_was_overtaken_or_lost_is_in_nobodys_way() {
+fn a_job_that_was_superseded_or_lost_is_in_nobodys_way() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
