@@ -22,14 +22,12 @@ use std::{
 };
 
 use command_fds::{CommandFdExt, FdMapping, FdMappingCollision};
-use rustix::process::{Signal, WaitOptions};
+use rustix::process::{Pid, Signal, WaitOptions, kill_process};
 use signal_hook::{
     consts::{SIGCHLD, SIGHUP, SIGINT, SIGQUIT, SIGTERM},
     iterator::Signals,
 };
 use thiserror::Error;
-
-use crate::process::signal_process;
 
 pub mod handover;
 pub mod restart;
@@ -201,7 +199,10 @@ impl Worker {
             SIGQUIT => Signal::QUIT,
             _ => Signal::TERM,
         };
-        signal_process(self.pid, signal);
+        // It is a child that has not been waited for: nobody else has its process id.
+        if let Some(pid) = i32::try_from(self.pid).ok().and_then(Pid::from_raw) {
+            let _ = kill_process(pid, signal);
+        }
     }
 
     /// Whether it says `word` before its end, or within [`START_TIME`]. What it said before `word` is
