@@ -8,6 +8,7 @@
 
 mod cases;
 mod documents;
+mod fuzz_seeds;
 mod peer;
 mod shown;
 #[path = "../support/mod.rs"]

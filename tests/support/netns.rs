@@ -32,12 +32,9 @@ impl Netns {
         static COUNT: AtomicU8 = AtomicU8::new(0);
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
         let pid = std::process::id();
-        // Networks of test processes that run at the same time differ in all likelihood.
-        let net = format!(
-            "10.{}.{}",
-            64 + (pid >> 6) % 128,
-            (pid & 63) * 4 + u32::from(number) % 4
-        );
+        // 32 networks for each of 1,024 test processes that may run at the same time.
+        let net = (pid % 1024) * 32 + u32::from(number) % 32;
+        let net = format!("10.{}.{}", 64 + (net >> 8), net & 255);
         let near = format!("rr{pid}n{number}");
         let far = format!("rr{pid}f{number}");
         let name = format!("rosrescue-{pid}-{number}");

@@ -200,6 +200,13 @@ impl Robot {
         }
     }
 
+    /// SIGKILL to the real master, until the mirror stands in.
+    #[track_caller]
+    pub(crate) fn take_master_away(&mut self) {
+        self.kill_master();
+        eventually("the mirror stands in", || !self.is_open());
+    }
+
     /// SIGKILL to a core's master of which the process id is known: it may be a zombie by now.
     pub(crate) fn kill_master_at_once(&mut self, pid: u32) {
         signal(pid, Signal::KILL);

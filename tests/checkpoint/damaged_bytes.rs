@@ -1,0 +1,309 @@
+//! What is left of a damaged checkpoint is what was written, or nothing; never something else.
+
+// The lints know `#[test]` functions only, not their helpers.
+use std::path::Path;
+
+use indexmap::IndexMap;
+use rosrescue::checkpoint::format::{
+    Checkpoint, DecodeError, Decoded, Entry, Record, Session, SnapshotError, Stamp, decode,
+    encode_checkpoint, encode_record,
+};
+use rosrescue::master::{Snapshot, SnapshotNode};
+use rosrescue::xmlrpc::{Call, Struct, Value};
+
+fn checkpoint(seq: u64) -> Checkpoint {
+    Checkpoint {
+        seq,
+        session: Session {
+            id: "run".to_owned(),
+            boot_id: "boot".to_owned(),
+            ..Session::default()
+        },
+        snapshot: Snapshot {
+            nodes: IndexMap::from([(
+                "/talker".to_owned(),
+                SnapshotNode {
+                    api: "http://robot:40001/".to_owned(),
+                    ..SnapshotNode::default()
+                },
+            )]),
+            publishers: IndexMap::from([("/chatter".to_owned(), vec!["/talker".to_owned()])]),
+            params: Struct::from([("rate".to_owned(), Value::Double(10.0))]),
+            ..Snapshot::default()
+        },
+        pending: Vec::new(),
+    }
+}
+
+fn record(seq: u64) -> Record {
+    let params = vec![
+        "/n".into(),
+        format!("/p{seq}").into(),
+        Value::Double(seq as f64),
+    ];
+    Record {
+        seq,
+        entry: Entry::call(Call::new("setParam", params)),
+    }
+}
+
+/// A checkpoint as of record 7 followed by `count` records, where each line starts, and its stamp.
+fn file(count: u64, generation: u64) -> (Vec<u8>, Vec<usize>, Stamp) {
+    let encoded = encode_checkpoint(&checkpoint(7), generation).unwrap();
+    let mut bytes = encoded.bytes;
+    let mut starts = vec![bytes.len()];
+    for seq in 8..8 + count {
+        bytes.extend(encode_record(&record(seq), encoded.stamp).unwrap());
+        starts.push(bytes.len());
+    }
+    (bytes, starts, encoded.stamp)
+}
+
+/// Everything that came back was written; says whether all of it did and nothing was noticed.
+fn is_untouched(decoded: &Decoded, count: u64) -> bool {
+    if let Ok(found) = &decoded.checkpoint {
+        assert_eq!(*found, checkpoint(7));
+    }
+    for found in &decoded.records {
+        assert_eq!(*found, record(found.seq));
+        assert!((8..8 + count).contains(&found.seq));
+    }
+    assert!(decoded.records.is_sorted_by(|a, b| a.seq < b.seq));
+    decoded.checkpoint.is_ok()
+        && decoded.records.len() as u64 == count
+        && decoded.torn.is_none()
+        && decoded.damaged.is_empty()
+}
+
+#[test]
+fn an_untouched_file_is_whole() {
+    let (bytes, _, _) = file(3, 2);
+    let decoded = decode(&bytes).unwrap();
+    assert!(is_untouched(&decoded, 3));
+    assert_eq!(decoded.generation, 2);
+}
+
+#[test]
+fn every_flipped_bit_is_noticed() {
+    let (bytes, starts, _) = file(6, 2);
+    let mut flipped = bytes.clone();
+    for at in 0..bytes.len() {
+        for bit in 0..8 {
+            flipped[at] ^= 1 << bit;
+            let decoded = decode(&flipped).unwrap_or_else(|error| panic!("byte {at}: {error}"));
+            assert!(
+                !is_untouched(&decoded, 6),
+                "bit {bit} of byte {at} went unnoticed"
+            );
+            // One bit costs the snapshot or one record, or two if they are joined.
+            if at < starts[0] {
+                assert!(decoded.checkpoint.is_err(), "bit {bit} of byte {at}");
+                assert_eq!(decoded.records.len(), 6, "bit {bit} of byte {at}");
+            } else {
+                assert!(decoded.checkpoint.is_ok());
+                assert!(decoded.records.len() >= 4, "bit {bit} of byte {at}");
+            }
+            flipped[at] ^= 1 << bit;
+        }
+    }
+    println!("{} bits flipped", bytes.len() * 8);
+}
+
+#[test]
+fn a_file_cut_anywhere_gives_the_records_before_the_cut() {
+    let (bytes, starts, _) = file(30, 2);
+    for cut in 0..bytes.len() {
+        let decoded = decode(&bytes[..cut]).unwrap_or_else(|error| panic!("byte {cut}: {error}"));
+        is_untouched(&decoded, 30);
+        // A record whose line feed alone is missing is whole.
+        let whole = starts.iter().skip(1).filter(|end| **end <= cut + 1).count();
+        assert_eq!(decoded.records.len(), whole, "byte {cut}");
+        assert_eq!(decoded.checkpoint.is_ok(), cut >= starts[0], "byte {cut}");
+        assert!(decoded.damaged.is_empty());
+        let clean = cut < starts[0] || starts.iter().any(|s| *s == cut || *s == cut + 1);
+        let torn = (!clean).then(|| starts[whole]..cut);
+        assert_eq!(decoded.torn, torn, "byte {cut}");
+    }
+}
+
+#[test]
+fn a_zeroed_sector_costs_what_was_in_it() {
+    let (bytes, starts, _) = file(200, 2);
+    for sector in (0..bytes.len()).step_by(512) {
+        let end = bytes.len().min(sector + 512);
+        let mut zeroed = bytes.clone();
+        zeroed[sector..end].fill(0);
+        let decoded = decode(&zeroed).unwrap();
+        assert!(!is_untouched(&decoded, 200));
+        let hit = starts
+            .windows(2)
+            .filter(|line| line[0] < end && sector < line[1])
+            .count();
+        assert_eq!(decoded.records.len(), 200 - hit, "sector at {sector}");
+        // The end of the file is a torn write; anything else is damage.
+        if sector >= starts[0] {
+            assert_eq!(
+                decoded.torn.is_some(),
+                end == bytes.len(),
+                "sector at {sector}"
+            );
+            assert_eq!(
+                decoded.damaged.is_empty(),
+                end == bytes.len(),
+                "sector at {sector}"
+            );
+        }
+    }
+}
+
+#[test]
+fn records_of_another_life_of_the_file_do_not_count() {
+    let (mut bytes, starts, stamp) = file(3, 2);
+    let (old, old_starts, _) = file(9, 1);
+    let whole = bytes.len();
+    // Old whole records with the very numbers that would come next.
+    bytes.extend_from_slice(&old[old_starts[3]..]);
+    let decoded = decode(&bytes).unwrap();
+    assert_eq!(decoded.records.len(), 3);
+    assert_eq!(decoded.torn, Some(whole..bytes.len()));
+    assert!(decoded.damaged.is_empty());
+
+    // The same in the middle is damage.
+    bytes.extend(encode_record(&record(11), stamp).unwrap());
+    let decoded = decode(&bytes).unwrap();
+    assert_eq!(decoded.records.len(), 4);
+    assert_eq!(decoded.damaged.len(), 6);
+
+    // A record twice, or one that the snapshot contains.
+    for seq in [8, 7] {
+        let mut bytes = bytes[..starts[1]].to_vec();
+        bytes.extend(encode_record(&record(seq), stamp).unwrap());
+        bytes.extend(encode_record(&record(9), stamp).unwrap());
+        let decoded = decode(&bytes).unwrap();
+        assert_eq!(decoded.records, [record(8), record(9)]);
+        assert_eq!(decoded.damaged.len(), 1);
+    }
+}
+
+#[test]
+fn random_damage_is_never_taken_for_state() {
+    use proptest::prelude::*;
+    let (bytes, _, _) = file(40, 2);
+    let mut runner = proptest::test_runner::TestRunner::new(ProptestConfig::with_cases(2_000));
+    let strategy = proptest::collection::vec((0..bytes.len(), any::<u8>()), 1..12);
+    let run = runner.run(&strategy, |changes| {
+        let mut damaged = bytes.clone();
+        for (at, byte) in changes {
+            damaged[at] = byte;
+        }
+        if let Ok(decoded) = decode(&damaged) {
+            prop_assert!(!is_untouched(&decoded, 40) || damaged == bytes);
+        }
+        Ok(())
+    });
+    run.unwrap();
+}
+
+#[test]
+fn any_bytes_are_read_without_a_panic() {
+    use proptest::prelude::*;
+    let mut runner = proptest::test_runner::TestRunner::new(ProptestConfig::with_cases(2_000));
+    let run = runner.run(&proptest::collection::vec(any::<u8>(), 0..400), |bytes| {
+        let _ = decode(&bytes);
+        Ok(())
+    });
+    run.unwrap();
+}
+
+#[test]
+fn what_is_not_ours_is_told_apart() {
+    for foreign in [
+        "use_sim_time: true\n",
+        "# my parameters\nrate: 10\n",
+        "journal:\n- lunch\n",
+        "<launch/>",
+        "\u{7f}ELF",
+    ] {
+        let error = decode(foreign.as_bytes()).unwrap_err();
+        assert_eq!(error, DecodeError::NotACheckpoint, "{foreign}");
+    }
+    // What a crash of the machine makes of a file is not foreign.
+    for ours in [&b""[..], &[0; 4096], b"# rosrescue check"] {
+        assert_eq!(
+            decode(ours).unwrap().checkpoint.unwrap_err(),
+            SnapshotError::Header
+        );
+    }
+}
+
+#[test]
+fn a_later_format_is_told_apart() {
+    let line = b"# rosrescue checkpoint v2 whatever=this says header=";
+    let mut bytes = line.to_vec();
+    bytes.extend(format!("{:08x}\n- newer: true\n", crc32c::crc32c(line)).bytes());
+    assert_eq!(
+        decode(&bytes).unwrap_err(),
+        DecodeError::NewerVersion { version: 2 }
+    );
+    // Without its check sum it is a damaged one of ours.
+    bytes[line.len()] ^= 1;
+    assert_eq!(
+        decode(&bytes).unwrap().checkpoint.unwrap_err(),
+        SnapshotError::Header
+    );
+}
+
+/// A file whose session and writes know more: what has not reached the master yet.
+fn file_with_pending_writes() -> Vec<u8> {
+    let mut checkpoint = checkpoint(7);
+    checkpoint.session.incarnation = 2;
+    checkpoint.session.delivered = 5;
+    let pending = |seq| match record(seq).entry {
+        Entry::Call { call, .. } => call,
+        Entry::Session(_) => unreachable!(),
+    };
+    checkpoint.pending = vec![pending(6), pending(7)];
+    let encoded = encode_checkpoint(&checkpoint, 1).unwrap();
+    let mut session = checkpoint.session;
+    session.delivered = 8;
+    let entries = [
+        Entry::Call {
+            call: pending(8),
+            pending: true,
+        },
+        Entry::Session(session),
+        record(10).entry,
+    ];
+    let mut bytes = encoded.bytes;
+    for (seq, entry) in (8..).zip(entries) {
+        bytes.extend(encode_record(&Record { seq, entry }, encoded.stamp).unwrap());
+    }
+    bytes
+}
+
+/// Files of earlier releases stay readable, and today's are written as they were.
+#[test]
+fn golden_files() {
+    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    let files = [
+        ("checkpoint-v1.yaml", file(2, 1).0, 2),
+        ("checkpoint-v1-pending.yaml", file_with_pending_writes(), 3),
+    ];
+    for (name, bytes, records) in files {
+        let path = golden.join(name);
+        if std::env::var_os("BLESS").is_some() {
+            std::fs::write(&path, &bytes).unwrap();
+        }
+        let golden = std::fs::read(path).unwrap();
+        let decoded = decode(&golden).unwrap();
+        assert!(decoded.damaged.is_empty() && decoded.torn.is_none());
+        assert_eq!(
+            (decoded.checkpoint.is_ok(), decoded.records.len()),
+            (true, records)
+        );
+        assert_eq!(
+            String::from_utf8(bytes).unwrap(),
+            String::from_utf8(golden).unwrap()
+        );
+    }
+}

@@ -1,0 +1,17 @@
+//! The checkpoint, without ROS: its bytes, its YAML, and the store on a real disk.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+/// Any damage to the bytes of a file.
+mod damaged_bytes;
+/// SIGKILL to a process that records.
+mod kill;
+/// The store on a disk: locks, generations, compaction.
+mod store;
+/// What Python reads in it.
+mod yaml;

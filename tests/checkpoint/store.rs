@@ -1,0 +1,307 @@
+//! The checkpoint on a real disk.
+
+// The lints know `#[test]` functions only, not their helpers.
+mod damage;
+mod moved;
+
+use std::fs;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::path::Path;
+
+use rosrescue::checkpoint::format::{Checkpoint, Entry, Session};
+use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
+use rosrescue::xmlrpc::{Call, Value};
+
+fn entry(nth: i32) -> Entry {
+    Entry::call(Call::new(
+        "setParam",
+        vec!["/n".into(), format!("/p{nth}").into(), nth.into()],
+    ))
+}
+
+fn checkpoint(seq: u64) -> Checkpoint {
+    let mut checkpoint = Checkpoint {
+        seq,
+        ..Checkpoint::default()
+    };
+    checkpoint.session.id = "run".to_owned();
+    checkpoint
+        .snapshot
+        .params
+        .insert("as_of".to_owned(), Value::from(seq as i32));
+    checkpoint
+}
+
+/// A store at `path`, begun and with records up to number `seq`.
+fn started(path: &Path, seq: i32) -> Store {
+    let (mut store, loaded) = Store::open(path).unwrap();
+    assert!(loaded.is_none());
+    store.begin(&checkpoint(0)).unwrap();
+    for nth in 1..=seq {
+        assert_eq!(store.append(&[entry(nth)]).unwrap(), nth as u64);
+    }
+    store
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = fs::read_dir(folder)
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn what_was_appended_is_there_after_a_crash() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("deep/er/latest-chkpt.yaml");
+    let store = started(&path, 3);
+    drop(store);
+    let (store, loaded) = Store::open(&path).unwrap();
+    let loaded = loaded.unwrap();
+    assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
+    assert_eq!(
+        loaded
+            .records
+            .iter()
+            .map(|record| record.entry.clone())
+            .collect::<Vec<_>>(),
+        [entry(1), entry(2), entry(3)]
+    );
+    assert!(loaded.exact && loaded.torn.is_none() && loaded.damage.is_empty());
+    assert_eq!(loaded.session().unwrap().id, "run");
+    assert_eq!(store.seq(), 3);
+    assert!(store.unprotected().is_some());
+}
+
+#[test]
+fn a_second_one_is_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let _store = started(&path, 0);
+    let link = folder.path().join("other.yaml");
+    symlink("c.yaml", &link).unwrap();
+    for path in [&path, &link] {
+        let error = Store::open(path).err().unwrap();
+        let text = error.to_string();
+        assert!(matches!(error, OpenError::Locked { .. }));
+        assert!(
+            text.contains("c.yaml") && text.contains("another rosrescue"),
+            "{text}"
+        );
+        assert!(
+            text.contains(&format!("process {}", std::process::id())),
+            "{text}"
+        );
+    }
+}
+
+#[test]
+fn files_are_for_their_owner_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 1);
+    store.begin(&checkpoint(1)).unwrap();
+    for name in names(folder.path()) {
+        let mode = fs::metadata(folder.path().join(&name))
+            .unwrap()
+            .permissions()
+            .mode();
+        assert_eq!(mode & 0o777, 0o600, "{name}");
+    }
+    assert_eq!(
+        names(folder.path()),
+        ["c.yaml", "c.yaml.lock", "c.yaml.previous"]
+    );
+}
+
+#[test]
+fn a_link_is_followed_and_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    let (link, real) = (
+        folder.path().join("link.yaml"),
+        folder.path().join("real/c.yaml"),
+    );
+    symlink("real/c.yaml", &link).unwrap();
+    let mut store = started(&link, 1);
+    store.begin(&checkpoint(1)).unwrap();
+    assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+    assert!(real.is_file());
+    assert_eq!(names(folder.path()), ["link.yaml", "real"]);
+    symlink("loop.yaml", folder.path().join("loop.yaml")).unwrap();
+    assert!(Store::open(&folder.path().join("loop.yaml")).is_err());
+}
+
+#[test]
+fn what_is_recorded_during_a_compaction_is_in_both_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    let job = store.begin_compaction(checkpoint(2)).unwrap();
+    assert!(matches!(
+        store.begin_compaction(checkpoint(2)),
+        Err(StoreError::Busy)
+    ));
+    store.append(&[entry(3)]).unwrap();
+    let done = job.run();
+    store.append(&[entry(4)]).unwrap();
+    let journal = store.journal_bytes();
+    store.finish_compaction(done).unwrap();
+    assert!(store.journal_bytes() < journal);
+    store.append(&[entry(5)]).unwrap();
+    drop(store);
+    let (store, loaded) = Store::open(&path).unwrap();
+    let loaded = loaded.unwrap();
+    assert_eq!(loaded.checkpoint, Some(checkpoint(2)));
+    assert_eq!(
+        loaded
+            .records
+            .iter()
+            .map(|record| record.seq)
+            .collect::<Vec<_>>(),
+        [3, 4, 5]
+    );
+    assert!(loaded.exact);
+    assert_eq!(store.generation(), 2);
+    let previous = rosrescue::checkpoint::store::read(&folder.path().join("c.yaml.previous"))
+        .unwrap()
+        .unwrap();
+    assert_eq!(
+        previous
+            .records
+            .iter()
+            .map(|record| record.seq)
+            .collect::<Vec<_>>(),
+        [1, 2, 3, 4]
+    );
+}
+
+#[test]
+fn compaction_is_wanted_when_the_journal_outgrows_the_snapshot() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = started(&folder.path().join("c.yaml"), 0);
+    let mut appended = 0;
+    while !store.wants_compaction() {
+        appended += 1;
+        store.append(&[entry(appended)]).unwrap();
+        assert!(appended < 5_000);
+    }
+    assert!(store.journal_bytes() > 64 * 1024);
+    store.begin(&checkpoint(appended as u64)).unwrap();
+    assert!(!store.wants_compaction());
+    let stale = store.begin(&checkpoint(3)).unwrap_err();
+    assert!(matches!(stale, StoreError::Stale { snapshot: 3, .. }));
+    assert!(store.unprotected().is_none());
+}
+
+#[test]
+fn a_session_set_aside_has_no_part_in_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    store.begin(&checkpoint(2)).unwrap();
+    for nth in 1..=12 {
+        let aside = store.set_aside("session").unwrap().unwrap();
+        assert_eq!(
+            aside,
+            folder.path().join(format!("c.yaml.session-{}", 2 * nth))
+        );
+        assert!(store.append(&[entry(0)]).is_err());
+        store.begin(&checkpoint(store.seq())).unwrap();
+        store.append(&[entry(nth)]).unwrap();
+        store.begin(&checkpoint(store.seq())).unwrap();
+    }
+    // The last ten are kept.
+    let kept = names(folder.path())
+        .iter()
+        .filter(|name| name.contains("session-"))
+        .count();
+    assert_eq!(kept, 10);
+    store.set_aside("session").unwrap();
+    assert_eq!(store.set_aside("session").unwrap(), None);
+    drop(store);
+    assert!(Store::open(&path).unwrap().1.is_none());
+}
+
+#[test]
+fn a_session_set_aside_is_no_fallback_of_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    store.begin(&checkpoint(2)).unwrap();
+    store.set_aside("session").unwrap();
+    store.begin(&checkpoint(2)).unwrap();
+    drop(store);
+    let mut broken = fs::read(&path).unwrap();
+    broken[200] ^= 4;
+    fs::write(&path, broken).unwrap();
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert!(loaded.checkpoint.is_none() && loaded.records.is_empty() && !loaded.exact);
+}
+
+#[test]
+fn a_file_that_was_removed_to_start_afresh_stays_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 2);
+    store.begin(&checkpoint(2)).unwrap();
+    drop(store);
+    fs::remove_file(&path).unwrap();
+    let (mut store, loaded) = Store::open(&path).unwrap();
+    assert!(loaded.is_none());
+    store.begin(&checkpoint(0)).unwrap();
+    drop(store);
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert!(loaded.exact && loaded.records.is_empty());
+    assert_eq!(
+        names(folder.path()),
+        ["c.yaml", "c.yaml.lock", "c.yaml.old-1"]
+    );
+}
+
+#[test]
+fn jobs_can_run_on_another_thread() {
+    fn sendable<T: Send + 'static>() {}
+    sendable::<Store>();
+    sendable::<rosrescue::checkpoint::store::SyncJob<rosrescue::checkpoint::store::Disk>>();
+    sendable::<rosrescue::checkpoint::store::Synced>();
+    sendable::<rosrescue::checkpoint::store::CompactionJob<rosrescue::checkpoint::store::Disk>>();
+    sendable::<rosrescue::checkpoint::store::Compacted<rosrescue::checkpoint::store::Disk>>();
+}
+
+#[test]
+fn an_orderly_stop_is_in_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    let mut store = started(&path, 1);
+    let session = Session {
+        closed: true,
+        ..Session::default()
+    };
+    store
+        .close(&Checkpoint {
+            session,
+            ..checkpoint(1)
+        })
+        .unwrap();
+    assert!(store.append(&[entry(2)]).is_err());
+    drop(store);
+    let loaded = Store::open(&path).unwrap().1.unwrap();
+    assert!(loaded.session().unwrap().closed && loaded.records.is_empty());
+}
+
+#[test]
+fn synced_records_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = started(&folder.path().join("c.yaml"), 2);
+    assert_eq!(store.synced_seq(), 0);
+    let job = store.sync_job().unwrap();
+    store.append(&[entry(3)]).unwrap();
+    store.synced(job.run()).unwrap();
+    assert_eq!(store.synced_seq(), 2);
+    let job = store.sync_job().unwrap();
+    store.synced(job.run()).unwrap();
+    assert_eq!(store.synced_seq(), 3);
+    assert!(store.sync_job().is_none());
+}

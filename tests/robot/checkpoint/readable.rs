@@ -1,0 +1,124 @@
+//! The checkpoint as other people's tools see it: after real traffic PyYAML reads the file and finds
+//! every parameter with the type, the text and the place that it has in the master.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::Command;
+
+use crate::support::{
+    FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, Tool, eventually, kinds, params,
+    sorted, tree,
+};
+
+/// What the script says that compares `checkpoint` with the master at `uri`.
+fn compared(checkpoint: &Path, uri: &str) -> String {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/checkpoint.py");
+    let output = Command::new("/usr/bin/python3")
+        .arg(script)
+        .arg(checkpoint)
+        .arg(uri)
+        .output()
+        .expect("the system's Python runs");
+    let said = [output.stdout, output.stderr].concat();
+    String::from_utf8_lossy(&said).trim().to_owned()
+}
+
+#[test]
+fn pyyaml_reads_what_the_master_holds() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    let client = rescue.client();
+    // By default the paper's place and name.
+    let checkpoint = scratch.log_dir().join("latest-chkpt.yaml");
+    let bare = master.client();
+    client.set_param("/kinds", kinds());
+    assert_eq!(compared(&checkpoint, &bare.uri()), "same");
+    client.set_param("/kinds/texts", "one instead of many");
+    client.set_param("/a/b/c", 1);
+    client.set_param("/a/b", "over a subtree");
+    client.set_param("/a/b/d", 2.0);
+    client.set_param("/big", vec!["x".repeat(10_000); 20]);
+    client.ok("deleteParam", params!["/test", "/kinds/one"]);
+    assert_eq!(compared(&checkpoint, &bare.uri()), "same");
+    // Many more calls than any journal keeps: the file stays whole while it is replaced.
+    for i in 0..3000 {
+        client.set_param(&format!("/many/p{}", i % 50), i);
+        if i % 500 == 0 {
+            assert_eq!(compared(&checkpoint, &bare.uri()), "same", "after call {i}");
+        }
+    }
+    assert_eq!(compared(&checkpoint, &bare.uri()), "same");
+    let size = fs::metadata(&checkpoint).unwrap().len();
+    assert!(
+        size < 4_000_000,
+        "the journal is never compacted: {size} bytes"
+    );
+    assert_eq!(
+        fs::metadata(&checkpoint).unwrap().permissions().mode() & 0o777,
+        0o600
+    );
+
+    // The closing snapshot.
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(compared(&checkpoint, &bare.uri()), "same");
+}
+
+#[test]
+fn a_person_finds_nodes_topics_and_services_in_it() {
+    let robot = Robot::start(Mode::Core);
+    let _talker = robot.node(Library::Rospy, "talker", &[]);
+    let node = FakeNode::start("/fake");
+    node.offer(&robot.client(), "/fake/service");
+    node.watch_param(&robot.client(), "/gains");
+    let checkpoint = robot.rescue.checkpoint();
+    eventually("the file tells of everything", || {
+        let text = fs::read_to_string(&checkpoint).unwrap_or_default();
+        let facts = [
+            "/talker",
+            "/chatter",
+            "std_msgs/String",
+            "/fake/service",
+            "/gains",
+            "run_id",
+            &node.api,
+            &node.service_api(),
+        ];
+        facts.iter().all(|fact| text.contains(fact))
+    });
+    assert_eq!(compared(&checkpoint, &robot.bare().uri()), "same");
+}
+
+/// The parameters in the file are a tree that `rosparam load` takes.
+#[test]
+fn rosparam_loads_the_parameters_of_a_checkpoint() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    let robot = tree! {
+        "name" => "no", "gain" => 1.0, "joints" => vec![1, 2], "on" => true, "time" => "1:30",
+        "inner" => tree! { "empty" => "", "lines" => "a\nb\n", "whole" => 1 },
+    };
+    rescue.client().set_param("/robot", robot.clone());
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    let parameters = scratch.path("parameters.yaml");
+    let python = "import sys, yaml; yaml.dump(yaml.safe_load(open(sys.argv[1]))['parameters'], open(sys.argv[2], 'w'))";
+    let mut command = Command::new("/usr/bin/python3");
+    command
+        .args(["-c", python])
+        .args([&rescue.checkpoint(), &parameters]);
+    assert!(
+        command
+            .status()
+            .expect("the system's Python runs")
+            .success()
+    );
+    let arguments = ["load", parameters.to_str().unwrap(), "/copy"];
+    let loaded = Tool::run(&scratch, master.port, "rosparam", &arguments);
+    assert!(loaded.status.success(), "{loaded:?}");
+    // PyYAML writes keys in the order of the alphabet.
+    let copy = master.client().param("/copy/robot").expect("the copy");
+    assert_eq!(sorted(&copy), sorted(&robot));
+}

@@ -1,0 +1,147 @@
+//! A checkpoint that cannot be read at the start: its previous generation is restored, and what was at the
+//! path is kept, whatever it is.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::support::{Rescue, Scratch, Setup, eventually, free_port, signal, status};
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+use rustix::process::Signal;
+
+/// One that has died with its master and left the parameter `/kept` in both generations, and its folder.
+fn dead(scratch: &Scratch) -> (Rescue, PathBuf) {
+    let folder = scratch.path("robot");
+    fs::create_dir(&folder).unwrap();
+    let mut rescue = Setup::core(scratch, free_port())
+        .at_checkpoint(folder.join("chkpt.yaml"))
+        .start();
+    rescue.client().set_param("/kept", 1);
+    kill(&mut rescue);
+    // Its first generation makes that one the previous.
+    rescue.start_again();
+    rescue.wait_serving();
+    kill(&mut rescue);
+    assert!(folder.join("chkpt.yaml.previous").is_file());
+    (rescue, folder)
+}
+
+fn kill(rescue: &mut Rescue) {
+    let master = rescue.client().master_pid().unwrap();
+    rescue.kill();
+    signal(master, Signal::KILL);
+}
+
+fn unprotected(rescue: &Rescue) -> bool {
+    !status(&rescue.client())["unprotected"].is_null()
+}
+
+fn assert_restored(rescue: &mut Rescue) {
+    rescue.wait_line("what cannot be read", |line| {
+        line.contains("cannot read") && line.contains("chkpt.yaml")
+    });
+    rescue.wait_line("what is used instead", |line| {
+        line.contains("chkpt.yaml.previous` is used")
+    });
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    eventually("it is protected", || !unprotected(rescue));
+}
+
+/// Everything goes on from there, and the old thing is still beside it.
+fn assert_restored_and_kept(spoil: impl FnOnce(&Path)) {
+    let scratch = Scratch::new();
+    let (mut rescue, folder) = dead(&scratch);
+    let path = folder.join("chkpt.yaml");
+    spoil(&path);
+    let look = |path: &Path| {
+        let metadata = fs::metadata(path).unwrap();
+        (metadata.file_type(), metadata.len())
+    };
+    let before = look(&path);
+    rescue.start_again();
+    assert_restored(&mut rescue);
+    rescue.client().set_param("/more", 2);
+    kill(&mut rescue);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    assert_eq!(rescue.client().param("/more"), Some(2.into()));
+    assert_eq!(look(&folder.join("chkpt.yaml.unreadable-1")), before);
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+#[test]
+fn a_folder() {
+    assert_restored_and_kept(|path| {
+        fs::remove_file(path).unwrap();
+        fs::create_dir_all(path.join("within")).unwrap();
+    });
+}
+
+#[test]
+fn a_pipe() {
+    assert_restored_and_kept(|path| {
+        fs::remove_file(path).unwrap();
+        assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+    });
+}
+
+#[test]
+fn a_file_beyond_all_measure() {
+    assert_restored_and_kept(|path| {
+        let file = File::options().write(true).open(path).unwrap();
+        file.set_len((1 << 30) + 1).unwrap();
+    });
+}
+
+/// A disk that gives an error, and later the file.
+#[test]
+fn a_good_file_that_could_not_be_read_at_the_start() {
+    let scratch = Scratch::new();
+    let (rescue, folder) = dead(&scratch);
+    let path = folder.join("chkpt.yaml");
+    let good = fs::read(&path).unwrap();
+    drop(rescue);
+    let mut rescue = Setup::core(&scratch, free_port())
+        .at_checkpoint(path.clone())
+        .wrapped(|command| {
+            let mut strace = Command::new("strace");
+            strace
+                .args(["-f", "--seccomp-bpf", "-qq", "-o", "/dev/null"])
+                .args(["-e", "trace=read", "-e", "inject=read:error=EIO", "-P"])
+                .arg(&path);
+            crate::support::behind(strace, command)
+        })
+        .spawn();
+    assert_restored(&mut rescue);
+    let aside = folder.join("chkpt.yaml.unreadable-1");
+    assert_eq!(fs::read(aside).unwrap(), good);
+}
+
+/// Nothing can be read at the start, so a new session begins; what turns up later is not its to replace.
+#[test]
+fn a_good_file_that_turns_up_later() {
+    let scratch = Scratch::new();
+    let (mut rescue, folder) = dead(&scratch);
+    let path = folder.join("chkpt.yaml");
+    let elsewhere = scratch.path("good.yaml");
+    let good = fs::read(&path).unwrap();
+    fs::rename(&path, &elsewhere).unwrap();
+    fs::remove_file(folder.join("chkpt.yaml.previous")).unwrap();
+    fs::create_dir(&path).unwrap();
+    rescue.start_again();
+    rescue.wait_serving();
+    assert!(unprotected(&rescue));
+    assert_eq!(rescue.client().param("/kept"), None);
+    renameat_with(CWD, &elsewhere, CWD, &path, RenameFlags::EXCHANGE).unwrap();
+    eventually("it is protected", || !unprotected(&rescue));
+    rescue.client().set_param("/new", 1);
+    kill(&mut rescue);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/new"), Some(1.into()));
+    let kept = fs::read_dir(&folder).unwrap().flatten();
+    let mut kept = kept.filter(|entry| fs::read(entry.path()).is_ok_and(|bytes| bytes == good));
+    assert!(kept.next().is_some(), "the good file is gone");
+}

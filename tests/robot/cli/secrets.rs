@@ -1,0 +1,65 @@
+//! What the log and the status page are silent about: the values of parameters, which may be passwords.
+
+use crate::support::{Mode, Robot, encode_call, eventually, http_request, params, request, tree};
+use rosrescue::xmlrpc::{Call, Value};
+
+const SECRET: &str = "hunter2";
+
+/// With every call logged, in every way that a value can take, and through an outage.
+#[test]
+fn values_are_never_logged() {
+    let mut robot = Robot::start_with(Mode::Core, &["-v"]);
+    let client = robot.client();
+    client.set_param("/alone", SECRET);
+    client.set_param("/tree", tree! { "password" => SECRET });
+    let several = [
+        Call::new("setParam", params!["/c", "/m", SECRET]),
+        Call::new("getParam", params!["/c", "/m"]),
+        Call::new("noSuchMethod", params!["/c", SECRET]),
+    ];
+    client
+        .call("system.multicall", Call::multicall(several).params)
+        .unwrap();
+    assert_eq!(client.param("/alone"), Some(SECRET.into()));
+    // What cannot be decoded, or what the master refuses.
+    let call = String::from_utf8(encode_call("setParam", params!["/c", "/odd", SECRET])).unwrap();
+    let typed = call.replace(SECRET, &format!("<int>{SECRET}</int>"));
+    let document = &call[call.find("<methodCall").unwrap()..];
+    let doctype = format!("<!DOCTYPE methodCall>{document}");
+    for body in [&typed, &doctype, &call.replace("</params>", "")] {
+        client.exchange(&http_request(body.as_bytes())).unwrap();
+    }
+    for header in ["Content-Type: text/plain", "Content-Encoding: br"] {
+        let bytes = request("POST / HTTP/1.1", &[header], call.as_bytes());
+        client.exchange(&bytes).unwrap();
+    }
+    // What the mirror does not know: a divergence.
+    robot.bare().set_param("/past", SECRET);
+    let api = "http://127.0.0.1:1/";
+    let answer = client.ok("subscribeParam", params!["/c", api, "/past"]);
+    assert_eq!(answer, SECRET.into());
+    eventually("it has been noticed", || robot.counter("divergences") > 0);
+    // What cannot be restored, and what waits for the new master.
+    client.set_param(
+        "/large",
+        tree! { "password" => SECRET, "number" => Value::BigInt("9".repeat(30)) },
+    );
+    let dead = robot.master_pid();
+    robot.kill_master_at_once(dead);
+    client.set_param("/alone", format!("{SECRET}2"));
+    robot.await_recovery(dead);
+    assert_eq!(client.param("/alone"), Some(format!("{SECRET}2").into()));
+
+    for path in ["/", "/status.json", "/metrics"] {
+        let page = request(&format!("GET {path} HTTP/1.1"), &[], b"");
+        let page = client.exchange(&page).unwrap().text();
+        assert!(!page.contains(SECRET), "{path}: {page}");
+    }
+    let log = robot.rescue.output();
+    assert!(
+        log.iter().any(|line| line.contains("setParam")),
+        "every call is logged: {log:?}"
+    );
+    let leak = log.iter().find(|line| line.contains(SECRET));
+    assert!(leak.is_none(), "{leak:?}");
+}

@@ -1,0 +1,427 @@
+//! How rosrescue starts and refuses to start: its arguments, files and ports. Each mistake gets one clear
+//! sentence; nothing is left behind and nothing of a person's is lost.
+
+use std::fs;
+use std::net::{TcpListener, TcpStream};
+use std::path::Path;
+use std::process::Command;
+use std::thread;
+use std::time::Duration;
+
+use crate::support::{
+    Client, Rescue, Rosmaster, Scratch, Setup, eventually, find_program, free_port, holds, params,
+};
+use rustix::process::Signal;
+
+/// Runs rosrescue to its end, which must come by itself, with `code`, one clear sentence on standard
+/// error, and nothing left behind. Gives the sentence.
+#[track_caller]
+fn refused(scratch: &Scratch, setup: Setup, code: i32) -> String {
+    let before = scratch.survivors();
+    let mut rescue = setup.spawn();
+    let status = rescue.wait_output();
+    let said = rescue.stderr().join("\n");
+    assert_eq!(status.code(), Some(code), "{said}");
+    rescue.assert_no_panic();
+    // A usage error comes with a hint how to get help; anything else is one sentence, perhaps
+    // after lines of the log.
+    let sentence = said.lines().last().unwrap().to_owned();
+    for noise in ["Os {", "Err(", "Some(", "stack backtrace", "kind:"] {
+        assert!(!said.contains(noise), "`{noise}` is not for people: {said}");
+    }
+    // What it has killed at its end may take a moment to be gone.
+    eventually("no process is left behind", || {
+        scratch.survivors() == before
+    });
+    if code == 2 { said } else { sentence }
+}
+
+#[test]
+fn usage_errors_end_with_2_and_say_which() {
+    let scratch = Scratch::new();
+    let cases: &[(&[&str], &str)] = &[
+        (&["--no-such-option"], "--no-such-option"),
+        (&["no-such-command"], "no-such-command"),
+        (&["core", "-p", "0"], "-p"),
+        (&["core", "-p", "70000"], "70000"),
+        (&["core", "-p", "eleven"], "eleven"),
+        (&["core", "--master-port", "-1"], "-1"),
+        (&["core", "--hold", "long"], "long"),
+        (&["core", "--hold", "-1"], "hold"),
+        (&["core", "--probe-interval", "0"], "--probe-interval"),
+        (&["core", "--restore", "sometimes"], "sometimes"),
+        (&["proxy"], "--master"),
+        (&["proxy", "--master", ""], "master"),
+        (&["proxy", "--master", "ftp://localhost:1"], "ftp"),
+        (&["proxy", "--master", "http://"], "http://"),
+        (&["proxy", "--master", "http://localhost:99999"], "99999"),
+        (
+            &[
+                "proxy",
+                "--master",
+                "http://localhost:1",
+                "--listen",
+                "nowhere:at:all",
+            ],
+            "nowhere",
+        ),
+        (
+            &["proxy", "--master", "http://localhost:1", "-w", "3"],
+            "-w",
+        ),
+    ];
+    for (arguments, named) in cases {
+        let said = refused(&scratch, Setup::bare(&scratch, *arguments), 2);
+        assert!(said.contains(named), "{arguments:?}: {said}");
+    }
+    let said = refused(
+        &scratch,
+        Setup::bare(&scratch, ["core"]).env("ROSRESCUE_PORT", "x"),
+        2,
+    );
+    assert!(said.contains('x'), "{said}");
+    for bad in ["bad host", "a/b"] {
+        let setup = Setup::bare(&scratch, ["core"]).env("ROS_HOSTNAME", bad);
+        let said = refused(&scratch, setup, 2);
+        assert!(
+            said.contains("ROS_HOSTNAME") && said.contains(bad),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn variables_of_core_are_no_matter_of_proxy() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = || {
+        Setup::proxy(&scratch, master.port)
+            .env("ROSRESCUE_NUMWORKERS", "bad")
+            .env("ROSRESCUE_PORT", "bad")
+    };
+    setup().start();
+    // Its own still are.
+    let said = refused(&scratch, setup().env("ROSRESCUE_HOLD", "bad"), 2);
+    assert!(said.contains("--hold"), "{said}");
+    for arguments in [&[][..], &["core"], &["--no-rosout"]] {
+        let setup = Setup::bare(&scratch, arguments).env("ROSRESCUE_NUMWORKERS", "bad");
+        let said = refused(&scratch, setup, 2);
+        assert!(said.contains("--numworkers"), "{arguments:?}: {said}");
+    }
+}
+
+#[test]
+fn an_address_that_this_computer_does_not_have() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port, "--listen", "198.51.100.7"]);
+    let said = refused(&scratch, setup, 1);
+    assert!(
+        said.contains("198.51.100.7") && said.contains("--listen"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_new_session_is_said_to_be_one() {
+    let scratch = Scratch::new();
+    let mut rescue = Setup::core(&scratch, free_port()).start();
+    rescue.wait_line("what it did", |line| line.contains("is served"));
+    let said = rescue.output().join("\n");
+    assert!(!said.contains("restored"), "{said}");
+}
+
+/// The gate stays open although rosmaster closes what is idle for a second.
+#[test]
+fn probes_keep_the_sentinel_from_being_idle() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port());
+    let rescue = setup.args(["-t", "1", "--probe-interval", "3000"]).start();
+    let shut = || {
+        let lines = rescue.stderr();
+        lines.iter().any(|line| line.contains("standing in"))
+    };
+    assert!(holds(Duration::from_secs(5), || !shut()));
+}
+
+#[test]
+fn help_and_version_need_nothing_and_end_with_0() {
+    let scratch = Scratch::new();
+    for arguments in [
+        &["--help"][..],
+        &["--version"],
+        &["core", "--help"],
+        &["proxy", "--help"],
+    ] {
+        let mut rescue = Setup::bare(&scratch, arguments)
+            .env("PATH", "/nonexistent")
+            .spawn();
+        assert_eq!(rescue.wait().code(), Some(0), "{arguments:?}");
+        eventually("it said something", || !rescue.stdout().is_empty());
+        assert_eq!(rescue.stderr(), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn a_ros_master_uri_that_is_none() {
+    let scratch = Scratch::new();
+    for uri in ["rosmaster", "http://", "http://host:port/", "://"] {
+        let setup = Setup::bare(&scratch, ["core"]).env("ROS_MASTER_URI", uri);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(code == Some(1) || code == Some(2), "{uri}: {code:?}");
+        eventually("it names the variable", || {
+            rescue.stderr().join("\n").contains("ROS_MASTER_URI")
+        });
+        rescue.assert_no_panic();
+    }
+}
+
+#[test]
+fn ports_in_use() {
+    let scratch = Scratch::new();
+    let taken = TcpListener::bind("0.0.0.0:0").unwrap();
+    let port = taken.local_addr().unwrap().port();
+    let text = port.to_string();
+    let master = free_port();
+    let core = Setup::bare(
+        &scratch,
+        ["core", "-p", &text, "--master-port", &master.to_string()],
+    );
+    let said = refused(&scratch, core, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+
+    let core = Setup::bare(
+        &scratch,
+        ["core", "-p", &master.to_string(), "--master-port", &text],
+    );
+    let said = refused(&scratch, core, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+
+    let listen = format!("127.0.0.1:{port}");
+    let uri = format!("http://127.0.0.1:{master}");
+    let proxy = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &listen]);
+    let said = refused(&scratch, proxy, 1);
+    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+}
+
+/// `own` where nothing lies in /opt but, if one is given, a ROS with this rosmaster.
+fn with_opt(own: &Command, rosmaster: &Path) -> Command {
+    const MOUNT: &str = r#"
+        own_path=$PATH
+        PATH=/usr/sbin:/usr/bin:/sbin:/bin
+        mount -t tmpfs none /opt
+        if [ -n "$0" ]; then
+            mkdir -p /opt/ros/noetic/bin
+            ln -s "$0" /opt/ros/noetic/bin/rosmaster
+        fi
+        PATH=$own_path
+        exec "$@""#;
+    let mut command = Command::new("/usr/bin/unshare");
+    if !rustix::process::geteuid().is_root() {
+        command.arg("--map-root-user");
+    }
+    command.args(["--mount", "/bin/sh", "-ec", MOUNT]);
+    command.arg(rosmaster);
+    command.arg(own.get_program()).args(own.get_args());
+    for (key, value) in own.get_envs() {
+        match value {
+            Some(value) => command.env(key, value),
+            None => command.env_remove(key),
+        };
+    }
+    command
+}
+
+#[test]
+fn no_rosmaster_installed() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(
+        &scratch,
+        ["core", "-p", &port, "--rosmaster", "/nonexistent/rosmaster"],
+    );
+    let said = refused(&scratch, setup, 1);
+    assert!(said.contains("/nonexistent/rosmaster"), "{said}");
+
+    // With an empty PATH, on a computer without a ROS in /opt.
+    let empty = scratch.path("empty");
+    fs::create_dir(&empty).unwrap();
+    let bare = |more: &[&str]| {
+        Setup::bare(&scratch, ["core", "-p", &port])
+            .args(more)
+            .at_port(port.parse().unwrap())
+            .env("PATH", &empty)
+    };
+    let said = refused(
+        &scratch,
+        bare(&[]).wrapped(|own| with_opt(own, Path::new(""))),
+        1,
+    );
+    assert!(
+        said.contains("python3-rosmaster"),
+        "it says which package to install: {said}"
+    );
+    // A ROS in /opt is found without a PATH.
+    let rosmaster = find_program("rosmaster");
+    let mut setup = bare(&["--no-rosout"]);
+    if !rosmaster.starts_with("/opt/ros") {
+        setup = setup.wrapped(|own| with_opt(own, &rosmaster));
+    }
+    let mut rescue = setup.start();
+    rescue.client().set_param("/x", 1);
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    // One that ends at once is no master either, and is reported as such.
+    let mut setup = Setup::bare(&scratch, ["core", "-p", &port, "--rosmaster", "/bin/false"]);
+    setup.port = port.parse().unwrap();
+    let mut rescue = setup.spawn();
+    let said = |rescue: &Rescue| rescue.stderr().join("\n");
+    eventually("it says that its rosmaster ends", || {
+        rescue.exited().is_some() || said(&rescue).contains("rosmaster")
+    });
+    assert!(said(&rescue).contains("rosmaster"), "{}", said(&rescue));
+    if rescue.exited().is_none() {
+        assert_eq!(rescue.terminate().code(), Some(0));
+    }
+}
+
+/// rosout is a client as any: it must find the master by what is said.
+#[test]
+fn an_address_to_serve_is_the_one_that_is_said() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let said = format!("http://127.0.0.7:{port}/");
+    let arguments = ["core", "--listen", "127.0.0.7", "-p", &port.to_string()];
+    // An empty variable is none.
+    let mut rescue = Setup::bare(&scratch, arguments).env("ROS_IP", "").spawn();
+    rescue.wait_line("that address", |line| {
+        line == format!("ROS_MASTER_URI={said}")
+    });
+    let client = Client::at("127.0.0.7", port);
+    eventually("rosout has registered", || {
+        let name = params!["/test", "/rosout"];
+        client.ask("lookupNode", name).is_some()
+    });
+    assert_eq!(client.ok("getUri", params!["/test"]), said.as_str().into());
+    assert!(TcpStream::connect(("127.0.0.1", port)).is_err());
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    let master = Rosmaster::start(&scratch);
+    let address = format!("127.0.0.7:{port}");
+    let uri = format!("http://127.0.0.1:{}", master.port);
+    let arguments = ["proxy", "--master", &uri, "--listen", &address];
+    let mut rescue = Setup::bare(&scratch, arguments).env("ROS_IP", "").spawn();
+    rescue.wait_line("that address", |line| {
+        line == format!("ROS_MASTER_URI={said}")
+    });
+}
+
+/// Such as while its package is being upgraded.
+#[test]
+fn a_rosmaster_that_is_gone_for_a_while_is_started_when_it_is_back() {
+    let scratch = Scratch::new();
+    let program = scratch.path("rosmaster");
+    let away = scratch.path("away");
+    fs::copy(find_program("rosmaster"), &program).unwrap();
+    let port = free_port();
+    let arguments = [
+        "core",
+        "--no-rosout",
+        "-p",
+        &port.to_string(),
+        "--rosmaster",
+    ];
+    let setup = Setup::bare(&scratch, arguments).arg(&program);
+    let mut rescue = setup.at_port(port).start();
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    let dead = client.master_pid().expect("the master's process id");
+    fs::rename(&program, &away).unwrap();
+    crate::support::signal(dead, Signal::KILL);
+    let program_text = program.to_str().unwrap();
+    rescue.wait_line("which program cannot be started", |line| {
+        line.contains("cannot start a master") && line.contains(program_text)
+    });
+    assert!(holds(Duration::from_secs(3), || rescue.exited().is_none()));
+    let lines = rescue.stderr().len();
+    assert!(lines < 30, "{lines} lines:\n{}", rescue.stderr().join("\n"));
+    fs::rename(&away, &program).unwrap();
+    eventually("another master is there", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    assert_eq!(client.param("/kept"), Some(1.into()));
+}
+
+#[test]
+fn a_master_that_is_not_there_is_waited_for() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let mut rescue = Setup::proxy(&scratch, port).spawn();
+    rescue.wait_line("that it waits", |line| line.to_lowercase().contains("wait"));
+    assert!(holds(Duration::from_secs(1), || rescue.exited().is_none()));
+    let client = rescue.client();
+    let early = thread::spawn({
+        let client = client.clone();
+        move || client.status("setParam", params!["/c", "/early", 1])
+    });
+    // Nobody knows yet what there is in it.
+    assert!(holds(Duration::from_secs(1), || !early.is_finished()));
+    let master = Rosmaster::start_at(&scratch, port);
+    rescue.wait_serving();
+    assert_eq!(early.join().unwrap().expect("the call is answered").0, 1);
+    assert_eq!(master.client().param("/early"), Some(1.into()));
+}
+
+#[test]
+fn master_pointing_at_ourselves() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    for (host, listen) in [
+        ("127.0.0.1", "127.0.0.1"),
+        ("localhost", "127.0.0.1"),
+        ("127.0.0.1", "0.0.0.0"),
+        ("[::1]", "[::]"),
+        ("localhost", "0.0.0.0"),
+    ] {
+        let uri = format!("http://{host}:{port}");
+        let address = format!("{listen}:{port}");
+        let setup = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &address]);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(
+            code == Some(1) || code == Some(2),
+            "{uri} at {address}: {code:?}"
+        );
+        eventually("it says why", || {
+            rescue.stderr().join("\n").contains(&port.to_string())
+        });
+    }
+    // As roscore's own port it may come from the environment.
+    let text = port.to_string();
+    let said = {
+        let setup = Setup::bare(&scratch, ["core", "-p", &text, "--master-port", &text]);
+        let mut rescue = setup.spawn();
+        let code = rescue.wait().code();
+        assert!(code == Some(1) || code == Some(2), "{code:?}");
+        eventually("it says why", || !rescue.stderr().is_empty());
+        rescue.stderr().join("\n")
+    };
+    assert!(said.contains(&text), "{said}");
+}
+
+#[test]
+fn a_second_rosrescue_on_the_same_checkpoint_is_refused() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let first = Setup::proxy(&scratch, master.port).start();
+    first.client().set_param("/first", 1);
+    let said = refused(&scratch, Setup::proxy(&scratch, master.port), 1);
+    assert!(said.contains("latest-chkpt.yaml"), "{said}");
+    first.client().set_param("/first", 2);
+    // Another file is no matter of the first one.
+    let other = Setup::proxy(&scratch, master.port)
+        .at_checkpoint(scratch.path("other.yaml"))
+        .start();
+    assert_eq!(other.client().param("/first"), Some(2.into()));
+}

@@ -1,0 +1,208 @@
+//! How rosrescue stops, and what it keeps alive until then: signals end it in good order whatever hangs,
+//! with nothing left behind and nothing answered falsely.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Mode, Rescue, Robot, Scratch, Setup, alive, eventually, free_port, holds, params, unreadable,
+};
+use rustix::process::Signal;
+
+#[test]
+fn an_orderly_stop_leaves_nothing_behind() {
+    for signal in [Signal::TERM, Signal::INT, Signal::HUP] {
+        let mut robot = Robot::start(Mode::Core);
+        robot.client().set_param("/x", 1);
+        let master = robot.master_pid();
+        assert!(
+            robot.processes().len() >= 3,
+            "rosrescue, rosmaster and rosout: {:?}",
+            robot.processes()
+        );
+        robot.rescue.signal(signal);
+        assert_eq!(robot.rescue.wait().code(), Some(0));
+        assert!(!alive(master), "rosmaster is left behind");
+        assert_eq!(robot.scratch.survivors(), vec![], "{signal:?}");
+        assert!(robot.rescue.checkpoint().exists());
+    }
+    let mut robot = Robot::start(Mode::Proxy);
+    let master = robot.master_pid();
+    robot.rescue.signal(Signal::TERM);
+    assert_eq!(robot.rescue.wait().code(), Some(0));
+    assert!(alive(master), "the master of others is ended");
+}
+
+#[test]
+fn an_orderly_stop_in_an_outage_keeps_what_was_answered_and_answers_nothing_falsely() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.kill_master();
+    let client = robot.client();
+    for number in 0..5 {
+        client.ok("setParam", params!["/c", "/answered", number]);
+    }
+    // Only a master understands these.
+    let waiting: Vec<_> = (0..5)
+        .map(|number| {
+            let client = client.clone();
+            thread::spawn(move || client.exchange(&unreadable("/waiting", number)))
+        })
+        .collect();
+    assert!(holds(Duration::from_millis(500), || waiting
+        .iter()
+        .all(|call| !call.is_finished())));
+    let start = Instant::now();
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    assert!(
+        start.elapsed() < Duration::from_secs(15),
+        "{:?}",
+        start.elapsed()
+    );
+    for call in waiting {
+        // Nothing did it, so nothing may say that it was done.
+        assert!(call.join().unwrap().is_err());
+    }
+    let checkpoint = fs::read_to_string(robot.rescue.checkpoint()).unwrap();
+    assert!(checkpoint.contains("\"answered\": 4"), "{checkpoint}");
+    assert!(!checkpoint.contains("waiting"), "{checkpoint}");
+}
+
+#[test]
+fn a_core_stops_even_if_its_master_hangs() {
+    let mut robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    crate::support::stop(master);
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    eventually("the master that hangs is ended", || !alive(master));
+    assert_eq!(robot.scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_second_signal_ends_at_once() {
+    for (second, code) in [(Signal::INT, 130), (Signal::TERM, 143), (Signal::HUP, 129)] {
+        let mut robot = Robot::start(Mode::Core);
+        let master = robot.master_pid();
+        // An orderly stop has to wait for this one.
+        crate::support::stop(master);
+        robot.rescue.signal(Signal::TERM);
+        // The first one has been taken: two that are under way may become one.
+        eventually("the stop has begun", || rosout(&robot).is_none());
+        let start = Instant::now();
+        robot.rescue.signal(second);
+        assert_eq!(robot.rescue.wait().code(), Some(code));
+        assert!(
+            start.elapsed() < Duration::from_secs(3),
+            "{:?}",
+            start.elapsed()
+        );
+    }
+}
+
+/// Runs its arguments in a terminal of its own, closes that once calls pass, and ends as they do.
+const IN_A_TERMINAL: &str = r#"
+import os, pty, sys
+pid, terminal = pty.fork()
+if pid == 0:
+    os.execv(sys.argv[1], sys.argv[1:])
+said = b""
+while b"fault tolerant" not in said:
+    said += os.read(terminal, 4096)
+os.close(terminal)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) % 256)
+"#;
+
+#[test]
+fn a_terminal_that_is_closed_ends_it_in_good_order() {
+    let scratch = Scratch::new();
+    let port = free_port().to_string();
+    let setup = Setup::bare(&scratch, ["core", "-v", "-p", &port]).wrapped(|command| {
+        let mut python = Command::new("/usr/bin/python3");
+        scratch.prepare(&mut python);
+        python.args(["-c", IN_A_TERMINAL]);
+        python.arg(command.get_program()).args(command.get_args());
+        python
+    });
+    let mut rescue = setup.spawn();
+    assert_eq!(rescue.wait().code(), Some(0), "{:?}", rescue.output());
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_core_under_nohup_outlives_its_terminal() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port.to_string()]);
+    let setup = setup.wrapped(|command| {
+        let mut nohup = Command::new("nohup");
+        scratch.prepare(&mut nohup);
+        nohup.arg(command.get_program()).args(command.get_args());
+        nohup
+    });
+    let mut rescue = setup.at_port(port).start();
+    rescue.signal(Signal::HUP);
+    assert!(holds(Duration::from_millis(500), || rescue
+        .exited()
+        .is_none()));
+    rescue.client().set_param("/alive", true);
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+/// The process of rosout, if it runs.
+fn rosout(robot: &Robot) -> Option<u32> {
+    let mut processes = robot.scratch.survivors().into_iter();
+    let rosout = processes.find(|(_, command)| command.contains("rosout/rosout"));
+    rosout.map(|(pid, _)| pid)
+}
+
+/// rosout is kept alive; what it says for itself in the master is there again.
+#[test]
+fn a_core_keeps_rosout_alive() {
+    let robot = Robot::start(Mode::Core);
+    let before = robot.settled_state();
+    let old = rosout(&robot).expect("rosout runs");
+    crate::support::signal(old, Signal::KILL);
+    eventually("another rosout runs", || {
+        rosout(&robot).is_some_and(|pid| pid != old)
+    });
+    eventually("it is registered", || {
+        let now = robot.settled_state();
+        now.publishers == before.publishers
+            && now.subscribers == before.subscribers
+            && now.nodes != before.nodes
+    });
+}
+
+/// One that ends at once, such as without its libraries, is started ever more seldom, and says why.
+#[test]
+fn a_rosout_that_cannot_run_is_said_with_its_last_words() {
+    let scratch = Scratch::new();
+    let folder = scratch.path("bin");
+    fs::create_dir(&folder).unwrap();
+    let program = folder.join("rosout");
+    fs::write(&program, "#!/bin/sh\necho no library here >&2\nexit 127\n").unwrap();
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    let port = free_port();
+    let setup = Setup::bare(&scratch, ["core", "-p", &port.to_string()]);
+    let mut rescue = setup.env("PATH", path).at_port(port).start();
+    let line = rescue.wait_line("that it has ended", |line| {
+        line.contains("rosout has ended")
+    });
+    assert!(line.contains("no library here"), "{line}");
+    assert!(line.contains("127"), "{line}");
+    let starts = |rescue: &Rescue| {
+        let lines = rescue.stderr().into_iter();
+        lines.filter(|line| line.contains("started rosout")).count()
+    };
+    let (first, start) = (starts(&rescue), Instant::now());
+    eventually("it is started three times more", || {
+        starts(&rescue) >= first + 3
+    });
+    // The pauses are of 1, 2 and 4 seconds.
+    let least = Duration::from_millis(6500);
+    assert!(start.elapsed() > least, "{:?}", start.elapsed());
+    assert_eq!(rescue.terminate().code(), Some(0));
+}

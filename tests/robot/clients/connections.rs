@@ -1,0 +1,286 @@
+//! Connections: how long they live, what may be in pieces, at once, large, zipped or slow, over IPv4 and
+//! IPv6.
+
+use std::thread;
+use std::time::Duration;
+
+use crate::support::{
+    Client, FakeNode, Rosmaster, Scratch, Setup, Twins, assert_form, encode_call, free_port, gzip,
+    holds, http_request, params, request,
+};
+use rosrescue::xmlrpc::{Reply, Value};
+
+#[test]
+fn connections_live_as_long_as_the_masters() {
+    let twins = Twins::start();
+    let body = encode_call("hasParam", params!["/c", "/x"]);
+    let cases: [(&str, &[&str], bool); 5] = [
+        ("POST /RPC2 HTTP/1.1", &[], true),
+        ("POST /RPC2 HTTP/1.1", &["Connection: close"], false),
+        ("POST /RPC2 HTTP/1.0", &[], false),
+        ("POST /RPC2 HTTP/1.0", &["Connection: keep-alive"], true),
+        ("POST /RPC2 HTTP/1.1", &["Connection: keep-alive"], true),
+    ];
+    for (first, headers, lives) in cases {
+        for (who, client) in [
+            ("the bare master", &twins.bare),
+            ("rosrescue", &twins.through),
+        ] {
+            let mut wire = client.connect().unwrap();
+            wire.send(&request(first, headers, &body)).unwrap();
+            assert_eq!(wire.response().unwrap().code, 200);
+            if lives {
+                for _ in 0..3 {
+                    wire.send(&request(first, headers, &body)).unwrap();
+                    assert_eq!(
+                        wire.response().unwrap().code,
+                        200,
+                        "{who}: {first} {headers:?}"
+                    );
+                }
+                assert!(
+                    !wire.closes(Duration::from_millis(100)),
+                    "{who}: {first} {headers:?}"
+                );
+            } else {
+                assert!(
+                    wire.closes(crate::support::PATIENCE),
+                    "{who}: {first} {headers:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn pipelined_requests_are_answered_in_order() {
+    let twins = Twins::start();
+    let mut bytes = Vec::new();
+    for i in 0..50 {
+        bytes.extend(http_request(&encode_call(
+            "setParam",
+            params!["/c", "/counter", i],
+        )));
+        bytes.extend(http_request(&encode_call(
+            "getParam",
+            params!["/c", "/counter"],
+        )));
+    }
+    let mut wire = twins.through.connect().unwrap();
+    wire.send(&bytes).unwrap();
+    for i in 0..50 {
+        let reply = |value: Value| {
+            Reply::Value(Value::Array(vec![
+                1.into(),
+                "Parameter [/counter]".into(),
+                value,
+            ]))
+        };
+        assert_eq!(wire.response().unwrap().code, 200);
+        assert_eq!(wire.response().unwrap().reply(), reply(i.into()));
+    }
+}
+
+#[test]
+fn a_request_may_come_in_any_pieces() {
+    let twins = Twins::start();
+    let bytes = http_request(&encode_call("setParam", params!["/c", "/slow", "value"]));
+    let mut wire = twins.through.connect().unwrap();
+    for piece in bytes.chunks(3) {
+        wire.send(piece).unwrap();
+        thread::sleep(Duration::from_micros(300));
+    }
+    assert_eq!(wire.response().unwrap().code, 200);
+    assert_eq!(twins.behind.param("/slow"), Some("value".into()));
+    // The client may close its half behind the request.
+    let mut wire = twins.through.connect().unwrap();
+    wire.send(&bytes).unwrap();
+    wire.finish().unwrap();
+    assert_eq!(wire.response().unwrap().code, 200);
+}
+
+/// rosmaster sends its `100 Continue` too, but only together with the answer.
+#[test]
+fn expect_100_continue_is_answered_before_the_body() {
+    let twins = Twins::start();
+    let body = encode_call("setParam", params!["/c", "/expected", 1]);
+    let whole = request("POST /RPC2 HTTP/1.1", &["Expect: 100-continue"], &body);
+    let (head, body) = whole.split_at(whole.len() - body.len());
+    let mut wire = twins.through.connect().unwrap();
+    wire.send(head).unwrap();
+    assert_eq!(wire.head().unwrap().code, 100);
+    wire.send(body).unwrap();
+    let response = wire.response().unwrap();
+    assert_eq!(response.code, 200);
+    assert_form(&response, "Expect: 100-continue");
+    assert_eq!(twins.behind.param("/expected"), Some(1.into()));
+    // Who does not wait gets the answer as well.
+    wire.send(&whole).unwrap();
+    let mut response = wire.response().unwrap();
+    if response.code == 100 {
+        response = wire.response().unwrap();
+    }
+    assert_eq!(response.code, 200);
+}
+
+#[test]
+fn large_bodies_pass_and_too_large_ones_do_no_harm() {
+    let twins = Twins::start();
+    let text = "<0123456789abcdef>".repeat(40 * 1024 * 1024 / 18);
+    twins.through.set_param("/large", text.as_str());
+    assert_eq!(twins.through.param("/large"), Some(Value::String(text)));
+    twins.through.ok("deleteParam", params!["/c", "/large"]);
+
+    let mut wire = twins.through.connect().unwrap();
+    let head = format!(
+        "POST / HTTP/1.1\r\nHost: x\r\nContent-Length: {}\r\n\r\n",
+        65_u64 << 20
+    );
+    wire.send(head.as_bytes()).unwrap();
+    // Refused by a status or by the end of the connection, not by silence.
+    match wire.response() {
+        Ok(response) => assert_eq!(response.code, 413, "{}", response.status),
+        Err(error) => assert_ne!(error.kind(), std::io::ErrorKind::WouldBlock, "{error}"),
+    }
+    assert!(twins.through.master_pid().is_some());
+}
+
+#[test]
+fn gzip_passes_both_ways() {
+    let twins = Twins::start();
+    let body = encode_call("setParam", params!["/c", "/zipped", "z".repeat(5000)]);
+    let zipped = gzip(&body);
+    twins.same(&request(
+        "POST /RPC2 HTTP/1.1",
+        &["Content-Encoding: gzip"],
+        &zipped,
+    ));
+    assert_eq!(twins.behind.param("/zipped"), Some("z".repeat(5000).into()));
+    // A client that would take gzip gets an answer that it can read; an unzipped one is one.
+    let body = encode_call("getParam", params!["/c", "/zipped"]);
+    let response = twins
+        .through
+        .exchange(&request(
+            "POST /RPC2 HTTP/1.1",
+            &["Accept-Encoding: gzip"],
+            &body,
+        ))
+        .unwrap();
+    assert_form(&response, "Accept-Encoding: gzip");
+    if response.header("content-encoding").is_none() {
+        assert_eq!(response.body, twins.same(&http_request(&body)).body);
+    } else {
+        assert_eq!(response.header("content-encoding"), Some("gzip"));
+        assert!(response.body.starts_with(&[0x1f, 0x8b]));
+    }
+    // What is no gzip is the master's to refuse.
+    let broken = request(
+        "POST /RPC2 HTTP/1.1",
+        &["Content-Encoding: gzip"],
+        b"no gzip",
+    );
+    twins.same(&broken);
+    twins.same(&request(
+        "POST /RPC2 HTTP/1.1",
+        &["Content-Encoding: br"],
+        b"what",
+    ));
+}
+
+#[test]
+fn many_clients_at_once_each_get_their_own_answer() {
+    let twins = Twins::start();
+    let clients: Vec<_> = (0..16)
+        .map(|id: i32| {
+            let client = twins.through.clone();
+            thread::spawn(move || {
+                let mut wire = client.connect().unwrap();
+                for i in 0..100 {
+                    let key = format!("/many/c{id}");
+                    let number = id * 1000 + i;
+                    for body in [
+                        encode_call("setParam", params!["/c", key.as_str(), number]),
+                        encode_call("getParam", params!["/c", key.as_str()]),
+                    ] {
+                        wire.send(&http_request(&body)).unwrap();
+                    }
+                    let Reply::Value(set) = wire.response().unwrap().reply() else {
+                        panic!()
+                    };
+                    assert_eq!(set.as_array().unwrap()[0], Value::Int(1));
+                    let Reply::Value(get) = wire.response().unwrap().reply() else {
+                        panic!()
+                    };
+                    assert_eq!(get.as_array().unwrap()[2], Value::Int(number));
+                }
+            })
+        })
+        .collect();
+    for client in clients {
+        client.join().unwrap();
+    }
+    let many = twins.behind.param("/many").unwrap();
+    for id in 0..16 {
+        assert_eq!(
+            many.as_struct().unwrap()[&format!("c{id}")],
+            Value::Int(id * 1000 + 99)
+        );
+    }
+}
+
+#[test]
+fn a_slow_client_does_not_hold_up_the_others() {
+    let twins = Twins::start();
+    let whole = http_request(&encode_call("setParam", params!["/c", "/half", 1]));
+    let half: Vec<_> = (0..50)
+        .map(|i| {
+            let mut wire = twins.through.connect().unwrap();
+            wire.send(&whole[..10 + i * (whole.len() - 11) / 50])
+                .unwrap();
+            wire
+        })
+        .collect();
+    // A node that takes a publisherUpdate and does not answer holds up nobody else either.
+    let stuck = FakeNode::start("/stuck");
+    stuck.subscribe(&twins.through, "/topic", "std_msgs/String");
+    stuck.hold();
+    let node = FakeNode::start("/node");
+    node.publish(&twins.through, "/topic", "std_msgs/String");
+    assert!(holds(Duration::from_millis(500), || {
+        let start = std::time::Instant::now();
+        twins.through.set_param("/quick", 1);
+        start.elapsed() < Duration::from_secs(5)
+    }));
+    drop(half);
+    assert_eq!(twins.behind.param("/half"), None);
+}
+
+#[test]
+fn ipv6_on_both_sides() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let _master = Rosmaster::start_with(&scratch, port, |command| {
+        command.env("ROS_IPV6", "on").env("ROS_IP", "::1");
+    });
+    let uri = format!("http://[::1]:{port}");
+    let bare = Client::at("[::1]", port);
+
+    // All addresses, unless it is told otherwise.
+    let listen = free_port();
+    let mut rescue = Setup::bare(&scratch, ["proxy", "--master", &uri])
+        .env("ROS_MASTER_URI", format!("http://localhost:{listen}"))
+        .env("ROS_IP", "")
+        .env("ROS_HOSTNAME", "localhost.localdomain")
+        .at_port(listen)
+        .start();
+    for host in ["[::1]", "127.0.0.1"] {
+        Client::at(host, listen).set_param("/from", host);
+        assert_eq!(bare.param("/from"), Some(host.into()));
+    }
+    assert_eq!(rescue.terminate().code(), Some(0));
+
+    let only = format!("[::1]:{listen}");
+    let _rescue = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &only]).start();
+    Client::at("[::1]", listen).set_param("/from", "one address");
+    assert_eq!(bare.param("/from"), Some("one address".into()));
+}

@@ -1,0 +1,295 @@
+//! The wall clock jumps: by years when a robot without a battery finds the network, by seconds back
+//! when it is corrected. Nothing depends on it. rosrescue runs under libfaketime, which changes what
+//! it reads of the wall clock and leaves the monotonic clock alone.
+
+use std::fs;
+use std::path::PathBuf;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FakeNode, Rescue, Rosmaster, SICK_ROSMASTER, Scratch, Setup, Sickness, State, alive,
+    eventually, free_port, holds, params, signal, status, unreadable,
+};
+
+/// A wall clock that is wrong by so many seconds.
+struct WallClock {
+    file: PathBuf,
+}
+
+const DAY: i64 = 86_400;
+/// Forward by 20 years, back to 63 days ago, then again and again by 13 seconds; to 1970, about,
+/// where a robot without a battery wakes up. No kernel's clock is before that.
+const JUMPS: [i64; 7] = [
+    20 * 365 * DAY,
+    -63 * DAY,
+    -63 * DAY - 13,
+    -63 * DAY - 26,
+    -63 * DAY - 39,
+    -56 * 365 * DAY,
+    0,
+];
+
+impl WallClock {
+    fn new(scratch: &Scratch) -> Self {
+        let clock = Self {
+            file: scratch.path("wall-clock"),
+        };
+        clock.jump(0);
+        clock
+    }
+
+    fn jump(&self, seconds: i64) {
+        let half = self.file.with_extension("half");
+        fs::write(&half, format!("{seconds:+}\n")).unwrap();
+        fs::rename(half, &self.file).unwrap();
+    }
+
+    fn rule(&self, setup: Setup) -> Setup {
+        let library = fs::read_dir("/usr/lib")
+            .unwrap()
+            .flatten()
+            .map(|folder| folder.path().join("faketime/libfaketimeMT.so.1"))
+            .find(|library| library.exists())
+            .expect("this test needs libfaketime: `tests/run.sh` installs it");
+        setup
+            .env("LD_PRELOAD", library)
+            .env("FAKETIME_TIMESTAMP_FILE", &self.file)
+            .env("FAKETIME_NO_CACHE", "1")
+            .env("FAKETIME_DONT_FAKE_MONOTONIC", "1")
+    }
+}
+
+/// rosrescue by that clock, with a rosmaster that can be made to die, or before one of the test's.
+struct Robot {
+    rescue: Rescue,
+    master_port: u16,
+    clock: WallClock,
+    sickness: Sickness,
+    scratch: Scratch,
+}
+
+impl Robot {
+    fn core(options: &[&str]) -> Self {
+        Self::start(options, |scratch, port, sickness| {
+            Setup::core(scratch, port)
+                .args(["--no-rosout", "--rosmaster", SICK_ROSMASTER])
+                .env("SICK", &sickness.file)
+        })
+    }
+
+    fn start(options: &[&str], setup: impl Fn(&Scratch, u16, &Sickness) -> Setup) -> Self {
+        let scratch = Scratch::new();
+        let sickness = Sickness::new(&scratch);
+        let clock = WallClock::new(&scratch);
+        let master_port = free_port();
+        let setup = setup(&scratch, master_port, &sickness).args(options);
+        let rescue = clock.rule(setup).start();
+        Self {
+            rescue,
+            master_port,
+            clock,
+            sickness,
+            scratch,
+        }
+    }
+
+    fn client(&self) -> Client {
+        self.rescue.client()
+    }
+
+    fn bare(&self) -> Client {
+        Client::new(self.master_port)
+    }
+
+    fn kill_master(&self) -> u32 {
+        let pid = self.bare().master_pid().unwrap();
+        signal(pid, rustix::process::Signal::KILL);
+        pid
+    }
+
+    fn await_recovery(&self, dead: u32) {
+        let client = self.client();
+        eventually("a new master has the state", || {
+            let status = status(&client);
+            status["open"] == true && status["last_recovery"]["master_pid"] != dead
+        });
+    }
+
+    /// What rosrescue's last report takes for the time of the outage, less the right time.
+    fn clock_error(&self) -> f64 {
+        let report = &status(&self.client())["last_recovery"];
+        report["detected_at"].as_f64().unwrap() - rosrescue::clock::wall_time()
+    }
+}
+
+#[test]
+fn recovery_does_not_depend_on_it() {
+    let robot = Robot::core(&[]);
+    let client = robot.client();
+    let node = FakeNode::start("/fake");
+    node.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/kept", "yes");
+    eventually("the parameters of core are set", || {
+        ["/rosversion", "/rosdistro"]
+            .iter()
+            .all(|key| client.param(key).is_some())
+    });
+    let before = State::read(&robot.bare());
+    for jump in JUMPS {
+        let start = Instant::now();
+        robot.clock.jump(jump);
+        let dead = robot.kill_master();
+        // It is answered without a master, or by the new one, whatever the clock says meanwhile.
+        client.set_param("/held", 1);
+        client.ok("deleteParam", params!["/test", "/held"]);
+        robot.await_recovery(dead);
+        before.assert_same(
+            &State::read(&robot.bare()),
+            &format!("after a jump to {jump:+} s"),
+        );
+        let took = start.elapsed().as_secs_f64();
+        let report = &status(&client)["last_recovery"];
+        for phase in ["absence_ms", "look_ms", "injection_ms", "total_ms"] {
+            let ms = report["phases"][phase].as_f64().unwrap();
+            assert!(
+                (0.0..=took * 1e3).contains(&ms),
+                "{phase} {ms} of {took} s ({jump:+})"
+            );
+        }
+        // The clock was really wrong.
+        let error = robot.clock_error();
+        assert!(
+            (error - jump as f64).abs() < took + 1.0,
+            "{error} instead of {jump}"
+        );
+    }
+    assert_eq!(status(&client)["deaths"], JUMPS.len());
+}
+
+#[test]
+fn neither_hold_nor_probes_depend_on_it() {
+    let options = [
+        "--hold",
+        "2",
+        "--probe-interval",
+        "100",
+        "--probe-timeout",
+        "300",
+        "--probe-count",
+        "3",
+    ];
+    let robot = Robot::start(&options, |scratch, port, _| {
+        // Before rosrescue, whose start waits for it; the scratch folder ends it.
+        std::mem::forget(Rosmaster::start_at(scratch, port));
+        Setup::proxy(scratch, port)
+    });
+    let client = robot.client();
+    let pid = robot.bare().master_pid().unwrap();
+    let mut jumps = JUMPS.into_iter().cycle();
+    let mut jump = || robot.clock.jump(jumps.next().unwrap());
+    // A master that answers is not taken for hung.
+    assert!(holds(Duration::from_secs(2), || {
+        jump();
+        status(&client)["open"] == true
+    }));
+    // One that hangs is, after three times 0.3 s.
+    let start = Instant::now();
+    crate::support::stop(pid);
+    eventually("the hung master is found", || {
+        jump();
+        status(&client)["open"] == false
+    });
+    let found = start.elapsed();
+    assert!(found > Duration::from_millis(700), "{found:?}");
+    assert!(found < Duration::from_secs(15), "{found:?}");
+    // What only a master understands is held for two seconds, neither less nor much more.
+    let start = Instant::now();
+    let waiting = thread::spawn({
+        let client = client.clone();
+        move || {
+            let answer = client.exchange(&unreadable("/late", 1));
+            (answer.is_err(), start.elapsed())
+        }
+    });
+    eventually("the call is given back", || {
+        jump();
+        waiting.is_finished()
+    });
+    let (given_back, held) = waiting.join().unwrap();
+    assert!(given_back);
+    assert!(held > Duration::from_millis(1_900), "{held:?}");
+    assert!(held < Duration::from_secs(12), "{held:?}");
+    signal(pid, rustix::process::Signal::CONT);
+    client.set_param("/late", 2);
+    eventually("the master goes on", || {
+        jump();
+        status(&client)["open"] == true
+    });
+    assert_eq!(robot.bare().param("/late"), Some(2.into()));
+    assert!(alive(pid));
+    assert_eq!(client.master_pid(), Some(pid));
+}
+
+#[test]
+fn pauses_between_restarts_do_not_depend_on_it() {
+    let robot = Robot::core(&[]);
+    let client = robot.client();
+    let before = robot.sickness.starts().len();
+    robot.sickness.set("at once");
+    robot.kill_master();
+    let mut jumps = JUMPS.into_iter().cycle();
+    eventually("it is a crash loop", || {
+        robot.clock.jump(jumps.next().unwrap());
+        robot.sickness.starts().len() >= before + 9
+    });
+    // Five at once, then after 0.5, 1, 2 and 4 s.
+    let starts = robot.sickness.starts().split_off(before);
+    for (number, pause) in [(5, 0.5), (6, 1.0), (7, 2.0), (8, 4.0)] {
+        let took = starts[number] - starts[number - 1];
+        assert!((pause..pause + 5.0).contains(&took), "{number}: {took} s");
+    }
+    assert!(starts[4] - starts[0] < 10.0, "{starts:?}");
+    robot.sickness.cure();
+    eventually("the crash loop is over", || {
+        robot.clock.jump(jumps.next().unwrap());
+        status(&client)["crash_loop"] == false
+    });
+}
+
+/// Kept files are numbered; none takes the place of another.
+#[test]
+fn names_of_files_do_not_depend_on_it() {
+    let mut robot = Robot::core(&["--restore", "never"]);
+    let mut jumps = JUMPS.into_iter();
+    for number in 1..=3 {
+        robot
+            .client()
+            .set_param(&format!("/session{number}"), number);
+        robot.clock.jump(jumps.next().unwrap());
+        assert!(robot.rescue.terminate().success());
+        robot.rescue.start_again();
+        robot.rescue.wait_serving();
+    }
+    let mut names: Vec<_> = fs::read_dir(robot.scratch.log_dir())
+        .unwrap()
+        .flatten()
+        .filter_map(|file| {
+            let name = file.file_name().into_string().unwrap();
+            name.strip_prefix("latest-chkpt.yaml.").map(str::to_owned)
+        })
+        .filter(|name| name.starts_with("session-"))
+        .collect();
+    names.sort();
+    // Of each session its file, and perhaps its previous generation.
+    assert!(names.len() >= 3, "{names:?}");
+    for number in 1..=3 {
+        let key = format!("\"session{number}\": {number}");
+        let kept = names.iter().filter(|name| {
+            let path = format!("latest-chkpt.yaml.{name}");
+            let text = fs::read_to_string(robot.scratch.log_dir().join(path)).unwrap();
+            text.contains(&key)
+        });
+        assert!(kept.count() >= 1, "session {number}: {names:?}");
+    }
+}

@@ -1,0 +1,92 @@
+//! The whole program, with real rosmasters and real rospy and roscpp nodes. What measures times is in
+//! `tests/timing`.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+/// The four cases of the ROS Rescue paper.
+mod paper {
+    mod every_callback;
+    mod four_cases;
+}
+
+/// What nodes, tools and callers meet while there is no master.
+mod outage;
+
+/// Masters that hang, are far away, crash in a loop, answer garbage, or differ from the mirror.
+mod master {
+    mod crash_loop;
+    mod divergence;
+    mod far;
+    mod garbage;
+    mod hung;
+    mod returns;
+    mod unreturnable_values;
+}
+
+/// A new master is given the state, and the nodes are looked after.
+mod recovery {
+    mod health_check;
+    mod injection;
+    mod no_shutdown;
+    mod random_kills;
+    mod reconciliation;
+}
+
+/// Long lives of nodes, and the tools of ROS.
+mod nodes {
+    mod streams;
+    mod tools;
+}
+
+/// HTTP and XML-RPC as clients send them.
+mod clients {
+    mod connections;
+    mod forwarding;
+    mod hostile;
+    mod largest_body;
+}
+
+/// Memory, connections and files.
+mod limits {
+    mod connections;
+    mod memory;
+}
+
+/// Options, start and stop.
+mod cli {
+    mod addresses;
+    mod as_roscore;
+    mod options;
+    mod secrets;
+    mod start;
+    mod stop;
+}
+
+/// The checkpoint as the whole program keeps it.
+mod checkpoint {
+    mod at_the_start;
+    mod full_disk;
+    mod moved;
+    mod readable;
+    mod rosparam;
+    mod unreadable;
+}
+
+/// rosrescue itself dies, and is started again.
+mod restart {
+    mod guardian;
+    mod sessions;
+    mod systemd;
+    mod worker;
+}
+
+/// The wall clock jumps.
+mod clock;

@@ -1,0 +1,221 @@
+//! A master on another computer: connections to it that have become dead ends, and its name, hold up
+//! nobody for long.
+
+use std::process::Command;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, NameServer, Netns, Process, Rosmaster, Scratch, Setup, eventually, find_program,
+    free_port, holds, params, status,
+};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+/// Where the master is, on the other side.
+const HOST: u8 = 2;
+/// Options with which a connection that is silent for three seconds has ended.
+const PROBES: [&str; 6] = [
+    "--probe-interval",
+    "100",
+    "--probe-timeout",
+    "1000",
+    "--probe-count",
+    "2",
+];
+/// That time, and as much again for two busy cores.
+const SILENCE: Duration = Duration::from_secs(6);
+const SOON: Duration = Duration::from_secs(2);
+
+/// A rosmaster on the other side of `net`, which answers.
+#[track_caller]
+fn rosmaster(scratch: &Scratch, net: &Netns, port: u16) -> (Process, Client) {
+    let mut command = Command::new(find_program("rosmaster"));
+    scratch.prepare(&mut command);
+    command.args(["--core", "-p"]).arg(port.to_string());
+    command.env("ROS_IP", net.far(HOST));
+    let process = Process::start("the far rosmaster", &mut net.inside(&command));
+    let client = Client::at(&net.far(HOST), port);
+    eventually("the far rosmaster answers", || {
+        client.master_pid() == Some(process.pid())
+    });
+    (process, client)
+}
+
+/// A rosrescue before the master at `host`.
+fn proxy(scratch: &Scratch, host: &str, master_port: u16) -> Setup {
+    let port = free_port();
+    let master = format!("http://{host}:{master_port}");
+    let listen = format!("127.0.0.1:{port}");
+    let arguments = ["proxy", "--master", &master, "--listen", &listen];
+    let setup = Setup::bare(scratch, arguments).at_port(port);
+    setup.args(["--hold", "60", "--verbose"]).args(PROBES)
+}
+
+fn is_open(client: &Client) -> bool {
+    status(client)["open"] == true
+}
+
+/// What was on its way when the link went is answered by the mirror, and brought to the master when the link is
+/// back, without waiting until TCP tries again.
+#[test]
+fn a_cut_link_is_stood_in_for_and_writes_pass_as_soon_as_it_is_back() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    net.cut(HOST);
+    let start = Instant::now();
+    client.set_param("/flying", 1);
+    let verdict = start.elapsed();
+    println!("the verdict took {verdict:?}");
+    assert!(verdict < SILENCE, "{verdict:?}");
+    let start = Instant::now();
+    client.set_param("/without", 1);
+    assert_eq!(client.param("/flying"), Some(Value::Int(1)));
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    // TCP sends again after 0.2, 0.6, 1.4, 3, 6.2, 12.6 and 25.4 s.
+    assert!(holds(Duration::from_secs(14), || !is_open(&client)));
+    net.mend(HOST);
+    let start = Instant::now();
+    eventually("the gate is open", || is_open(&client));
+    println!("open {:?} after the link was back", start.elapsed());
+    assert!(start.elapsed() < SILENCE, "{:?}", start.elapsed());
+    let start = Instant::now();
+    client.set_param("/after", 1);
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    for key in ["/before", "/flying", "/without", "/after"] {
+        assert_eq!(far.param(key), Some(Value::Int(1)), "{key}");
+    }
+}
+
+/// The connections lead nowhere, and all that is connected anew is well.
+#[test]
+fn a_change_of_the_own_address_costs_one_short_wait() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    assert_eq!(client.param("/before"), Some(Value::Int(1)));
+    net.move_near();
+    let start = Instant::now();
+    let writing = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/after", 1)
+    });
+    assert_eq!(client.param("/before"), Some(Value::Int(1)));
+    let read = start.elapsed();
+    writing.join().unwrap();
+    let wrote = start.elapsed();
+    println!("after the change: read {read:?}, wrote {wrote:?}");
+    assert!(read < SILENCE && wrote < SILENCE, "{read:?} {wrote:?}");
+    let start = Instant::now();
+    client.set_param("/later", 1);
+    let later = start.elapsed();
+    assert!(later < SOON, "{later:?}");
+    eventually("the gate is open", || is_open(&client));
+    for key in ["/after", "/later"] {
+        assert_eq!(far.param(key), Some(Value::Int(1)), "{key}");
+    }
+}
+
+/// It is stood in for, and given all when it goes on.
+#[test]
+fn a_far_master_that_hangs_knows_everything_when_it_goes_on() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let port = free_port();
+    let (master, far) = rosmaster(&scratch, &net, port);
+    let rescue = proxy(&scratch, &net.far(HOST), port).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    crate::support::stop(master.pid());
+    client.set_param("/flying", 1);
+    client.set_param("/flying", 2);
+    assert!(!is_open(&client));
+    crate::support::signal(master.pid(), Signal::CONT);
+    eventually("the gate is open", || is_open(&client));
+    assert_eq!(far.param("/flying"), Some(Value::Int(2)));
+    assert_eq!(client.param("/flying"), Some(Value::Int(2)));
+    assert_eq!(client.master_pid(), Some(master.pid()));
+}
+
+/// It is looked up again for each connection; what it meant before must do.
+#[test]
+fn a_name_server_that_fails_takes_no_master_away() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let names = NameServer::silent(&scratch);
+    names.say(net.far(HOST).parse().unwrap(), Duration::ZERO);
+    let port = free_port();
+    let (mut master, _) = rosmaster(&scratch, &net, port);
+    let setup = proxy(&scratch, "master.test", port);
+    let rescue = setup.wrapped(|own| names.serving(own)).start();
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    names.fall_silent();
+    let mut number = 0;
+    let all_is_well = || {
+        number += 1;
+        client.set_param("/number", number);
+        is_open(&client)
+    };
+    assert!(holds(Duration::from_secs(5), all_is_well));
+    // Nor does it prevent a recovery at the same place.
+    master.kill();
+    let (_master, far) = rosmaster(&scratch, &net, port);
+    eventually("the master is restored", || {
+        far.param("/kept") == Some(Value::Int(1)) && is_open(&client)
+    });
+    // A master that has another address is found, even if that is told too late for each probe.
+    net.cut(HOST);
+    eventually("the gate is shut", || !is_open(&client));
+    names.say(
+        net.far(HOST + 1).parse().unwrap(),
+        Duration::from_millis(600),
+    );
+    eventually("the gate is open", || is_open(&client));
+    client.set_param("/elsewhere", 1);
+}
+
+#[test]
+fn a_stop_does_not_wait_for_the_name_of_the_master() {
+    let scratch = Scratch::new();
+    let names = NameServer::silent(&scratch);
+    let setup = proxy(&scratch, "master.test", free_port());
+    let mut rescue = setup.wrapped(|own| names.serving(own)).spawn();
+    rescue.wait_line("that it waits", |line| line.contains("cannot reach"));
+    let start = Instant::now();
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let took = start.elapsed();
+    assert!(took < SOON, "{took:?}");
+}
+
+/// After a boot it is asked whether the nodes of the session are on other computers.
+#[test]
+fn a_stop_does_not_wait_for_the_names_of_nodes() {
+    let scratch = Scratch::new();
+    let names = NameServer::silent(&scratch);
+    let port = free_port();
+    let _master = Rosmaster::start_at(&scratch, port);
+    let setup = Setup::proxy(&scratch, port);
+    let mut rescue = setup.wrapped(|own| names.serving(own)).start();
+    let api = "http://node.test:4711/";
+    let params = params!["/node", "/topic", "std_msgs/String", api];
+    rescue.client().ok("registerPublisher", params);
+    rescue.kill();
+    let boot_id = scratch.path("boot_id");
+    std::fs::write(&boot_id, "another boot").unwrap();
+    rescue.start_after_reboot(&boot_id);
+    rescue.wait_serving();
+    let start = Instant::now();
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let took = start.elapsed();
+    assert!(took < SOON, "{took:?}");
+}

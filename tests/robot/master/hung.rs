@@ -1,0 +1,406 @@
+//! A master that hangs, and one that is only slow: the one is found by probes, stood in for, replaced by `core`
+//! and waited for by `proxy`, and if it goes on it is given what was written meanwhile; the other is left
+//! alone.
+
+use std::fs;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    FakeNode, Library, Mode, NODES, Robot, State, alive, eventually, holds, params,
+};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+/// Options with which a master that does not answer for a second counts as hung.
+const PROBES: [&str; 6] = [
+    "--probe-interval",
+    "100",
+    "--probe-timeout",
+    "500",
+    "--probe-count",
+    "2",
+];
+
+/// The values that a node was told of a parameter, as they came, and whether rosrescue told it.
+fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
+    let calls = node.calls().into_iter();
+    let updates = calls.filter(|call| call.method == "paramUpdate");
+    let of_key = updates.filter(|call| {
+        let told = call.params[1].as_str();
+        told.map(|key| key.trim_end_matches('/')) == Some(key)
+    });
+    of_key
+        .map(|call| (call.params[2].as_int().unwrap(), call.from_rosrescue))
+        .collect()
+}
+
+/// The gate shuts, the mirror answers and nodes are notified; the same master, when it goes on, is given what
+/// it missed, and tells nobody.
+#[test]
+fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
+    // Three seconds for what happens before the verdict.
+    let probes = ["--probe-timeout", "1500", "--probe-count", "2"];
+    let robot = Robot::start_with(Mode::Proxy, &probes);
+    let client = robot.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/gain", 7);
+    for key in ["/flying", "/standing"] {
+        node.watch_param(&client, key);
+    }
+    let watcher = FakeNode::start("/watcher");
+    watcher.subscribe(&client, "/topic", "std_msgs/String");
+    let before = State::read(&client);
+    let pid = robot.master_pid();
+    let injections = robot.counter("injections");
+
+    crate::support::stop(pid);
+    // It is under way in the master, which has not run it.
+    let flying = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/flying", 1)
+    });
+    // Neither who reads nor who changes nothing waits for the verdict.
+    assert_eq!(client.param("/gain"), Some(Value::Int(7)));
+    client.set_param("/gain", 7);
+    node.watch_param(&client, "/standing");
+    assert!(robot.is_open(), "the verdict has come too early");
+    flying.join().unwrap();
+    eventually("the gate is shut", || !robot.is_open());
+    let start = Instant::now();
+    for number in 1..=3 {
+        client.set_param("/standing", number);
+    }
+    let coming = FakeNode::start("/coming");
+    coming.publish(&client, "/topic", "std_msgs/String");
+    let after = State::read(&client);
+    assert_eq!(client.param("/gain"), Some(Value::Int(7)));
+    assert_eq!(client.master_pid(), Some(pid));
+    assert!(
+        start.elapsed() < Duration::from_secs(10),
+        "{:?}",
+        start.elapsed()
+    );
+    before.assert_same(
+        &after.without_node("/coming").with_params_of(&before),
+        "but for what was called",
+    );
+    let both = [node.api.clone(), coming.api.clone()];
+    eventually("the subscriber is told of the new publisher", || {
+        watcher
+            .updates("/topic")
+            .last()
+            .is_some_and(|it| *it == both)
+    });
+    let every = [1, 2, 3].map(|number| (number, true));
+    eventually("the node is told of every value", || {
+        told(&node, "/standing") == every
+    });
+    assert!(told(&node, "/flying").contains(&(1, true)));
+
+    crate::support::signal(pid, Signal::CONT);
+    robot.await_gate();
+    assert_eq!(robot.master_pid(), pid, "the same master goes on");
+    assert_eq!(robot.counter("injections"), injections + 1);
+    after.assert_same(&robot.state(), "in the master that goes on");
+    after.assert_same(&State::read(&client), "through rosrescue");
+    // Never of an older value, and never of a part of the publishers.
+    assert!(holds(Duration::from_secs(1), || {
+        let standing = told(&node, "/standing");
+        standing[..3] == every && standing[3..].iter().all(|(value, _)| *value == 3)
+    }));
+    assert!(told(&node, "/flying").iter().all(|(value, _)| *value == 1));
+    let updates = watcher.updates("/topic");
+    let first = updates.iter().position(|uris| *uris == both).unwrap();
+    assert!(
+        updates[first..].iter().all(|uris| *uris == both),
+        "{updates:?}"
+    );
+    // It serves its parameters' subscribers as before.
+    client.set_param("/standing", 4);
+    eventually("the node is told by the master", || {
+        told(&node, "/standing").contains(&(4, false))
+    });
+    for node in [&node, &watcher, &coming] {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+    }
+}
+
+/// Ends what others do, after a panic too.
+struct Finish<'a>(&'a AtomicBool);
+
+impl Drop for Finish<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Many hangs, too short to be noticed or long enough, with writes under way all the time.
+#[test]
+fn ten_hangs_under_writes_lose_nothing() {
+    let robot = Robot::start_with(Mode::Proxy, &PROBES);
+    let client = robot.client();
+    let pid = robot.master_pid();
+    let injections = robot.counter("injections");
+    let watcher = FakeNode::start("/watcher");
+    let keys = ["/first", "/second"];
+    for key in keys {
+        watcher.watch_param(&client, key);
+    }
+    let leaving = FakeNode::start("/leaving");
+    for round in 0..10 {
+        leaving.publish(&client, &format!("/leaving{round}"), "std_msgs/String");
+    }
+    let done = AtomicBool::new(false);
+    let seed = std::process::id();
+    println!("seed {seed}");
+    let (written, publisher, shut) = thread::scope(|scope| {
+        let finish = Finish(&done);
+        let writers = keys.map(|key| {
+            let (client, done) = (&client, &done);
+            scope.spawn(move || {
+                let mut number = 0;
+                while !done.load(Ordering::Relaxed) {
+                    number += 1;
+                    // Panics if it is answered with anything but success, or not at all.
+                    client.set_param(key, number);
+                    thread::sleep(Duration::from_millis(5));
+                }
+                number
+            })
+        });
+        let registering = scope.spawn(|| {
+            let node = FakeNode::start("/publisher");
+            let mut number = 0;
+            while !done.load(Ordering::Relaxed) {
+                number += 1;
+                // Each one for itself: what is lost is not made up for by the next.
+                let topic = format!("/topic{number}");
+                node.publish(&client, &topic, "std_msgs/String");
+                node.unpublish(&client, &topic);
+                thread::sleep(Duration::from_millis(20));
+            }
+            node.publish(&client, "/last", "std_msgs/String");
+            node
+        });
+        let mut dice = u64::from(seed);
+        let mut roll = |most: u64| {
+            dice = dice
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            (dice >> 33) % most
+        };
+        let mut shut = 0;
+        for round in 0..10 {
+            crate::support::stop(pid);
+            // The faults themselves take a time, by dice. A master that hangs for a second is noticed.
+            let length = match round % 3 {
+                0 => 1800 + roll(800),
+                _ => 10 + roll(700),
+            };
+            thread::sleep(Duration::from_millis(length));
+            if !robot.is_open() {
+                shut += 1;
+                // Answered at once, by the mirror.
+                leaving.unpublish(&client, &format!("/leaving{round}"));
+            }
+            crate::support::signal(pid, Signal::CONT);
+            robot.await_gate();
+            thread::sleep(Duration::from_millis(roll(200)));
+        }
+        println!("{shut} of 10 hangs were noticed");
+        assert!(shut >= 3, "{shut}");
+        drop(finish);
+        (
+            writers.map(|it| it.join().unwrap()),
+            registering.join().unwrap(),
+            shut,
+        )
+    });
+    assert_eq!(robot.master_pid(), pid, "the same master goes on");
+    // Once after each hang that was noticed, however often the gate was found shut besides.
+    assert!(robot.counter("injections") >= injections + shut);
+    for (key, written) in keys.into_iter().zip(written) {
+        assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
+        eventually("the node is told of the last value", || {
+            told(&watcher, key)
+                .last()
+                .is_some_and(|(value, _)| *value == written)
+        });
+        // Every value, and those from the master once and in order.
+        let told = told(&watcher, key);
+        for number in 1..=written {
+            let is_told = told.iter().any(|(value, _)| *value == number);
+            assert!(is_told, "{key} {number}: {told:?}");
+        }
+        let by_master: Vec<_> = told.iter().filter(|(_, ours)| !ours).collect();
+        assert!(by_master.is_sorted_by(|a, b| a.0 < b.0), "{key}: {told:?}");
+    }
+    let state = robot.state();
+    let mut publishers = state.publishers.clone();
+    publishers.retain(|(_, nodes)| nodes.contains(&publisher.name));
+    assert_eq!(
+        publishers,
+        [("/last".to_owned(), vec![publisher.name.clone()])]
+    );
+    let left = state.publishers.iter();
+    let left = left.filter(|(_, nodes)| nodes.contains(&leaving.name));
+    assert_eq!(
+        left.count() as u64,
+        10 - shut,
+        "what was unregistered is back"
+    );
+    state.assert_same(&State::read(&client), "through rosrescue");
+    for node in [&watcher, &publisher, &leaving] {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+    }
+}
+
+/// What was unregistered while the master did not answer is unregistered in the master that goes on.
+#[test]
+fn unregistrations_in_a_hang_reach_the_master_that_goes_on() {
+    let robot = Robot::start_with(Mode::Proxy, &PROBES);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+        node.subscribe(&client, "/other", "std_msgs/String");
+        node.offer(&client, &format!("{}/service", node.name));
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let pid = robot.master_pid();
+    crate::support::stop(pid);
+    // Whether the answer comes at once or when the master goes on: it is a promise.
+    let unregistering = thread::spawn(move || {
+        leaving.unpublish(&client, "/topic");
+        leaving.unsubscribe(&client, "/other");
+        leaving.withdraw(&client, "/leaving/service");
+        leaving
+    });
+    eventually("it is answered, or rosrescue knows of the hang", || {
+        unregistering.is_finished() || !robot.is_open()
+    });
+    crate::support::signal(pid, Signal::CONT);
+    let _leaving = unregistering.join().unwrap();
+    robot.await_gate();
+    robot.await_state(&after, "when the master went on");
+    assert_eq!(robot.client().master_pid(), Some(pid));
+    after.assert_same(&State::read(&robot.client()), "through rosrescue");
+}
+
+/// It is under way in the master when that hangs, and answered by the mirror: the next master, if the one that
+/// hangs dies of it, does not know the node either.
+#[test]
+fn an_unregistration_that_a_hung_master_took_with_it_is_not_forgotten() {
+    let mut robot = Robot::start_with(Mode::Proxy, &PROBES);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let dead = robot.master_pid();
+    crate::support::stop(dead);
+    leaving.unpublish(&client, "/topic");
+    after.assert_same(&State::read(&client), "in the mirror");
+    robot.kill_master();
+    robot.revive_master();
+    robot.await_recovery(dead);
+    robot.await_state(&after, "in the next master");
+    after.assert_same(&State::read(&client), "through rosrescue");
+}
+
+/// `core` asks, decides, kills and replaces; the streams of its nodes go on.
+#[test]
+fn a_core_replaces_a_hung_master_under_its_nodes() {
+    let robot = Robot::start_with(Mode::Core, &PROBES);
+    let client = robot.client();
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    let hung = robot.master_pid();
+    crate::support::stop(hung);
+    let waiting = thread::spawn({
+        let client = client.clone();
+        move || client.status("setParam", params!["/test", "/waits", 1])
+    });
+    eventually("the mirror reads while nobody else does", || {
+        !robot.is_open() && State::read(&client).knows("/talker")
+    });
+    robot.await_recovery(hung);
+    assert!(!alive(hung), "the master that hangs is ended");
+    assert_eq!(waiting.join().unwrap().expect("the call is answered").0, 1);
+    client.ok("deleteParam", params!["/test", "/waits"]);
+    before.assert_same(&robot.state(), "after the hung master was replaced");
+    let status = robot.status().unwrap();
+    assert_eq!(
+        status["last_recovery"]["cause"],
+        "the master stopped answering"
+    );
+    listener.wait_messages("/talker", 10);
+    listener.assert_no_message_lost("/talker");
+    listener.assert_no_link_lost();
+    talker.assert_no_link_lost();
+}
+
+/// Up to two seconds a call are no reason to end a master that is given three, and twenty seconds are.
+#[test]
+fn a_slow_master_is_left_alone_below_the_threshold() {
+    let program = format!("{NODES}/slow_rosmaster.py");
+    let options = [
+        "--rosmaster",
+        &program,
+        "--no-rosout",
+        "--probe-interval",
+        "100",
+        "--probe-timeout",
+        "1500",
+        "--probe-count",
+        "2",
+    ];
+    let robot = Robot::start_with(Mode::Core, &options);
+    let client = robot.client();
+    client.set_param("/kept", 0);
+    let pid = robot.master_pid();
+    let slow = robot.scratch.path("slow");
+
+    // The second one takes almost as long as a probe may, and the third longer than one may.
+    for (number, seconds) in (1..).zip(["0.3", "1.4", "2"]) {
+        fs::write(&slow, seconds).unwrap();
+        let start = Instant::now();
+        client.set_param("/kept", number);
+        let delay = Duration::from_secs_f64(seconds.parse().unwrap());
+        assert!(
+            start.elapsed() >= delay,
+            "it was not slow: {:?}",
+            start.elapsed()
+        );
+        // Who reads need not wait so long.
+        let start = Instant::now();
+        assert_eq!(client.param("/kept"), Some(Value::Int(number)));
+        assert!(start.elapsed() < delay, "{:?}", start.elapsed());
+        // So many probes have met it.
+        let probes = Duration::from_millis(3500);
+        assert!(holds(probes, || robot.is_open()), "{seconds} s a call");
+    }
+    let ask = Instant::now();
+    assert_eq!(client.master_pid(), Some(pid));
+    assert!(
+        ask.elapsed() < Duration::from_secs(2),
+        "roslaunch waits for this: {:?}",
+        ask.elapsed()
+    );
+    let status = robot.status().unwrap();
+    assert_eq!(status["recoveries"], 1, "{status}");
+    assert!(robot.is_open());
+
+    fs::write(&slow, "20").unwrap();
+    eventually("the gate is shut", || !robot.is_open());
+    fs::remove_file(&slow).unwrap();
+    robot.await_recovery(pid);
+    assert!(!alive(pid));
+    assert_eq!(robot.bare().param("/kept"), Some(Value::Int(3)));
+}

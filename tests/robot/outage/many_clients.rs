@@ -1,0 +1,244 @@
+//! Many clients at once, at the moment at which an outage begins: each gets the answer that is due to it, at
+//! once and in its order.
+
+use std::io;
+use std::sync::{Arc, Barrier};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, http_request, params, tree,
+};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+
+/// Clients of the crowd; a multiple of four.
+const CROWD: i32 = 200;
+
+/// The calls that each client of a kind makes, one behind the other on one connection without waiting for
+/// answers.
+fn calls_of(client: i32, api: &str) -> Vec<(&'static str, Vec<Value>)> {
+    let name = format!("/client{client}");
+    let own = |what: &str| format!("{name}/{what}");
+    match client % 4 {
+        0 => vec![
+            ("getParam", params![name.as_str(), own("gain")]),
+            ("hasParam", params![name.as_str(), own("nothing")]),
+            ("lookupNode", params![name.as_str(), "/present"]),
+            ("getUri", params![name.as_str()]),
+            ("getPublishedTopics", params![name.as_str(), "/client1"]),
+        ],
+        1 => vec![(
+            "unregisterPublisher",
+            params![name.as_str(), own("old"), api],
+        )],
+        2 => (0..3)
+            .map(|number| {
+                let topic = own(&format!("new{number}"));
+                let params = params![name.as_str(), topic, "std_msgs/String", api];
+                ("registerPublisher", params)
+            })
+            .collect(),
+        _ => (0..5)
+            .map(|number| ("setParam", params![name.as_str(), own("last"), number]))
+            .collect(),
+    }
+}
+
+/// Code and value of each answer.
+type Answers = io::Result<Vec<(i32, Value)>>;
+
+/// A client on a connection of its own, which makes its calls when the barrier falls.
+fn start(
+    client: &Client,
+    calls: Vec<(&'static str, Vec<Value>)>,
+    barrier: &Arc<Barrier>,
+) -> JoinHandle<(Answers, Duration)> {
+    let mut wire = client.connect().unwrap();
+    let ask = http_request(&encode_call("getPid", params!["/client"]));
+    wire.send(&ask).unwrap();
+    wire.response().unwrap();
+    let barrier = Arc::clone(barrier);
+    thread::spawn(move || {
+        barrier.wait();
+        let start = Instant::now();
+        (say(&mut wire, &calls), start.elapsed())
+    })
+}
+
+fn say(wire: &mut Wire, calls: &[(&str, Vec<Value>)]) -> Answers {
+    let bytes: Vec<_> = calls
+        .iter()
+        .flat_map(|(method, params)| http_request(&encode_call(method, params.clone())))
+        .collect();
+    wire.send(&bytes)?;
+    let answer = |wire: &mut Wire| match wire.response()?.reply() {
+        Reply::Value(Value::Array(fields)) => Ok((fields[0].as_int().unwrap(), fields[2].clone())),
+        other => Err(io::Error::other(format!("{other:?}"))),
+    };
+    calls.iter().map(|_| answer(wire)).collect()
+}
+
+#[test]
+fn two_hundred_clients_call_when_the_outage_begins() {
+    when_the_outage_begins(Mode::Proxy);
+}
+
+#[test]
+fn two_hundred_clients_call_when_the_own_master_dies() {
+    when_the_outage_begins(Mode::Core);
+}
+
+fn when_the_outage_begins(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    let client = robot.client();
+    let present = FakeNode::start("/present");
+    present.publish(&client, "/present/topic", "std_msgs/String");
+    // The health check asks the nodes whether they are alive.
+    let nodes: Vec<_> = (0..CROWD)
+        .map(|number| FakeNode::start(&format!("/client{number}")))
+        .collect();
+    for (node, number) in nodes.iter().zip(0..CROWD) {
+        match number % 4 {
+            0 => client.set_param(&format!("{}/gain", node.name), number),
+            1 => {
+                let old = format!("{}/old", node.name);
+                node.publish(&client, &old, "std_msgs/String");
+                node.claim_publication(&old, None);
+            }
+            2 => {
+                for topic in ["new0", "new1", "new2"] {
+                    let topic = format!("{}/{topic}", node.name);
+                    node.claim_publication(&topic, Some("std_msgs/String"));
+                }
+            }
+            _ => {}
+        }
+    }
+    let dead = robot.master_pid();
+    let barrier = Arc::new(Barrier::new(CROWD as usize + 1));
+    let crowd: Vec<_> = (0..CROWD)
+        .zip(&nodes)
+        .map(|(number, node)| start(&client, calls_of(number, &node.api), &barrier))
+        .collect();
+    barrier.wait();
+    robot.kill_master_at_once(dead);
+
+    // Nobody waits for a master.
+    for (thread, number) in crowd.into_iter().zip(0..CROWD) {
+        let (answers, took) = thread.join().unwrap();
+        let answers = answers.unwrap_or_else(|error| panic!("client {number}: {error}"));
+        assert!(took < Duration::from_secs(20), "client {number}: {took:?}");
+        let expected = [
+            (1, Value::Int(number)),
+            (1, Value::Bool(false)),
+            (1, Value::from(present.api.as_str())),
+            (1, Value::from(client.uri())),
+        ];
+        match number % 4 {
+            0 => {
+                assert_eq!(answers[..4], expected, "client {number}");
+                assert_eq!(answers[4].0, 1);
+            }
+            1 => assert_eq!(answers, [(1, Value::Int(1))], "client {number}"),
+            _ => assert!(
+                answers.iter().all(|(code, _)| *code == 1),
+                "client {number}: {answers:?}"
+            ),
+        }
+    }
+    let state = State::read(&client);
+    assert!(!(0..CROWD).any(|number| number % 4 == 1 && state.knows(&format!("/client{number}"))));
+    robot.revive_master();
+    robot.await_recovery(dead);
+    // No call was closed without an answer.
+    assert_eq!(robot.counter("hold_expired"), 0);
+    let (bare, state) = (robot.bare(), robot.state());
+    for number in 0..CROWD {
+        let name = format!("/client{number}");
+        let publishes = |what: &str| state.publishers_of(&format!("{name}/{what}"));
+        match number % 4 {
+            1 => assert!(publishes("old").is_empty(), "{name} is back:\n{state}"),
+            2 => {
+                let found = ["new0", "new1", "new2"].map(publishes);
+                let own = vec![name.clone()];
+                assert_eq!(found, [own.clone(), own.clone(), own]);
+            }
+            3 => assert_eq!(
+                bare.param(&format!("{name}/last")),
+                Some(Value::Int(4)),
+                "the last of its calls counts"
+            ),
+            _ => {}
+        }
+    }
+}
+
+/// What rospy sends when a node ends is one multicall, and so is what roslaunch sends when it begins.
+#[test]
+fn multicalls_in_an_outage_are_answered_at_once_and_in_order() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let nodes = ["/staying", "/leaving"].map(FakeNode::start);
+    for node in &nodes {
+        node.publish(&client, "/topic", "std_msgs/String");
+    }
+    let subscriber = FakeNode::start("/subscriber");
+    subscriber.subscribe(&client, "/topic", "std_msgs/String");
+    let told = subscriber.updates("/topic").len();
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+    let call = |calls: Vec<Call>| {
+        let answer = client
+            .call("system.multicall", Call::multicall(calls).params)
+            .unwrap();
+        let Reply::Value(Value::Array(answers)) = answer else {
+            panic!("{answer:?}");
+        };
+        let value = |answer: &Value| answer.as_array().unwrap()[0].as_array().unwrap()[2].clone();
+        answers.iter().map(value).collect::<Vec<_>>()
+    };
+    let unregister = |node: &FakeNode, topic: &str| {
+        let params = params![node.name.as_str(), topic, node.api.as_str()];
+        Call::new("unregisterPublisher", params)
+    };
+    let start = Instant::now();
+    let launch = call(vec![
+        Call::new(
+            "setParam",
+            params!["/roslaunch", "/launched", tree! { "a" => 1 }],
+        ),
+        Call::new("setParam", params!["/leaving", "/leaving/private", 1]),
+        Call::new("getParam", params!["/roslaunch", "/launched/a"]),
+    ]);
+    assert_eq!(launch, [0.into(), 0.into(), Value::Int(1)]);
+    let params = params![
+        "/staying",
+        "/late",
+        "std_msgs/String",
+        nodes[0].api.as_str()
+    ];
+    call(vec![Call::new("registerPublisher", params)]);
+    nodes[1].claim_publication("/topic", None);
+    assert_eq!(call(vec![unregister(&nodes[1], "/topic")]), [Value::Int(1)]);
+    assert_eq!(State::read(&client).publishers_of("/topic"), ["/staying"]);
+    assert_eq!(call(vec![unregister(&nodes[0], "/late")]), [Value::Int(1)]);
+    assert!(start.elapsed() < Duration::from_secs(10));
+    assert!(!robot.is_open(), "there was a master");
+    eventually("the subscriber is told", || {
+        subscriber.updates("/topic").last() == Some(&vec![nodes[0].api.clone()])
+    });
+    let before = State::read(&client);
+    robot.revive_master();
+    robot.await_recovery(dead);
+    let state = robot.state();
+    before.assert_same(&state, "in the next master");
+    assert_eq!(state.publishers_of("/topic"), ["/staying"]);
+    assert!(state.publishers_of("/late").is_empty(), "{state}");
+    assert_eq!(robot.bare().param("/launched/a"), Some(Value::Int(1)));
+    let updates = &subscriber.updates("/topic")[told..];
+    assert!(
+        updates.iter().all(|list| list.contains(&nodes[0].api)),
+        "{updates:?}"
+    );
+}

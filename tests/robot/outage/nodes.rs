@@ -1,0 +1,239 @@
+//! What real nodes and tools meet while there is no master: those that read, those that begin and end
+//! meanwhile, and those that register and set all that there is.
+
+use std::time::{Duration, Instant};
+
+use crate::support::{Library, Mode, Node, Process, Robot, Tool, eventually, holds, ros_command};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+const LIBRARIES: [(Library, &str); 2] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
+
+/// Starts a node of each library, named with its suffix, and does not wait for it.
+fn spawn_both(robot: &Robot, node: &str, name: &str, arguments: &[&str]) -> [Node; 2] {
+    LIBRARIES.map(|(library, suffix)| {
+        let name = format!("__name:={name}_{suffix}");
+        robot.spawn_node(library, node, &[arguments, &[name.as_str()]].concat())
+    })
+}
+
+fn await_ready(nodes: &mut [Node]) {
+    for node in nodes {
+        node.wait_line("`ready`", |line| line.starts_with("ready "));
+    }
+}
+
+/// A node whose `getParam` fails goes on with its default, and a robot drives with the wrong gains.
+#[test]
+fn whoever_reads_notices_nothing_in_proxy_mode() {
+    whoever_reads_notices_nothing(Mode::Proxy);
+}
+
+#[test]
+fn whoever_reads_notices_nothing_in_core_mode() {
+    whoever_reads_notices_nothing(Mode::Core);
+}
+
+fn whoever_reads_notices_nothing(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let mut readers = spawn_both(&robot, "reader", "reader", &["/gain"]);
+    let mut others = spawn_both(&robot, "server", "server", &[]);
+    await_ready(&mut readers);
+    await_ready(&mut others);
+    let count = |node: &Node| node.said("reads").last().map_or(0, |n| n.parse().unwrap());
+    let read_on = |nodes: &[Node], more: u64| {
+        for node in nodes {
+            let before: u64 = count(node);
+            eventually("a node reads on", || count(node) >= before + more);
+        }
+    };
+    let listings: [&[&str]; 6] = [
+        &["rosnode", "list"],
+        &["rosnode", "info", "/server_cpp"],
+        &["rostopic", "list", "-v"],
+        &["rosservice", "list"],
+        &["rosparam", "list"],
+        &["rosparam", "get", "/gain"],
+    ];
+    let list = |robot: &Robot| {
+        listings.map(|run| {
+            let tool = Tool::run(&robot.scratch, robot.port(), run[0], &run[1..]);
+            assert!(tool.status.success(), "{run:?}: {}", tool.stderr);
+            assert!(!tool.stdout.is_empty(), "{run:?}");
+            tool.stdout
+        })
+    };
+    let before = robot.settled_state();
+    let listed = list(&robot);
+    let dead = robot.master_pid();
+
+    robot.kill_master();
+    read_on(&readers, 50);
+    assert_eq!(listed, list(&robot), "what the tools say");
+    let mut late = spawn_both(&robot, "reader", "late", &["/gain"]);
+    await_ready(&mut late);
+    read_on(&late, 20);
+    let mut command = ros_command(&robot.scratch, "rosparam", robot.port());
+    let mut setting = Process::start("rosparam set", command.args(["set", "/gain", "8"]));
+    assert_eq!(setting.wait().code(), Some(0));
+    read_on(&readers, 50);
+    assert!(!robot.is_open(), "there was a master");
+
+    robot.revive_master();
+    robot.await_recovery(dead);
+    assert_eq!(robot.bare().param("/gain"), Some(Value::Int(8)));
+    read_on(&readers, 20);
+    read_on(&late, 20);
+    for node in readers.iter().chain(&late) {
+        assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
+    }
+    let now = robot.settled_state();
+    let now = now.without_node("/late_py").without_node("/late_cpp");
+    assert_eq!(before.nodes, now.nodes);
+    assert_eq!(before.publishers, now.publishers);
+    assert_eq!(before.services, now.services);
+}
+
+/// Publishers, subscribers, services and parameters of real nodes, while there is no master.
+#[test]
+fn all_calls_of_nodes_get_through_at_once_without_a_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.client().set_param("/gain", 7);
+    let mut nodes = spawn_both(&robot, "late", "late", &[]);
+    await_ready(&mut nodes);
+    robot.settled_state();
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+    for node in &nodes {
+        node.signal(Signal::USR1);
+    }
+    let start = Instant::now();
+    for node in &nodes {
+        eventually("everything has got through", || {
+            let mut done = node.said("done");
+            done.sort();
+            done == ["offer", "publish", "read", "set", "subscribe"]
+        });
+        assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
+        assert_eq!(node.said("again"), Vec::<String>::new(), "{}", node.log());
+    }
+    assert!(
+        start.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        start.elapsed()
+    );
+    assert!(!robot.is_open(), "there was a master");
+    robot.revive_master();
+    robot.await_recovery(dead);
+    let (state, bare) = (robot.state(), robot.bare());
+    for (_, suffix) in LIBRARIES {
+        let name = format!("/late_{suffix}");
+        assert_eq!(
+            state.publishers_of(&format!("{name}/published")),
+            [name.as_str()]
+        );
+        assert_eq!(
+            state.subscribers_of(&format!("{name}/subscribed")),
+            [name.as_str()]
+        );
+        let offered = (format!("{name}/offered"), vec![name.clone()]);
+        assert!(state.services.contains(&offered), "{state}");
+        assert_eq!(bare.param(&format!("{name}/late")), Some(Value::Int(1)));
+    }
+}
+
+/// Nodes that start, end and die while there is no master are registered as long as they live.
+#[test]
+fn nodes_that_start_and_end_without_a_master_leave_nothing_in_proxy_mode() {
+    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Proxy);
+}
+
+#[test]
+fn nodes_that_start_and_end_without_a_master_leave_nothing_in_core_mode() {
+    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Core);
+}
+
+fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
+    let mut leaving = spawn_both(&robot, "talker", "leaving", &[]);
+    let mut staying = spawn_both(&robot, "listener", "staying", &[]);
+    await_ready(&mut leaving);
+    await_ready(&mut staying);
+    for node in &staying {
+        node.wait_messages("/leaving_py", 5);
+        node.wait_messages("/leaving_cpp", 5);
+    }
+    let before = robot.settled_state();
+    let after = before
+        .without_node("/leaving_py")
+        .without_node("/leaving_cpp");
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+
+    // A node that is there and ends says so at once, and is believed.
+    for node in &mut leaving {
+        end(node, Signal::INT);
+    }
+    let now = crate::support::State::read(&robot.client());
+    assert!(
+        !now.knows("/leaving_py") && !now.knows("/leaving_cpp"),
+        "{now}"
+    );
+
+    // Nodes that start meanwhile, find each other, and are killed, or asked to end.
+    let mut brief = [
+        spawn_both(&robot, "talker", "killed", &[]),
+        spawn_both(&robot, "talker", "ended", &[]),
+    ];
+    let names = ["/killed_py", "/killed_cpp", "/ended_py", "/ended_cpp"];
+    for nodes in &mut brief {
+        await_ready(nodes);
+    }
+    for node in &staying {
+        for name in names {
+            node.wait_messages(name, 5);
+        }
+    }
+    for (nodes, signal) in brief.iter_mut().zip([Signal::KILL, Signal::INT]) {
+        for node in nodes {
+            end(node, signal);
+        }
+    }
+    let now = crate::support::State::read(&robot.client());
+    assert!(!now.knows("/ended_py") && !now.knows("/ended_cpp"), "{now}");
+    assert!(!robot.is_open(), "there was a master");
+    robot.revive_master();
+    robot.await_recovery(dead);
+    let mut last = None;
+    eventually("the killed ones are taken out", || {
+        last = crate::support::State::try_read(&robot.bare()).ok();
+        last.as_ref()
+            .is_some_and(|now| names.iter().all(|name| !now.knows(name)))
+    });
+    after_types(&after, &robot).assert_same(&last.unwrap(), "when all have ended");
+    assert!(holds(Duration::from_secs(2), || {
+        let now = robot.state();
+        names.iter().all(|name| !now.knows(name))
+    }));
+}
+
+/// `state` with the topic types that the master holds now: a node that ended may have left one.
+fn after_types(state: &crate::support::State, robot: &Robot) -> crate::support::State {
+    crate::support::State {
+        topic_types: robot.state().topic_types,
+        ..state.clone()
+    }
+}
+
+/// Ends a node, which must not wait for the master.
+fn end(node: &mut Node, signal: Signal) {
+    let start = Instant::now();
+    node.signal(signal);
+    node.wait();
+    let took = start.elapsed();
+    assert!(took < Duration::from_secs(20), "{took:?}");
+}

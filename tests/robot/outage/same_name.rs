@@ -1,0 +1,170 @@
+//! Two nodes of one name, and a master that dies before it has told the first of them to shut down.
+
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+
+use crate::support::{
+    Client, FakeNode, Library, Mode, Node, Robot, eventually, eventually_some, holds, params,
+};
+
+/// A master's words to a node whose name another one has taken.
+fn goodbye(name: &str) -> Vec<Value> {
+    let reason = format!("[{name}] Reason: new node registered with same name");
+    params!["/master", reason.as_str()]
+}
+
+fn port_of(client: &Client, node: &str) -> u16 {
+    let api = client.ok("lookupNode", params!["/test", node]);
+    let port = api.as_str().unwrap().trim_end_matches('/').rsplit(':');
+    port.map(|port| port.parse().unwrap()).next().unwrap()
+}
+
+fn twin(robot: &Robot) -> Node {
+    robot.spawn_node(Library::Rospy, "talker", &["__name:=twin"])
+}
+
+/// Waits until /twin is not at `port` any more, and kills the master at once.
+fn kill_when_taken(robot: &mut Robot, master: u32, port: u16) {
+    let client = robot.client();
+    eventually_some("the second one takes the name", || {
+        (port_of(&client, "/twin") != port).then_some(())
+    });
+    robot.kill_master_at_once(master);
+}
+
+#[test]
+fn a_displaced_node_ends_though_its_master_died_before_it_said_so_in_core_mode() {
+    a_displaced_node_ends_though_its_master_died_before_it_said_so(Mode::Core, "rosmaster");
+}
+
+#[test]
+fn a_displaced_node_ends_though_its_master_died_before_it_said_so_in_proxy_mode() {
+    a_displaced_node_ends_though_its_master_died_before_it_said_so(Mode::Proxy, "rosmaster");
+}
+
+/// With a master of which it is certain that it has told nobody.
+#[test]
+fn a_displaced_node_ends_though_its_master_never_said_so() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        a_displaced_node_ends_though_its_master_died_before_it_said_so(mode, "silent_rosmaster.py");
+    }
+}
+
+fn a_displaced_node_ends_though_its_master_died_before_it_said_so(mode: Mode, program: &str) {
+    let mut robot = match program {
+        "rosmaster" => Robot::start(mode),
+        program => Robot::start_under(mode, program, &[]),
+    };
+    let mut first = twin(&robot);
+    first.wait_line("`ready`", |line| line.starts_with("ready "));
+    let port = port_of(&robot.client(), "/twin");
+    let master = robot.master_pid();
+    let mut second = twin(&robot);
+    kill_when_taken(&mut robot, master, port);
+    robot.revive_master();
+    second.wait_line("`ready`", |line| line.starts_with("ready "));
+    eventually("one of them ends", || {
+        first.exited().is_some() || second.exited().is_some()
+    });
+    robot.await_recovery(master);
+    // A node that logs something before it is told takes its name back, at every master: by subscribeParam.
+    let taken_back = first.exited().is_none();
+    assert!(
+        !taken_back || first.log().contains("[WARN]"),
+        "{}",
+        first.log()
+    );
+    let heir = if taken_back { &mut first } else { &mut second };
+    assert!(
+        holds(Duration::from_secs(2), || heir.exited().is_none()),
+        "{}",
+        heir.log()
+    );
+    assert_eq!(port_of(&robot.bare(), "/twin") == port, taken_back);
+}
+
+/// The port of a displaced node belongs to another one by the time at which it is told.
+#[test]
+fn who_has_the_port_of_a_displaced_node_by_now_is_not_told() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        for is_registered in [false, true] {
+            let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
+            let mut first = twin(&robot);
+            first.wait_line("`ready`", |line| line.starts_with("ready "));
+            let port = port_of(&robot.client(), "/twin");
+            first.kill();
+            let innocent = innocent_at(&robot, port, is_registered);
+            let master = robot.master_pid();
+            let mut second = twin(&robot);
+            kill_when_taken(&mut robot, master, port);
+            robot.revive_master();
+            robot.await_recovery(master);
+            second.wait_line("`ready`", |line| line.starts_with("ready "));
+            assert_unharmed(&innocent);
+        }
+    }
+}
+
+/// As above, when it is rosrescue that tells while there is no master.
+#[test]
+fn who_has_the_port_of_a_node_that_is_displaced_without_a_master_is_not_told() {
+    for is_registered in [false, true] {
+        let mut robot = Robot::start_for_outages(Mode::Proxy);
+        let mut first = twin(&robot);
+        first.wait_line("`ready`", |line| line.starts_with("ready "));
+        let port = port_of(&robot.client(), "/twin");
+        robot.take_master_away();
+        first.kill();
+        let innocent = innocent_at(&robot, port, is_registered);
+        let second = FakeNode::start("/twin");
+        second.publish(&robot.client(), "/chatter", "std_msgs/String");
+        assert_ne!(port_of(&robot.client(), "/twin"), port);
+        assert_unharmed(&innocent);
+    }
+}
+
+/// Another node at `port`, with another process id.
+fn innocent_at(robot: &Robot, port: u16, is_registered: bool) -> FakeNode {
+    let innocent = FakeNode::start_at("/innocent", port);
+    innocent.claim_pid(4_000_000);
+    innocent.claim_publication("/elsewhere", Some("std_msgs/String"));
+    if is_registered {
+        innocent.publish(&robot.client(), "/elsewhere", "std_msgs/String");
+    }
+    innocent
+}
+
+fn assert_unharmed(innocent: &FakeNode) {
+    assert!(
+        holds(Duration::from_secs(3), || innocent
+            .heard("shutdown")
+            .is_empty()),
+        "{:?}",
+        innocent.calls()
+    );
+}
+
+/// Exactly once, and in a master's words.
+#[test]
+fn a_node_that_is_displaced_without_a_master_is_told_once() {
+    let mut robot = Robot::start_for_outages(Mode::Proxy);
+    let client = robot.client();
+    let first = FakeNode::start("/twin");
+    first.claim_pid(4_000_000);
+    first.publish(&client, "/chatter", "std_msgs/String");
+    let dead = robot.master_pid();
+    robot.take_master_away();
+    let second = FakeNode::start("/twin");
+    second.publish(&client, "/chatter", "std_msgs/String");
+    eventually("the first one is told", || {
+        !first.heard("shutdown").is_empty()
+    });
+    robot.revive_master();
+    robot.await_recovery(dead);
+    assert!(holds(Duration::from_secs(3), || {
+        first.heard("shutdown") == [goodbye("/twin")] && second.heard("shutdown").is_empty()
+    }));
+    let api = robot.bare().ok("lookupNode", params!["/test", "/twin"]);
+    assert_eq!(api, Value::from(second.api.as_str()));
+}

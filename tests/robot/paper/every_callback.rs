@@ -1,0 +1,200 @@
+//! The paper's case 2 at every point: the master dies after it has changed its state, before or while it
+//! tells the subscribers. All of them get to know the full list, once, from rosrescue.
+
+use std::ops::RangeInclusive;
+use std::thread;
+
+use crate::support::{FakeNode, Heard, Library, Mode, Node, Robot, eventually, status};
+use rosrescue::xmlrpc::Value;
+
+const TOPIC: &str = "/chatter";
+
+/// What the master dies of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Change {
+    Registration,
+    /// As in the paper: a publisher that leaves.
+    Unregistration,
+}
+
+/// The subscribers: four fakes, and a real node of each library. So there are six callbacks.
+struct Audience {
+    fakes: Vec<FakeNode>,
+    real: [Node; 2],
+}
+
+impl Audience {
+    fn start(robot: &Robot) -> Self {
+        let client = robot.client();
+        let fakes = (0..4).map(|i| FakeNode::start(&format!("/subscriber{i}")));
+        let fakes: Vec<_> = fakes.collect();
+        for fake in &fakes {
+            fake.subscribe(&client, TOPIC, "std_msgs/String");
+        }
+        let real = [Library::Rospy, Library::Roscpp]
+            .map(|library| robot.node(library, "listener", &[&format!("__name:={library:?}")]));
+        Self { fakes, real }
+    }
+
+    /// Whether the last list that each of them got is `all`.
+    fn knows(&self, all: &[String]) -> bool {
+        let fakes = self.fakes.iter().map(|fake| fake.updates(TOPIC));
+        let real = self.real.iter().map(|node| node.updates(TOPIC));
+        fakes.chain(real).all(|updates| match updates.last() {
+            Some(last) => last == all,
+            None => all.is_empty(),
+        })
+    }
+}
+
+/// The lists of publishers in `calls`, and whether each came from rosrescue.
+fn lists(calls: &[Heard]) -> Vec<(Vec<&str>, bool)> {
+    let updates = calls.iter().filter(|call| call.method == "publisherUpdate");
+    let lists = updates.map(|call| {
+        let uris = call.params[2].as_array().unwrap().iter();
+        let uris = uris.map(|uri| uri.as_str().unwrap()).collect();
+        (uris, call.from_rosrescue)
+    });
+    lists.collect()
+}
+
+/// With 0 the master dies before any callback, with N as the Nth is about to be sent; `workers` are its
+/// threads for callbacks.
+fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeInclusive<usize>) {
+    let mut robot = Robot::start_under(mode, "fragile_master.py", &["-w", workers]);
+    let client = robot.client();
+    let audience = Audience::start(&robot);
+    let names = points.clone().map(|point| format!("/publisher{point}"));
+    let mut coming: Vec<_> = names.map(|name| FakeNode::start(&name)).collect();
+    let mut there = Vec::new();
+    if change == Change::Unregistration {
+        // The last one that leaves leaves an empty list.
+        for publisher in coming.drain(..) {
+            publisher.publish(&client, TOPIC, "std_msgs/String");
+            there.push(publisher);
+        }
+    }
+    let mut gone = Vec::new();
+    let all = |there: &[FakeNode]| {
+        there
+            .iter()
+            .map(|node| node.api.clone())
+            .collect::<Vec<_>>()
+    };
+    let mut once = 0;
+    for point in points {
+        let before = all(&there);
+        eventually("all know the publishers before", || audience.knows(&before));
+        let heard: Vec<_> = audience.fakes.iter().map(|it| it.calls().len()).collect();
+        let dead = robot.master_pid();
+        let file = robot.scratch.path("die-at");
+        std::fs::write(&file, format!("publisherUpdate {point}")).unwrap();
+        let calling = thread::spawn({
+            let client = client.clone();
+            let publisher = coming.pop().or_else(|| there.pop()).unwrap();
+            move || {
+                match change {
+                    Change::Registration => publisher.publish(&client, TOPIC, "std_msgs/String"),
+                    Change::Unregistration => publisher.unpublish(&client, TOPIC),
+                }
+                publisher
+            }
+        });
+        eventually(&format!("the master dies at point {point}"), || {
+            !file.exists()
+        });
+        if mode == Mode::Proxy {
+            robot.kill_master();
+            robot.revive_master();
+        }
+        robot.await_recovery(dead);
+        let publisher = calling.join().unwrap();
+        match change {
+            Change::Registration => there.push(publisher),
+            Change::Unregistration => gone.push(publisher),
+        }
+        let now = all(&there);
+        eventually(&format!("all know the publishers, point {point}"), || {
+            audience.knows(&now)
+        });
+        let mut check_ms = None;
+        eventually("the recovery is complete", || {
+            let status = status(&client);
+            let report = &status["last_recovery"];
+            check_ms = report["health_check_ms"].as_f64();
+            report["master_pid"] != dead && check_ms.is_some()
+        });
+        // Everything that was sent to a fake because of this change.
+        for (fake, heard) in audience.fakes.iter().zip(heard) {
+            let calls = &fake.calls()[heard..];
+            let lists = lists(calls);
+            let full = |(list, _): &&(Vec<&str>, bool)| *list == now;
+            // Never a part of the list, and never an old one again.
+            assert!(
+                lists.iter().all(|list| full(&list)),
+                "{lists:?}, not {now:?}"
+            );
+            let ours = lists.iter().filter(|(_, ours)| *ours).count();
+            // One from the master that died, and one from the next, if the call travelled again because
+            // its reply was lost. No master tells a node twice.
+            assert!(lists.len() - ours <= 2, "{lists:?}");
+            assert!(ours >= 1, "{lists:?}");
+            // Who has not answered 300 ms after the change may hold up the master: then we tell it again.
+            if check_ms.is_some_and(|ms| ms < 250.0) {
+                assert_eq!(ours, 1, "point {point}: {lists:?}");
+                once += 1;
+            }
+        }
+    }
+    println!("{once} fakes were told once");
+    let nodes = audience.fakes.iter().chain(&there).chain(&gone);
+    for node in nodes {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
+    }
+    drop(audience);
+    robot.kill_master();
+}
+
+// A core restarts its master at once for the first five deaths within a minute.
+
+#[test]
+fn registration_in_core_mode_before_and_at_the_first_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Registration, "3", 0..=3);
+}
+
+#[test]
+fn registration_in_core_mode_at_the_last_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Registration, "3", 4..=6);
+}
+
+#[test]
+fn registration_with_more_threads_than_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Registration, "16", 0..=3);
+    the_master_dies_at(Mode::Core, Change::Registration, "16", 4..=6);
+}
+
+#[test]
+fn registration_in_proxy_mode() {
+    the_master_dies_at(Mode::Proxy, Change::Registration, "3", 0..=6);
+}
+
+#[test]
+fn unregistration_in_core_mode_before_and_at_the_first_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Unregistration, "3", 0..=3);
+}
+
+#[test]
+fn unregistration_in_core_mode_at_the_last_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Unregistration, "3", 4..=6);
+}
+
+#[test]
+fn unregistration_with_more_threads_than_callbacks() {
+    the_master_dies_at(Mode::Core, Change::Unregistration, "16", 0..=3);
+    the_master_dies_at(Mode::Core, Change::Unregistration, "16", 4..=6);
+}
+
+#[test]
+fn unregistration_in_proxy_mode() {
+    the_master_dies_at(Mode::Proxy, Change::Unregistration, "3", 0..=6);
+}

@@ -1,0 +1,302 @@
+//! Which nodes are taken out after an outage and which are kept: the dead, the ones whose port another
+//! node has, and the ones that do not answer.
+
+use std::fs;
+use std::thread;
+use std::time::Duration;
+
+use crate::support::{
+    Client, FakeNode, Library, Mode, Robot, State, encode_call, eventually, eventually_some, holds,
+    http_request, names, params, status,
+};
+use rustix::process::Signal;
+
+/// Waits for the report of a recovery whose health check is over, and checks what every report has.
+#[track_caller]
+fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) {
+    let mut last = serde_json::Value::Null;
+    let found = holds(Duration::from_secs(20), || {
+        last = status(&robot.client())["last_recovery"].clone();
+        !wanted(&last)
+    });
+    assert!(!found, "the report never says {what}: {last:#}");
+    for field in [
+        "cause",
+        "outcome",
+        "phases",
+        "restored",
+        "skipped",
+        "mismatches",
+        "removed",
+        "reconciled",
+        "unreachable",
+        "notified",
+    ] {
+        assert!(!last[field].is_null(), "no `{field}` in {last:#}");
+    }
+}
+
+#[test]
+fn a_node_whose_port_refuses_is_taken_out_and_others_are_told() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        let client = robot.client();
+        let dead = FakeNode::start("/dead");
+        let living = FakeNode::start("/living");
+        let subscriber = FakeNode::start("/subscriber");
+        for node in [&dead, &living] {
+            node.publish(&client, "/topic", "std_msgs/String");
+            node.subscribe(&client, "/other", "std_msgs/String");
+            node.offer(&client, &format!("{}/service", node.name));
+            node.watch_param(&client, "/gains");
+        }
+        subscriber.subscribe(&client, "/topic", "std_msgs/String");
+        let after = robot.settled_state().without_node("/dead");
+        drop(dead);
+        robot.crash_master();
+        robot.await_state(&after, "when the dead node has been taken out");
+        eventually("the subscriber is told", || {
+            subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
+        });
+        report(&robot, "who was removed", |report| {
+            names(&report["removed"]) == ["/dead"]
+        });
+        for node in [&living, &subscriber] {
+            assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+        }
+    }
+}
+
+/// Both were asked for their process ids soon after they had registered.
+#[test]
+fn another_process_at_the_port_is_another_node() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let [old, same] = [("/old", 4001), ("/same", 4002)].map(|(name, pid)| {
+        let node = FakeNode::start(name);
+        node.claim_pid(pid);
+        node.publish(&client, "/topic", "std_msgs/String");
+        node.offer(&client, &format!("{name}/service"));
+        node
+    });
+    for node in [&old, &same] {
+        eventually("it is asked for its process id", || {
+            !node.heard("getPid").is_empty()
+        });
+    }
+    let after = robot.settled_state().without_node("/old");
+    // What it says of its topics would fit.
+    let taker = take_port(old, "/taker");
+    taker.claim_pid(4003);
+    taker.claim_publication("/topic", Some("std_msgs/String"));
+    robot.crash_master();
+    robot.await_state(&after, "when the old node has been taken out");
+    report(&robot, "who was removed", |report| {
+        names(&report["removed"]) == ["/old"]
+    });
+    assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
+}
+
+/// Nobody has asked the old one for its process id.
+#[test]
+fn other_topics_at_the_port_are_another_node() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let old = FakeNode::start("/old");
+    old.publish(&client, "/rosout", "rosgraph_msgs/Log");
+    old.publish(&client, "/old/topic", "std_msgs/String");
+    old.offer(&client, "/old/service");
+    let same = FakeNode::start("/same");
+    same.publish(&client, "/rosout", "rosgraph_msgs/Log");
+    same.publish(&client, "/same/topic", "std_msgs/String");
+    let taker = take_port(old, "/taker");
+    taker.publish(&client, "/rosout", "rosgraph_msgs/Log");
+    taker.publish(&client, "/taker/topic", "std_msgs/String");
+    let after = robot.settled_state().without_node("/old");
+    robot.crash_master();
+    robot.await_state(&after, "when the old node has been taken out");
+    assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
+}
+
+/// Ends `node` and starts another one at its port.
+fn take_port(node: FakeNode, name: &str) -> FakeNode {
+    let port = node.port();
+    drop(node);
+    FakeNode::start_at(name, port)
+}
+
+#[test]
+fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
+    let client = robot.client();
+    let silent = FakeNode::start("/silent");
+    silent.subscribe(&client, "/topic", "std_msgs/String");
+    client.set_param("/gain", 1);
+    silent.watch_param(&client, "/gain");
+    let before = robot.settled_state();
+    silent.hold();
+    robot.crash_master();
+    let unreachable = || names(&status(&client)["unreachable"]);
+    eventually("it is suspect", || unreachable() == ["/silent"]);
+    report(&robot, "who is suspect", |report| {
+        names(&report["unreachable"]) == ["/silent"]
+    });
+    before.assert_same(&robot.state(), "an unreachable node is kept");
+    // The master has tried in vain, or is still trying, to tell it of this.
+    let late = FakeNode::start("/late");
+    late.publish(&client, "/topic", "std_msgs/String");
+    client.set_param("/gain", 2);
+    silent.release();
+    eventually("it is no suspect any more", || unreachable().is_empty());
+    eventually("it knows the publisher", || {
+        silent.updates("/topic").last() == Some(&vec![late.api.clone()])
+    });
+    eventually("it knows the parameter", || {
+        let told = silent.heard("paramUpdate");
+        told.last().is_some_and(|told| told[2] == 2.into())
+    });
+}
+
+#[test]
+fn a_suspect_that_dies_is_taken_out() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
+    let client = robot.client();
+    let silent = FakeNode::start("/silent");
+    silent.publish(&client, "/topic", "std_msgs/String");
+    let after = robot.settled_state().without_node("/silent");
+    silent.hold();
+    robot.crash_master();
+    eventually("it is suspect", || {
+        names(&status(&client)["unreachable"]) == ["/silent"]
+    });
+    drop(silent);
+    robot.await_state(&after, "when the suspect has died");
+    eventually("nobody is suspect", || {
+        names(&status(&client)["unreachable"]).is_empty()
+    });
+}
+
+/// Without an outage.
+#[test]
+fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
+    let robot = Robot::start_with(Mode::Core, &["--reap-dead-nodes", "0.5"]);
+    let client = robot.client();
+    let mut talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    listener.wait_messages("/talker", 5);
+    let after = robot.settled_state().without_node("/talker");
+    let with = robot.settled_state();
+    assert!(holds(Duration::from_secs(2), || {
+        let now = State::try_read(&robot.bare());
+        now.is_ok_and(|now| now == with)
+    }));
+    talker.kill();
+    robot.await_state(&after, "after the regular health check");
+    eventually("the listener is told", || {
+        listener.updates("/chatter").last() == Some(&Vec::new())
+    });
+
+    let robot = Robot::start(Mode::Proxy);
+    let dead = FakeNode::start("/dead");
+    dead.publish(&robot.client(), "/topic", "std_msgs/String");
+    let before = robot.settled_state();
+    drop(dead);
+    assert!(holds(Duration::from_secs(3), || {
+        let now = State::try_read(&robot.bare());
+        now.is_ok_and(|now| now == before)
+    }));
+    drop((client, after));
+}
+
+/// roscpp holds its list of subscriptions while it registers one, and whatever asks for that list holds its
+/// only thread for calls. The health check after a recovery waits for what came during the injection.
+#[test]
+fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
+    // The injection takes longer than `--hold`.
+    let options = ["--hold", "1", "--node-timeout", "1500"];
+    let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let node = robot.node(Library::Roscpp, "late", &[]);
+    let subscriber = FakeNode::start("/subscriber");
+    subscriber.subscribe(&client, "/topic", "std_msgs/String");
+    let before = robot.settled_state();
+    let (_, api) = before
+        .nodes
+        .iter()
+        .find(|(name, _)| name == "/late")
+        .unwrap();
+    let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
+    let itself = Client::new(port.parse().unwrap());
+    let answers = |method: &str| {
+        let body = http_request(&encode_call(method, params!["/test"]));
+        let mut wire = itself.connect().unwrap();
+        wire.set_patience(Duration::from_millis(500));
+        wire.send(&body).unwrap();
+        wire.response().is_ok()
+    };
+    let dead = robot.master_pid();
+    robot.kill_master();
+    eventually("the gate is shut", || !robot.is_open());
+    // The injection takes some time, and so does the registration in the new master: longer than a node
+    // has time to answer.
+    fs::write(robot.scratch.path("slow"), "3 registerSubscriber").unwrap();
+    robot.revive_master();
+    let mut value = 0;
+    let held = eventually_some("a write waits for the end of the injection", || {
+        let client = client.clone();
+        // What changes nothing does not wait.
+        value += 1;
+        let setting = thread::spawn(move || client.set_param("/held", value));
+        holds(Duration::from_millis(300), || !setting.is_finished()).then_some(setting)
+    });
+    client.set_param("/gain", 7);
+    assert!(
+        !held.is_finished(),
+        "what changes nothing waited for the injection"
+    );
+    node.signal(Signal::USR1);
+    eventually("it cannot answer", || !answers("getSubscriptions"));
+    assert!(!answers("getPid"));
+    assert!(!node.said("done").contains(&"subscribe".to_owned()));
+    robot.await_recovery(dead);
+    held.join().unwrap();
+    report(&robot, "that the health check is over", |report| {
+        report["master_pid"] != dead && report["health_check_ms"].is_number()
+    });
+    let last = status(&client)["last_recovery"].clone();
+    assert_eq!(names(&last["removed"]), Vec::<String>::new());
+    assert_eq!(names(&last["unreachable"]), Vec::<String>::new());
+    assert!(answers("getPid"));
+    eventually("everything has got through", || {
+        let mut done = node.said("done");
+        done.sort();
+        done == ["offer", "publish", "read", "set", "subscribe"]
+    });
+    let state = robot.state();
+    assert_eq!(state.publishers_of("/late/published"), ["/late"]);
+    assert_eq!(state.subscribers_of("/late/subscribed"), ["/late"]);
+    assert_eq!(state.nodes, before.nodes);
+}
+
+/// A node that does not answer, such as a busy one, waits for nobody when it registers.
+#[test]
+fn a_silent_node_registers_at_once_in_an_outage_and_is_kept() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    let dead = robot.master_pid();
+    robot.kill_master();
+    node.hold();
+    node.subscribe(&client, "/more", "std_msgs/String");
+    assert!(!robot.is_open(), "there was a master");
+    robot.revive_master();
+    robot.await_recovery(dead);
+    node.release();
+    let state = robot.state();
+    assert_eq!(state.subscribers_of("/more"), ["/node"]);
+    assert_eq!(state.publishers_of("/topic"), ["/node"]);
+}

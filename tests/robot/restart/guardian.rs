@@ -1,0 +1,430 @@
+//! The guardian: whatever becomes of the worker, the port stays open, and somebody serves it again.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, alive, behind, eventually,
+    eventually_some, free_port, holds, params, signal, status,
+};
+use rustix::process::Signal;
+
+/// Between two calls of a client.
+const PACE: Duration = Duration::from_millis(3);
+
+/// The one process that has this word in its environment since its start.
+fn process_with(scratch: &Scratch, word: &str) -> Option<u32> {
+    let has = |pid: &u32| {
+        let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
+        String::from_utf8_lossy(&environment).contains(word)
+    };
+    let mut found = scratch.survivors().into_iter().map(|(pid, _)| pid);
+    found.find(has)
+}
+
+/// The worker that is not `dead`.
+#[track_caller]
+fn worker_after(scratch: &Scratch, dead: u32) -> u32 {
+    eventually_some("there is a worker", || {
+        process_with(scratch, "ROSRESCUE_GUARDIAN=").filter(|pid| *pid != dead)
+    })
+}
+
+#[track_caller]
+fn worker(scratch: &Scratch) -> u32 {
+    worker_after(scratch, 0)
+}
+
+/// The process that runs `program`.
+#[track_caller]
+fn process_of(scratch: &Scratch, program: &str) -> u32 {
+    let found = || {
+        let mut processes = scratch.survivors().into_iter();
+        processes.find(|(_, command)| command.contains(program))
+    };
+    eventually_some(program, found).0
+}
+
+/// The sockets that a process has open.
+fn sockets(pid: u32) -> BTreeSet<PathBuf> {
+    let open = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
+    let open = open.filter_map(|entry| fs::read_link(entry.path()).ok());
+    open.filter(|link| link.starts_with("socket:") || link.to_string_lossy().starts_with("socket:"))
+        .collect()
+}
+
+/// `rosrescue core` with its guardian, once all is there that roscore has, too.
+#[track_caller]
+fn core(scratch: &Scratch) -> Rescue {
+    let rescue = Setup::core(scratch, free_port()).guarded().start();
+    let client = rescue.client();
+    eventually("roscore's parameters are set", || {
+        client.param("/rosdistro").is_some() && client.param("/rosversion").is_some()
+    });
+    // It subscribes last, and does nothing more in the master.
+    eventually("rosout is at work", || {
+        State::try_read(&client).is_ok_and(|state| !state.subscribers_of("/rosout").is_empty())
+    });
+    rescue
+}
+
+/// Calls with a new connection each, one after the other, until `done`. Answers with the longest time
+/// that one took from its first connection to its answer; whoever is cut off tries again.
+fn call_until(done: &AtomicBool, client: &Client) -> Duration {
+    let mut longest = Duration::ZERO;
+    while !done.load(Ordering::Relaxed) {
+        let start = Instant::now();
+        loop {
+            match client.status("getParam", params!["/caller", "/kept"]) {
+                Ok((code, _, value)) => {
+                    assert_eq!((code, value), (1, "yes".into()));
+                    break;
+                }
+                Err(error) => assert_ne!(error.kind(), ErrorKind::ConnectionRefused),
+            }
+        }
+        longest = longest.max(start.elapsed());
+        thread::sleep(PACE);
+    }
+    longest
+}
+
+#[test]
+fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
+    let scratch = Scratch::new();
+    let rescue = core(&scratch);
+    let client = rescue.client();
+    client.set_param("/kept", "yes");
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    let rosout = process_of(&scratch, "rosout/rosout");
+    let master = client.master_pid().unwrap();
+    assert_eq!(status(&client)["guarded"], true);
+    let before = State::read(&client);
+
+    let done = AtomicBool::new(false);
+    let longest = thread::scope(|scope| {
+        let callers: Vec<_> = (0..4)
+            .map(|_| scope.spawn(|| call_until(&done, &client)))
+            .collect();
+        let mut dead = 0;
+        for _ in 0..5 {
+            let alive = worker_after(&scratch, dead);
+            signal(alive, Signal::KILL);
+            dead = alive;
+            worker_after(&scratch, dead);
+            eventually("calls pass again", || status(&client)["open"] == true);
+        }
+        done.store(true, Ordering::Relaxed);
+        let longest = callers.into_iter().map(|caller| caller.join().unwrap());
+        longest.max().unwrap()
+    });
+    println!("the longest wait of a call: {longest:?}");
+    assert_eq!(client.master_pid(), Some(master), "it is adopted");
+    assert_eq!(process_of(&scratch, "rosout/rosout"), rosout);
+    before.assert_same(&State::read(&client), "after five deaths");
+    assert_eq!(node.heard("publisherUpdate").len(), 0);
+    let said = rescue.stderr().join("\n");
+    assert_eq!(said.matches("the worker has ended").count(), 5, "{said}");
+}
+
+/// It takes rosout some time to register: until then the next worker knows it by its process.
+#[test]
+fn a_rosout_that_has_just_been_started_is_adopted() {
+    let scratch = Scratch::new();
+    let mut rescue = Setup::core(&scratch, free_port()).guarded().start();
+    rescue.wait_line("that it starts rosout", |line| {
+        line.contains("started rosout")
+    });
+    let dead = worker(&scratch);
+    signal(dead, Signal::KILL);
+    worker_after(&scratch, dead);
+    let client = rescue.client();
+    eventually("rosout is at work", || {
+        State::try_read(&client).is_ok_and(|state| state.knows("/rosout"))
+    });
+    let said = rescue.stderr().join("\n");
+    assert_eq!(said.matches("started rosout").count(), 1, "{said}");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+#[test]
+fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
+    let scratch = Scratch::new();
+    let rescue = core(&scratch);
+    let guardian = rescue.pid();
+    let shared = |pid| {
+        let common: BTreeSet<_> = sockets(pid)
+            .intersection(&sockets(guardian))
+            .cloned()
+            .collect();
+        common.len()
+    };
+    // IPv4 and, where there is one, IPv6.
+    assert!(shared(worker(&scratch)) >= 1);
+    for program in ["rosmaster --core", "rosout/rosout"] {
+        let pid = process_of(&scratch, program);
+        assert_eq!(shared(pid), 0, "{program} has inherited a socket");
+        let environment = fs::read(format!("/proc/{pid}/environ")).unwrap();
+        let environment = String::from_utf8_lossy(&environment);
+        assert!(!environment.contains("LISTEN_FDS"), "{program}");
+        assert!(!environment.contains("ROSRESCUE_GUARDIAN"), "{program}");
+    }
+    let memory = fs::read_to_string(format!("/proc/{guardian}/smaps_rollup")).unwrap();
+    let line = memory
+        .lines()
+        .find(|line| line.starts_with("Private_Dirty"));
+    println!("the guardian has {}", line.unwrap());
+    let kib: u64 = line
+        .unwrap()
+        .split_whitespace()
+        .nth(1)
+        .unwrap()
+        .parse()
+        .unwrap();
+    assert!(kib < 2048, "{kib} KiB");
+}
+
+/// Kills one worker after the other until the guardian pauses.
+#[track_caller]
+fn kill_until_paused(scratch: &Scratch, rescue: &Rescue) {
+    let paused = || {
+        let lines = rescue.stderr().into_iter();
+        lines
+            .filter(|line| line.contains("again and again"))
+            .count()
+            > 0
+    };
+    let mut dead = 0;
+    eventually("it is said", || {
+        dead = worker_after(scratch, dead);
+        signal(dead, Signal::KILL);
+        // Those before the sixth are followed by another worker at once.
+        eventually("it is followed by another, or by a pause", || {
+            let next = process_with(scratch, "ROSRESCUE_GUARDIAN=");
+            paused() || next.is_some_and(|next| next != dead)
+        });
+        paused()
+    });
+}
+
+#[test]
+fn workers_that_die_again_and_again_are_started_after_a_pause() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    kill_until_paused(&scratch, &rescue);
+    let said = rescue.stderr().join("\n");
+    assert!(said.contains("500ms"), "{said}");
+    assert_eq!(said.matches("starting it again").count(), 5, "{said}");
+    // Whoever calls in the pause waits for its end.
+    assert!(rescue.client().master_pid().is_some());
+    assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+#[test]
+fn a_stop_in_a_pause_ends_everything() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    kill_until_paused(&scratch, &rescue);
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+#[test]
+fn an_orderly_stop_ends_everything() {
+    for signals in [
+        &[Signal::TERM][..],
+        &[Signal::INT],
+        &[Signal::HUP],
+        // As by killall, which signals both processes.
+        &[Signal::TERM, Signal::TERM],
+    ] {
+        let scratch = Scratch::new();
+        let mut rescue = core(&scratch);
+        if signals.len() > 1 {
+            signal(worker(&scratch), signals[1]);
+        }
+        rescue.signal(signals[0]);
+        assert_eq!(rescue.wait().code(), Some(0), "{signals:?}");
+        assert_eq!(scratch.survivors(), vec![], "{signals:?}");
+        let said = rescue.stderr().join("\n");
+        assert!(said.contains("closed in order"), "{said}");
+        assert!(!said.contains("unguarded"), "{said}");
+    }
+}
+
+/// However far the next worker has come: it ends what the dead one has left.
+#[test]
+fn a_stop_right_after_a_death_ends_everything() {
+    for lines in [1, 2] {
+        let scratch = Scratch::new();
+        let mut rescue = core(&scratch);
+        let dead = worker(&scratch);
+        signal(dead, Signal::KILL);
+        worker_after(&scratch, dead);
+        let said = || {
+            let lines = rescue.stdout().into_iter();
+            let lines = lines.filter(|line| line.starts_with("ROS_MASTER_URI="));
+            lines.count()
+        };
+        eventually("it has come so far", || said() >= lines);
+        assert_eq!(rescue.terminate().code(), Some(0));
+        assert_eq!(scratch.survivors(), vec![]);
+    }
+}
+
+#[test]
+fn a_second_signal_ends_both_at_once() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    // An orderly stop has to wait for this one.
+    crate::support::stop(process_of(&scratch, "rosmaster --core"));
+    eventually("it has ended", || {
+        rescue.signal(Signal::INT);
+        rescue.exited().is_some()
+    });
+    assert_eq!(rescue.wait().code(), Some(130));
+    assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
+}
+
+/// Ctrl-\ in a terminal: the worker does not go on in secret.
+#[test]
+fn a_quit_ends_both() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.signal(Signal::QUIT);
+    assert_eq!(rescue.wait().code(), Some(131));
+    assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
+}
+
+#[test]
+fn errors_of_the_start_are_said_once_and_end_it() {
+    let scratch = Scratch::new();
+    let taken = std::net::TcpListener::bind("0.0.0.0:0").unwrap();
+    let taken = taken.local_addr().unwrap().port().to_string();
+    let free = free_port().to_string();
+    for (arguments, status, sentence) in [
+        (&["core", "-p", &taken][..], 1, "is in use"),
+        (
+            &["core", "-p", &free, "--rosmaster", "/nonexistent"],
+            1,
+            "is not a program that can be run",
+        ),
+        (
+            &["proxy", "--master", "m:1"],
+            2,
+            "is not the URI of a master",
+        ),
+    ] {
+        let mut rescue = Setup::bare(&scratch, arguments).guarded().spawn();
+        assert_eq!(rescue.wait_output().code(), Some(status), "{arguments:?}");
+        let said = rescue.output().join("\n");
+        assert_eq!(said.matches(sentence).count(), 1, "{said}");
+        assert!(!said.contains("worker"), "{said}");
+    }
+}
+
+#[test]
+fn a_worker_outlives_its_guardian_and_says_so() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.client().port());
+    let mut rescue = setup.guarded().start();
+    let client = rescue.client();
+    let worker = worker(&scratch);
+    rescue.kill();
+    eventually("it says so", || {
+        let lines = rescue.stderr().into_iter();
+        let warned = lines.filter(|line| line.contains("unguarded")).count();
+        warned == 1
+    });
+    client.set_param("/x", 1);
+    let page = status(&client);
+    assert_eq!(page["guarded"], false);
+    assert!(page["guarded_by"].as_str().unwrap().contains("has ended"));
+    signal(worker, Signal::TERM);
+    eventually("it ends", || !alive(worker));
+    let said = rescue.stderr().join("\n");
+    assert!(said.contains("closed in order"), "{said}");
+}
+
+#[test]
+fn both_killed_at_once_are_started_again_by_a_person() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    let client = rescue.client();
+    client.set_param("/kept", "yes");
+    let before = State::read(&client);
+    let (master, worker) = (client.master_pid(), worker(&scratch));
+    rescue.signal(Signal::KILL);
+    signal(worker, Signal::KILL);
+    rescue.wait();
+    eventually("the worker is dead", || !alive(worker));
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(client.master_pid(), master, "it is adopted");
+    before.assert_same(&State::read(&client), "after the death of both");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
+/// As the first process of a container the guardian becomes the parent of the master that a dead
+/// worker leaves: it is left behind all the same, and a zombie when it ends, unless it is waited for.
+#[test]
+fn the_first_process_of_a_container_guards_as_any_other() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).guarded();
+    let rescue = setup
+        .wrapped(|own| {
+            let mut unshare = Command::new("unshare");
+            if !rustix::process::geteuid().is_root() {
+                unshare.arg("--map-root-user");
+            }
+            unshare.args(["--pid", "--fork", "--mount-proc", "--kill-child"]);
+            behind(unshare, own)
+        })
+        .start();
+    let client = rescue.client();
+    client.set_param("/kept", "yes");
+    let named = client.master_pid();
+    let master = process_of(&scratch, "rosmaster --core");
+    let dead = worker(&scratch);
+    signal(dead, Signal::KILL);
+    worker_after(&scratch, dead);
+    // Until it is adopted, rosrescue answers with its own.
+    eventually("it is adopted", || client.master_pid() == named);
+    eventually("changes pass again", || {
+        client
+            .ask("setParam", params!["/test", "/again", 1])
+            .is_some()
+    });
+    assert_eq!(client.master_pid(), named);
+    assert!(alive(master));
+    signal(master, Signal::KILL);
+    eventually("no zombie is left", || {
+        !Path::new(&format!("/proc/{master}")).exists()
+    });
+    eventually("there is another master", || {
+        client.master_pid().is_some_and(|pid| Some(pid) != named)
+    });
+    assert_eq!(client.param("/kept"), Some("yes".into()));
+}
+
+#[test]
+fn without_a_guardian_nobody_pretends_to_be_one() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.client().port()).guarded();
+    let rescue = setup.arg("--no-guardian").start();
+    assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
+    assert_eq!(status(&rescue.client())["guarded"], false);
+    let silent = || !rescue.stderr().join("\n").contains("unguarded");
+    assert!(holds(Duration::from_millis(200), silent));
+}

@@ -1,0 +1,210 @@
+//! Whether a start goes on with the session before: after an orderly stop, a crash, a reboot.
+//!
+//! A reboot is a private mount that shows another boot id, and another computer is a network namespace;
+//! everything else is the real thing. What a
+//! crash and an orderly stop come to is in `own_restart.rs` too.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::thread;
+
+use crate::support::{
+    Client, Library, Mode, Netns, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
+    free_port, params, signal,
+};
+use rustix::process::Signal;
+
+/// The id of another boot, as the kernel shows it.
+fn another_boot(scratch: &Scratch) -> PathBuf {
+    let file = scratch.path("boot_id");
+    fs::write(&file, "01234567-89ab-4cde-8f01-23456789abcd\n").unwrap();
+    file
+}
+
+/// SIGKILL to rosrescue and to its master, as a power cut does it.
+fn cut_power(robot: &mut Robot) {
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    robot.kill_master_at_once(master);
+    eventually("the master is dead", || !alive(master));
+}
+
+/// Files beside the checkpoint that hold `text`.
+fn kept(robot: &Robot, text: &str) -> Vec<String> {
+    let checkpoint = robot.rescue.checkpoint();
+    let is_old = |path: &Path| path != checkpoint && path.to_string_lossy().contains("chkpt");
+    let folder = fs::read_dir(checkpoint.parent().unwrap()).unwrap();
+    let others = folder.flatten().filter(|entry| is_old(&entry.path()));
+    let holding = others.filter(|entry| {
+        fs::read_to_string(entry.path()).is_ok_and(|content| content.contains(text))
+    });
+    let names = holding.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    names.collect()
+}
+
+#[test]
+fn after_a_reboot_without_nodes_the_robot_starts_afresh() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        robot.client().set_param("/use_sim_time", true);
+        let _talker = robot.node(Library::Rospy, "talker", &[]);
+        robot.settled_state();
+        cut_power(&mut robot);
+        // The nodes too, rosout among them.
+        for pid in robot.processes() {
+            signal(pid, Signal::KILL);
+        }
+        eventually("every process has ended", || {
+            !robot.processes().into_iter().any(alive)
+        });
+        let boot = another_boot(&robot.scratch);
+        robot.revive_master();
+        robot.rescue.start_after_reboot(&boot);
+        robot.rescue.wait_serving();
+        robot.await_gate();
+        let client = robot.client();
+        assert_eq!(client.param("/use_sim_time"), None, "{mode:?}");
+        assert!(!robot.settled_state().knows("/talker"), "{mode:?}");
+        let names = kept(&robot, "use_sim_time");
+        // And the generation before it, if that had the parameter too.
+        let all_old = names.iter().all(|name| name.contains(".session-"));
+        assert!(
+            !names.is_empty() && all_old,
+            "the old file is kept: {names:?}"
+        );
+        // The new session is one: a crash now restores it.
+        client.set_param("/today", 1);
+        robot.crash_master();
+        assert_eq!(robot.client().param("/today"), Some(1.into()));
+        assert_eq!(robot.client().param("/use_sim_time"), None);
+    }
+}
+
+/// A node at `host` of another computer.
+fn node_elsewhere(
+    net: &Netns,
+    (scratch, port): (&Scratch, u16),
+    host: u8,
+    (library, node, name): (Library, &str, &str),
+) -> Node {
+    let mut command = library.command(scratch, port, node);
+    command
+        .arg(format!("__name:={name}"))
+        .env("ROS_IP", net.far(host))
+        .env("ROS_MASTER_URI", format!("http://{}:{port}", net.near()));
+    Node::run(&mut net.inside(&command))
+}
+
+#[test]
+fn after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let net = Netns::new();
+        let scratch = Scratch::new();
+        let (port, master_port) = (free_port(), free_port());
+        let mut master = (mode == Mode::Proxy).then(|| Rosmaster::start_at(&scratch, master_port));
+        let setup = match mode {
+            Mode::Core => Setup::bare(&scratch, ["core", "-p", &port.to_string()]).args([
+                "--no-rosout",
+                "--master-port",
+                &master_port.to_string(),
+            ]),
+            Mode::Proxy => Setup::bare(&scratch, ["proxy", "--listen", &format!(":{port}")])
+                .args(["--master", &format!("http://127.0.0.1:{master_port}")]),
+        };
+        let mut rescue = setup.env("ROS_IP", net.near()).at_port(port).start();
+        rescue.client().set_param("/gain", 3);
+        let at = (&scratch, port);
+        let talker = node_elsewhere(&net, at, 2, (Library::Roscpp, "talker", "talker"));
+        let listener = node_elsewhere(&net, at, 3, (Library::Rospy, "listener", "listener"));
+        listener.wait_messages("/talker", 5);
+        let bare = Client::new(master_port);
+        let before = State::read(&bare);
+        assert!(before.knows("/talker") && before.knows("/listener"));
+        let dead = bare.master_pid().expect("a master");
+        rescue.kill();
+        signal(dead, Signal::KILL);
+        if let Some(master) = &mut master {
+            master.kill();
+            *master = Rosmaster::start_at(&scratch, master_port);
+        }
+        eventually("the master is dead", || !alive(dead));
+        rescue.start_after_reboot(&another_boot(&scratch));
+        rescue.wait_serving();
+        eventually("the state is back", || {
+            State::try_read(&bare).is_ok_and(|now| now == before)
+        });
+        let late = node_elsewhere(&net, at, 4, (Library::Roscpp, "listener", "late"));
+        late.wait_messages("/talker", 5);
+        listener.assert_no_message_lost("/talker");
+        talker.assert_no_link_lost();
+    }
+}
+
+/// Nothing on this computer has survived: who answers where a node was is somebody else.
+#[test]
+fn after_a_reboot_a_stranger_at_a_nodes_port_is_no_node() {
+    let net = Netns::new();
+    for host in ["127.0.0.1", "localhost", &net.near()] {
+        let mut robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+        let client = robot.client();
+        client.set_param("/use_sim_time", true);
+        let stranger = TcpListener::bind("0.0.0.0:0").unwrap();
+        let api = format!("http://{host}:{}/", stranger.local_addr().unwrap().port());
+        let topic = params!["/node", "/topic", "std_msgs/String", api];
+        client.ok("registerPublisher", topic);
+        thread::spawn(move || {
+            const FAULT: &str = "<?xml version=\"1.0\"?><methodResponse><fault><value><struct>\
+                <member><name>faultCode</name><value><int>1</int></value></member>\
+                <member><name>faultString</name><value><string>who?</string></value></member>\
+                </struct></value></fault></methodResponse>";
+            for mut stream in stranger.incoming().flatten() {
+                let _ = stream.read(&mut [0; 4096]);
+                let length = FAULT.len();
+                let head = format!("HTTP/1.0 200 OK\r\nContent-Length: {length}\r\n\r\n");
+                let _ = stream.write_all(format!("{head}{FAULT}").as_bytes());
+            }
+        });
+        cut_power(&mut robot);
+        robot
+            .rescue
+            .start_after_reboot(&another_boot(&robot.scratch));
+        robot.rescue.wait_serving();
+        assert_eq!(robot.client().param("/use_sim_time"), None, "{host}");
+        assert!(!robot.settled_state().knows("/node"), "{host}");
+    }
+}
+
+#[test]
+fn after_a_crash_without_nodes_the_session_goes_on() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        robot.client().set_param("/gain", 3);
+        robot.settled_state();
+        cut_power(&mut robot);
+        robot.revive_master();
+        robot.rescue.start_again();
+        robot.rescue.wait_serving();
+        robot.await_gate();
+        assert_eq!(robot.client().param("/gain"), Some(3.into()), "{mode:?}");
+    }
+}
+
+#[test]
+fn after_an_orderly_stop_living_nodes_keep_their_session() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.client().set_param("/gain", 3);
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state().without_node("/rosout");
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    let now = robot.settled_state().without_node("/rosout");
+    before.assert_same(&now, "after an orderly stop and start with nodes alive");
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}

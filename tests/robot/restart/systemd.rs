@@ -1,0 +1,159 @@
+//! rosrescue under systemd: sockets by `sd_listen_fds(3)`, its state by `sd_notify(3)`. The test
+//! speaks systemd's part.
+
+use std::net::TcpListener;
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixDatagram;
+use std::process::Command;
+
+use crate::support::{Client, PATIENCE, Rosmaster, Scratch, Setup, behind, free_port, status};
+use command_fds::{CommandFdExt, FdMapping};
+use rustix::process::Signal;
+
+/// `command` as a unit's process that is given `socket` as number 3.
+fn activated(command: &Command, socket: OwnedFd) -> Command {
+    let mut shell = Command::new("sh");
+    // The process id is that of the shell, and then of what it becomes.
+    shell.args(["-c", r#"LISTEN_PID=$$ exec "$0" "$@""#]);
+    let mut command = behind(shell, command);
+    let mapping = FdMapping {
+        parent_fd: socket,
+        child_fd: 3,
+    };
+    command.env("LISTEN_FDS", "1");
+    command.fd_mappings(vec![mapping]).unwrap();
+    command
+}
+
+/// systemd's end of a notification socket.
+struct Manager {
+    socket: UnixDatagram,
+    heard: Vec<String>,
+}
+
+impl Manager {
+    fn new(scratch: &Scratch) -> Self {
+        let socket = UnixDatagram::bind(scratch.path("notify")).unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        let heard = Vec::new();
+        Self { socket, heard }
+    }
+
+    /// Waits until `assignment` is said.
+    #[track_caller]
+    fn wait(&mut self, assignment: &str) {
+        let mut buffer = [0; 4096];
+        loop {
+            let length = self.socket.recv(&mut buffer);
+            let length = length.unwrap_or_else(|_| panic!("no {assignment}: {:?}", self.heard));
+            let message = String::from_utf8(buffer[..length].to_vec()).unwrap();
+            let lines: Vec<_> = message.lines().map(str::to_owned).collect();
+            let found = lines.iter().any(|line| line == assignment);
+            self.heard.extend(lines);
+            if found {
+                return;
+            }
+        }
+    }
+
+    fn has_heard(&self, assignment: &str) -> bool {
+        self.heard.iter().any(|line| line == assignment)
+    }
+}
+
+#[test]
+fn a_socket_unit_takes_the_place_of_the_guardian() {
+    let scratch = Scratch::new();
+    let mut manager = Manager::new(&scratch);
+    let master_port = free_port();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let master = format!("http://127.0.0.1:{master_port}");
+    let setup = Setup::bare(&scratch, ["proxy", "--master", &master])
+        .guarded()
+        .env("NOTIFY_SOCKET", scratch.path("notify"))
+        .env("WATCHDOG_USEC", "300000");
+    let socket = listener.try_clone().unwrap();
+    let mut rescue = setup
+        .wrapped(|own| activated(own, socket.into()))
+        .at_port(port)
+        .spawn();
+    manager.wait("STATUS=the master is away");
+    manager.wait("WATCHDOG=1");
+    assert!(!manager.has_heard("READY=1"));
+    let mut master = Rosmaster::start_at(&scratch, master_port);
+    manager.wait("READY=1");
+    rescue.wait_serving();
+    let uri = format!("ROS_MASTER_URI=http://127.0.0.1:{port}/");
+    assert!(rescue.stdout().contains(&uri), "{:?}", rescue.stdout());
+    manager.wait("STATUS=protected");
+    manager.wait("WATCHDOG=1");
+    let page = status(&rescue.client());
+    assert_eq!(page["guarded"], true);
+    assert_eq!(page["guarded_by"], "systemd");
+    master.kill();
+    manager.wait("STATUS=the master is away");
+
+    // A crash, and what systemd does then: the socket is the same.
+    rescue.kill();
+    let waiting = Client::new(port).connect();
+    assert!(waiting.is_ok(), "a connection is refused");
+    rescue.start_again();
+    let _master = Rosmaster::start_at(&scratch, master_port);
+    manager.wait("READY=1");
+    rescue.signal(Signal::TERM);
+    manager.wait("STOPPING=1");
+    assert_eq!(rescue.wait().code(), Some(0));
+}
+
+/// A service without a socket unit: the guardian is its main process, the worker speaks for it.
+#[test]
+fn the_worker_of_a_guardian_speaks_to_systemd() {
+    let scratch = Scratch::new();
+    let mut manager = Manager::new(&scratch);
+    let rescue = Setup::core(&scratch, free_port())
+        .args(["--no-rosout"])
+        .guarded()
+        .env("NOTIFY_SOCKET", scratch.path("notify"));
+    let mut rescue = rescue
+        .wrapped(|own| {
+            let mut shell = Command::new("sh");
+            shell.args(["-c", r#"WATCHDOG_PID=$$ exec "$0" "$@""#]);
+            let mut command = behind(shell, own);
+            command.env("WATCHDOG_USEC", "300000");
+            command
+        })
+        .spawn();
+    manager.wait("READY=1");
+    manager.wait("WATCHDOG=1");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    manager.wait("STOPPING=1");
+}
+
+#[test]
+fn what_is_no_listening_socket_is_refused() {
+    let scratch = Scratch::new();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let connected = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let datagram = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    for socket in [OwnedFd::from(connected), datagram.into()] {
+        let setup = Setup::bare(&scratch, ["proxy", "--master", "http://127.0.0.1:1"]);
+        let mut rescue = setup.wrapped(|own| activated(own, socket)).spawn();
+        assert_eq!(rescue.wait_output().code(), Some(1));
+        let said = rescue.stderr().join("\n");
+        assert!(said.contains("ListenStream="), "{said}");
+    }
+}
+
+/// Sockets for somebody else are left alone.
+#[test]
+fn the_sockets_of_others_are_not_taken() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.client().port())
+        .env("LISTEN_FDS", "1")
+        .env("LISTEN_PID", "1");
+    let rescue = setup.start();
+    rescue.client().set_param("/x", 1);
+    assert_eq!(status(&rescue.client())["guarded"], false);
+}

@@ -1,0 +1,387 @@
+//! rosrescue's own restarts: it adopts a living master, fills an empty one, restores from the file what
+//! is worth restoring, and takes over a system that ran without it.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::thread;
+use std::time::Duration;
+
+use crate::support::{
+    Client, FakeNode, Library, Mode, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State, alive,
+    eventually, eventually_some, free_port, signal, status,
+};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+#[test]
+fn rosrescue_that_was_killed_adopts_the_living_master() {
+    for mode in [Mode::Core, Mode::Proxy] {
+        let mut robot = Robot::start(mode);
+        let client = robot.client();
+        let talker = robot.node(Library::Roscpp, "talker", &[]);
+        let listener = robot.node(Library::Rospy, "listener", &[]);
+        let node = FakeNode::start("/fake");
+        client.set_param("/watched", 1);
+        node.watch_param(&client, "/watched");
+        node.subscribe(&client, "/chatter", "std_msgs/String");
+        listener.wait_messages("/talker", 5);
+        let before = robot.settled_state();
+        let master = robot.master_pid();
+        let updates = node.heard("publisherUpdate").len();
+
+        robot.rescue.kill();
+        robot.rescue.start_again();
+        robot.rescue.wait_serving();
+        robot.await_gate();
+        assert_eq!(
+            robot.master_pid(),
+            master,
+            "the living master is adopted, not replaced"
+        );
+        before.assert_same(&robot.state(), "after rosrescue's own restart");
+        assert_eq!(
+            node.heard("publisherUpdate").len(),
+            updates,
+            "nothing is injected"
+        );
+
+        // What it adopted it can restore; parameter subscriptions it knows from the checkpoint.
+        robot.crash_master();
+        before.assert_same(&robot.state(), "after the master's crash that followed");
+        client.set_param("/watched", 2);
+        eventually("the parameter's subscriber is told", || {
+            node.heard("paramUpdate")
+                .last()
+                .is_some_and(|call| call[2] == Value::Int(2))
+        });
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+        listener.wait_messages("/talker", 5);
+        listener.assert_no_message_lost("/talker");
+        talker.assert_no_link_lost();
+    }
+}
+
+/// Between its first open port and its first look at the living master it knows only the checkpoint.
+/// What it acknowledges then must be true in the master that it adopts.
+#[test]
+fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
+    for node in [&leaving, &staying] {
+        node.publish(&client, "/topic", "std_msgs/String");
+    }
+    let after = robot.settled_state().without_node("/leaving");
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    crate::support::stop(master);
+    robot.rescue.start_again();
+    eventually("rosrescue listens", || client.connect().is_ok());
+    // The master is still stopped.
+    leaving.unpublish(&client, "/topic");
+    signal(master, Signal::CONT);
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    robot.await_state(&after, "at the adopted master");
+    after.assert_same(&State::read(&robot.client()), "through rosrescue");
+}
+
+#[test]
+fn rosrescue_that_was_killed_fills_an_empty_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.client().set_param("/kept", "yes");
+    let listener = robot.node(Library::Rospy, "listener", &[]);
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    robot.rescue.kill();
+    robot.kill_master();
+    robot.revive_master();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    before.assert_same(&robot.state(), "after the restart of both");
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}
+
+#[test]
+fn a_core_of_which_everything_was_killed_restores_from_the_file() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.client().set_param("/kept", "yes");
+    let talker = robot.node(Library::Rospy, "talker", &[]);
+    let listener = robot.node(Library::Roscpp, "listener", &[]);
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    robot.kill_master_at_once(master);
+    eventually("the master is dead", || !alive(master));
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    // rosout may have been started anew; its address is its own affair.
+    let (before, now) = (before.without_node("/rosout"), robot.settled_state());
+    before.assert_same(&now.without_node("/rosout"), "after both were killed");
+    let late = robot.node(Library::Roscpp, "listener", &["__name:=late"]);
+    late.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}
+
+#[test]
+fn yesterdays_parameters_do_not_wake_up_tomorrow() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.client().set_param("/use_sim_time", true);
+    let run_id = robot.client().param("/run_id").expect("a run id");
+    assert_eq!(robot.rescue.terminate().code(), Some(0));
+    let yesterday = fs::read_to_string(robot.rescue.checkpoint()).expect("a closing snapshot");
+    assert!(yesterday.contains("use_sim_time"), "{yesterday}");
+
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(robot.client().param("/use_sim_time"), None);
+    assert_ne!(robot.client().param("/run_id"), Some(run_id));
+    let kept = fs::read_dir(robot.rescue.checkpoint().parent().unwrap())
+        .unwrap()
+        .flatten()
+        .filter(|entry| entry.path() != robot.rescue.checkpoint() && entry.path().is_file())
+        .filter_map(|entry| fs::read_to_string(entry.path()).ok())
+        .any(|text| text.contains("use_sim_time"));
+    assert!(kept, "the old checkpoint is kept under another name");
+}
+
+#[test]
+fn a_stopped_session_is_restored_when_told_so() {
+    let scratch = Scratch::new();
+    let (port, master_port) = (free_port(), free_port());
+    let start = |restore: &str| {
+        let master_port = master_port.to_string();
+        let port_text = port.to_string();
+        let arguments = [
+            "core",
+            "-p",
+            &port_text,
+            "--master-port",
+            &master_port,
+            "--restore",
+            restore,
+        ];
+        Setup::bare(&scratch, arguments).at_port(port).start()
+    };
+    let mut rescue = start("auto");
+    rescue.client().set_param("/kept", "yes");
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let mut rescue = start("always");
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
+    rescue.kill();
+    let mut rescue = start("never");
+    // With --restore never even the living master of the killed rosrescue is no reason to inject,
+    // but what that master holds is the truth.
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
+    assert_eq!(rescue.terminate().code(), Some(0));
+    let rescue = start("never");
+    assert_eq!(rescue.client().param("/kept"), None);
+}
+
+#[test]
+fn a_running_system_is_taken_over() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let bare = master.client();
+    bare.set_param("/gain", 3);
+    let talker = Node::start(&scratch, Library::Rospy, master.port, "talker", &[]);
+    let listener = Node::start(&scratch, Library::Roscpp, master.port, "listener", &[]);
+    let _server = Node::start(&scratch, Library::Roscpp, master.port, "server", &[]);
+    listener.wait_messages("/talker", 5);
+    let mut before = State::read(&bare);
+    eventually("the state is at rest", || {
+        thread::sleep(Duration::from_millis(300));
+        let last = std::mem::replace(&mut before, State::read(&bare));
+        last == before
+    });
+
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    before.assert_same(&State::read(&rescue.client()), "when it was taken over");
+    let dead = master.pid();
+    master.kill();
+    let master = Rosmaster::start_at(&scratch, master.port);
+    let client = rescue.client();
+    eventually("rosrescue names the new master", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    eventually("the state is back", || {
+        State::try_read(&master.client()).is_ok_and(|now| now == before)
+    });
+    listener.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
+}
+
+/// A parameter that rosmaster cannot return hides the others, from everybody: they are unknown until it
+/// is gone, which is said.
+#[test]
+fn a_system_with_a_parameter_that_hides_the_others_is_taken_over_without_them() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let bare = master.client();
+    bare.set_param("/gain", 3);
+    bare.set_param("/arm/poison", Value::BigInt("9999999999".to_owned()));
+    let node = FakeNode::start("/node");
+    node.publish(&bare, "/topic", "std_msgs/String");
+
+    let mut rescue = Setup::proxy(&scratch, master.port).start();
+    let client = rescue.client();
+    eventually("the master is served", || status(&client)["open"] == true);
+    rescue.wait_line("what is hidden is said", |line| {
+        line.contains("a parameter that it can never return")
+    });
+    client.set_param("/speed", 1.5);
+    let dead = master.pid();
+    master.kill();
+    let _master = Rosmaster::start_at(&scratch, master.port);
+    eventually("rosrescue names the new master", || {
+        client.master_pid().is_some_and(|pid| pid != dead)
+    });
+    eventually("what was known is back", || {
+        State::read(&client).publishers_of("/topic") == ["/node"]
+            && client.param("/speed") == Some(1.5.into())
+    });
+    assert_eq!(client.param("/gain"), None);
+}
+
+/// `rosrescue core` whose rosmaster chooses its own port.
+fn core(scratch: &Scratch) -> Rescue {
+    let port = free_port();
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    Setup::bare(scratch, arguments).at_port(port).start()
+}
+
+/// Process id and port of the rosmaster behind it.
+fn master_of(rescue: &Rescue) -> (u32, u16) {
+    let client = rescue.client();
+    let pid = eventually_some("the master's process id", || client.master_pid());
+    let words = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap();
+    let mut words = words.split('\0');
+    assert!(words.any(|word| word == "-p"), "its port is in its command");
+    (pid, words.next().unwrap().parse().unwrap())
+}
+
+/// What somebody else does with each connection to the port where our master was.
+fn squat(port: u16, what: &'static str) {
+    let listener = eventually_some("the port is free", || {
+        TcpListener::bind(("127.0.0.1", port)).ok()
+    });
+    thread::spawn(move || {
+        let mut kept = Vec::new();
+        for mut stream in listener.incoming().flatten() {
+            match what {
+                "closes" => {}
+                "is silent" => kept.push(stream),
+                _ => {
+                    let _ = stream.read(&mut [0; 4096]);
+                    let _ = stream.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nno\n");
+                }
+            }
+        }
+    });
+}
+
+#[test]
+fn a_core_starts_although_somebody_else_has_its_masters_port() {
+    for what in ["closes", "is silent", "answers nonsense"] {
+        let scratch = Scratch::new();
+        let mut rescue = core(&scratch);
+        rescue.client().set_param("/kept", what);
+        let (master, port) = master_of(&rescue);
+        rescue.kill();
+        signal(master, Signal::KILL);
+        eventually("the master is dead", || !alive(master));
+        squat(port, what);
+        rescue.start_again();
+        rescue.wait_serving();
+        assert_eq!(rescue.client().param("/kept"), Some(what.into()));
+        assert_ne!(master_of(&rescue).1, port, "{what}");
+    }
+}
+
+#[test]
+fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.client().set_param("/ours", 1);
+    let (master, port) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
+    let stranger = Rosmaster::start_at(&scratch, port);
+    stranger.client().set_param("/theirs", 1);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/ours"), Some(1.into()));
+    assert_eq!(rescue.client().param("/theirs"), None);
+    assert_eq!(stranger.client().param("/ours"), None);
+    assert_eq!(rescue.terminate().code(), Some(0));
+    assert!(alive(stranger.pid()), "it is not ours to end");
+}
+
+#[test]
+fn the_old_port_of_the_master_may_become_our_own() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    rescue.client().set_param("/kept", 1);
+    let (master, port) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+}
+
+#[test]
+fn a_master_that_was_left_hanging_is_replaced() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+    let probing = ["--probe-timeout", "300"];
+    let setup = Setup::bare(&scratch, arguments).args(probing);
+    let mut rescue = setup.at_port(port).start();
+    rescue.client().set_param("/kept", 1);
+    let (master, _) = master_of(&rescue);
+    rescue.kill();
+    crate::support::stop(master);
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    assert_ne!(master_of(&rescue).0, master);
+    eventually("the one that hung is gone", || !alive(master));
+}
+
+/// Killed right after it has started its rosmaster, which nobody has spoken to yet.
+#[test]
+fn a_master_that_was_left_empty_serves_or_is_ended() {
+    for millis in [0, 60, 120, 180, 240] {
+        let scratch = Scratch::new();
+        let port = free_port();
+        let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
+        let mut rescue = Setup::bare(&scratch, arguments).at_port(port).spawn();
+        rescue.wait_line("that it has one", |line| line.contains("started rosmaster"));
+        thread::sleep(Duration::from_millis(millis));
+        rescue.kill();
+        rescue.start_again();
+        rescue.wait_serving();
+        let (master, at) = master_of(&rescue);
+        assert_eq!(Client::new(at).master_pid(), Some(master));
+        let masters = || {
+            let all = scratch.survivors().into_iter();
+            all.filter(|(pid, words)| words.contains("rosmaster") && alive(*pid))
+                .count()
+        };
+        eventually("there is one rosmaster", || masters() == 1);
+        assert_eq!(rescue.terminate().code(), Some(0));
+        assert_eq!(scratch.survivors(), vec![]);
+    }
+}

@@ -1,0 +1,199 @@
+//! Drivers of robots that log at 10 Hz and run `diagnostic_updater` at 4 Hz: both call `subscribeParam` each time,
+//! because rospy caches no parameter that is not set. None of their loops stalls, whatever happens to the
+//! master, and no exception reaches them.
+//!
+//! The bound is [`PASS`], or what the same driver takes at the same time at a bare rosmaster to which
+//! nothing happens, [`NOISE`] times, if that is longer: the starts of rosmasters take every core of a small computer.
+//!
+//! `ROSRESCUE_LOOP_SECONDS` is how long a crash loop lasts; 600 is the full size.
+
+use std::{
+    thread::sleep,
+    time::{Duration, Instant},
+};
+
+use crate::support::{Library, Mode, Node, Robot, Rosmaster, Scratch, eventually, signal, stop};
+use rustix::process::Signal;
+
+/// The longest pass of a driver's loop, in milliseconds.
+const PASS: f64 = 50.0;
+/// The same behind a master that hangs.
+const PASS_HUNG: f64 = 150.0;
+/// How much longer than an undisturbed driver's longest pass one may take.
+const NOISE: f64 = 3.0;
+/// Between two kills.
+const PAUSE: Duration = Duration::from_secs(2);
+/// How long a crash loop lasts by default.
+const LOOP_SECONDS: u64 = 20;
+
+/// Drivers at rosrescue, and one at a bare rosmaster.
+struct Drivers {
+    drivers: [Node; 2],
+    undisturbed: Node,
+    _master: Rosmaster,
+    _scratch: Scratch,
+}
+
+impl Drivers {
+    fn start(robot: &Robot) -> Self {
+        let drivers = ["__name:=driver_a", "__name:=driver_b"];
+        let scratch = Scratch::new();
+        let master = Rosmaster::start(&scratch);
+        let driver =
+            |scratch, port, name| Node::start(scratch, Library::Rospy, port, "driver", &[name]);
+        Self {
+            drivers: drivers.map(|name| driver(&robot.scratch, robot.port(), name)),
+            undisturbed: driver(&scratch, master.port, "__name:=undisturbed"),
+            _master: master,
+            _scratch: scratch,
+        }
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Node> {
+        self.drivers.iter().chain([&self.undisturbed])
+    }
+
+    /// Waits until every driver has made its passes for a second more.
+    #[track_caller]
+    fn go_on(&self) {
+        for driver in self.all() {
+            let before = driver.said("pass").len();
+            eventually("a driver goes on", || {
+                driver.said("pass").len() >= before + 5
+            });
+        }
+    }
+
+    /// Panics if a pass takes longer than `limit` while `event` takes place, or anything fails.
+    #[track_caller]
+    fn assert_no_stall(&mut self, what: &str, limit: f64, event: impl FnOnce()) {
+        self.go_on();
+        let before: Vec<_> = self.all().map(|driver| driver.said("pass").len()).collect();
+        event();
+        self.go_on();
+        let longest: Vec<f64> = self
+            .all()
+            .zip(before)
+            .map(|(driver, before)| {
+                let passes = driver.said("pass");
+                let passes = passes[before..].iter().map(|ms| ms.parse::<f64>().unwrap());
+                passes.fold(0.0, f64::max)
+            })
+            .collect();
+        let allowed = limit.max(NOISE * longest[2]);
+        println!(
+            "{what}: longest passes {longest:?} ms, the last one undisturbed; allowed {allowed}"
+        );
+        for driver in &mut self.drivers {
+            assert_eq!(driver.exited(), None, "{}", driver.log());
+            let log = driver.output().join("\n");
+            for bad in ["Traceback", "Error", "xception"] {
+                assert!(!log.contains(bad), "{bad}:\n{}", driver.log());
+            }
+        }
+        assert!(
+            longest[..2].iter().all(|ms| *ms <= allowed),
+            "{what}: passes of {longest:?} ms"
+        );
+    }
+}
+
+#[test]
+fn no_driver_stalls_when_its_master_is_killed_in_core_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_when_its_master_is_killed(Mode::Core);
+}
+
+#[test]
+fn no_driver_stalls_when_its_master_is_killed_in_proxy_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_when_its_master_is_killed(Mode::Proxy);
+}
+
+fn no_driver_stalls_when_its_master_is_killed(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    let mut drivers = Drivers::start(&robot);
+    for kill in 1..=5 {
+        drivers.assert_no_stall(&format!("{mode:?}, kill {kill}"), PASS, || {
+            robot.crash_master();
+        });
+    }
+}
+
+#[test]
+fn no_driver_stalls_while_there_is_no_master_for_twenty_seconds() {
+    let _alone = crate::alone();
+    let mut robot = Robot::start(Mode::Proxy);
+    let mut drivers = Drivers::start(&robot);
+    drivers.assert_no_stall("20 s without a master", PASS, || {
+        let dead = robot.master_pid();
+        robot.kill_master();
+        sleep(Duration::from_secs(20));
+        robot.revive_master();
+        robot.await_recovery(dead);
+    });
+}
+
+#[test]
+fn no_driver_stalls_while_the_master_dies_again_and_again_in_core_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_while_the_master_dies_again_and_again(Mode::Core);
+}
+
+#[test]
+fn no_driver_stalls_while_the_master_dies_again_and_again_in_proxy_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_while_the_master_dies_again_and_again(Mode::Proxy);
+}
+
+fn no_driver_stalls_while_the_master_dies_again_and_again(mode: Mode) {
+    let seconds = std::env::var("ROSRESCUE_LOOP_SECONDS");
+    let seconds = seconds.map_or(LOOP_SECONDS, |text| text.parse().unwrap());
+    let mut robot = Robot::start(mode);
+    let mut drivers = Drivers::start(&robot);
+    let mut kills = 0;
+    drivers.assert_no_stall(&format!("{mode:?}, a crash loop"), PASS, || {
+        let end = Instant::now() + Duration::from_secs(seconds);
+        while Instant::now() < end {
+            let next = Instant::now() + PAUSE;
+            // A core answers a crash loop with pauses of its own.
+            if robot.bare().master_pid().is_some() {
+                robot.kill_master();
+                robot.revive_master();
+                kills += 1;
+            }
+            sleep(next.saturating_duration_since(Instant::now()));
+        }
+    });
+    println!("{kills} kills");
+    assert!(kills >= 5, "{kills} kills");
+    eventually("the last master serves", || robot.is_open());
+    let state = robot.settled_state();
+    for name in ["/driver_a", "/driver_b"] {
+        assert!(state.knows(name), "{state}");
+    }
+}
+
+#[test]
+fn no_driver_stalls_behind_a_master_that_hangs_in_core_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_behind_a_master_that_hangs(Mode::Core);
+}
+
+#[test]
+fn no_driver_stalls_behind_a_master_that_hangs_in_proxy_mode() {
+    let _alone = crate::alone();
+    no_driver_stalls_behind_a_master_that_hangs(Mode::Proxy);
+}
+
+fn no_driver_stalls_behind_a_master_that_hangs(mode: Mode) {
+    let robot = Robot::start(mode);
+    let mut drivers = Drivers::start(&robot);
+    let master = robot.master_pid();
+    drivers.assert_no_stall(&format!("{mode:?}, hung for 5 s"), PASS_HUNG, || {
+        stop(master);
+        sleep(Duration::from_secs(5));
+        signal(master, Signal::CONT);
+        robot.await_gate();
+    });
+}

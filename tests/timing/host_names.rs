@@ -1,0 +1,213 @@
+//! Nodes that are registered under names of hosts: names that resolve slowly or not at all delay nobody, and
+//! a node is found where its name leads now.
+
+use std::net::Ipv4Addr;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FakeNode, NameServer, Rescue, Scratch, Setup, State, eventually, free_port, holds,
+    names, params, status,
+};
+
+/// By then a living subscriber knows a new publisher.
+const SOON: Duration = Duration::from_secs(1);
+
+/// `rosrescue core` that asks `server` and no other, and so does its master.
+fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
+    let setup = Setup::core(scratch, master_port);
+    setup.wrapped(|own| server.serving(own)).start()
+}
+
+fn kill_master(client: &Client) -> u32 {
+    let dead = client.master_pid().expect("a master");
+    crate::support::signal(dead, rustix::process::Signal::KILL);
+    dead
+}
+
+/// Waits for the report of the recovery after the death of `dead`, with its health check.
+fn report(client: &Client, dead: u32) -> serde_json::Value {
+    let mut last = serde_json::Value::Null;
+    eventually("the recovery is complete", || {
+        last = status(client)["last_recovery"].clone();
+        last["master_pid"] != dead && last["health_check_ms"].is_number()
+    });
+    last
+}
+
+#[test]
+fn names_that_resolve_slowly_delay_nobody() {
+    let _alone = crate::alone();
+    let scratch = Scratch::new();
+    let server = NameServer::silent(&scratch);
+    let rescue = core(&server, &scratch, free_port());
+    let client = rescue.client();
+    for i in 0..40 {
+        let (name, api) = (format!("/slow{i}"), format!("http://slow{i}.test:4711/"));
+        client.ok(
+            "registerSubscriber",
+            params![name.as_str(), "/chatter", "std_msgs/String", api],
+        );
+    }
+    let living = FakeNode::start("/living");
+    // By a name that the computer knows itself.
+    let api = format!("http://localhost:{}/", living.port());
+    living.claim_subscription("/chatter", Some("std_msgs/String"));
+    client.ok(
+        "registerSubscriber",
+        params!["/living", "/chatter", "std_msgs/String", api],
+    );
+    let dead = client.master_pid().expect("a master");
+    crate::support::signal(dead, rustix::process::Signal::KILL);
+    let start = Instant::now();
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let registered = start.elapsed();
+    eventually("the living subscriber is told", || {
+        living.updates("/chatter").last() == Some(&vec![publisher.api.clone()])
+    });
+    let told = start.elapsed() - registered;
+    println!("registration {registered:?}, told {told:?} later");
+    assert!(registered < SOON, "{registered:?}");
+    assert!(told < SOON, "{told:?}");
+    // While the lookups are under way: calls pass, and so do new publishers.
+    for i in 0..50 {
+        let start = Instant::now();
+        client.set_param("/n", i);
+        assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    }
+    eventually("the slow ones are suspect, and only they", || {
+        names(&status(&client)["unreachable"]).len() == 40
+    });
+    let second = FakeNode::start("/second");
+    let start = Instant::now();
+    second.publish(&client, "/chatter", "std_msgs/String");
+    eventually("the living subscriber is told of the second", || {
+        living
+            .updates("/chatter")
+            .last()
+            .is_some_and(|list| list.len() == 2)
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    assert_eq!(living.heard("shutdown").len(), 0);
+    // Nobody waits for a name server at the end either.
+    let mut rescue = rescue;
+    let start = Instant::now();
+    rescue.terminate();
+    assert!(
+        start.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        start.elapsed()
+    );
+}
+
+/// A name that does not exist may exist tomorrow: its node is suspect, and kept.
+#[test]
+fn names_that_do_not_exist_are_suspect_and_delay_nobody() {
+    let _alone = crate::alone();
+    const COUNT: usize = 20;
+    let scratch = Scratch::new();
+    let server = NameServer::of_hosts(&scratch);
+    let port = free_port();
+    let rescue = core(&server, &scratch, port);
+    let client = rescue.client();
+    let nobody: Vec<_> = (0..COUNT)
+        .map(|i| FakeNode::start(&format!("/nobody{i}")).at_host(&format!("nobody{i}.test")))
+        .collect();
+    let living = FakeNode::start("/living");
+    for node in nobody.iter().chain([&living]) {
+        node.subscribe(&client, "/chatter", "std_msgs/String");
+    }
+    let dead = kill_master(&client);
+    let start = Instant::now();
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    assert!(
+        start.elapsed() < Duration::from_secs(4),
+        "{:?}",
+        start.elapsed()
+    );
+    let start = Instant::now();
+    let all = vec![publisher.api.clone()];
+    eventually("the living subscriber is told", || {
+        living.updates("/chatter").last() == Some(&all)
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    let report = report(&client, dead);
+    assert_eq!(names(&report["removed"]), Vec::<String>::new());
+    let mut unreachable: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
+    unreachable.sort();
+    assert_eq!(names(&report["unreachable"]), unreachable);
+    assert_eq!(names(&status(&client)["unreachable"]), unreachable);
+    let state = State::read(&Client::new(port));
+    assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
+
+    // The name that begins to exist leads to a node that is whole.
+    let found = &nobody[0];
+    assert!(found.calls().is_empty(), "{:?}", found.calls());
+    server.set("nobody0.test", Ipv4Addr::LOCALHOST);
+    eventually("it is found", || {
+        found.updates("/chatter").last() == Some(&all)
+    });
+    eventually("it is suspect no more, and the others are", || {
+        let unreachable = names(&status(&client)["unreachable"]);
+        unreachable.len() == COUNT - 1 && !unreachable.contains(&found.name)
+    });
+    for node in nobody.iter().chain([&living]) {
+        assert_eq!(node.heard("shutdown").len(), 0);
+    }
+}
+
+/// A node's host gets another address, and the node's address stays the same text.
+#[test]
+fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
+    let _alone = crate::alone();
+    let scratch = Scratch::new();
+    let server = NameServer::of_hosts(&scratch);
+    let master_port = free_port();
+    let rescue = core(&server, &scratch, master_port);
+    let client = rescue.client();
+    let port = free_port();
+    let host = |number: u8| Ipv4Addr::new(127, 0, 0, number);
+    let start = |number| FakeNode::start_on("/mover", host(number), port).at_host("mover.test");
+    let first = start(1);
+    server.set("mover.test", host(1));
+    first.subscribe(&client, "/chatter", "std_msgs/String");
+    let kept = || {
+        let state = State::read(&Client::new(master_port));
+        state.subscribers_of("/chatter") == ["/mover"]
+    };
+
+    // It moves during an outage. At the old address the port refuses: that would be death.
+    let second = start(2);
+    second.claim_subscription("/chatter", Some("std_msgs/String"));
+    server.set("mover.test", host(2));
+    drop(first);
+    let dead = kill_master(&client);
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let recovered = report(&client, dead);
+    assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
+    assert_eq!(names(&recovered["unreachable"]), Vec::<String>::new());
+    let all = vec![publisher.api.clone()];
+    eventually("it is told at the new address", || {
+        second.updates("/chatter").last() == Some(&all)
+    });
+    let asked = second.calls().into_iter().any(|call| call.from_rosrescue);
+    assert!(asked && kept());
+
+    // It moves while it is suspect.
+    second.hold();
+    let dead = kill_master(&client);
+    assert_eq!(names(&report(&client, dead)["unreachable"]), ["/mover"]);
+    let third = start(3);
+    third.claim_subscription("/chatter", Some("std_msgs/String"));
+    server.set("mover.test", host(3));
+    eventually("it is suspect no more", || {
+        names(&status(&client)["unreachable"]).is_empty()
+    });
+    eventually("it is told all at the new address", || {
+        third.updates("/chatter").last() == Some(&all)
+    });
+    assert!(kept());
+    assert!(holds(SOON, || third.heard("shutdown").is_empty()));
+}

@@ -1,0 +1,230 @@
+//! Nodes that cannot be reached, because packets to them vanish, hold up nobody; and as soon as they can be
+//! reached again they are whole. `host_names.rs` has those whose names do not resolve.
+
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually,
+    eventually_some, free_port, holds, names, params, status,
+};
+
+/// Nodes that cannot be reached, and others.
+const UNREACHABLE: u8 = 20;
+const LIVING: usize = 18;
+/// By then a living subscriber knows a new publisher.
+const SOON: Duration = Duration::from_secs(1);
+
+/// The living half: fakes, and a real node of each library.
+struct Living {
+    fakes: Vec<FakeNode>,
+    real: [Node; 2],
+}
+
+impl Living {
+    fn start(robot: &Robot) -> Self {
+        let client = robot.client();
+        let fakes = (0..LIVING).map(|i| FakeNode::start(&format!("/living{i}")));
+        let fakes: Vec<_> = fakes.collect();
+        for fake in &fakes {
+            fake.subscribe(&client, "/chatter", "std_msgs/String");
+        }
+        let real = [Library::Rospy, Library::Roscpp].map(|library| {
+            let name = format!("__name:={}", format!("{library:?}").to_lowercase());
+            robot.node(library, "listener", &[&name])
+        });
+        Self { fakes, real }
+    }
+
+    /// How long it takes each to hear of a publisher that registers now.
+    #[track_caller]
+    fn hear_of(&self, publisher: &FakeNode, client: &Client) -> Vec<Duration> {
+        let start = Instant::now();
+        publisher.publish(client, "/chatter", "std_msgs/String");
+        let mut heard = vec![None; LIVING + 2];
+        eventually("every living subscriber hears of a publisher", || {
+            for (i, heard) in heard.iter_mut().enumerate() {
+                if heard.is_none() {
+                    let updates = match i.checked_sub(LIVING) {
+                        None => self.fakes[i].updates("/chatter"),
+                        Some(real) => self.real[real].updates("/chatter"),
+                    };
+                    let knows = updates.iter().any(|list| list.contains(&publisher.api));
+                    *heard = knows.then(|| start.elapsed());
+                }
+            }
+            heard.iter().all(Option::is_some)
+        });
+        heard.into_iter().flatten().collect()
+    }
+}
+
+/// Median and maximum in milliseconds.
+fn summary(times: &[Duration]) -> (f64, f64) {
+    let mut times: Vec<_> = times.iter().map(|time| time.as_secs_f64() * 1e3).collect();
+    times.sort_by(f64::total_cmp);
+    (times[times.len() / 2], times[times.len() - 1])
+}
+
+/// How long it takes from the new master's open port to the open gate, in milliseconds, when the
+/// master dies: the rest is the start of a Python program.
+#[track_caller]
+fn crash(robot: &mut Robot) -> f64 {
+    let before = status(&robot.client())["recoveries"].as_u64();
+    robot.crash_master();
+    eventually_some("the recovery is reported", || {
+        let status = status(&robot.client());
+        let new = status["recoveries"].as_u64() > before;
+        let phase = |name: &str| status["last_recovery"]["phases"][name].as_f64();
+        new.then(|| Some(phase("total_ms")? - phase("absence_ms")?))?
+    })
+}
+
+fn twenty_of_forty_are_unreachable(mode: Mode) {
+    let net = Netns::new();
+    let mut robot = Robot::start(mode);
+    let client = robot.client();
+    let living = Living::start(&robot);
+    let gone = || (10..10 + UNREACHABLE).map(|host| (host, format!("/gone{host}")));
+    let reachable: Vec<_> = gone().map(|(_, name)| FakeNode::start(&name)).collect();
+    for node in &reachable {
+        node.subscribe(&client, "/chatter", "std_msgs/String");
+        node.watch_param(&client, "/gain");
+    }
+    let without = [(); 3].map(|()| crash(&mut robot));
+    // The same registrations, where nobody can be reached.
+    for (host, name) in gone() {
+        net.cut(host);
+        let api = format!("http://{}:4711/", net.far(host));
+        let (name, api) = (name.as_str(), api.as_str());
+        client.ok(
+            "registerSubscriber",
+            params![name, "/chatter", "std_msgs/String", api],
+        );
+        client.ok("subscribeParam", params![name, api, "/gain"]);
+    }
+    drop(reachable);
+    let before = robot.settled_state();
+    let with = [(); 3].map(|()| crash(&mut robot));
+
+    // At once, when nobody knows yet who is suspect; and later, when it is known.
+    let mut publishers: Vec<FakeNode> = Vec::new();
+    let mut tell = |count: usize| {
+        let mut times = Vec::new();
+        for _ in 0..count {
+            let publisher = FakeNode::start(&format!("/publisher{}", publishers.len()));
+            times.extend(living.hear_of(&publisher, &client));
+            publishers.push(publisher);
+        }
+        times
+    };
+    let at_once = tell(5);
+    eventually("the unreachable ones are suspect", || {
+        names(&status(&client)["unreachable"]).len() == usize::from(UNREACHABLE)
+    });
+    let later = tell(5);
+    let (median, most) = summary(&at_once);
+    let (median_later, most_later) = summary(&later);
+    println!(
+        "{mode:?}: told after {median:.1} ms (most {most:.1}) at once, {median_later:.1} ms (most \
+         {most_later:.1}) later; the master restored in {with:.1?} ms, and in {without:.1?} ms when \
+         all could be reached"
+    );
+    let least = |times: [f64; 3]| times.into_iter().fold(f64::INFINITY, f64::min);
+    for times in [at_once, later] {
+        assert!(times.iter().all(|time| *time < SOON), "{times:?}");
+    }
+    // One attempt to connect that was waited for would be 1000 ms.
+    assert!(
+        least(with) < least(without) * 1.5 + 20.0,
+        "{with:?} {without:?}"
+    );
+    // Parameters reach the living, too, and nobody was taken out or disturbed.
+    let state = robot.state();
+    assert!(gone().all(|(_, name)| state.knows(&name)));
+    assert_eq!(
+        before.subscribers_of("/chatter"),
+        state.subscribers_of("/chatter")
+    );
+    let watcher = FakeNode::start("/watcher");
+    watcher.watch_param(&client, "/gain");
+    let start = Instant::now();
+    client.set_param("/gain", 7);
+    eventually("a living node is told of a parameter", || {
+        !watcher.heard("paramUpdate").is_empty()
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    // A list that the master sends late does not stand for long.
+    let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
+    eventually("all know all publishers", || {
+        let fakes = living.fakes.iter().map(|fake| fake.updates("/chatter"));
+        let real = living.real.iter().map(|node| node.updates("/chatter"));
+        fakes
+            .chain(real)
+            .all(|updates| updates.last() == Some(&all))
+    });
+    for fake in &living.fakes {
+        let updates = fake.updates("/chatter");
+        // A core has more threads than there are nodes to hold them up.
+        assert!(
+            mode == Mode::Proxy || updates.is_sorted_by_key(Vec::len),
+            "{updates:?}"
+        );
+        assert_eq!(fake.heard("shutdown").len(), 0);
+    }
+}
+
+#[test]
+fn living_subscribers_are_told_soon_in_core_mode() {
+    let _alone = crate::alone();
+    twenty_of_forty_are_unreachable(Mode::Core);
+}
+
+/// With the three threads and without the timeout that rosmaster has when nobody says otherwise.
+#[test]
+fn living_subscribers_are_told_soon_in_proxy_mode() {
+    let _alone = crate::alone();
+    twenty_of_forty_are_unreachable(Mode::Proxy);
+}
+
+/// Real nodes behind a cable that is cut during an outage, and mended later.
+#[test]
+fn a_node_that_can_be_reached_again_is_whole() {
+    let _alone = crate::alone();
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
+    let rescue = setup.args(["--node-timeout", "1000"]).start();
+    let client = rescue.client();
+    let port = rescue.port();
+    let nodes = [(2, Library::Rospy), (3, Library::Roscpp)].map(|(host, library)| {
+        let mut command = library.command(&scratch, port, "listener");
+        let name = format!("__name:={}", format!("{library:?}").to_lowercase());
+        command
+            .arg(name)
+            .env("ROS_IP", net.far(host))
+            .env("ROS_MASTER_URI", format!("http://{}:{port}", net.near()));
+        Node::run(&mut net.inside(&command))
+    });
+    for host in [2, 3] {
+        net.cut(host);
+    }
+    let dead = client.master_pid().expect("a master");
+    crate::support::signal(dead, rustix::process::Signal::KILL);
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let unreachable = || names(&status(&client)["unreachable"]);
+    eventually("both are suspect", || {
+        unreachable() == ["/roscpp", "/rospy"]
+    });
+    let knows = |node: &Node| {
+        let updates = node.updates("/chatter");
+        updates.last() == Some(&vec![publisher.api.clone()])
+    };
+    // Longer than the supervised rosmaster tries.
+    assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
+    for host in [2, 3] {
+        net.mend(host);
+    }
+    eventually("both know the publisher", || nodes.iter().all(knows));
+    eventually("nobody is suspect any more", || unreachable().is_empty());
+}
