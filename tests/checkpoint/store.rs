@@ -1,16 +1,27 @@
 //! The checkpoint on a real disk.
 
-// The lints know `#[test]` functions only, not their helpers.
 mod damage;
-mod moved;
+mod taken_lock;
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use rosrescue::checkpoint::format::{Checkpoint, Entry, Session};
+use rosrescue::checkpoint::format::{Checkpoint, Entry, Record, Session};
 use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
 use rosrescue::xmlrpc::{Call, Value};
+use tempfile::TempDir;
+
+/// A folder of a test's own, and a checkpoint in it.
+fn place() -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.yaml");
+    (folder, path)
+}
+
+fn seqs(records: &[Record]) -> Vec<u64> {
+    records.iter().map(|record| record.seq).collect()
+}
 
 fn entry(nth: i32) -> Entry {
     Entry::call(Call::new(
@@ -77,8 +88,7 @@ fn what_was_appended_is_there_after_a_crash() {
 
 #[test]
 fn a_second_one_is_refused_by_name() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let _store = started(&path, 0);
     let link = folder.path().join("other.yaml");
     symlink("c.yaml", &link).unwrap();
@@ -99,8 +109,7 @@ fn a_second_one_is_refused_by_name() {
 
 #[test]
 fn files_are_for_their_owner_only() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let mut store = started(&path, 1);
     store.begin(&checkpoint(1)).unwrap();
     for name in names(folder.path()) {
@@ -135,8 +144,7 @@ fn a_link_is_followed_and_stays() {
 
 #[test]
 fn what_is_recorded_during_a_compaction_is_in_both_files() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let mut store = started(&path, 2);
     let job = store.begin_compaction(checkpoint(2)).unwrap();
     assert!(matches!(
@@ -154,27 +162,13 @@ fn what_is_recorded_during_a_compaction_is_in_both_files() {
     let (store, loaded) = Store::open(&path).unwrap();
     let loaded = loaded.unwrap();
     assert_eq!(loaded.checkpoint, Some(checkpoint(2)));
-    assert_eq!(
-        loaded
-            .records
-            .iter()
-            .map(|record| record.seq)
-            .collect::<Vec<_>>(),
-        [3, 4, 5]
-    );
+    assert_eq!(seqs(&loaded.records), [3, 4, 5]);
     assert!(loaded.exact);
     assert_eq!(store.generation(), 2);
     let previous = rosrescue::checkpoint::store::read(&folder.path().join("c.yaml.previous"))
         .unwrap()
         .unwrap();
-    assert_eq!(
-        previous
-            .records
-            .iter()
-            .map(|record| record.seq)
-            .collect::<Vec<_>>(),
-        [1, 2, 3, 4]
-    );
+    assert_eq!(seqs(&previous.records), [1, 2, 3, 4]);
 }
 
 #[test]
@@ -197,8 +191,7 @@ fn compaction_is_wanted_when_the_journal_outgrows_the_snapshot() {
 
 #[test]
 fn a_session_set_aside_has_no_part_in_the_next() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
     for nth in 1..=12 {
@@ -226,8 +219,7 @@ fn a_session_set_aside_has_no_part_in_the_next() {
 
 #[test]
 fn a_session_set_aside_is_no_fallback_of_the_next() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
     store.set_aside("session").unwrap();
@@ -242,8 +234,7 @@ fn a_session_set_aside_is_no_fallback_of_the_next() {
 
 #[test]
 fn a_file_that_was_removed_to_start_afresh_stays_removed() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
     drop(store);
@@ -261,19 +252,8 @@ fn a_file_that_was_removed_to_start_afresh_stays_removed() {
 }
 
 #[test]
-fn jobs_can_run_on_another_thread() {
-    fn sendable<T: Send + 'static>() {}
-    sendable::<Store>();
-    sendable::<rosrescue::checkpoint::store::SyncJob<rosrescue::checkpoint::store::Disk>>();
-    sendable::<rosrescue::checkpoint::store::Synced>();
-    sendable::<rosrescue::checkpoint::store::CompactionJob<rosrescue::checkpoint::store::Disk>>();
-    sendable::<rosrescue::checkpoint::store::Compacted<rosrescue::checkpoint::store::Disk>>();
-}
-
-#[test]
 fn an_orderly_stop_is_in_the_file() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 1);
     let session = Session {
         closed: true,

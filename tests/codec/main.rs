@@ -3,7 +3,9 @@
 
 #![allow(
     clippy::unwrap_used,
-    reason = "a failed test panics, in its helpers too"
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
 )]
 
 mod cases;
@@ -11,20 +13,17 @@ mod documents;
 mod fuzz_seeds;
 mod peer;
 mod shown;
-#[path = "../support/mod.rs"]
-mod support;
 
 use std::fmt::Write;
 
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{
-    Call, DecodeError, Reply, Struct, Value, decode_call, decode_reply, encode_call, encode_reply,
+    Call, DecodeError, Reply, Value, decode_call, decode_reply, encode_call, encode_reply,
 };
 
 use cases::{any_value, double, mess, returnable, text};
 use documents::{odd_documents, params, refused_documents};
 use peer::{Peer, hex};
-use support::{Rosmaster, Scratch, http_request};
 
 /// A value in the notation of the peer.
 fn notation(value: &Value) -> String {
@@ -248,52 +247,20 @@ fn senseless_documents_are_taken_as_cpython_takes_them() {
     });
 }
 
+/// What is put into a document to damage it.
+#[rustfmt::skip]
+const DAMAGE: &[&str] = &[
+    "", "<", ">", "/", "&", ";", "'", "=", " ", "\n", "]]>", "<!--", "-->", "--", "<?", "?>", "<![CDATA[", "x",
+    "\u{1}", "é", "</value>", "<value>", "<array>", "</array>", "<a/>", "\u{ffff}", ":", "\"", "!", "?", "]",
+    "-", "/>", "</", "<!", " a='b'", "&#", "&#65;", "\r",
+];
+
 #[test]
 fn damaged_documents_are_taken_as_cpython_takes_them() {
     let damage = (
         any::<proptest::sample::Index>(),
         0..4_usize,
-        proptest::sample::select(vec![
-            "",
-            "<",
-            ">",
-            "/",
-            "&",
-            ";",
-            "'",
-            "=",
-            " ",
-            "\n",
-            "]]>",
-            "<!--",
-            "-->",
-            "--",
-            "<?",
-            "?>",
-            "<![CDATA[",
-            "x",
-            "\u{1}",
-            "é",
-            "</value>",
-            "<value>",
-            "<array>",
-            "</array>",
-            "<a/>",
-            "\u{ffff}",
-            ":",
-            "\"",
-            "!",
-            "?",
-            "]",
-            "-",
-            "/>",
-            "</",
-            "<!",
-            " a='b'",
-            "&#",
-            "&#65;",
-            "\r",
-        ]),
+        proptest::sample::select(DAMAGE),
     );
     let sound = prop_oneof![
         any_value().prop_map(|value| encode_call(&Call::new("m", vec![value]))),
@@ -316,49 +283,6 @@ fn damaged_documents_are_taken_as_cpython_takes_them() {
         }
         compare(peer, "call", document.as_bytes()).map_err(TestCaseError::fail)
     });
-}
-
-/// What rosmaster does at the limit of Python's recursion depends on how deep its own calls are
-/// already, so only the real one can tell.
-#[test]
-fn what_rosmaster_cannot_return_becomes_its_fault() {
-    let leaves = [
-        Value::Int(1),
-        Value::Bool(true),
-        Value::Double(1.5),
-        Value::from("<a>"),
-        Value::DateTime("20240101T00:00:00".to_owned()),
-        Value::Base64(b"abc".to_vec()),
-        Value::Nil,
-        Value::BigInt("2147483648".to_owned()),
-        Value::Array(Vec::new()),
-        Value::Struct(Struct::new()),
-    ];
-    let in_array = |value| Value::Array(vec![value]);
-    let in_struct = |value| Value::Struct(Struct::from([("k".to_owned(), value)]));
-    let wraps: [fn(Value) -> Value; 2] = [in_array, in_struct];
-    let scratch = Scratch::new();
-    let master = Rosmaster::start(&scratch);
-    let answer = |method: &str, params: Vec<Value>| {
-        let call = encode_call(&Call::new(method, params));
-        let response = master.client().exchange(&http_request(&call));
-        response.unwrap().text()
-    };
-    for (leaf, wrap) in leaves
-        .iter()
-        .flat_map(|leaf| wraps.map(|wrap| (leaf, wrap)))
-    {
-        for depth in [1, 300, 489, 490, 491, 492, 493, 510] {
-            let value = (0..depth).fold(leaf.clone(), |value, _| wrap(value));
-            let caller = Value::from("/n");
-            answer("setParam", vec![caller.clone(), "/p".into(), value.clone()]);
-            let theirs = answer("getParam", vec![caller, "/p".into()]);
-            let reply = Value::Array(vec![1.into(), "Parameter [/p]".into(), value]);
-            let ours = encode_reply(&Reply::Value(reply));
-            let ours = String::from_utf8(ours).unwrap();
-            assert!(ours == theirs, "{leaf:?} at {depth}\n{ours}\n{theirs}");
-        }
-    }
 }
 
 /// Of several things that cannot be marshalled, the first one decides.

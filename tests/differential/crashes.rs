@@ -21,7 +21,7 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
         apis: (0..nodes).map(node_api).collect(),
         // What a master cannot return does not survive it: while there is such a value no crash
         // happens, and before and after they do.
-        poison: dice.once_in(4),
+        unreturnable: dice.once_in(4),
         errors: !dice.once_in(4),
         // Another master is another process.
         process: false,
@@ -44,8 +44,11 @@ pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> S
             steps.insert(at, Step::Crash { in_flight });
         }
     }
-    let poison = cast.poison;
-    Script { poison, steps }
+    let unreturnable = cast.unreturnable;
+    Script {
+        unreturnable,
+        steps,
+    }
 }
 
 /// rosrescue and what is behind it.
@@ -188,10 +191,10 @@ pub(crate) struct Share {
 /// What a run was.
 #[derive(Default)]
 pub(crate) struct Tally {
-    /// Crashes that happened, and those that were asked for, in sequences without poison.
+    /// Crashes that happened, and those that were asked for, in sequences of values that a master can return.
     pub(crate) sound: Share,
-    /// The same with poison.
-    pub(crate) poisoned: Share,
+    /// The same with others.
+    pub(crate) with_unreturnable: Share,
     /// Crashes left out, since something could not have been brought back: what.
     pub(crate) spared: Vec<Skipped>,
 }
@@ -207,7 +210,7 @@ pub(crate) fn run(
     let model = rig.state();
     let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
     let mut stage = Stage::new(nodes, wires, model);
-    stage.callbacks = !script.poison;
+    stage.callbacks = !script.unreturnable;
     let mut in_flight = false;
     for (nth, step) in script.steps.iter().enumerate() {
         let done = match step {
@@ -232,8 +235,8 @@ pub(crate) fn run(
                 }
             }
             Step::Crash { in_flight: during } => {
-                let share = match script.poison {
-                    true => &mut tally.poisoned,
+                let share = match script.unreturnable {
+                    true => &mut tally.with_unreturnable,
                     false => &mut tally.sound,
                 };
                 share.asked += 1;

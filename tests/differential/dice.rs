@@ -10,7 +10,7 @@ pub(crate) struct Cast {
     /// Addresses of nodes.
     pub(crate) apis: Vec<String>,
     /// Whether values occur that a master cannot return.
-    pub(crate) poison: bool,
+    pub(crate) unreturnable: bool,
     /// Whether parameters may be of the wrong kind and number, and multicalls malformed.
     pub(crate) errors: bool,
     /// Whether the master is asked for its process id.
@@ -45,24 +45,11 @@ const READS: &[&str] = &[
     "getPid",
     "getUri",
 ];
+#[rustfmt::skip]
 const NO_METHODS: &[&str] = &[
-    "nope",
-    "uri",
-    "done",
-    "topics_types",
-    "param_update_task",
-    "system.listMethods",
-    "_shutdown",
-    "shutdown",
-    "",
-    "getParam.x",
-    "reg_manager",
-    "thread_pool",
-    "ps_lock",
-    "publishers",
-    "services",
-    "param_subscribers",
-    "param_server",
+    "nope", "uri", "done", "topics_types", "param_update_task", "system.listMethods", "_shutdown",
+    "shutdown", "", "getParam.x", "reg_manager", "thread_pool", "ps_lock", "publishers",
+    "services", "param_subscribers", "param_server",
 ];
 
 impl Dice {
@@ -124,7 +111,7 @@ impl Dice {
                 .into(),
             4 => Value::DateTime(self.pick(&["20200101T00:00:00", "b", "now"]).to_owned()),
             5 => Value::Base64(vec![0, 255, 10][..self.below(4)].to_vec()),
-            6 | 7 if cast.poison && self.once_in(3) => match self.below(2) {
+            6 | 7 if cast.unreturnable && self.once_in(3) => match self.below(2) {
                 0 => Value::Nil,
                 _ => Value::BigInt(
                     self.pick(&["2147483648", "-5000000000", "99999999999999999999"])

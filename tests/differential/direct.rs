@@ -18,14 +18,14 @@ pub(crate) fn script(seed: u64, calls: usize, nodes: usize) -> Script {
     let mut dice = Dice(seed);
     let mut cast = Cast {
         apis: (0..nodes).map(node_api).collect(),
-        poison: dice.once_in(3),
+        unreturnable: dice.once_in(3),
         errors: !dice.once_in(4),
         process: true,
     };
     cast.apis.push("rosrpc://h:1".to_owned());
-    let poison = cast.poison;
+    let unreturnable = cast.unreturnable;
     // What a master cannot return is not brought along, which ends the comparison of values.
-    let between = (!poison && dice.once_in(2)).then(|| dice.below(calls.max(1)));
+    let between = (!unreturnable && dice.once_in(2)).then(|| dice.below(calls.max(1)));
     let mut steps = Vec::with_capacity(calls + 2);
     for nth in 0..calls {
         if between == Some(nth) {
@@ -34,9 +34,12 @@ pub(crate) fn script(seed: u64, calls: usize, nodes: usize) -> Script {
         let (by, call) = (dice.below(CLIENTS), dice.call(&cast, 2));
         steps.push(Step::Call { by, call });
     }
-    cast.poison = false;
+    cast.unreturnable = false;
     steps.push(successor(&mut dice, &cast));
-    Script { poison, steps }
+    Script {
+        unreturnable,
+        steps,
+    }
 }
 
 fn successor(dice: &mut Dice, cast: &Cast) -> Step {
@@ -57,7 +60,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
     };
     let (mut real, wires, model) = fresh();
     let mut stage = Stage::new(nodes, wires, model);
-    stage.callbacks = !script.poison;
+    stage.callbacks = !script.unreturnable;
     for (nth, step) in script.steps.iter().enumerate() {
         let done = match step {
             Step::Call { by, call } => {

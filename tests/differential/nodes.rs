@@ -1,15 +1,13 @@
 //! Nodes that only listen: they note every callback that a master sends them.
 
-use std::io::{BufReader, Write};
-use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use rosrescue::master::Notice;
-use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call, encode_reply};
+use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
-use crate::real::read_message;
+use crate::support::FakeMaster;
 
 /// Whether a failure is known, and only its shortest script is looked for.
 pub(crate) static HURRIED: AtomicBool = AtomicBool::new(false);
@@ -30,21 +28,31 @@ const QUESTIONS: [&str; 3] = ["getPid", "getPublications", "getSubscriptions"];
 pub(crate) struct Node {
     pub(crate) api: String,
     heard: Arc<Mutex<Vec<Call>>>,
+    _server: FakeMaster,
 }
 
 impl Node {
     pub(crate) fn start() -> Self {
-        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let api = format!("http://{}/", listener.local_addr().unwrap());
         let heard = Arc::new(Mutex::new(Vec::new()));
         let notes = Arc::clone(&heard);
-        std::thread::spawn(move || {
-            for connection in listener.incoming().flatten() {
-                let notes = Arc::clone(&notes);
-                std::thread::spawn(move || serve(connection, &notes));
-            }
+        let server = FakeMaster::start(move |body| {
+            let call = decode_call(body).unwrap();
+            // A question changes nothing in a node. It is alive and has no answer: what it registers is
+            // rolled with dice.
+            let reply = if QUESTIONS.contains(&call.method.as_str()) {
+                let text = "no such method".to_owned();
+                Reply::Fault { code: 1, text }
+            } else {
+                notes.lock().unwrap().push(call);
+                Reply::Value(vec![Value::Int(1), "".into(), 0.into()].into())
+            };
+            FakeMaster::proper(&reply)
         });
-        Self { api, heard }
+        Self {
+            api: format!("http://127.0.0.1:{}/", server.port()),
+            heard,
+            _server: server,
+        }
     }
 
     /// Waits until something heard is the `last` thing, and takes all that was heard.
@@ -66,37 +74,6 @@ impl Node {
     /// Takes what was heard up to now.
     pub(crate) fn take_now(&self) -> Vec<Call> {
         std::mem::take(&mut *self.heard.lock().unwrap())
-    }
-}
-
-fn serve(connection: TcpStream, notes: &Mutex<Vec<Call>>) {
-    connection.set_nodelay(true).unwrap();
-    let mut connection = BufReader::new(connection);
-    while let Some(body) = read_message(&mut connection) {
-        let call = decode_call(&body).unwrap();
-        // A question changes nothing in a node. It is alive and has no answer: what it registers is
-        // rolled with dice.
-        let reply = if QUESTIONS.contains(&call.method.as_str()) {
-            Reply::Fault {
-                code: 1,
-                text: "no such method".to_owned(),
-            }
-        } else {
-            notes.lock().unwrap().push(call);
-            Reply::Value(vec![Value::Int(1), "".into(), 0.into()].into())
-        };
-        let body = encode_reply(&reply);
-        let head = format!(
-            "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
-            body.len()
-        );
-        if connection
-            .get_mut()
-            .write_all(&[head.as_bytes(), &body].concat())
-            .is_err()
-        {
-            return;
-        }
     }
 }
 

@@ -1,16 +1,11 @@
 //! A real rosmaster, and talking to it.
 
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
-use crate::support::{Scratch, find_program, free_port};
-
-/// Longest wait for an answer: of a rosmaster that starts, or while another one takes its place.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+use crate::support::{self, Client, PATIENCE, Scratch, find_program, free_port, http_request};
 
 /// A rosmaster of its own, ended when this is dropped.
 pub(crate) struct Rosmaster {
@@ -82,36 +77,24 @@ impl Drop for Rosmaster {
 }
 
 /// A client's connection to a master.
-pub(crate) struct Wire {
-    stream: BufReader<TcpStream>,
-}
+pub(crate) struct Wire(support::Wire);
 
 impl Wire {
     pub(crate) fn connect(port: u16) -> std::io::Result<Self> {
-        let stream = TcpStream::connect(("127.0.0.1", port))?;
-        stream.set_nodelay(true)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
-        Ok(Self {
-            stream: BufReader::new(stream),
-        })
+        Client::new(port).connect().map(Self)
     }
 
     /// Sends a call and does not wait for the reply.
     pub(crate) fn send(&mut self, call: &Call) -> Result<(), String> {
-        let body = encode_call(call);
-        let head = format!(
-            "POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/xml\r\nContent-Length: {}\r\n\r\n",
-            body.len()
-        );
-        let request = [head.as_bytes(), &body].concat();
-        let sent = self.stream.get_mut().write_all(&request);
+        let sent = self.0.send(&http_request(&encode_call(call)));
         sent.map_err(|error| format!("the call cannot be sent: {error}"))
     }
 
     /// The reply to the call that was sent.
     pub(crate) fn receive(&mut self) -> Result<Reply, String> {
-        let body = read_message(&mut self.stream).ok_or("no answer")?;
-        decode_reply(&body).map_err(|error| error.to_string())
+        let answer = self.0.response();
+        let answer = answer.map_err(|error| format!("no answer: {error}"))?;
+        decode_reply(&answer.body).map_err(|error| error.to_string())
     }
 
     /// Sends a call and reads the reply.
@@ -129,26 +112,6 @@ impl Wire {
         let (pid, uri) = (ask("getPid"), ask("getUri"));
         (pid.as_int().unwrap(), uri.as_str().unwrap().to_owned())
     }
-}
-
-/// The body of an HTTP message; none if the connection was closed before it.
-pub(crate) fn read_message(connection: &mut BufReader<TcpStream>) -> Option<Vec<u8>> {
-    let mut length = 0;
-    loop {
-        let mut line = String::new();
-        if connection.read_line(&mut line).ok()? == 0 {
-            return None;
-        }
-        let line = line.trim_end().to_ascii_lowercase();
-        if let Some(value) = line.strip_prefix("content-length:") {
-            length = value.trim().parse().ok()?;
-        } else if line.is_empty() {
-            break;
-        }
-    }
-    let mut body = vec![0; length];
-    connection.read_exact(&mut body).ok()?;
-    Some(body)
 }
 
 const LOGGING: &str = "[loggers]

@@ -31,7 +31,7 @@ pub(crate) enum Step {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Script {
     /// Whether values occur that a master cannot return, so that callbacks cannot be foretold.
-    pub(crate) poison: bool,
+    pub(crate) unreturnable: bool,
     pub(crate) steps: Vec<Step>,
 }
 
@@ -71,8 +71,8 @@ impl Script {
     /// One line a step; [`Script::parse`] reads it.
     pub(crate) fn print(&self) -> String {
         let mut text = String::new();
-        if self.poison {
-            text += "poison\n";
+        if self.unreturnable {
+            text += "unreturnable\n";
         }
         for step in &self.steps {
             match step {
@@ -94,13 +94,13 @@ impl Script {
 
     /// The way back of [`Script::print`]. Empty lines and those with `#` are passed over.
     pub(crate) fn parse(text: &str) -> Self {
-        let mut poison = false;
+        let mut unreturnable = false;
         let mut steps = Vec::new();
         for line in text.lines().map(str::trim) {
             match line {
                 "" => {}
                 _ if line.starts_with('#') => {}
-                "poison" => poison = true,
+                "unreturnable" => unreturnable = true,
                 "crash" => steps.push(Step::Crash { in_flight: false }),
                 "crash in flight" => steps.push(Step::Crash { in_flight: true }),
                 "away" => steps.push(Step::Away),
@@ -120,7 +120,10 @@ impl Script {
                 }
             }
         }
-        Self { poison, steps }
+        Self {
+            unreturnable,
+            steps,
+        }
     }
 
     pub(crate) fn calls(&self) -> usize {

@@ -8,30 +8,23 @@
 //! was first?), no caller in the root namespace (its names are everybody's), and no process id. One
 //! service is there from the start: a master that never had any answers otherwise to all.
 
-use std::io::{BufReader, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpListener;
 
 use rosrescue::master::{Kind, kind};
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
 use crate::dice::{Cast, Dice};
 use crate::number;
-use crate::real::{PATIENCE, Rosmaster, read_message};
-use crate::support::{Scratch, Setup, eventually, http_request, short, status};
+use crate::real::Rosmaster;
+use crate::support::{Client, Scratch, Setup, eventually, http_request, short, status};
 
 const CALLERS: usize = 24;
 const CALLS: usize = 150;
 /// Calls of these methods may share a journey.
+#[rustfmt::skip]
 const SHARE: [&str; 9] = [
-    "registerPublisher",
-    "registerSubscriber",
-    "registerService",
-    "unregisterPublisher",
-    "unregisterSubscriber",
-    "unregisterService",
-    "unsubscribeParam",
-    "setParam",
-    "deleteParam",
+    "registerPublisher", "registerSubscriber", "registerService", "unregisterPublisher",
+    "unregisterSubscriber", "unregisterService", "unsubscribeParam", "setParam", "deleteParam",
 ];
 
 /// One caller's calls, from names that nobody else has.
@@ -43,14 +36,14 @@ struct Caller {
 
 impl Caller {
     /// Its nodes are at `silent`.
-    fn new(seed: u64, index: usize, silent: &str, poison: bool) -> Self {
+    fn new(seed: u64, index: usize, silent: &str, unreturnable: bool) -> Self {
         let space = format!("/c{index}");
         let apis = (1..3).map(|node| format!("http://{silent}{space}/{node}/"));
         Self {
             dice: Dice(seed.wrapping_add(index as u64 * 1000)),
             cast: Cast {
                 apis: apis.collect(),
-                poison,
+                unreturnable,
                 errors: true,
                 process: false,
             },
@@ -190,14 +183,13 @@ impl Caller {
 
 /// The bodies of the answers to `calls` on one connection, one after the other.
 fn ask(port: u16, calls: &[Call]) -> Vec<Vec<u8>> {
-    let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
-    stream.set_nodelay(true).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let mut stream = BufReader::new(stream);
+    let mut wire = Client::new(port).connect().unwrap();
     let answers = calls.iter().map(|call| {
-        let request = http_request(&encode_call(call));
-        stream.get_mut().write_all(&request).unwrap();
-        read_message(&mut stream).unwrap_or_else(|| panic!("no answer to {call:?}"))
+        wire.send(&http_request(&encode_call(call))).unwrap();
+        let answer = wire.response();
+        answer
+            .unwrap_or_else(|error| panic!("{call:?}: {error}"))
+            .body
     });
     answers.collect()
 }
@@ -238,9 +230,9 @@ fn same(seed: u64, calls: &[Call], theirs: &[Vec<u8>], ours: &[Vec<u8>]) {
     assert_eq!(theirs.len(), ours.len());
 }
 
-/// Plays all callers. With `poison` there are values that a master cannot return; without, the master
+/// Plays all callers. With `unreturnable` there are values that a master cannot return; without, the master
 /// behind rosrescue is killed at the end, and its successor has to answer as it did.
-fn play(seed: u64, poison: bool) {
+fn play(seed: u64, unreturnable: bool) {
     let mut bare = Rosmaster::start();
     let mut behind = Rosmaster::start();
     drop((bare.ready(), behind.ready()));
@@ -250,7 +242,7 @@ fn play(seed: u64, poison: bool) {
     let silent = TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let address = silent.local_addr().unwrap().to_string();
     let mut callers: Vec<_> = (0..CALLERS)
-        .map(|index| Caller::new(seed, index, &address, poison))
+        .map(|index| Caller::new(seed, index, &address, unreturnable))
         .collect();
     let scripts: Vec<Vec<Call>> = callers
         .iter_mut()
@@ -287,7 +279,7 @@ fn play(seed: u64, poison: bool) {
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
     let batches = usize::try_from(counter("batches")).unwrap() - alone.len();
     println!(
-        "seed {seed}, poison {poison}: {} calls, of which {} went alone and {} in {batches} batches",
+        "seed {seed}, unreturnable {unreturnable}: {} calls, of which {} went alone and {} in {batches} batches",
         CALLERS * CALLS,
         alone.len(),
         shared.len()
@@ -312,7 +304,7 @@ fn play(seed: u64, poison: bool) {
         }
     };
     states(behind.port, behind.port, "at the end");
-    if !poison {
+    if !unreturnable {
         let port = behind.port;
         behind.kill();
         let mut behind = Rosmaster::start_at(port);

@@ -4,33 +4,11 @@ use std::fs;
 
 use rosrescue::checkpoint::store::{OpenError, Store};
 
-use super::{checkpoint, entry, names, started};
-
-#[test]
-fn a_foreign_file_is_left_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("params.yaml");
-    fs::write(&path, "use_sim_time: true\n").unwrap();
-    let error = Store::open(&path).err().unwrap();
-    assert!(matches!(error, OpenError::NotACheckpoint { .. }));
-    assert!(
-        error
-            .to_string()
-            .contains("is not a rosrescue checkpoint; move it away"),
-        "{error}"
-    );
-    assert_eq!(fs::read(&path).unwrap(), b"use_sim_time: true\n");
-    assert_eq!(names(folder.path()), ["params.yaml", "params.yaml.lock"]);
-
-    // Nor is a folder one, or a pipe, at which reading would wait for ever.
-    let error = Store::open(&folder.path().join("")).err().unwrap();
-    assert!(matches!(error, OpenError::Io { .. }), "{error}");
-}
+use super::{checkpoint, entry, names, place, seqs, started};
 
 #[test]
 fn a_torn_record_is_cut_and_kept() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     drop(started(&path, 3));
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() - 5]).unwrap();
@@ -61,8 +39,7 @@ fn a_torn_record_is_cut_and_kept() {
 
 #[test]
 fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     let mut store = started(&path, 3);
     store.begin(&checkpoint(3)).unwrap();
     store.append(&[entry(4), entry(5)]).unwrap();
@@ -75,14 +52,7 @@ fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
         let (store, loaded) = Store::open(&path).unwrap();
         let loaded = loaded.unwrap();
         assert_eq!(loaded.checkpoint, Some(checkpoint(0)));
-        assert_eq!(
-            loaded
-                .records
-                .iter()
-                .map(|record| record.seq)
-                .collect::<Vec<_>>(),
-            [1, 2, 3, 4, 5]
-        );
+        assert_eq!(seqs(&loaded.records), [1, 2, 3, 4, 5]);
         assert!(loaded.exact, "{:?}", loaded.damage);
         assert!(
             loaded
@@ -106,8 +76,7 @@ fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
 
 #[test]
 fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 3);
     store.begin(&checkpoint(3)).unwrap();
     drop(store);
@@ -125,8 +94,7 @@ fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
 
 #[test]
 fn a_file_put_back_from_a_copy_is_what_it_was() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 2);
     let copy = fs::read(&path).unwrap();
     store.begin(&checkpoint(2)).unwrap();
@@ -146,21 +114,13 @@ fn a_file_put_back_from_a_copy_is_what_it_was() {
 
 #[test]
 fn a_lost_record_is_said_and_the_others_are_used() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     drop(started(&path, 3));
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replacen("\"/p2\"", "\"/q2\"", 1)).unwrap();
     let (mut store, loaded) = Store::open(&path).unwrap();
     let loaded = loaded.unwrap();
-    assert_eq!(
-        loaded
-            .records
-            .iter()
-            .map(|record| record.seq)
-            .collect::<Vec<_>>(),
-        [1, 3]
-    );
+    assert_eq!(seqs(&loaded.records), [1, 3]);
     assert!(!loaded.exact);
     assert_eq!(loaded.damage.len(), 3, "{:?}", loaded.damage);
     assert!(loaded.damage[1].contains("the records 2 to 2 are lost"));
@@ -169,8 +129,7 @@ fn a_lost_record_is_said_and_the_others_are_used() {
 
 #[test]
 fn without_any_snapshot_the_records_are_left() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     drop(started(&path, 3));
     let mut bytes = fs::read(&path).unwrap();
     bytes[200] ^= 1;
@@ -182,8 +141,7 @@ fn without_any_snapshot_the_records_are_left() {
 
 #[test]
 fn a_file_removed_under_a_running_store_is_noticed_by_the_next_check() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 1);
     fs::remove_file(&path).unwrap();
     let done = store.check_job().unwrap().run();
@@ -201,8 +159,7 @@ fn a_file_removed_under_a_running_store_is_noticed_by_the_next_check() {
 
 #[test]
 fn what_a_crash_left_unfinished_is_removed() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (folder, path) = place();
     drop(started(&path, 1));
     for name in [
         "c.yaml.new-7",
@@ -220,8 +177,7 @@ fn what_a_crash_left_unfinished_is_removed() {
 
 #[test]
 fn a_later_format_is_refused_and_left_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let line = "# rosrescue checkpoint v9 header=";
     let text = format!("{line}{:08x}\nnew: true\n", crc32c::crc32c(line.as_bytes()));
     fs::write(&path, &text).unwrap();
@@ -248,8 +204,7 @@ fn a_folder_that_cannot_be_made_is_named() {
 
 #[test]
 fn a_fallback_of_a_later_history_adds_nothing_to_the_next_generation() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("c.yaml");
+    let (_folder, path) = place();
     let mut store = started(&path, 0);
     let mut copy = fs::read(&path).unwrap();
     store.begin(&checkpoint(0)).unwrap();

@@ -1,0 +1,62 @@
+//! A lock file that was taken away, and that somebody else holds by now.
+
+use std::fs::{self, File};
+use std::path::Path;
+
+use rosrescue::checkpoint::store::{CheckJob, OpenError, Store, StoreError};
+
+use super::{checkpoint, entry, names, place, started};
+
+fn check(store: &mut Store) {
+    if let Some(done) = store.check_job().map(CheckJob::run) {
+        let _ = store.checked(done);
+    }
+}
+
+fn assert_refused(path: &Path) {
+    let error = Store::open(path).err().expect("two of them");
+    assert!(matches!(error, OpenError::Locked { .. }), "{error}");
+}
+
+/// The files are where they belong, and hold everything.
+fn assert_whole(path: &Path, mut store: Store) {
+    let reason = store.unprotected().unwrap().to_owned();
+    assert!(reason.contains("c.yaml"), "{reason}");
+    store.rearm(&checkpoint(store.seq())).unwrap();
+    store.append(&[entry(9)]).unwrap();
+    check(&mut store);
+    assert_eq!(store.unprotected(), None);
+    assert_refused(path);
+    let seq = store.seq();
+    drop(store);
+    let (store, loaded) = Store::open(path).unwrap();
+    assert!(loaded.unwrap().exact);
+    assert_eq!(store.seq(), seq);
+}
+
+/// In another container, say, where the socket is not seen.
+#[test]
+fn a_lock_that_another_one_took_is_waited_for() {
+    let (folder, path) = place();
+    let mut store = started(&path, 3);
+    let lock = folder.path().join("c.yaml.lock");
+    fs::remove_file(&lock).unwrap();
+    fs::write(&lock, "4711\n").unwrap();
+    let other = File::open(&lock).unwrap();
+    other.lock().unwrap();
+    check(&mut store);
+    for _ in 0..2 {
+        let error = store.rearm(&checkpoint(store.seq())).unwrap_err();
+        assert!(matches!(
+            error,
+            StoreError::Taken {
+                holder: Some(4711),
+                ..
+            }
+        ));
+        assert!(store.append(&[entry(4)]).is_err());
+    }
+    assert_eq!(names(folder.path()), ["c.yaml", "c.yaml.lock"]);
+    drop(other);
+    assert_whole(&path, store);
+}
