@@ -3,13 +3,14 @@
 //! it reads of the wall clock and leaves the monotonic clock alone.
 
 use std::fs;
+use std::ops::Deref;
 use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, FakeNode, Rescue, Rosmaster, SICK_ROSMASTER, Scratch, Setup, Sickness, State, alive,
-    eventually, free_port, holds, params, signal, status, unreadable,
+    Failing, Failures, FakeNode, Rosmaster, Scratch, Setup, State, alive, eventually, holds,
+    params, signal, status, unreadable,
 };
 
 /// A wall clock that is wrong by so many seconds.
@@ -60,52 +61,33 @@ impl WallClock {
     }
 }
 
-/// rosrescue by that clock, with a rosmaster that can be made to die, or before one of the test's.
+/// rosrescue by that clock.
 struct Robot {
-    rescue: Rescue,
-    master_port: u16,
+    failing: Failing,
     clock: WallClock,
-    sickness: Sickness,
-    scratch: Scratch,
+}
+
+impl Deref for Robot {
+    type Target = Failing;
+
+    fn deref(&self) -> &Failing {
+        &self.failing
+    }
 }
 
 impl Robot {
     fn core(options: &[&str]) -> Self {
-        Self::start(options, |scratch, port, sickness| {
-            Setup::core(scratch, port)
-                .args(["--no-rosout", "--rosmaster", SICK_ROSMASTER])
-                .env("SICK", &sickness.file)
-        })
+        Self::start(|scratch, port, failures| failures.core(scratch, port).args(options))
     }
 
-    fn start(options: &[&str], setup: impl Fn(&Scratch, u16, &Sickness) -> Setup) -> Self {
-        let scratch = Scratch::new();
-        let sickness = Sickness::new(&scratch);
-        let clock = WallClock::new(&scratch);
-        let master_port = free_port();
-        let setup = setup(&scratch, master_port, &sickness).args(options);
-        let rescue = clock.rule(setup).start();
-        Self {
-            rescue,
-            master_port,
-            clock,
-            sickness,
-            scratch,
-        }
-    }
-
-    fn client(&self) -> Client {
-        self.rescue.client()
-    }
-
-    fn bare(&self) -> Client {
-        Client::new(self.master_port)
-    }
-
-    fn kill_master(&self) -> u32 {
-        let pid = self.bare().master_pid().unwrap();
-        signal(pid, rustix::process::Signal::KILL);
-        pid
+    fn start(setup: impl FnOnce(&Scratch, u16, &Failures) -> Setup) -> Self {
+        let mut clock = None;
+        let failing = Failing::start(|scratch, port, failures| {
+            let setup = setup(scratch, port, failures);
+            clock.insert(WallClock::new(scratch)).rule(setup)
+        });
+        let clock = clock.unwrap();
+        Self { failing, clock }
     }
 
     fn await_recovery(&self, dead: u32) {
@@ -130,12 +112,7 @@ fn recovery_does_not_depend_on_it() {
     let node = FakeNode::start("/fake");
     node.publish(&client, "/topic", "std_msgs/String");
     client.set_param("/kept", "yes");
-    eventually("the parameters of core are set", || {
-        ["/rosversion", "/rosdistro"]
-            .iter()
-            .all(|key| client.param(key).is_some())
-    });
-    let before = State::read(&robot.bare());
+    let before = robot.state();
     for jump in JUMPS {
         let start = Instant::now();
         robot.clock.jump(jump);
@@ -179,10 +156,10 @@ fn neither_hold_nor_probes_depend_on_it() {
         "--probe-count",
         "3",
     ];
-    let robot = Robot::start(&options, |scratch, port, _| {
+    let robot = Robot::start(|scratch, port, _| {
         // Before rosrescue, whose start waits for it; the scratch folder ends it.
         std::mem::forget(Rosmaster::start_at(scratch, port));
-        Setup::proxy(scratch, port)
+        Setup::proxy(scratch, port).args(options)
     });
     let client = robot.client();
     let pid = robot.bare().master_pid().unwrap();
@@ -235,22 +212,22 @@ fn neither_hold_nor_probes_depend_on_it() {
 fn pauses_between_restarts_do_not_depend_on_it() {
     let robot = Robot::core(&[]);
     let client = robot.client();
-    let before = robot.sickness.starts().len();
-    robot.sickness.set("at once");
+    let before = robot.failures.starts().len();
+    robot.failures.set("at once");
     robot.kill_master();
     let mut jumps = JUMPS.into_iter().cycle();
     eventually("it is a crash loop", || {
         robot.clock.jump(jumps.next().unwrap());
-        robot.sickness.starts().len() >= before + 9
+        robot.failures.starts().len() >= before + 9
     });
     // Five at once, then after 0.5, 1, 2 and 4 s.
-    let starts = robot.sickness.starts().split_off(before);
+    let starts = robot.failures.starts().split_off(before);
     for (number, pause) in [(5, 0.5), (6, 1.0), (7, 2.0), (8, 4.0)] {
         let took = starts[number] - starts[number - 1];
         assert!((pause..pause + 5.0).contains(&took), "{number}: {took} s");
     }
     assert!(starts[4] - starts[0] < 10.0, "{starts:?}");
-    robot.sickness.cure();
+    robot.failures.clear();
     eventually("the crash loop is over", || {
         robot.clock.jump(jumps.next().unwrap());
         status(&client)["crash_loop"] == false
@@ -267,9 +244,9 @@ fn names_of_files_do_not_depend_on_it() {
             .client()
             .set_param(&format!("/session{number}"), number);
         robot.clock.jump(jumps.next().unwrap());
-        assert!(robot.rescue.terminate().success());
-        robot.rescue.start_again();
-        robot.rescue.wait_serving();
+        assert!(robot.failing.rescue.terminate().success());
+        robot.failing.rescue.start_again();
+        robot.failing.rescue.wait_serving();
     }
     let mut names: Vec<_> = fs::read_dir(robot.scratch.log_dir())
         .unwrap()

@@ -13,12 +13,23 @@ mod support;
 
 /// The four cases of the ROS Rescue paper.
 mod paper {
-    mod every_callback;
-    mod four_cases;
+    mod case_2_not_yet_told;
+    mod case_3_both_are_killed;
+    mod cases_0_and_1;
 }
 
-/// What nodes, tools and callers meet while there is no master.
-mod outage;
+/// While there is no master nodes start, find each other, talk, are displaced and end as if there were one; the
+/// next master is given what came of it.
+mod outage {
+    mod calls;
+    mod durability;
+    mod first_start;
+    mod long;
+    mod many_clients;
+    mod nodes;
+    mod notifications;
+    mod same_name;
+}
 
 /// Masters that hang, are far away, crash in a loop, answer garbage, or differ from the mirror.
 mod master {
@@ -34,10 +45,11 @@ mod master {
 /// A new master is given the state, and the nodes are looked after.
 mod recovery {
     mod health_check;
+    mod host_names;
     mod injection;
     mod no_shutdown;
-    mod random_kills;
     mod reconciliation;
+    mod unreachable;
 }
 
 /// Long lives of nodes, and the tools of ROS.
@@ -51,7 +63,6 @@ mod clients {
     mod connections;
     mod forwarding;
     mod hostile;
-    mod largest_body;
 }
 
 /// Memory, connections and files.
@@ -76,7 +87,6 @@ mod checkpoint {
     mod full_disk;
     mod moved;
     mod readable;
-    mod rosparam;
     mod unreadable;
 }
 

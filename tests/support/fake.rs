@@ -123,48 +123,40 @@ impl FakeNode {
 
     #[track_caller]
     pub(crate) fn publish(&self, master: &Client, topic: &str, topic_type: &str) {
-        lock(&self.inner.publications).insert(topic.to_owned(), topic_type.to_owned());
+        self.claim_publication(topic, Some(topic_type));
         let params = params![self.name.as_str(), topic, topic_type, self.api.as_str()];
         master.ok("registerPublisher", params);
     }
 
     #[track_caller]
     pub(crate) fn unpublish(&self, master: &Client, topic: &str) {
-        lock(&self.inner.publications).remove(topic);
+        self.claim_publication(topic, None);
         let params = params![self.name.as_str(), topic, self.api.as_str()];
         assert_eq!(master.ok("unregisterPublisher", params), Value::Int(1));
     }
 
     #[track_caller]
     pub(crate) fn subscribe(&self, master: &Client, topic: &str, topic_type: &str) {
-        lock(&self.inner.subscriptions).insert(topic.to_owned(), topic_type.to_owned());
+        self.claim_subscription(topic, Some(topic_type));
         let params = params![self.name.as_str(), topic, topic_type, self.api.as_str()];
         master.ok("registerSubscriber", params);
     }
 
     #[track_caller]
     pub(crate) fn unsubscribe(&self, master: &Client, topic: &str) {
-        lock(&self.inner.subscriptions).remove(topic);
+        self.claim_subscription(topic, None);
         let params = params![self.name.as_str(), topic, self.api.as_str()];
         assert_eq!(master.ok("unregisterSubscriber", params), Value::Int(1));
     }
 
     /// What the node says when it is asked, without a call to the master.
     pub(crate) fn claim_publication(&self, topic: &str, topic_type: Option<&str>) {
-        let mut publications = lock(&self.inner.publications);
-        match topic_type {
-            Some(topic_type) => publications.insert(topic.to_owned(), topic_type.to_owned()),
-            None => publications.remove(topic),
-        };
+        claim(&self.inner.publications, topic, topic_type);
     }
 
     /// As [`Self::claim_publication`], for a topic that it subscribes.
     pub(crate) fn claim_subscription(&self, topic: &str, topic_type: Option<&str>) {
-        let mut subscriptions = lock(&self.inner.subscriptions);
-        match topic_type {
-            Some(topic_type) => subscriptions.insert(topic.to_owned(), topic_type.to_owned()),
-            None => subscriptions.remove(topic),
-        };
+        claim(&self.inner.subscriptions, topic, topic_type);
     }
 
     /// Its address for services. Nobody answers there in TCPROS.
@@ -202,6 +194,13 @@ impl Drop for FakeNode {
     fn drop(&mut self) {
         self.release();
     }
+}
+
+fn claim(table: &Mutex<BTreeMap<String, String>>, topic: &str, topic_type: Option<&str>) {
+    match topic_type {
+        Some(topic_type) => lock(table).insert(topic.to_owned(), topic_type.to_owned()),
+        None => lock(table).remove(topic),
+    };
 }
 
 fn serve_node(inner: &Inner, stream: TcpStream) {

@@ -17,6 +17,7 @@
 )]
 
 mod disk;
+mod failing;
 mod fake;
 mod gzip;
 mod kinds;
@@ -31,19 +32,20 @@ mod robot;
 mod ros;
 mod rpc;
 mod scratch;
-mod sick;
 mod state;
 mod status;
+mod streams;
 mod twins;
 
 pub(crate) use disk::SmallDisk;
+pub(crate) use failing::{Failing, Failures, Forkserver, page};
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
 pub(crate) use gzip::gzip;
 pub(crate) use kinds::{kinds, sorted};
 pub(crate) use name_server::NameServer;
 pub(crate) use netns::Netns;
 pub(crate) use node::{Library, Node};
-pub(crate) use patience::{PATIENCE, eventually, eventually_some, holds};
+pub(crate) use patience::{Finish, PATIENCE, eventually, eventually_some, holds};
 pub(crate) use process::{Process, alive, behind, signal, stop};
 pub(crate) use relay::Relay;
 pub(crate) use rescue::{Rescue, Setup};
@@ -51,9 +53,9 @@ pub(crate) use robot::{Mode, Robot};
 pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, find_program, ros_command};
 pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request, unreadable};
 pub(crate) use scratch::{Scratch, free_port};
-pub(crate) use sick::{SICK_ROSMASTER, Sickness, Zygote, page};
 pub(crate) use state::State;
 pub(crate) use status::{names, status};
+pub(crate) use streams::{LIBRARIES, Streams, port_of};
 pub(crate) use twins::{Twins, assert_form};
 
 /// `value` for a message, cut where it becomes long.
@@ -80,3 +82,55 @@ macro_rules! tree {
     };
 }
 pub(crate) use tree;
+
+/// A test for each way to run rosrescue, `name::core` and `name::proxy`, that call `name` with the mode.
+#[allow(unused_macros)]
+macro_rules! in_both_modes {
+    ($($test:ident),* $(,)?) => {$(
+        mod $test {
+            use crate::support::Mode;
+
+            #[test]
+            fn core() {
+                super::$test(Mode::Core);
+            }
+
+            #[test]
+            fn proxy() {
+                super::$test(Mode::Proxy);
+            }
+        }
+    )*};
+}
+pub(crate) use in_both_modes;
+
+/// As [`in_both_modes`], for each client library, too: each test is called with a library and the mode.
+#[allow(unused_macros)]
+macro_rules! everywhere {
+    ($($test:ident),* $(,)?) => {$(
+        mod $test {
+            use crate::support::{Library, Mode};
+
+            #[test]
+            fn rospy_core() {
+                super::$test(Library::Rospy, Mode::Core);
+            }
+
+            #[test]
+            fn rospy_proxy() {
+                super::$test(Library::Rospy, Mode::Proxy);
+            }
+
+            #[test]
+            fn roscpp_core() {
+                super::$test(Library::Roscpp, Mode::Core);
+            }
+
+            #[test]
+            fn roscpp_proxy() {
+                super::$test(Library::Roscpp, Mode::Proxy);
+            }
+        }
+    )*};
+}
+pub(crate) use everywhere;

@@ -1,5 +1,6 @@
 //! Waiting: for a condition, with a bound, never for a time.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -40,4 +41,13 @@ pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool
         sleep(STEP);
     }
     true
+}
+
+/// Tells the threads that look at it to end, when it is dropped: after a panic, too.
+pub(crate) struct Finish<'a>(pub(crate) &'a AtomicBool);
+
+impl Drop for Finish<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
 }

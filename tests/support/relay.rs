@@ -5,6 +5,10 @@ use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::thread;
 
+use super::rescue::{Rescue, Setup};
+use super::ros::Rosmaster;
+use super::scratch::Scratch;
+
 /// A marker in a request, and how many replies to such requests are to be swallowed yet.
 type Hunger = Arc<Mutex<(Vec<u8>, u32)>>;
 
@@ -19,6 +23,14 @@ pub(crate) struct Relay {
 }
 
 impl Relay {
+    /// A rosmaster behind a relay, and rosrescue before it.
+    pub(crate) fn between(scratch: &Scratch) -> (Rosmaster, Self, Rescue) {
+        let master = Rosmaster::start(scratch);
+        let relay = Self::to(master.port);
+        let rescue = Setup::proxy(scratch, relay.port()).start();
+        (master, relay, rescue)
+    }
+
     /// A relay to `port`.
     pub(crate) fn to(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();

@@ -1,4 +1,4 @@
-//! rosrescue answers before its rosmaster is up.
+//! rosrescue answers before its rosmaster is up, at once.
 
 use std::{
     fs,
@@ -9,8 +9,7 @@ use std::{
 };
 
 use crate::support::{
-    Client, FakeNode, Mode, NODES, Robot, Scratch, Setup, State, eventually, eventually_some,
-    free_port, params,
+    Client, FakeNode, NODES, Scratch, Setup, State, eventually, eventually_some, free_port, params,
 };
 
 /// A first answer takes no longer, from the moment at which the port is open: roslaunch and nodes find their
@@ -87,38 +86,4 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
     println!("getPid, and five registrations after it, from the open port: {times:?}");
     assert!(times[0].0 < AT_ONCE, "{times:?}");
     assert!(times[STARTS / 2].1 < BUSY, "{times:?}");
-}
-
-/// The checkpoint of a session that goes on.
-#[test]
-fn a_core_that_has_a_checkpoint_answers_from_it_before_its_master_is_up() {
-    let _alone = crate::alone();
-    let mut robot = Robot::start_for_outages(Mode::Core);
-    let node = FakeNode::start("/known");
-    node.publish(&robot.client(), "/chatter", "std_msgs/String");
-    robot.client().set_param("/gain", 7);
-    let before = robot.settled_state();
-    robot.kill_master();
-    robot.rescue.kill();
-    // The master that it had begun to start ends with the test.
-    robot.rescue.start_again();
-    let client = robot.client();
-    eventually("rosrescue answers", || client.param("/gain").is_some());
-    assert!(
-        robot.bare().master_pid().is_none(),
-        "there is no master yet"
-    );
-    let late = FakeNode::start("/late");
-    late.subscribe(&client, "/chatter", "std_msgs/String");
-    let mirror = State::read(&client);
-    let known = mirror.without_node("/late");
-    assert_eq!(known.nodes, before.nodes);
-    assert_eq!(known.publishers, before.publishers);
-    robot.revive_master();
-    eventually("the master has it", || {
-        State::try_read(&robot.bare()).is_ok_and(|state| {
-            state.publishers_of("/chatter") == ["/known"]
-                && state.subscribers_of("/chatter") == ["/late"]
-        })
-    });
 }

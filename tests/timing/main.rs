@@ -17,9 +17,7 @@ mod support;
 mod drivers;
 /// rosrescue answers before its rosmaster is up.
 mod first_start;
-/// Names of hosts that resolve slowly or not at all delay nobody.
-mod host_names;
-/// What nodes are told while there is no master.
+/// Who cannot be told, or does not answer, delays nobody while there is no master.
 mod notifications;
 /// Nodes that cannot be reached delay nobody.
 mod unreachable;

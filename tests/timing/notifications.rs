@@ -1,12 +1,8 @@
-//! What nodes are told while there is no master: the same as by a master.
+//! While there is no master, subscribers that cannot be told, or do not answer, delay nobody.
 
 use std::time::{Duration, Instant};
 
-use rosrescue::xmlrpc::Value;
-
-use crate::support::{
-    Client, FakeNode, Mode, Netns, Robot, eventually, eventually_some, holds, params, tree,
-};
+use crate::support::{Client, FakeNode, Mode, Netns, Robot, eventually, eventually_some, params};
 
 /// By then whoever can be reached has been told, on two busy cores.
 const SOON: Duration = Duration::from_secs(1);
@@ -18,76 +14,6 @@ fn robot_without_master() -> (Robot, Client) {
     robot.take_master_away();
     let client = robot.client();
     (robot, client)
-}
-
-#[test]
-fn a_subscriber_is_told_all_publishers_whenever_they_change() {
-    let _alone = crate::alone();
-    let mut robot = Robot::start_for_outages(Mode::Proxy);
-    let client = robot.client();
-    let publishers = ["/one", "/two", "/three"].map(FakeNode::start);
-    let [one, two, three] = &publishers;
-    let subscriber = FakeNode::start("/subscriber");
-    one.publish(&client, "/chatter", "std_msgs/String");
-    subscriber.subscribe(&client, "/chatter", "std_msgs/String");
-    let dead = robot.master_pid();
-    robot.take_master_away();
-    let late = FakeNode::start("/late");
-    late.subscribe(&client, "/chatter", "std_msgs/String");
-    two.publish(&client, "/chatter", "std_msgs/String");
-    three.publish(&client, "/chatter", "std_msgs/String");
-    one.unpublish(&client, "/chatter");
-    three.unpublish(&client, "/chatter");
-    two.unpublish(&client, "/chatter");
-    let lists: [&[&FakeNode]; 5] = [&[one, two], &[one, two, three], &[two, three], &[two], &[]];
-    let wanted = lists.map(|list| {
-        let apis = list.iter().map(|node| node.api.clone());
-        apis.collect::<Vec<_>>()
-    });
-    for node in [&subscriber, &late] {
-        // The master may have told the first subscriber of the first publisher before, or rosrescue of what
-        // that may have owed.
-        eventually("every list has come", || {
-            node.updates("/chatter").ends_with(&wanted)
-        });
-    }
-    assert_eq!(late.updates("/chatter"), wanted, "and nothing else");
-    robot.revive_master();
-    robot.await_recovery(dead);
-    // What may be repeated then is the present list.
-    assert!(holds(Duration::from_secs(2), || {
-        let repeated = late.updates("/chatter").split_off(wanted.len());
-        repeated.iter().all(Vec::is_empty)
-    }));
-}
-
-#[test]
-fn a_subscriber_of_a_parameter_is_told_each_value_in_order() {
-    let _alone = crate::alone();
-    const VALUES: i32 = 100;
-    let (_robot, client) = robot_without_master();
-    let [exact, above] = ["/exact", "/above"].map(FakeNode::start);
-    assert_eq!(exact.watch_param(&client, "/gains/p"), tree! {});
-    above.watch_param(&client, "/gains");
-    for value in 0..VALUES {
-        client.set_param("/gains/p", value);
-    }
-    client.set_param("/gains", tree! { "p" => -1, "d" => "no" });
-    client.ok("deleteParam", params!["/test", "/gains/p"]);
-    let update = |key: &str, value: Value| params!["/master", key, value];
-    let mut wanted: Vec<_> = (0..VALUES)
-        .map(|value| update("/gains/p/", value.into()))
-        .collect();
-    let mut wanted_above = wanted.clone();
-    wanted.extend([Value::Int(-1), tree! {}].map(|value| update("/gains/p/", value)));
-    wanted_above.push(update("/gains/", tree! { "p" => -1, "d" => "no" }));
-    wanted_above.push(update("/gains/p/", tree! {}));
-    for (node, wanted) in [(exact, wanted), (above, wanted_above)] {
-        eventually("the last value is told", || {
-            node.heard("paramUpdate").last() == wanted.last()
-        });
-        assert_eq!(node.heard("paramUpdate"), wanted);
-    }
 }
 
 /// How long it takes until `subscriber` knows `publisher`, which registers now.

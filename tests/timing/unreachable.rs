@@ -1,11 +1,10 @@
-//! Nodes that cannot be reached, because packets to them vanish, hold up nobody; and as soon as they can be
-//! reached again they are whole. `host_names.rs` has those whose names do not resolve.
+//! Nodes that cannot be reached, because packets to them vanish, hold up nobody.
 
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually,
-    eventually_some, free_port, holds, names, params, status,
+    Client, FakeNode, Library, Mode, Netns, Node, Robot, eventually, eventually_some,
+    in_both_modes, names, params, status,
 };
 
 /// Nodes that cannot be reached, and others.
@@ -79,7 +78,11 @@ fn crash(robot: &mut Robot) -> f64 {
     })
 }
 
-fn twenty_of_forty_are_unreachable(mode: Mode) {
+in_both_modes!(living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable);
+
+/// With the three threads and without the timeout that rosmaster has when nobody says otherwise.
+fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mode: Mode) {
+    let _alone = crate::alone();
     let net = Netns::new();
     let mut robot = Robot::start(mode);
     let client = robot.client();
@@ -106,7 +109,7 @@ fn twenty_of_forty_are_unreachable(mode: Mode) {
     let before = robot.settled_state();
     let with = [(); 3].map(|()| crash(&mut robot));
 
-    // At once, when nobody knows yet who is suspect; and later, when it is known.
+    // At once, when nobody knows yet who is unreachable; and later, when it is known.
     let mut publishers: Vec<FakeNode> = Vec::new();
     let mut tell = |count: usize| {
         let mut times = Vec::new();
@@ -118,7 +121,7 @@ fn twenty_of_forty_are_unreachable(mode: Mode) {
         times
     };
     let at_once = tell(5);
-    eventually("the unreachable ones are suspect", || {
+    eventually("they are known to be unreachable", || {
         names(&status(&client)["unreachable"]).len() == usize::from(UNREACHABLE)
     });
     let later = tell(5);
@@ -171,60 +174,4 @@ fn twenty_of_forty_are_unreachable(mode: Mode) {
         );
         assert_eq!(fake.heard("shutdown").len(), 0);
     }
-}
-
-#[test]
-fn living_subscribers_are_told_soon_in_core_mode() {
-    let _alone = crate::alone();
-    twenty_of_forty_are_unreachable(Mode::Core);
-}
-
-/// With the three threads and without the timeout that rosmaster has when nobody says otherwise.
-#[test]
-fn living_subscribers_are_told_soon_in_proxy_mode() {
-    let _alone = crate::alone();
-    twenty_of_forty_are_unreachable(Mode::Proxy);
-}
-
-/// Real nodes behind a cable that is cut during an outage, and mended later.
-#[test]
-fn a_node_that_can_be_reached_again_is_whole() {
-    let _alone = crate::alone();
-    let net = Netns::new();
-    let scratch = Scratch::new();
-    let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
-    let rescue = setup.args(["--node-timeout", "1000"]).start();
-    let client = rescue.client();
-    let port = rescue.port();
-    let nodes = [(2, Library::Rospy), (3, Library::Roscpp)].map(|(host, library)| {
-        let mut command = library.command(&scratch, port, "listener");
-        let name = format!("__name:={}", format!("{library:?}").to_lowercase());
-        command
-            .arg(name)
-            .env("ROS_IP", net.far(host))
-            .env("ROS_MASTER_URI", format!("http://{}:{port}", net.near()));
-        Node::run(&mut net.inside(&command))
-    });
-    for host in [2, 3] {
-        net.cut(host);
-    }
-    let dead = client.master_pid().expect("a master");
-    crate::support::signal(dead, rustix::process::Signal::KILL);
-    let publisher = FakeNode::start("/publisher");
-    publisher.publish(&client, "/chatter", "std_msgs/String");
-    let unreachable = || names(&status(&client)["unreachable"]);
-    eventually("both are suspect", || {
-        unreachable() == ["/roscpp", "/rospy"]
-    });
-    let knows = |node: &Node| {
-        let updates = node.updates("/chatter");
-        updates.last() == Some(&vec![publisher.api.clone()])
-    };
-    // Longer than the supervised rosmaster tries.
-    assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
-    for host in [2, 3] {
-        net.mend(host);
-    }
-    eventually("both know the publisher", || nodes.iter().all(knows));
-    eventually("nobody is suspect any more", || unreachable().is_empty());
 }

@@ -10,6 +10,7 @@ use crate::support::{
     FakeNode, Library, Mode, Robot, Rosmaster, Scratch, Setup, Tool, eventually, kinds, params,
     sorted, tree,
 };
+use rosrescue::xmlrpc::Value;
 
 /// What the script says that compares `checkpoint` with the master at `uri`.
 fn compared(checkpoint: &Path, uri: &str) -> String {
@@ -96,9 +97,15 @@ fn rosparam_loads_the_parameters_of_a_checkpoint() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
+    // Not `a/b`, `~x` and the empty one as keys: rosparam itself resolves keys as names.
     let robot = tree! {
-        "name" => "no", "gain" => 1.0, "joints" => vec![1, 2], "on" => true, "time" => "1:30",
-        "inner" => tree! { "empty" => "", "lines" => "a\nb\n", "whole" => 1 },
+        "texts" => vec!["no", "on", "1:30", "=", "1.0", "", " x ", "2024-01-31", "~", "a\nb\t\"c\"", "é\u{85}"],
+        "numbers" => vec![i32::MIN, 0, i32::MAX],
+        "doubles" => vec![1.0, 1.5, -0.0, 1e300, f64::INFINITY],
+        "odd" => tree! { "1" => 1, "x: #y" => 2, "on" => true },
+        "empty" => Value::Array(Vec::new()),
+        "when" => Value::DateTime("20240131T12:00:00".to_owned()),
+        "bytes" => Value::Base64(vec![0, 255, 10]),
     };
     rescue.client().set_param("/robot", robot.clone());
     assert_eq!(rescue.terminate().code(), Some(0));

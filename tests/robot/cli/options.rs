@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use crate::support::{Rosmaster, Scratch, Setup, signal};
+use crate::support::{Rosmaster, Scratch, Setup};
 
 #[test]
 fn the_log_as_json() {
@@ -21,27 +21,6 @@ fn the_log_as_json() {
         .collect();
     assert!(!lines.is_empty(), "{log:?}");
     assert!(lines.iter().all(|line| line["level"].is_string()));
-}
-
-/// What was acknowledged is on the disk, and so in the file, when rosrescue and the master are killed.
-#[test]
-fn every_record_on_the_disk_before_its_answer() {
-    let scratch = Scratch::new();
-    let mut master = Rosmaster::start(&scratch);
-    let port = master.client().port();
-    let mut rescue = Setup::proxy(&scratch, port)
-        .env("ROSRESCUE_SYNC", "always")
-        .start();
-    for value in 0..20 {
-        rescue.client().set_param("/a", value);
-    }
-    signal(rescue.pid(), rustix::process::Signal::KILL);
-    master.kill();
-    rescue.wait();
-    let _second = Rosmaster::start_at(&scratch, port);
-    rescue.start_again();
-    rescue.wait_serving();
-    assert_eq!(rescue.client().param("/a"), Some(19.into()));
 }
 
 /// The same command on a terminal.

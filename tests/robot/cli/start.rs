@@ -9,7 +9,8 @@ use std::thread;
 use std::time::Duration;
 
 use crate::support::{
-    Client, Rescue, Rosmaster, Scratch, Setup, eventually, find_program, free_port, holds, params,
+    Client, Rescue, Rosmaster, Scratch, Setup, behind, eventually, find_program, free_port, holds,
+    params,
 };
 use rustix::process::Signal;
 
@@ -111,18 +112,6 @@ fn variables_of_core_are_no_matter_of_proxy() {
 }
 
 #[test]
-fn an_address_that_this_computer_does_not_have() {
-    let scratch = Scratch::new();
-    let port = free_port().to_string();
-    let setup = Setup::bare(&scratch, ["core", "-p", &port, "--listen", "198.51.100.7"]);
-    let said = refused(&scratch, setup, 1);
-    assert!(
-        said.contains("198.51.100.7") && said.contains("--listen"),
-        "{said}"
-    );
-}
-
-#[test]
 fn a_new_session_is_said_to_be_one() {
     let scratch = Scratch::new();
     let mut rescue = Setup::core(&scratch, free_port()).start();
@@ -163,46 +152,68 @@ fn help_and_version_need_nothing_and_end_with_0() {
 }
 
 #[test]
-fn a_ros_master_uri_that_is_none() {
+fn an_address_that_cannot_be_served_is_named() {
     let scratch = Scratch::new();
-    for uri in ["rosmaster", "http://", "http://host:port/", "://"] {
-        let setup = Setup::bare(&scratch, ["core"]).env("ROS_MASTER_URI", uri);
-        let mut rescue = setup.spawn();
-        let code = rescue.wait().code();
-        assert!(code == Some(1) || code == Some(2), "{uri}: {code:?}");
-        eventually("it names the variable", || {
-            rescue.stderr().join("\n").contains("ROS_MASTER_URI")
-        });
-        rescue.assert_no_panic();
+    let taken = TcpListener::bind("0.0.0.0:0").unwrap();
+    let taken = taken.local_addr().unwrap().port().to_string();
+    let free = free_port().to_string();
+    let (uri, listen) = (
+        format!("http://127.0.0.1:{free}"),
+        format!("127.0.0.1:{taken}"),
+    );
+    for (arguments, named) in [
+        (
+            ["core", "-p", &taken, "--master-port", &free],
+            [&*taken, "in use"],
+        ),
+        (
+            ["core", "-p", &free, "--master-port", &taken],
+            [&*taken, "in use"],
+        ),
+        (
+            ["proxy", "--master", &uri, "--listen", &listen],
+            [&*taken, "in use"],
+        ),
+        (
+            ["core", "-p", &free, "--listen", "198.51.100.7"],
+            ["198.51.100.7", "--listen"],
+        ),
+    ] {
+        let said = refused(&scratch, Setup::bare(&scratch, arguments), 1);
+        assert!(named.iter().all(|word| said.contains(word)), "{said}");
     }
 }
 
 #[test]
-fn ports_in_use() {
+fn a_master_that_is_none_or_rosrescue_itself_is_refused() {
     let scratch = Scratch::new();
-    let taken = TcpListener::bind("0.0.0.0:0").unwrap();
-    let port = taken.local_addr().unwrap().port();
-    let text = port.to_string();
-    let master = free_port();
-    let core = Setup::bare(
-        &scratch,
-        ["core", "-p", &text, "--master-port", &master.to_string()],
-    );
-    let said = refused(&scratch, core, 1);
-    assert!(said.contains(&text) && said.contains("in use"), "{said}");
-
-    let core = Setup::bare(
-        &scratch,
-        ["core", "-p", &master.to_string(), "--master-port", &text],
-    );
-    let said = refused(&scratch, core, 1);
-    assert!(said.contains(&text) && said.contains("in use"), "{said}");
-
-    let listen = format!("127.0.0.1:{port}");
-    let uri = format!("http://127.0.0.1:{master}");
-    let proxy = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &listen]);
-    let said = refused(&scratch, proxy, 1);
-    assert!(said.contains(&text) && said.contains("in use"), "{said}");
+    let port = free_port().to_string();
+    let mut cases = Vec::new();
+    for uri in ["rosmaster", "http://", "http://host:port/", "://"] {
+        let setup = Setup::bare(&scratch, ["core"]).env("ROS_MASTER_URI", uri);
+        cases.push((setup, "ROS_MASTER_URI"));
+    }
+    for (host, listen) in [
+        ("127.0.0.1", "127.0.0.1"),
+        ("localhost", "127.0.0.1"),
+        ("127.0.0.1", "0.0.0.0"),
+        ("[::1]", "[::]"),
+        ("localhost", "0.0.0.0"),
+    ] {
+        let (uri, address) = (format!("http://{host}:{port}"), format!("{listen}:{port}"));
+        let arguments = ["proxy", "--master", &uri, "--listen", &address];
+        cases.push((Setup::bare(&scratch, arguments), &*port));
+    }
+    let arguments = ["core", "-p", &port, "--master-port", &port];
+    cases.push((Setup::bare(&scratch, arguments), &*port));
+    for (setup, named) in cases {
+        let mut rescue = setup.spawn();
+        let code = rescue.wait_output().code();
+        let said = rescue.stderr().join("\n");
+        assert!(code == Some(1) || code == Some(2), "{code:?}: {said}");
+        assert!(said.contains(named), "{said}");
+        rescue.assert_no_panic();
+    }
 }
 
 /// `own` where nothing lies in /opt but, if one is given, a ROS with this rosmaster.
@@ -223,14 +234,7 @@ fn with_opt(own: &Command, rosmaster: &Path) -> Command {
     }
     command.args(["--mount", "/bin/sh", "-ec", MOUNT]);
     command.arg(rosmaster);
-    command.arg(own.get_program()).args(own.get_args());
-    for (key, value) in own.get_envs() {
-        match value {
-            Some(value) => command.env(key, value),
-            None => command.env_remove(key),
-        };
-    }
-    command
+    behind(command, own)
 }
 
 #[test]
@@ -371,57 +375,4 @@ fn a_master_that_is_not_there_is_waited_for() {
     rescue.wait_serving();
     assert_eq!(early.join().unwrap().expect("the call is answered").0, 1);
     assert_eq!(master.client().param("/early"), Some(1.into()));
-}
-
-#[test]
-fn master_pointing_at_ourselves() {
-    let scratch = Scratch::new();
-    let port = free_port();
-    for (host, listen) in [
-        ("127.0.0.1", "127.0.0.1"),
-        ("localhost", "127.0.0.1"),
-        ("127.0.0.1", "0.0.0.0"),
-        ("[::1]", "[::]"),
-        ("localhost", "0.0.0.0"),
-    ] {
-        let uri = format!("http://{host}:{port}");
-        let address = format!("{listen}:{port}");
-        let setup = Setup::bare(&scratch, ["proxy", "--master", &uri, "--listen", &address]);
-        let mut rescue = setup.spawn();
-        let code = rescue.wait().code();
-        assert!(
-            code == Some(1) || code == Some(2),
-            "{uri} at {address}: {code:?}"
-        );
-        eventually("it says why", || {
-            rescue.stderr().join("\n").contains(&port.to_string())
-        });
-    }
-    // As roscore's own port it may come from the environment.
-    let text = port.to_string();
-    let said = {
-        let setup = Setup::bare(&scratch, ["core", "-p", &text, "--master-port", &text]);
-        let mut rescue = setup.spawn();
-        let code = rescue.wait().code();
-        assert!(code == Some(1) || code == Some(2), "{code:?}");
-        eventually("it says why", || !rescue.stderr().is_empty());
-        rescue.stderr().join("\n")
-    };
-    assert!(said.contains(&text), "{said}");
-}
-
-#[test]
-fn a_second_rosrescue_on_the_same_checkpoint_is_refused() {
-    let scratch = Scratch::new();
-    let master = Rosmaster::start(&scratch);
-    let first = Setup::proxy(&scratch, master.port).start();
-    first.client().set_param("/first", 1);
-    let said = refused(&scratch, Setup::proxy(&scratch, master.port), 1);
-    assert!(said.contains("latest-chkpt.yaml"), "{said}");
-    first.client().set_param("/first", 2);
-    // Another file is no matter of the first one.
-    let other = Setup::proxy(&scratch, master.port)
-        .at_checkpoint(scratch.path("other.yaml"))
-        .start();
-    assert_eq!(other.client().param("/first"), Some(2.into()));
 }

@@ -9,69 +9,25 @@ use rosrescue::xmlrpc::{Call, Value};
 fn calls_are_answered_with_the_masters_bytes() {
     let twins = Twins::start();
     let api = "http://127.0.0.1:1/";
+    // One of a kind; `tests/differential` has calls without end.
     let calls = [
-        ("getParamNames", params!["/c"]),
-        ("setParam", params!["/ns/c", "a", 1]),
-        ("setParam", params!["/ns/c", "~b", "two"]),
         (
             "setParam",
-            vec![
-                "/c".into(),
-                "/c".into(),
-                tree! { "x" => 1.5, "y" => tree! { "z" => true } },
-            ],
+            params!["/ns/c", "~b", tree! { "x" => 1.5, "y" => true }],
         ),
         ("getParam", params!["/c", "/"]),
         ("getParam", params!["/c", "/not/there"]),
-        ("hasParam", params!["/ns/c", "a"]),
         ("searchParam", params!["/ns/c", "a"]),
-        ("deleteParam", params!["/c", "/ns/a"]),
-        ("deleteParam", params!["/c", "/ns/a"]),
-        ("deleteParam", params!["/c", "/"]),
-        ("setParam", params!["/c", "/", 1]),
-        (
-            "registerPublisher",
-            params!["/p", "/t", "std_msgs/String", api],
-        ),
         ("registerPublisher", params!["/p", "/t", "no type", api]),
-        ("registerSubscriber", params!["/s", "/t", "*", api]),
-        (
-            "registerService",
-            params!["/p", "/srv", "rosrpc://127.0.0.1:1", api],
-        ),
-        ("lookupService", params!["/c", "/srv"]),
-        ("lookupService", params!["/c", "/nothing"]),
-        ("lookupNode", params!["/c", "/p"]),
-        ("lookupNode", params!["/c", "/nobody"]),
         ("subscribeParam", params!["/s", api, "/c"]),
-        ("unsubscribeParam", params!["/s", api, "/c"]),
+        ("lookupNode", params!["/c", "/nobody"]),
         ("getSystemState", params!["/c"]),
         ("getTopicTypes", params!["/c"]),
-        ("getPublishedTopics", params!["/c", ""]),
-        (
-            "unregisterService",
-            params!["/p", "/srv", "rosrpc://127.0.0.1:2"],
-        ),
-        (
-            "unregisterService",
-            params!["/p", "/srv", "rosrpc://127.0.0.1:1"],
-        ),
-        (
-            "unregisterPublisher",
-            params!["/p", "/t", "http://127.0.0.1:2/"],
-        ),
         ("unregisterPublisher", params!["/p", "/t", api]),
-        ("unregisterSubscriber", params!["/s", "/t", api]),
-        ("unregisterSubscriber", params!["/s", "/t", api]),
-        ("getSystemState", params!["/c"]),
         ("noSuchMethod", params!["/c", 1]),
         ("system.listMethods", params![]),
-        ("uri", params![]),
-        ("getPid", params![]),
         ("getPid", params!["/c", "too", "many"]),
         ("setParam", params![1, 2, 3]),
-        ("setParam", params!["/c"]),
-        ("registerPublisher", params!["/p", "", "", ""]),
         ("", params![]),
     ];
     for (method, params) in calls {
@@ -107,41 +63,21 @@ fn xml_of_every_kind_gets_the_masters_own_verdict() {
              <param><value>{value}</value></param></params>"
         ))
     };
+    // One of a kind; `tests/codec` has documents without end.
     let bodies = [
         String::new(),
         "garbage".to_owned(),
-        "<methodCall>".to_owned(),
         "<methodCall></methodCall>".to_owned(),
-        "<methodResponse><params></params></methodResponse>".to_owned(),
-        "<methodCall><methodName>getPid</methodName></methodCall> trailing".to_owned(),
         "<methodCall><methodName>getPid</methodName><params>".to_owned(),
-        "<!DOCTYPE x [<!ENTITY a \"b\">]><methodCall><methodName>&a;</methodName></methodCall>"
-            .to_owned(),
-        call(""),
         call("<params/>"),
         value("untyped  text "),
         value("<string>&lt;&amp;&gt; &#65; <![CDATA[<raw>]]></string>"),
-        value("<i4>5</i4>"),
-        value("<int>-2147483648</int>"),
-        value("<int>2147483648</int>"),
         value("<i8>99999999999</i8>"),
         value("<int>five</int>"),
-        value("<boolean>1</boolean>"),
-        value("<boolean>2</boolean>"),
-        value("<double>1e3</double>"),
-        value("<double>nan</double>"),
         value("<nil/>"),
-        value("<array><data><value><nil/></value></data></array>"),
-        value("<struct><member><name>a</name><value><i4>1</i4></value></member></struct>"),
         value("<struct><member><name>a</name></member></struct>"),
-        value("<base64>aGVsbG8=</base64>"),
         value("<dateTime.iso8601>20260101T00:00:00</dateTime.iso8601>"),
         value("<unknown>1</unknown>"),
-        value(&format!(
-            "{}{}",
-            "<array><data><value>".repeat(50),
-            "</value></data></array>".repeat(50)
-        )),
         value("\u{1}"),
     ];
     let mut differences = Vec::new();
@@ -165,17 +101,7 @@ fn paths_methods_and_versions() {
     let twins = Twins::start();
     let body = encode_call("hasParam", params!["/c", "/x"]);
     let mut differences = Vec::new();
-    for path in [
-        "/",
-        "/RPC2",
-        "//",
-        "/rpc2",
-        "/RPC2/",
-        "/RPC2?x=1",
-        "/other",
-        "/a/b",
-        "*",
-    ] {
+    for path in ["/", "/RPC2", "//", "/rpc2", "/RPC2/", "/other", "*"] {
         for version in ["HTTP/1.1", "HTTP/1.0"] {
             let first = format!("POST {path} {version}");
             differences.extend(twins.compare(&request(&first, &[], &body)).err());

@@ -1,15 +1,14 @@
-//! What others can take of rosrescue is bounded: memory for what gzip unpacks to, places for connections,
-//! file descriptors. Whoever has a call is served all the while.
+//! What others can take of rosrescue is bounded: places for connections, file descriptors. Whoever has a call is
+//! served all the while.
 
 use std::fs;
 use std::process::Command;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, Mode, PATIENCE, Process, Rescue, Robot, Scratch, Setup, Wire, behind, encode_call,
-    eventually, free_port, gzip, http_request, params, request, ros_command, signal,
+    eventually, free_port, http_request, params, ros_command, signal,
 };
 use rustix::process::{Pid, Resource, Rlimit, Signal, prlimit};
 
@@ -63,59 +62,6 @@ fn idle(client: &Client, count: usize) -> Vec<Wire> {
         _ => client.connect().unwrap(),
     };
     (0..count).map(wire).collect()
-}
-
-fn packed(body: &[u8]) -> Vec<u8> {
-    let header = ["Content-Encoding: gzip"];
-    request("POST /RPC2 HTTP/1.1", &header, &gzip(body))
-}
-
-/// Sends `request` `times` at once while others are served; tells the most memory that it took, in MB.
-fn memory_for(robot: &Robot, request: &[u8], times: usize) -> u64 {
-    let client = robot.client();
-    let done = AtomicBool::new(false);
-    thread::scope(|scope| {
-        let bombs: Vec<_> = (0..times)
-            .map(|_| {
-                scope.spawn(|| {
-                    // The master's own verdict, or the end of the connection.
-                    let _ = client.exchange(request);
-                })
-            })
-            .collect();
-        scope.spawn(|| {
-            for number in 0.. {
-                client.set_param("/meanwhile", number);
-                assert_eq!(client.param("/meanwhile"), Some(number.into()));
-                if done.load(Ordering::Relaxed) {
-                    break;
-                }
-            }
-        });
-        for bomb in bombs {
-            bomb.join().unwrap();
-        }
-        done.store(true, Ordering::Relaxed);
-    });
-    robot.rescue.kib("VmHWM") / 1000
-}
-
-#[test]
-fn what_unpacks_to_more_than_rosmaster_takes_takes_no_memory() {
-    let robot = Robot::start(Mode::Proxy);
-    let bomb = packed(&vec![b' '; 65 << 20]);
-    let most = memory_for(&robot, &bomb, 16);
-    assert!(most < 100, "{most} MB");
-}
-
-/// There is room for four bodies of the largest size, and for one more.
-#[test]
-fn what_is_unpacked_needs_room_as_any_body() {
-    let robot = Robot::start_with(Mode::Proxy, &["--max-body", "4"]);
-    let text = "z".repeat((4 << 20) - 1000);
-    let body = encode_call("hasParam", params![text, "/x"]);
-    let most = memory_for(&robot, &packed(&body), 64);
-    assert!(most < 200, "{most} MB");
 }
 
 #[test]

@@ -2,8 +2,8 @@
 //! were lost, from calls that it cannot read, and from looks at the master.
 
 use crate::support::{
-    FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, Setup, encode_call, eventually,
-    eventually_some, http_request, params, request, signal, status, stop,
+    FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, State, eventually, eventually_some, params,
+    status,
 };
 use rosrescue::xmlrpc::{Reply, Value};
 
@@ -101,75 +101,49 @@ fn what_was_written_past_the_proxy_is_found_at_the_interval() {
     assert_eq!(client.param("/a"), Some(1.into()));
 }
 
+/// What the master did is answered as done, although the connection ended before it said so.
 #[test]
-fn what_was_written_past_the_proxy_is_found_when_the_same_master_goes_on() {
-    let probes = [
-        "--probe-interval",
-        "100",
-        "--probe-timeout",
-        "300",
-        "--probe-count",
-        "2",
-    ];
-    let mut robot = Robot::start_with(Mode::Proxy, &probes);
-    let client = robot.client();
-    let pid = robot.master_pid();
-    stop(pid);
-    eventually("the gate is shut", || !robot.is_open());
-    let mut past = robot.bare().connect().unwrap();
-    let set = encode_call("setParam", params!["/x", "/a", 1]);
-    past.send(&http_request(&set)).unwrap();
-    signal(pid, rustix::process::Signal::CONT);
-    assert_eq!(code(&past.response().unwrap().reply()), Some(1));
-    robot.await_gate();
-    eventually("the mirror has it", || mirrored(&client) == 1);
-    robot.crash_master();
-    assert_eq!(client.param("/a"), Some(1.into()));
-}
-
-/// A rosmaster behind a relay, and rosrescue before it.
-fn relayed(scratch: &Scratch) -> (Rosmaster, Relay, crate::support::Rescue) {
-    let master = Rosmaster::start(scratch);
-    let relay = Relay::to(master.client().port());
-    let rescue = Setup::proxy(scratch, relay.port()).start();
-    (master, relay, rescue)
-}
-
-#[test]
-fn a_deletion_whose_reply_was_lost_is_answered_as_done() {
+fn a_call_whose_reply_was_lost_is_answered_as_done() {
     let scratch = Scratch::new();
-    let (master, relay, rescue) = relayed(&scratch);
+    let (master, relay, rescue) = Relay::between(&scratch);
     let client = rescue.client();
-    client.set_param("/swallowed", 1);
-    relay.swallow("deleteParam", 1);
-    let reply = client.call("deleteParam", params!["/n", "/swallowed"]);
-    assert_eq!(code(&reply.unwrap()), Some(1));
-    assert_eq!(relay.hunger(), 0);
-    assert_eq!(master.client().param("/swallowed"), None);
-    eventually("the mirror knows", || mirrored(&client) == 0);
-}
-
-#[test]
-fn a_write_whose_reply_was_lost_is_answered_as_done() {
-    let scratch = Scratch::new();
-    let (master, relay, rescue) = relayed(&scratch);
-    let client = rescue.client();
-    relay.swallow("/swallowed", 1);
-    let reply = client.call("setParam", params!["/n", "/swallowed", 5]);
-    assert_eq!(code(&reply.unwrap()), Some(1));
-    assert_eq!(client.param("/swallowed"), Some(5.into()));
-    eventually("calls pass", || {
-        relay.hunger() == 0 && status(&client)["open"] == true
-    });
-    assert_eq!(master.client().param("/swallowed"), Some(5.into()));
-    eventually("the mirror knows", || mirrored(&client) == 1);
+    let node = FakeNode::start("/node");
+    let (name, api, service_api) = ("/node", node.api.as_str(), node.service_api());
+    node.publish(&client, "/topic", "std_msgs/String");
+    node.subscribe(&client, "/topic", "std_msgs/String");
+    node.offer(&client, "/service");
+    for (method, params) in [
+        ("setParam", params![name, "/key", 5]),
+        ("deleteParam", params![name, "/key"]),
+        ("unregisterPublisher", params![name, "/topic", api]),
+        ("unregisterSubscriber", params![name, "/topic", api]),
+        ("unregisterService", params![name, "/service", service_api]),
+    ] {
+        eventually("calls pass", || status(&client)["open"] == true);
+        // What a living node says of itself counts.
+        match method {
+            "unregisterPublisher" => node.claim_publication("/topic", None),
+            "unregisterSubscriber" => node.claim_subscription("/topic", None),
+            _ => {}
+        }
+        relay.swallow(method, 1);
+        let answer = client.status(method, params).unwrap();
+        assert_eq!((relay.hunger(), answer.0), (0, 1), "{method}: {answer:?}");
+    }
+    eventually("calls pass", || status(&client)["open"] == true);
+    let state = State::read(&master.client());
+    assert!(
+        !state.knows("/node") && state.param_names.is_empty(),
+        "{state}"
+    );
+    state.assert_same(&State::read(&client), "through rosrescue");
 }
 
 /// It is what was recovered all the same, and nodes that died in the outage are taken out.
 #[test]
 fn an_injection_whose_reply_was_lost_is_a_recovery() {
     let scratch = Scratch::new();
-    let (mut master, relay, rescue) = relayed(&scratch);
+    let (mut master, relay, rescue) = Relay::between(&scratch);
     let client = rescue.client();
     client.set_param("/swallowed", 1);
     FakeNode::start("/dead").publish(&client, "/topic", "std_msgs/String");
@@ -188,23 +162,4 @@ fn an_injection_whose_reply_was_lost_is_a_recovery() {
         (!report["health_check_ms"].is_null()).then_some(report)
     });
     assert_eq!(report["outcome"], "injected", "{report}");
-}
-
-/// rosmaster understands more than we do: what such a call did is recorded before it is answered.
-#[test]
-fn a_call_that_cannot_be_read_is_answered_when_the_mirror_knows_what_it_did() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let call = String::from_utf8(encode_call("setParam", params!["/n", "/a", 1])).unwrap();
-    let call = call.replacen("?>", "?><!DOCTYPE methodCall>", 1);
-    let post = request(
-        "POST / HTTP/1.1",
-        &["Content-Type: text/xml"],
-        call.as_bytes(),
-    );
-    let reply = client.exchange(&post).unwrap().reply();
-    assert_eq!(code(&reply), Some(1), "{reply:?}");
-    assert_eq!(mirrored(&client), 1);
-    robot.crash_master();
-    assert_eq!(client.param("/a"), Some(1.into()));
 }

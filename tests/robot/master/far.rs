@@ -10,7 +10,6 @@ use crate::support::{
     free_port, holds, params, status,
 };
 use rosrescue::xmlrpc::Value;
-use rustix::process::Signal;
 
 /// Where the master is, on the other side.
 const HOST: u8 = 2;
@@ -123,27 +122,6 @@ fn a_change_of_the_own_address_costs_one_short_wait() {
     for key in ["/after", "/later"] {
         assert_eq!(far.param(key), Some(Value::Int(1)), "{key}");
     }
-}
-
-/// It is stood in for, and given all when it goes on.
-#[test]
-fn a_far_master_that_hangs_knows_everything_when_it_goes_on() {
-    let net = Netns::new();
-    let scratch = Scratch::new();
-    let port = free_port();
-    let (master, far) = rosmaster(&scratch, &net, port);
-    let rescue = proxy(&scratch, &net.far(HOST), port).start();
-    let client = rescue.client();
-    client.set_param("/before", 1);
-    crate::support::stop(master.pid());
-    client.set_param("/flying", 1);
-    client.set_param("/flying", 2);
-    assert!(!is_open(&client));
-    crate::support::signal(master.pid(), Signal::CONT);
-    eventually("the gate is open", || is_open(&client));
-    assert_eq!(far.param("/flying"), Some(Value::Int(2)));
-    assert_eq!(client.param("/flying"), Some(Value::Int(2)));
-    assert_eq!(client.master_pid(), Some(master.pid()));
 }
 
 /// It is looked up again for each connection; what it meant before must do.

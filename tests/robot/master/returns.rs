@@ -198,7 +198,7 @@ fn what_was_written_past_rosrescue_is_found_and_kept() {
 /// How often the random test plays; more by `ROSRESCUE_RETURNS`.
 fn rounds() -> u64 {
     let given = std::env::var("ROSRESCUE_RETURNS").ok();
-    given.map_or(30, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
+    given.map_or(12, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
 }
 
 /// The same incarnation comes back after 1, 10 or 100 writes, one of them in flight when it went away.

@@ -33,7 +33,7 @@ fn carriage_returns_outlive_master_and_rosrescue() {
 }
 
 /// CPython does not escape a date's text, so that whatever holds this one is answered with no XML.
-fn poison() -> Value {
+fn broken_date() -> Value {
     Value::DateTime("a<b & ]]>".to_owned())
 }
 
@@ -89,7 +89,7 @@ fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
     let mut master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
     let client = rescue.client();
-    client.set_param("/bad", poison());
+    client.set_param("/bad", broken_date());
     client.set_param("/good", 1);
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);

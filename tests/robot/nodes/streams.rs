@@ -1,100 +1,18 @@
-//! Live streams of rospy and roscpp, several publishers on a topic at 200 Hz, over a hundred deaths of the
-//! master and twenty of rosrescue: no message is lost and no connection is made anew. Service clients that
-//! look the service up for every call see no failure while masters die, and cached parameters follow.
+//! Live streams of rospy and roscpp, several publishers on a topic at 200 Hz, while the master is killed again and
+//! again, and rosrescue too: no message is lost and no connection is made anew. Service clients that look the
+//! service up for every call see no failure while masters die, and cached parameters follow.
+//!
+//! `ROSRESCUE_KILLS` says how often the master dies in each test (20 if it is not set).
 
-use crate::support::{Client, Library, Mode, Node, Robot, State, alive, eventually, params};
+use crate::support::{LIBRARIES, Library, Mode, Node, Robot, State, Streams, alive, eventually};
 use rosrescue::xmlrpc::Value;
 
-/// Deaths of the master.
-const KILLS: usize = 100;
-/// Deaths of rosrescue.
-const RESTARTS: usize = 20;
-/// Every talker's pace.
+/// Deaths of the master for each of rosrescue.
+const KILLS_EACH: usize = 5;
+/// Pace of every talker.
 const HZ: &str = "200";
 /// Every fiftieth message is said, and every gap.
 const EVERY: &str = "50";
-
-/// Two talkers on one topic and two listeners, one of each library.
-struct Streams {
-    talkers: [Node; 2],
-    listeners: [Node; 2],
-    /// What the nodes say of their links when all are there.
-    links: Vec<Value>,
-}
-
-const TALKERS: [&str; 2] = ["/talker_py", "/talker_cpp"];
-const LIBRARIES: [(Library, &str); 2] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
-
-impl Streams {
-    fn start(robot: &Robot) -> Self {
-        let start = |node: &str, arguments: [&str; 2]| {
-            LIBRARIES.map(|(library, suffix)| {
-                let name = format!("__name:={node}_{suffix}");
-                let arguments = [&arguments[..], &[name.as_str()]].concat();
-                let arguments: Vec<_> = arguments.into_iter().filter(|a| !a.is_empty()).collect();
-                robot.node(library, node, &arguments)
-            })
-        };
-        let mut streams = Self {
-            talkers: start("talker", [HZ, "quiet"]),
-            listeners: start("listener", [EVERY, ""]),
-            links: Vec::new(),
-        };
-        streams.flow();
-        streams.links = streams.bus_info(robot);
-        for links in &streams.links {
-            assert_eq!(links.as_array().unwrap().len(), 2, "{links:?}");
-        }
-        streams
-    }
-
-    /// Waits until messages have come from everybody to everybody.
-    fn flow(&self) {
-        for listener in &self.listeners {
-            for talker in TALKERS {
-                listener.wait_messages(talker, 2);
-            }
-        }
-    }
-
-    /// What each node says of its links of the topic: they have numbers, and ports.
-    fn bus_info(&self, robot: &Robot) -> Vec<Value> {
-        let names =
-            ["talker", "listener"].map(|node| LIBRARIES.map(|(_, s)| format!("/{node}_{s}")));
-        let client = robot.client();
-        let of = |name: &String| {
-            let api = client.ok("lookupNode", params!["/test", name.as_str()]);
-            let port = api
-                .as_str()
-                .unwrap()
-                .trim_end_matches('/')
-                .rsplit(':')
-                .next();
-            let node = Client::new(port.unwrap().parse().unwrap());
-            let links = node.ok("getBusInfo", params!["/test"]);
-            let links = links.as_array().unwrap().iter();
-            let of_topic = |link: &&Value| link.as_array().unwrap()[4] == Value::from("/chatter");
-            Value::Array(links.filter(of_topic).cloned().collect())
-        };
-        names.iter().flatten().map(of).collect()
-    }
-
-    /// Panics if a message was lost or a link was made anew.
-    fn assert_whole(&self, robot: &Robot) {
-        self.flow();
-        for listener in &self.listeners {
-            for talker in TALKERS {
-                let count = listener.assert_no_gap(talker);
-                println!("{count} messages of {talker}");
-            }
-        }
-        for node in self.listeners.iter().chain(&self.talkers) {
-            node.assert_no_link_lost();
-            assert_eq!(node.links().last(), Some(&2), "{:?}", node.links());
-        }
-        assert_eq!(self.links, self.bus_info(robot));
-    }
-}
 
 /// Waits until rosrescue has examined a master since it had examined `recoveries`, and calls pass.
 fn await_open(robot: &Robot, recoveries: u64) {
@@ -148,11 +66,18 @@ fn answered(clients: &[Node]) {
     }
 }
 
+/// Deaths of the master, a multiple of [`KILLS_EACH`].
+fn kills() -> usize {
+    let kills = std::env::var("ROSRESCUE_KILLS");
+    kills.map_or(20, |text| text.parse().unwrap())
+}
+
 #[test]
-fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
+fn nothing_is_lost_when_the_master_of_others_is_killed_again_and_again() {
+    let kills = kills();
     let mut robot = Robot::start(Mode::Proxy);
     robot.client().set_param("/speed", 0);
-    let streams = Streams::start(&robot);
+    let streams = Streams::start(&robot, "chatter", HZ, EVERY);
     let _server = robot.node(Library::Rospy, "server", &[]);
     let users = LIBRARIES.map(|(library, suffix)| {
         robot.node(
@@ -175,7 +100,7 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
     answered(&clients);
     robot.settled_state();
     let before = registrations(&robot);
-    for kill in 1..=KILLS {
+    for kill in 1..=kills {
         kill_master(&mut robot, &before, &format!("after kill {kill}"));
         set_speed(&robot, &users, kill);
     }
@@ -187,10 +112,10 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
             .said("reads")
             .last()
             .map_or(0, |n| n.parse().unwrap());
-        assert!(reads > 10 * KILLS, "{reads} reads");
+        assert!(reads > 10 * kills, "{reads} reads");
     }
     for user in &users {
-        let heard: Vec<_> = (0..=KILLS).map(|speed| speed.to_string()).collect();
+        let heard: Vec<_> = (0..=kills).map(|speed| speed.to_string()).collect();
         assert_eq!(user.said("value"), heard);
         assert_eq!(user.said("failed"), Vec::<String>::new());
     }
@@ -201,33 +126,34 @@ fn nothing_is_lost_when_the_master_of_others_dies_a_hundred_times() {
     for client in clients.iter_mut().chain(&mut readers) {
         client.kill();
     }
-    for _ in 0..RESTARTS {
+    for _ in 0..kills / KILLS_EACH {
         robot.rescue.kill();
         robot.rescue.start_again();
         robot.rescue.wait_serving();
         robot.await_gate();
     }
-    set_speed(&robot, &users, KILLS + 1);
+    set_speed(&robot, &users, kills + 1);
     streams.assert_whole(&robot);
 }
 
 /// A sixth death within a minute is answered with a pause: each rosrescue lives through five.
 #[test]
-fn nothing_is_lost_when_the_own_master_dies_a_hundred_times_and_rosrescue_twenty_times() {
+fn nothing_is_lost_when_the_own_master_and_rosrescue_are_killed_again_and_again() {
+    let restarts = kills() / KILLS_EACH;
     let mut robot = Robot::start(Mode::Core);
     robot.client().set_param("/speed", 0);
-    let streams = Streams::start(&robot);
+    let streams = Streams::start(&robot, "chatter", HZ, EVERY);
     let _server = robot.node(Library::Roscpp, "server", &[]);
     let users = [robot.node(Library::Roscpp, "param_user", &["/speed"])];
     let clients = [robot.node(Library::Rospy, "client", &["20"])];
     answered(&clients);
     robot.settled_state();
     let before = registrations(&robot);
-    for round in 1..=RESTARTS {
+    for round in 1..=restarts {
         // What it asked when rosrescue was away does not count.
         answered(&clients);
         let failed = failures(&clients).len();
-        for kill in 1..=KILLS / RESTARTS {
+        for kill in 1..=KILLS_EACH {
             kill_master(
                 &mut robot,
                 &before,

@@ -1,13 +1,13 @@
-//! The tools of ROS through rosrescue: what they print is what they print at a bare master, before and
-//! after a crash of the master; roslaunch brings a whole robot up, also without a master.
+//! The tools of ROS through rosrescue: after a crash of the master they print what they print at a bare one, and
+//! roslaunch brings a whole robot up.
 
 use std::fs;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::support::{
     Client, Library, Mode, NODES, Node, Process, Robot, Rosmaster, Scratch, State, Tool,
-    eventually, holds, params, ros_command, sorted, tree,
+    eventually, holds, in_both_modes, ros_command, sorted, tree,
 };
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
@@ -55,14 +55,11 @@ fn session(scratch: &Scratch, port: u16) -> Vec<String> {
     let dump_text = dump.to_str().unwrap().to_owned();
     let runs: &[&[&str]] = &[
         &["rosnode", "list"],
-        &["rosnode", "list", "-a"],
         &["rosnode", "info", "/talker"],
         &["rosnode", "info", "/server"],
-        &["rosnode", "info", "/nobody"],
         &["rosnode", "ping", "-c", "2", "/listener"],
         &["rostopic", "list", "-v"],
         &["rostopic", "info", "/chatter"],
-        &["rostopic", "type", "/chatter"],
         &[
             "rostopic",
             "echo",
@@ -72,14 +69,11 @@ fn session(scratch: &Scratch, port: u16) -> Vec<String> {
             "'talker' in m.data",
             "/chatter",
         ],
-        &["rosservice", "list"],
         &["rosservice", "info", "/who"],
         &["rosservice", "call", "/who"],
         &["rosparam", "load", &yaml, "/loaded"],
-        &["rosparam", "set", "/one", "1.0"],
         &["rosparam", "get", "/loaded"],
         &["rosparam", "get", "/nothing"],
-        &["rosparam", "delete", "/one"],
         &["rosparam", "list"],
         &["rosparam", "dump", &dump_text, "/"],
     ];
@@ -125,16 +119,6 @@ fn without_ports(line: &str) -> String {
     out
 }
 
-fn assert_same_session(bare: &[String], through: &[String], when: &str) {
-    assert_eq!(bare.len(), through.len());
-    for (bare, through) in bare.iter().zip(through) {
-        assert!(
-            bare == through,
-            "{when}\n==== at a bare master\n{bare}\n==== through rosrescue\n{through}"
-        );
-    }
-}
-
 #[test]
 fn tools_print_the_same_as_at_a_bare_master() {
     let scratch = Scratch::new();
@@ -149,18 +133,15 @@ fn tools_print_the_same_as_at_a_bare_master() {
 
     let mut robot = Robot::start(Mode::Proxy);
     let _cast = Cast::start(&robot.scratch, robot.port());
-    assert_same_session(
-        &bare,
-        &session(&robot.scratch, robot.port()),
-        "before a crash",
-    );
     robot.crash_master();
-    // The session sets the same parameters anew: the same result is due.
-    assert_same_session(
-        &bare,
-        &session(&robot.scratch, robot.port()),
-        "after a crash",
-    );
+    let through = session(&robot.scratch, robot.port());
+    assert_eq!(bare.len(), through.len());
+    for (bare, through) in bare.iter().zip(&through) {
+        assert!(
+            bare == through,
+            "==== at a bare master\n{bare}\n==== through rosrescue\n{through}"
+        );
+    }
 }
 
 /// `rosnode cleanup` asks at the terminal, so it is answered there.
@@ -268,6 +249,8 @@ fn await_launched(master: &Client, launch: &mut Process, namespace: &str) {
     assert_eq!(master.param("/use_sim_time"), Some(Value::Bool(false)));
 }
 
+in_both_modes!(roslaunch_before_and_after_a_crash);
+
 fn roslaunch_before_and_after_a_crash(mode: Mode) {
     let mut robot = Robot::start(mode);
     let file = robot.scratch.path("robot.launch");
@@ -295,17 +278,20 @@ fn roslaunch_before_and_after_a_crash(mode: Mode) {
     }
     let left = eventually_only(&robot, &empty);
     assert_eq!(left, Vec::<String>::new());
-    let said = [first.output(), second.output()].concat();
-    for bad in ["RLException", "auto-starting", "REQUIRED", "Traceback"] {
-        assert!(
-            said.iter().all(|line| !line.contains(bad)),
-            "{bad}: {}",
-            first.log()
-        );
-    }
-    for line in said.iter().filter(|line| line.contains("failed ")) {
+    assert_no_complaint(&first);
+    assert_no_complaint(&second);
+}
+
+/// Panics if roslaunch or a node of it complains.
+#[track_caller]
+fn assert_no_complaint(launched: &Process) {
+    for line in launched.output() {
+        for bad in ["RLException", "auto-starting", "REQUIRED", "Traceback"] {
+            assert!(!line.contains(bad), "{bad}: {}", launched.log());
+        }
         // A client may be stopped after its server.
-        assert!(!line.contains("lookup"), "{line}");
+        let failed = line.contains("failed ") && line.contains("lookup");
+        assert!(!failed, "{line}");
     }
 }
 
@@ -318,66 +304,73 @@ fn eventually_only(robot: &Robot, empty: &State) -> Vec<String> {
     others(&robot.settled_state())
 }
 
+/// It comes up and goes down while there is no master; the next one knows it in between.
 #[test]
-fn roslaunch_before_and_after_a_crash_in_core() {
-    roslaunch_before_and_after_a_crash(Mode::Core);
-}
-
-#[test]
-fn roslaunch_before_and_after_a_crash_in_proxy() {
-    roslaunch_before_and_after_a_crash(Mode::Proxy);
-}
-
-/// All of them start, find each other and work while there is no master, and the next one knows them.
-#[test]
-fn late_nodes_and_a_whole_roslaunch_come_up_without_a_master() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let talker = robot.node(Library::Roscpp, "talker", &[]);
+fn roslaunch_brings_nodes_up_and_down_without_a_master() {
+    let mut robot = Robot::start_for_outages(Mode::Proxy);
     let file = robot.scratch.path("robot.launch");
     fs::write(&file, LAUNCH).unwrap();
-    let before = robot.settled_state();
     let dead = robot.master_pid();
-    robot.kill_master();
-
-    let late = [
-        robot.node(Library::Rospy, "listener", &["__name:=late_py"]),
-        robot.node(Library::Roscpp, "listener", &["__name:=late_cpp"]),
-        robot.node(Library::Rospy, "talker", &["__name:=late_py_talker"]),
-        robot.node(Library::Roscpp, "talker", &["__name:=late_cpp_talker"]),
-    ];
-    for listener in &late[..2] {
-        for publisher in ["/talker", "/late_py_talker", "/late_cpp_talker"] {
-            listener.wait_messages(publisher, 5);
-        }
-    }
+    robot.take_master_away();
+    let client = robot.client();
     let mut launched = launch(&robot, file.to_str().unwrap(), "late");
     await_launched(&client, &mut launched, "late");
-    let mut last = State::read(&client);
-    eventually("all that is said at the start has been said", || {
-        std::thread::sleep(Duration::from_millis(300));
-        let before = std::mem::replace(&mut last, State::read(&client));
-        before == last
-    });
-    assert!(!robot.is_open(), "there was a master");
+    let mirror = State::read(&client);
     robot.revive_master();
     robot.await_recovery(dead);
-    last.assert_same(&robot.state(), "in the next master");
-    for (name, address) in &before.nodes {
-        let same = last
-            .nodes
-            .iter()
-            .any(|node| node == &(name.clone(), address.clone()));
-        assert!(same, "{name} at {address}:\n{last}");
+    mirror.assert_same(&robot.state(), "in the new master");
+
+    robot.take_master_away();
+    launched.signal(Signal::INT);
+    assert_eq!(launched.wait().code(), Some(0));
+    let left = State::read(&client).nodes;
+    assert!(
+        !left.iter().any(|(name, _)| name.starts_with("/late/")),
+        "{left:?}"
+    );
+    assert_no_complaint(&launched);
+}
+
+/// By then a tool that was interrupted has ended: it does not wait for a master.
+const ENDED: Duration = Duration::from_secs(10);
+
+in_both_modes!(tools_that_are_started_without_a_master_end_at_ctrl_c);
+
+fn tools_that_are_started_without_a_master_end_at_ctrl_c(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
+    let nobody = robot.settled_state().nodes;
+    robot.take_master_away();
+    let client = robot.client();
+    let runs: [(&[&str], &str); 5] = [
+        (&["echo", "/chatter"], "data:"),
+        (&["hz", "/chatter"], "average rate"),
+        (&["pub", "-r", "20", "/chatter", "std_msgs/String", "x"], ""),
+        (&["pub", "/latched", "std_msgs/String", "x"], "latching"),
+        // Of a type that nobody publishes: it waits.
+        (&["echo", "/nobody"], ""),
+    ];
+    let mut tools = runs.map(|(arguments, _)| {
+        let mut command = ros_command(&robot.scratch, "rostopic", robot.port());
+        Process::start(format!("rostopic {arguments:?}"), command.args(arguments))
+    });
+    eventually("the two that publish are known", || {
+        let state = State::read(&client);
+        state.publishers_of("/chatter").len() == 1 && state.publishers_of("/latched").len() == 1
+    });
+    for (tool, (_, says)) in tools.iter_mut().zip(runs) {
+        if !says.is_empty() {
+            tool.wait_line(says, |line| line.contains(says));
+        }
     }
-    let said = launched.output();
-    for bad in ["RLException", "auto-starting", "Traceback"] {
-        assert!(said.iter().all(|line| !line.contains(bad)), "{bad}");
+    for tool in &mut tools {
+        let begin = Instant::now();
+        tool.signal(Signal::INT);
+        tool.wait();
+        let took = begin.elapsed();
+        println!("{mode:?}: {took:?}");
+        assert!(took < ENDED, "{took:?}\n{}", tool.log());
+        let log = tool.output().join("\n");
+        assert!(!log.contains("Unable to communicate"), "{log}");
     }
-    for node in &late {
-        node.assert_no_link_lost();
-    }
-    talker.assert_no_link_lost();
-    let pid = robot.client().ok("getPid", params!["/test"]);
-    assert_eq!(pid, robot.bare().ok("getPid", params!["/test"]));
+    eventually("nobody is left", || State::read(&client).nodes == nobody);
 }

@@ -7,12 +7,12 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, FakeNode, Mode, Robot, State, Wire, encode_call, eventually, http_request, params, tree,
+    Client, FakeNode, Mode, Robot, State, Wire, encode_call, http_request, in_both_modes, params,
 };
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use rosrescue::xmlrpc::{Reply, Value};
 
-/// Clients of the crowd; a multiple of four.
-const CROWD: i32 = 200;
+/// Clients that call at once; a multiple of four.
+const CLIENTS: i32 = 200;
 
 /// The calls that each client of a kind makes, one behind the other on one connection without waiting for
 /// answers.
@@ -78,26 +78,18 @@ fn say(wire: &mut Wire, calls: &[(&str, Vec<Value>)]) -> Answers {
     calls.iter().map(|_| answer(wire)).collect()
 }
 
-#[test]
-fn two_hundred_clients_call_when_the_outage_begins() {
-    when_the_outage_begins(Mode::Proxy);
-}
+in_both_modes!(two_hundred_clients_call_when_the_outage_begins);
 
-#[test]
-fn two_hundred_clients_call_when_the_own_master_dies() {
-    when_the_outage_begins(Mode::Core);
-}
-
-fn when_the_outage_begins(mode: Mode) {
+fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let present = FakeNode::start("/present");
     present.publish(&client, "/present/topic", "std_msgs/String");
     // The health check asks the nodes whether they are alive.
-    let nodes: Vec<_> = (0..CROWD)
+    let nodes: Vec<_> = (0..CLIENTS)
         .map(|number| FakeNode::start(&format!("/client{number}")))
         .collect();
-    for (node, number) in nodes.iter().zip(0..CROWD) {
+    for (node, number) in nodes.iter().zip(0..CLIENTS) {
         match number % 4 {
             0 => client.set_param(&format!("{}/gain", node.name), number),
             1 => {
@@ -115,8 +107,8 @@ fn when_the_outage_begins(mode: Mode) {
         }
     }
     let dead = robot.master_pid();
-    let barrier = Arc::new(Barrier::new(CROWD as usize + 1));
-    let crowd: Vec<_> = (0..CROWD)
+    let barrier = Arc::new(Barrier::new(CLIENTS as usize + 1));
+    let callers: Vec<_> = (0..CLIENTS)
         .zip(&nodes)
         .map(|(number, node)| start(&client, calls_of(number, &node.api), &barrier))
         .collect();
@@ -124,7 +116,7 @@ fn when_the_outage_begins(mode: Mode) {
     robot.kill_master_at_once(dead);
 
     // Nobody waits for a master.
-    for (thread, number) in crowd.into_iter().zip(0..CROWD) {
+    for (thread, number) in callers.into_iter().zip(0..CLIENTS) {
         let (answers, took) = thread.join().unwrap();
         let answers = answers.unwrap_or_else(|error| panic!("client {number}: {error}"));
         assert!(took < Duration::from_secs(20), "client {number}: {took:?}");
@@ -147,13 +139,15 @@ fn when_the_outage_begins(mode: Mode) {
         }
     }
     let state = State::read(&client);
-    assert!(!(0..CROWD).any(|number| number % 4 == 1 && state.knows(&format!("/client{number}"))));
+    assert!(
+        !(0..CLIENTS).any(|number| number % 4 == 1 && state.knows(&format!("/client{number}")))
+    );
     robot.revive_master();
     robot.await_recovery(dead);
     // No call was closed without an answer.
     assert_eq!(robot.counter("hold_expired"), 0);
     let (bare, state) = (robot.bare(), robot.state());
-    for number in 0..CROWD {
+    for number in 0..CLIENTS {
         let name = format!("/client{number}");
         let publishes = |what: &str| state.publishers_of(&format!("{name}/{what}"));
         match number % 4 {
@@ -171,74 +165,4 @@ fn when_the_outage_begins(mode: Mode) {
             _ => {}
         }
     }
-}
-
-/// What rospy sends when a node ends is one multicall, and so is what roslaunch sends when it begins.
-#[test]
-fn multicalls_in_an_outage_are_answered_at_once_and_in_order() {
-    let mut robot = Robot::start(Mode::Proxy);
-    let client = robot.client();
-    let nodes = ["/staying", "/leaving"].map(FakeNode::start);
-    for node in &nodes {
-        node.publish(&client, "/topic", "std_msgs/String");
-    }
-    let subscriber = FakeNode::start("/subscriber");
-    subscriber.subscribe(&client, "/topic", "std_msgs/String");
-    let told = subscriber.updates("/topic").len();
-    let dead = robot.master_pid();
-    robot.kill_master();
-    eventually("the gate is shut", || !robot.is_open());
-    let call = |calls: Vec<Call>| {
-        let answer = client
-            .call("system.multicall", Call::multicall(calls).params)
-            .unwrap();
-        let Reply::Value(Value::Array(answers)) = answer else {
-            panic!("{answer:?}");
-        };
-        let value = |answer: &Value| answer.as_array().unwrap()[0].as_array().unwrap()[2].clone();
-        answers.iter().map(value).collect::<Vec<_>>()
-    };
-    let unregister = |node: &FakeNode, topic: &str| {
-        let params = params![node.name.as_str(), topic, node.api.as_str()];
-        Call::new("unregisterPublisher", params)
-    };
-    let start = Instant::now();
-    let launch = call(vec![
-        Call::new(
-            "setParam",
-            params!["/roslaunch", "/launched", tree! { "a" => 1 }],
-        ),
-        Call::new("setParam", params!["/leaving", "/leaving/private", 1]),
-        Call::new("getParam", params!["/roslaunch", "/launched/a"]),
-    ]);
-    assert_eq!(launch, [0.into(), 0.into(), Value::Int(1)]);
-    let params = params![
-        "/staying",
-        "/late",
-        "std_msgs/String",
-        nodes[0].api.as_str()
-    ];
-    call(vec![Call::new("registerPublisher", params)]);
-    nodes[1].claim_publication("/topic", None);
-    assert_eq!(call(vec![unregister(&nodes[1], "/topic")]), [Value::Int(1)]);
-    assert_eq!(State::read(&client).publishers_of("/topic"), ["/staying"]);
-    assert_eq!(call(vec![unregister(&nodes[0], "/late")]), [Value::Int(1)]);
-    assert!(start.elapsed() < Duration::from_secs(10));
-    assert!(!robot.is_open(), "there was a master");
-    eventually("the subscriber is told", || {
-        subscriber.updates("/topic").last() == Some(&vec![nodes[0].api.clone()])
-    });
-    let before = State::read(&client);
-    robot.revive_master();
-    robot.await_recovery(dead);
-    let state = robot.state();
-    before.assert_same(&state, "in the next master");
-    assert_eq!(state.publishers_of("/topic"), ["/staying"]);
-    assert!(state.publishers_of("/late").is_empty(), "{state}");
-    assert_eq!(robot.bare().param("/launched/a"), Some(Value::Int(1)));
-    let updates = &subscriber.updates("/topic")[told..];
-    assert!(
-        updates.iter().all(|list| list.contains(&nodes[0].api)),
-        "{updates:?}"
-    );
 }

@@ -3,11 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use crate::support::{Library, Mode, Node, Process, Robot, Tool, eventually, holds, ros_command};
+use crate::support::{
+    LIBRARIES, Mode, Node, Process, Robot, State, Tool, eventually, holds, in_both_modes,
+    ros_command,
+};
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
-
-const LIBRARIES: [(Library, &str); 2] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
 
 /// Starts a node of each library, named with its suffix, and does not wait for it.
 fn spawn_both(robot: &Robot, node: &str, name: &str, arguments: &[&str]) -> [Node; 2] {
@@ -23,17 +24,9 @@ fn await_ready(nodes: &mut [Node]) {
     }
 }
 
+in_both_modes!(whoever_reads_notices_nothing);
+
 /// A node whose `getParam` fails goes on with its default, and a robot drives with the wrong gains.
-#[test]
-fn whoever_reads_notices_nothing_in_proxy_mode() {
-    whoever_reads_notices_nothing(Mode::Proxy);
-}
-
-#[test]
-fn whoever_reads_notices_nothing_in_core_mode() {
-    whoever_reads_notices_nothing(Mode::Core);
-}
-
 fn whoever_reads_notices_nothing(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
     let client = robot.client();
@@ -49,12 +42,9 @@ fn whoever_reads_notices_nothing(mode: Mode) {
             eventually("a node reads on", || count(node) >= before + more);
         }
     };
-    let listings: [&[&str]; 6] = [
-        &["rosnode", "list"],
+    let listings: [&[&str]; 3] = [
         &["rosnode", "info", "/server_cpp"],
         &["rostopic", "list", "-v"],
-        &["rosservice", "list"],
-        &["rosparam", "list"],
         &["rosparam", "get", "/gain"],
     ];
     let list = |robot: &Robot| {
@@ -96,66 +86,9 @@ fn whoever_reads_notices_nothing(mode: Mode) {
     assert_eq!(before.services, now.services);
 }
 
-/// Publishers, subscribers, services and parameters of real nodes, while there is no master.
-#[test]
-fn all_calls_of_nodes_get_through_at_once_without_a_master() {
-    let mut robot = Robot::start(Mode::Proxy);
-    robot.client().set_param("/gain", 7);
-    let mut nodes = spawn_both(&robot, "late", "late", &[]);
-    await_ready(&mut nodes);
-    robot.settled_state();
-    let dead = robot.master_pid();
-    robot.kill_master();
-    eventually("the gate is shut", || !robot.is_open());
-    for node in &nodes {
-        node.signal(Signal::USR1);
-    }
-    let start = Instant::now();
-    for node in &nodes {
-        eventually("everything has got through", || {
-            let mut done = node.said("done");
-            done.sort();
-            done == ["offer", "publish", "read", "set", "subscribe"]
-        });
-        assert_eq!(node.said("failed"), Vec::<String>::new(), "{}", node.log());
-        assert_eq!(node.said("again"), Vec::<String>::new(), "{}", node.log());
-    }
-    assert!(
-        start.elapsed() < Duration::from_secs(5),
-        "{:?}",
-        start.elapsed()
-    );
-    assert!(!robot.is_open(), "there was a master");
-    robot.revive_master();
-    robot.await_recovery(dead);
-    let (state, bare) = (robot.state(), robot.bare());
-    for (_, suffix) in LIBRARIES {
-        let name = format!("/late_{suffix}");
-        assert_eq!(
-            state.publishers_of(&format!("{name}/published")),
-            [name.as_str()]
-        );
-        assert_eq!(
-            state.subscribers_of(&format!("{name}/subscribed")),
-            [name.as_str()]
-        );
-        let offered = (format!("{name}/offered"), vec![name.clone()]);
-        assert!(state.services.contains(&offered), "{state}");
-        assert_eq!(bare.param(&format!("{name}/late")), Some(Value::Int(1)));
-    }
-}
+in_both_modes!(nodes_that_start_and_end_without_a_master_leave_nothing);
 
 /// Nodes that start, end and die while there is no master are registered as long as they live.
-#[test]
-fn nodes_that_start_and_end_without_a_master_leave_nothing_in_proxy_mode() {
-    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Proxy);
-}
-
-#[test]
-fn nodes_that_start_and_end_without_a_master_leave_nothing_in_core_mode() {
-    nodes_that_start_and_end_without_a_master_leave_nothing(Mode::Core);
-}
-
 fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
     let mut leaving = spawn_both(&robot, "talker", "leaving", &[]);
@@ -178,7 +111,7 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
     for node in &mut leaving {
         end(node, Signal::INT);
     }
-    let now = crate::support::State::read(&robot.client());
+    let now = State::read(&robot.client());
     assert!(
         !now.knows("/leaving_py") && !now.knows("/leaving_cpp"),
         "{now}"
@@ -203,14 +136,14 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
             end(node, signal);
         }
     }
-    let now = crate::support::State::read(&robot.client());
+    let now = State::read(&robot.client());
     assert!(!now.knows("/ended_py") && !now.knows("/ended_cpp"), "{now}");
     assert!(!robot.is_open(), "there was a master");
     robot.revive_master();
     robot.await_recovery(dead);
     let mut last = None;
     eventually("the killed ones are taken out", || {
-        last = crate::support::State::try_read(&robot.bare()).ok();
+        last = State::try_read(&robot.bare()).ok();
         last.as_ref()
             .is_some_and(|now| names.iter().all(|name| !now.knows(name)))
     });
@@ -222,8 +155,8 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
 }
 
 /// `state` with the topic types that the master holds now: a node that ended may have left one.
-fn after_types(state: &crate::support::State, robot: &Robot) -> crate::support::State {
-    crate::support::State {
+fn after_types(state: &State, robot: &Robot) -> State {
+    State {
         topic_types: robot.state().topic_types,
         ..state.clone()
     }

@@ -5,19 +5,14 @@ use std::time::Duration;
 use rosrescue::xmlrpc::Value;
 
 use crate::support::{
-    Client, FakeNode, Library, Mode, Node, Robot, eventually, eventually_some, holds, params,
+    FakeNode, Library, Mode, Node, Robot, eventually, eventually_some, holds, in_both_modes,
+    params, port_of,
 };
 
 /// A master's words to a node whose name another one has taken.
 fn goodbye(name: &str) -> Vec<Value> {
     let reason = format!("[{name}] Reason: new node registered with same name");
     params!["/master", reason.as_str()]
-}
-
-fn port_of(client: &Client, node: &str) -> u16 {
-    let api = client.ok("lookupNode", params!["/test", node]);
-    let port = api.as_str().unwrap().trim_end_matches('/').rsplit(':');
-    port.map(|port| port.parse().unwrap()).next().unwrap()
 }
 
 fn twin(robot: &Robot) -> Node {
@@ -33,29 +28,21 @@ fn kill_when_taken(robot: &mut Robot, master: u32, port: u16) {
     robot.kill_master_at_once(master);
 }
 
-#[test]
-fn a_displaced_node_ends_though_its_master_died_before_it_said_so_in_core_mode() {
-    a_displaced_node_ends_though_its_master_died_before_it_said_so(Mode::Core, "rosmaster");
-}
+in_both_modes!(
+    a_displaced_node_ends_though_its_master_died_before_it_said_so,
+    a_displaced_node_ends_though_its_master_never_said_so,
+);
 
-#[test]
-fn a_displaced_node_ends_though_its_master_died_before_it_said_so_in_proxy_mode() {
-    a_displaced_node_ends_though_its_master_died_before_it_said_so(Mode::Proxy, "rosmaster");
+fn a_displaced_node_ends_though_its_master_died_before_it_said_so(mode: Mode) {
+    a_displaced_node_ends(Robot::start(mode));
 }
 
 /// With a master of which it is certain that it has told nobody.
-#[test]
-fn a_displaced_node_ends_though_its_master_never_said_so() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        a_displaced_node_ends_though_its_master_died_before_it_said_so(mode, "silent_rosmaster.py");
-    }
+fn a_displaced_node_ends_though_its_master_never_said_so(mode: Mode) {
+    a_displaced_node_ends(Robot::start_under(mode, "silent_rosmaster.py", &[]));
 }
 
-fn a_displaced_node_ends_though_its_master_died_before_it_said_so(mode: Mode, program: &str) {
-    let mut robot = match program {
-        "rosmaster" => Robot::start(mode),
-        program => Robot::start_under(mode, program, &[]),
-    };
+fn a_displaced_node_ends(mut robot: Robot) {
     let mut first = twin(&robot);
     first.wait_line("`ready`", |line| line.starts_with("ready "));
     let port = port_of(&robot.client(), "/twin");
@@ -87,22 +74,20 @@ fn a_displaced_node_ends_though_its_master_died_before_it_said_so(mode: Mode, pr
 /// The port of a displaced node belongs to another one by the time at which it is told.
 #[test]
 fn who_has_the_port_of_a_displaced_node_by_now_is_not_told() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        for is_registered in [false, true] {
-            let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
-            let mut first = twin(&robot);
-            first.wait_line("`ready`", |line| line.starts_with("ready "));
-            let port = port_of(&robot.client(), "/twin");
-            first.kill();
-            let innocent = innocent_at(&robot, port, is_registered);
-            let master = robot.master_pid();
-            let mut second = twin(&robot);
-            kill_when_taken(&mut robot, master, port);
-            robot.revive_master();
-            robot.await_recovery(master);
-            second.wait_line("`ready`", |line| line.starts_with("ready "));
-            assert_unharmed(&innocent);
-        }
+    for (mode, is_registered) in [(Mode::Core, false), (Mode::Proxy, true)] {
+        let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
+        let mut first = twin(&robot);
+        first.wait_line("`ready`", |line| line.starts_with("ready "));
+        let port = port_of(&robot.client(), "/twin");
+        first.kill();
+        let other = other_node_at(&robot, port, is_registered);
+        let master = robot.master_pid();
+        let mut second = twin(&robot);
+        kill_when_taken(&mut robot, master, port);
+        robot.revive_master();
+        robot.await_recovery(master);
+        second.wait_line("`ready`", |line| line.starts_with("ready "));
+        assert_unharmed(&other);
     }
 }
 
@@ -116,32 +101,32 @@ fn who_has_the_port_of_a_node_that_is_displaced_without_a_master_is_not_told() {
         let port = port_of(&robot.client(), "/twin");
         robot.take_master_away();
         first.kill();
-        let innocent = innocent_at(&robot, port, is_registered);
+        let other = other_node_at(&robot, port, is_registered);
         let second = FakeNode::start("/twin");
         second.publish(&robot.client(), "/chatter", "std_msgs/String");
         assert_ne!(port_of(&robot.client(), "/twin"), port);
-        assert_unharmed(&innocent);
+        assert_unharmed(&other);
     }
 }
 
 /// Another node at `port`, with another process id.
-fn innocent_at(robot: &Robot, port: u16, is_registered: bool) -> FakeNode {
-    let innocent = FakeNode::start_at("/innocent", port);
-    innocent.claim_pid(4_000_000);
-    innocent.claim_publication("/elsewhere", Some("std_msgs/String"));
+fn other_node_at(robot: &Robot, port: u16, is_registered: bool) -> FakeNode {
+    let other = FakeNode::start_at("/other", port);
+    other.claim_pid(4_000_000);
+    other.claim_publication("/elsewhere", Some("std_msgs/String"));
     if is_registered {
-        innocent.publish(&robot.client(), "/elsewhere", "std_msgs/String");
+        other.publish(&robot.client(), "/elsewhere", "std_msgs/String");
     }
-    innocent
+    other
 }
 
-fn assert_unharmed(innocent: &FakeNode) {
+fn assert_unharmed(other: &FakeNode) {
     assert!(
-        holds(Duration::from_secs(3), || innocent
+        holds(Duration::from_secs(3), || other
             .heard("shutdown")
             .is_empty()),
         "{:?}",
-        innocent.calls()
+        other.calls()
     );
 }
 

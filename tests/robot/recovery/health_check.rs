@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use crate::support::{
     Client, FakeNode, Library, Mode, Robot, State, encode_call, eventually, eventually_some, holds,
-    http_request, names, params, status,
+    http_request, in_both_modes, names, params, status,
 };
 use rustix::process::Signal;
 
@@ -36,34 +36,33 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
     }
 }
 
-#[test]
-fn a_node_whose_port_refuses_is_taken_out_and_others_are_told() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        let mut robot = Robot::start(mode);
-        let client = robot.client();
-        let dead = FakeNode::start("/dead");
-        let living = FakeNode::start("/living");
-        let subscriber = FakeNode::start("/subscriber");
-        for node in [&dead, &living] {
-            node.publish(&client, "/topic", "std_msgs/String");
-            node.subscribe(&client, "/other", "std_msgs/String");
-            node.offer(&client, &format!("{}/service", node.name));
-            node.watch_param(&client, "/gains");
-        }
-        subscriber.subscribe(&client, "/topic", "std_msgs/String");
-        let after = robot.settled_state().without_node("/dead");
-        drop(dead);
-        robot.crash_master();
-        robot.await_state(&after, "when the dead node has been taken out");
-        eventually("the subscriber is told", || {
-            subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
-        });
-        report(&robot, "who was removed", |report| {
-            names(&report["removed"]) == ["/dead"]
-        });
-        for node in [&living, &subscriber] {
-            assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
-        }
+in_both_modes!(a_node_whose_port_refuses_is_taken_out_and_others_are_told);
+
+fn a_node_whose_port_refuses_is_taken_out_and_others_are_told(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    let client = robot.client();
+    let dead = FakeNode::start("/dead");
+    let living = FakeNode::start("/living");
+    let subscriber = FakeNode::start("/subscriber");
+    for node in [&dead, &living] {
+        node.publish(&client, "/topic", "std_msgs/String");
+        node.subscribe(&client, "/other", "std_msgs/String");
+        node.offer(&client, &format!("{}/service", node.name));
+        node.watch_param(&client, "/gains");
+    }
+    subscriber.subscribe(&client, "/topic", "std_msgs/String");
+    let after = robot.settled_state().without_node("/dead");
+    drop(dead);
+    robot.crash_master();
+    robot.await_state(&after, "when the dead node has been taken out");
+    eventually("the subscriber is told", || {
+        subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
+    });
+    report(&robot, "who was removed", |report| {
+        names(&report["removed"]) == ["/dead"]
+    });
+    for node in [&living, &subscriber] {
+        assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
     }
 }
 
@@ -128,7 +127,7 @@ fn take_port(node: FakeNode, name: &str) -> FakeNode {
 }
 
 #[test]
-fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
+fn a_node_that_does_not_answer_is_unreachable_and_comes_back_by_itself() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
@@ -139,8 +138,8 @@ fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
     silent.hold();
     robot.crash_master();
     let unreachable = || names(&status(&client)["unreachable"]);
-    eventually("it is suspect", || unreachable() == ["/silent"]);
-    report(&robot, "who is suspect", |report| {
+    eventually("it is unreachable", || unreachable() == ["/silent"]);
+    report(&robot, "who is unreachable", |report| {
         names(&report["unreachable"]) == ["/silent"]
     });
     before.assert_same(&robot.state(), "an unreachable node is kept");
@@ -149,7 +148,7 @@ fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
     late.publish(&client, "/topic", "std_msgs/String");
     client.set_param("/gain", 2);
     silent.release();
-    eventually("it is no suspect any more", || unreachable().is_empty());
+    eventually("it is reachable again", || unreachable().is_empty());
     eventually("it knows the publisher", || {
         silent.updates("/topic").last() == Some(&vec![late.api.clone()])
     });
@@ -160,7 +159,7 @@ fn a_node_that_does_not_answer_is_suspect_and_comes_back_by_itself() {
 }
 
 #[test]
-fn a_suspect_that_dies_is_taken_out() {
+fn an_unreachable_node_that_dies_is_taken_out() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
@@ -168,19 +167,19 @@ fn a_suspect_that_dies_is_taken_out() {
     let after = robot.settled_state().without_node("/silent");
     silent.hold();
     robot.crash_master();
-    eventually("it is suspect", || {
+    eventually("it is unreachable", || {
         names(&status(&client)["unreachable"]) == ["/silent"]
     });
     drop(silent);
-    robot.await_state(&after, "when the suspect has died");
-    eventually("nobody is suspect", || {
+    robot.await_state(&after, "when the unreachable one has died");
+    eventually("nobody is unreachable", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
 }
 
 /// Without an outage.
 #[test]
-fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
+fn a_standing_health_check_takes_dead_nodes_out_and_is_off_by_default() {
     let robot = Robot::start_with(Mode::Core, &["--reap-dead-nodes", "0.5"]);
     let client = robot.client();
     let mut talker = robot.node(Library::Rospy, "talker", &[]);
@@ -193,7 +192,7 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
         now.is_ok_and(|now| now == with)
     }));
     talker.kill();
-    robot.await_state(&after, "after the regular health check");
+    robot.await_state(&after, "after the standing health check");
     eventually("the listener is told", || {
         listener.updates("/chatter").last() == Some(&Vec::new())
     });
@@ -213,7 +212,7 @@ fn a_standing_census_takes_dead_nodes_out_and_is_off_by_default() {
 /// roscpp holds its list of subscriptions while it registers one, and whatever asks for that list holds its
 /// only thread for calls. The health check after a recovery waits for what came during the injection.
 #[test]
-fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_suspect() {
+fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_unreachable() {
     // The injection takes longer than `--hold`.
     let options = ["--hold", "1", "--node-timeout", "1500"];
     let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    Client, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, alive, behind, eventually,
+    Client, FakeNode, Finish, Rescue, Rosmaster, Scratch, Setup, State, alive, behind, eventually,
     eventually_some, free_port, holds, params, signal, status,
 };
 use rustix::process::Signal;
@@ -110,6 +110,7 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
 
     let done = AtomicBool::new(false);
     let longest = thread::scope(|scope| {
+        let finish = Finish(&done);
         let callers: Vec<_> = (0..4)
             .map(|_| scope.spawn(|| call_until(&done, &client)))
             .collect();
@@ -121,7 +122,7 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
             worker_after(&scratch, dead);
             eventually("calls pass again", || status(&client)["open"] == true);
         }
-        done.store(true, Ordering::Relaxed);
+        drop(finish);
         let longest = callers.into_iter().map(|caller| caller.join().unwrap());
         longest.max().unwrap()
     });

@@ -1,8 +1,7 @@
 //! Whether a start goes on with the session before: after an orderly stop, a crash, a reboot.
 //!
 //! A reboot is a private mount that shows another boot id, and another computer is a network namespace;
-//! everything else is the real thing. What a
-//! crash and an orderly stop come to is in `own_restart.rs` too.
+//! everything else is the real thing. What a crash and an orderly stop come to is in `worker.rs` too.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -12,7 +11,7 @@ use std::thread;
 
 use crate::support::{
     Client, Library, Mode, Netns, Node, Robot, Rosmaster, Scratch, Setup, State, alive, eventually,
-    free_port, params, signal,
+    free_port, in_both_modes, params, signal,
 };
 use rustix::process::Signal;
 
@@ -44,42 +43,41 @@ fn kept(robot: &Robot, text: &str) -> Vec<String> {
     names.collect()
 }
 
-#[test]
-fn after_a_reboot_without_nodes_the_robot_starts_afresh() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        let mut robot = Robot::start(mode);
-        robot.client().set_param("/use_sim_time", true);
-        let _talker = robot.node(Library::Rospy, "talker", &[]);
-        robot.settled_state();
-        cut_power(&mut robot);
-        // The nodes too, rosout among them.
-        for pid in robot.processes() {
-            signal(pid, Signal::KILL);
-        }
-        eventually("every process has ended", || {
-            !robot.processes().into_iter().any(alive)
-        });
-        let boot = another_boot(&robot.scratch);
-        robot.revive_master();
-        robot.rescue.start_after_reboot(&boot);
-        robot.rescue.wait_serving();
-        robot.await_gate();
-        let client = robot.client();
-        assert_eq!(client.param("/use_sim_time"), None, "{mode:?}");
-        assert!(!robot.settled_state().knows("/talker"), "{mode:?}");
-        let names = kept(&robot, "use_sim_time");
-        // And the generation before it, if that had the parameter too.
-        let all_old = names.iter().all(|name| name.contains(".session-"));
-        assert!(
-            !names.is_empty() && all_old,
-            "the old file is kept: {names:?}"
-        );
-        // The new session is one: a crash now restores it.
-        client.set_param("/today", 1);
-        robot.crash_master();
-        assert_eq!(robot.client().param("/today"), Some(1.into()));
-        assert_eq!(robot.client().param("/use_sim_time"), None);
+in_both_modes!(after_a_reboot_without_nodes_the_robot_starts_afresh);
+
+fn after_a_reboot_without_nodes_the_robot_starts_afresh(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    robot.client().set_param("/use_sim_time", true);
+    let _talker = robot.node(Library::Rospy, "talker", &[]);
+    robot.settled_state();
+    cut_power(&mut robot);
+    // The nodes too, rosout among them.
+    for pid in robot.processes() {
+        signal(pid, Signal::KILL);
     }
+    eventually("every process has ended", || {
+        !robot.processes().into_iter().any(alive)
+    });
+    let boot = another_boot(&robot.scratch);
+    robot.revive_master();
+    robot.rescue.start_after_reboot(&boot);
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    let client = robot.client();
+    assert_eq!(client.param("/use_sim_time"), None, "{mode:?}");
+    assert!(!robot.settled_state().knows("/talker"), "{mode:?}");
+    let names = kept(&robot, "use_sim_time");
+    // And the generation before it, if that had the parameter too.
+    let all_old = names.iter().all(|name| name.contains(".session-"));
+    assert!(
+        !names.is_empty() && all_old,
+        "the old file is kept: {names:?}"
+    );
+    // The new session is one: a crash now restores it.
+    client.set_param("/today", 1);
+    robot.crash_master();
+    assert_eq!(robot.client().param("/today"), Some(1.into()));
+    assert_eq!(robot.client().param("/use_sim_time"), None);
 }
 
 /// A node at `host` of another computer.
@@ -97,49 +95,48 @@ fn node_elsewhere(
     Node::run(&mut net.inside(&command))
 }
 
-#[test]
-fn after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        let net = Netns::new();
-        let scratch = Scratch::new();
-        let (port, master_port) = (free_port(), free_port());
-        let mut master = (mode == Mode::Proxy).then(|| Rosmaster::start_at(&scratch, master_port));
-        let setup = match mode {
-            Mode::Core => Setup::bare(&scratch, ["core", "-p", &port.to_string()]).args([
-                "--no-rosout",
-                "--master-port",
-                &master_port.to_string(),
-            ]),
-            Mode::Proxy => Setup::bare(&scratch, ["proxy", "--listen", &format!(":{port}")])
-                .args(["--master", &format!("http://127.0.0.1:{master_port}")]),
-        };
-        let mut rescue = setup.env("ROS_IP", net.near()).at_port(port).start();
-        rescue.client().set_param("/gain", 3);
-        let at = (&scratch, port);
-        let talker = node_elsewhere(&net, at, 2, (Library::Roscpp, "talker", "talker"));
-        let listener = node_elsewhere(&net, at, 3, (Library::Rospy, "listener", "listener"));
-        listener.wait_messages("/talker", 5);
-        let bare = Client::new(master_port);
-        let before = State::read(&bare);
-        assert!(before.knows("/talker") && before.knows("/listener"));
-        let dead = bare.master_pid().expect("a master");
-        rescue.kill();
-        signal(dead, Signal::KILL);
-        if let Some(master) = &mut master {
-            master.kill();
-            *master = Rosmaster::start_at(&scratch, master_port);
-        }
-        eventually("the master is dead", || !alive(dead));
-        rescue.start_after_reboot(&another_boot(&scratch));
-        rescue.wait_serving();
-        eventually("the state is back", || {
-            State::try_read(&bare).is_ok_and(|now| now == before)
-        });
-        let late = node_elsewhere(&net, at, 4, (Library::Roscpp, "listener", "late"));
-        late.wait_messages("/talker", 5);
-        listener.assert_no_message_lost("/talker");
-        talker.assert_no_link_lost();
+in_both_modes!(after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on);
+
+fn after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on(mode: Mode) {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let (port, master_port) = (free_port(), free_port());
+    let mut master = (mode == Mode::Proxy).then(|| Rosmaster::start_at(&scratch, master_port));
+    let setup = match mode {
+        Mode::Core => Setup::bare(&scratch, ["core", "-p", &port.to_string()]).args([
+            "--no-rosout",
+            "--master-port",
+            &master_port.to_string(),
+        ]),
+        Mode::Proxy => Setup::bare(&scratch, ["proxy", "--listen", &format!(":{port}")])
+            .args(["--master", &format!("http://127.0.0.1:{master_port}")]),
+    };
+    let mut rescue = setup.env("ROS_IP", net.near()).at_port(port).start();
+    rescue.client().set_param("/gain", 3);
+    let at = (&scratch, port);
+    let talker = node_elsewhere(&net, at, 2, (Library::Roscpp, "talker", "talker"));
+    let listener = node_elsewhere(&net, at, 3, (Library::Rospy, "listener", "listener"));
+    listener.wait_messages("/talker", 5);
+    let bare = Client::new(master_port);
+    let before = State::read(&bare);
+    assert!(before.knows("/talker") && before.knows("/listener"));
+    let dead = bare.master_pid().expect("a master");
+    rescue.kill();
+    signal(dead, Signal::KILL);
+    if let Some(master) = &mut master {
+        master.kill();
+        *master = Rosmaster::start_at(&scratch, master_port);
     }
+    eventually("the master is dead", || !alive(dead));
+    rescue.start_after_reboot(&another_boot(&scratch));
+    rescue.wait_serving();
+    eventually("the state is back", || {
+        State::try_read(&bare).is_ok_and(|now| now == before)
+    });
+    let late = node_elsewhere(&net, at, 4, (Library::Roscpp, "listener", "late"));
+    late.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
 }
 
 /// Nothing on this computer has survived: who answers where a node was is somebody else.
@@ -173,21 +170,6 @@ fn after_a_reboot_a_stranger_at_a_nodes_port_is_no_node() {
         robot.rescue.wait_serving();
         assert_eq!(robot.client().param("/use_sim_time"), None, "{host}");
         assert!(!robot.settled_state().knows("/node"), "{host}");
-    }
-}
-
-#[test]
-fn after_a_crash_without_nodes_the_session_goes_on() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        let mut robot = Robot::start(mode);
-        robot.client().set_param("/gain", 3);
-        robot.settled_state();
-        cut_power(&mut robot);
-        robot.revive_master();
-        robot.rescue.start_again();
-        robot.rescue.wait_serving();
-        robot.await_gate();
-        assert_eq!(robot.client().param("/gain"), Some(3.into()), "{mode:?}");
     }
 }
 

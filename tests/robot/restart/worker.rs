@@ -9,57 +9,56 @@ use std::time::Duration;
 
 use crate::support::{
     Client, FakeNode, Library, Mode, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State, alive,
-    eventually, eventually_some, free_port, signal, status,
+    eventually, eventually_some, free_port, in_both_modes, signal, status,
 };
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-#[test]
-fn rosrescue_that_was_killed_adopts_the_living_master() {
-    for mode in [Mode::Core, Mode::Proxy] {
-        let mut robot = Robot::start(mode);
-        let client = robot.client();
-        let talker = robot.node(Library::Roscpp, "talker", &[]);
-        let listener = robot.node(Library::Rospy, "listener", &[]);
-        let node = FakeNode::start("/fake");
-        client.set_param("/watched", 1);
-        node.watch_param(&client, "/watched");
-        node.subscribe(&client, "/chatter", "std_msgs/String");
-        listener.wait_messages("/talker", 5);
-        let before = robot.settled_state();
-        let master = robot.master_pid();
-        let updates = node.heard("publisherUpdate").len();
+in_both_modes!(rosrescue_that_was_killed_adopts_the_living_master);
 
-        robot.rescue.kill();
-        robot.rescue.start_again();
-        robot.rescue.wait_serving();
-        robot.await_gate();
-        assert_eq!(
-            robot.master_pid(),
-            master,
-            "the living master is adopted, not replaced"
-        );
-        before.assert_same(&robot.state(), "after rosrescue's own restart");
-        assert_eq!(
-            node.heard("publisherUpdate").len(),
-            updates,
-            "nothing is injected"
-        );
+fn rosrescue_that_was_killed_adopts_the_living_master(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    let client = robot.client();
+    let talker = robot.node(Library::Roscpp, "talker", &[]);
+    let listener = robot.node(Library::Rospy, "listener", &[]);
+    let node = FakeNode::start("/fake");
+    client.set_param("/watched", 1);
+    node.watch_param(&client, "/watched");
+    node.subscribe(&client, "/chatter", "std_msgs/String");
+    listener.wait_messages("/talker", 5);
+    let before = robot.settled_state();
+    let master = robot.master_pid();
+    let updates = node.heard("publisherUpdate").len();
 
-        // What it adopted it can restore; parameter subscriptions it knows from the checkpoint.
-        robot.crash_master();
-        before.assert_same(&robot.state(), "after the master's crash that followed");
-        client.set_param("/watched", 2);
-        eventually("the parameter's subscriber is told", || {
-            node.heard("paramUpdate")
-                .last()
-                .is_some_and(|call| call[2] == Value::Int(2))
-        });
-        assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
-        listener.wait_messages("/talker", 5);
-        listener.assert_no_message_lost("/talker");
-        talker.assert_no_link_lost();
-    }
+    robot.rescue.kill();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.await_gate();
+    assert_eq!(
+        robot.master_pid(),
+        master,
+        "the living master is adopted, not replaced"
+    );
+    before.assert_same(&robot.state(), "after rosrescue's own restart");
+    assert_eq!(
+        node.heard("publisherUpdate").len(),
+        updates,
+        "nothing is injected"
+    );
+
+    // What it adopted it can restore; parameter subscriptions it knows from the checkpoint.
+    robot.crash_master();
+    before.assert_same(&robot.state(), "after the master's crash that followed");
+    client.set_param("/watched", 2);
+    eventually("the parameter's subscriber is told", || {
+        node.heard("paramUpdate")
+            .last()
+            .is_some_and(|call| call[2] == Value::Int(2))
+    });
+    assert_eq!(node.heard("shutdown"), Vec::<Vec<_>>::new());
+    listener.wait_messages("/talker", 5);
+    listener.assert_no_message_lost("/talker");
+    talker.assert_no_link_lost();
 }
 
 /// Between its first open port and its first look at the living master it knows only the checkpoint.
@@ -85,49 +84,6 @@ fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() 
     robot.await_gate();
     robot.await_state(&after, "at the adopted master");
     after.assert_same(&State::read(&robot.client()), "through rosrescue");
-}
-
-#[test]
-fn rosrescue_that_was_killed_fills_an_empty_master() {
-    let mut robot = Robot::start(Mode::Proxy);
-    robot.client().set_param("/kept", "yes");
-    let listener = robot.node(Library::Rospy, "listener", &[]);
-    let talker = robot.node(Library::Rospy, "talker", &[]);
-    listener.wait_messages("/talker", 5);
-    let before = robot.settled_state();
-    robot.rescue.kill();
-    robot.kill_master();
-    robot.revive_master();
-    robot.rescue.start_again();
-    robot.rescue.wait_serving();
-    robot.await_gate();
-    before.assert_same(&robot.state(), "after the restart of both");
-    listener.assert_no_message_lost("/talker");
-    talker.assert_no_link_lost();
-}
-
-#[test]
-fn a_core_of_which_everything_was_killed_restores_from_the_file() {
-    let mut robot = Robot::start(Mode::Core);
-    robot.client().set_param("/kept", "yes");
-    let talker = robot.node(Library::Rospy, "talker", &[]);
-    let listener = robot.node(Library::Roscpp, "listener", &[]);
-    listener.wait_messages("/talker", 5);
-    let before = robot.settled_state();
-    let master = robot.master_pid();
-    robot.rescue.kill();
-    robot.kill_master_at_once(master);
-    eventually("the master is dead", || !alive(master));
-    robot.rescue.start_again();
-    robot.rescue.wait_serving();
-    robot.await_gate();
-    // rosout may have been started anew; its address is its own affair.
-    let (before, now) = (before.without_node("/rosout"), robot.settled_state());
-    before.assert_same(&now.without_node("/rosout"), "after both were killed");
-    let late = robot.node(Library::Roscpp, "listener", &["__name:=late"]);
-    late.wait_messages("/talker", 5);
-    listener.assert_no_message_lost("/talker");
-    talker.assert_no_link_lost();
 }
 
 #[test]
@@ -228,7 +184,7 @@ fn a_system_with_a_parameter_that_hides_the_others_is_taken_over_without_them() 
     let mut master = Rosmaster::start(&scratch);
     let bare = master.client();
     bare.set_param("/gain", 3);
-    bare.set_param("/arm/poison", Value::BigInt("9999999999".to_owned()));
+    bare.set_param("/arm/huge", Value::BigInt("9999999999".to_owned()));
     let node = FakeNode::start("/node");
     node.publish(&bare, "/topic", "std_msgs/String");
 
@@ -269,6 +225,17 @@ fn master_of(rescue: &Rescue) -> (u32, u16) {
     (pid, words.next().unwrap().parse().unwrap())
 }
 
+/// A core that was killed with its master: it had set `/kept` to `value`. Gives the master's port, too.
+fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
+    let mut rescue = core(scratch);
+    rescue.client().set_param("/kept", value);
+    let (master, port) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
+    (rescue, port)
+}
+
 /// What somebody else does with each connection to the port where our master was.
 fn squat(port: u16, what: &'static str) {
     let listener = eventually_some("the port is free", || {
@@ -293,12 +260,7 @@ fn squat(port: u16, what: &'static str) {
 fn a_core_starts_although_somebody_else_has_its_masters_port() {
     for what in ["closes", "is silent", "answers nonsense"] {
         let scratch = Scratch::new();
-        let mut rescue = core(&scratch);
-        rescue.client().set_param("/kept", what);
-        let (master, port) = master_of(&rescue);
-        rescue.kill();
-        signal(master, Signal::KILL);
-        eventually("the master is dead", || !alive(master));
+        let (mut rescue, port) = killed_core(&scratch, what);
         squat(port, what);
         rescue.start_again();
         rescue.wait_serving();
@@ -310,19 +272,14 @@ fn a_core_starts_although_somebody_else_has_its_masters_port() {
 #[test]
 fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
     let scratch = Scratch::new();
-    let mut rescue = core(&scratch);
-    rescue.client().set_param("/ours", 1);
-    let (master, port) = master_of(&rescue);
-    rescue.kill();
-    signal(master, Signal::KILL);
-    eventually("the master is dead", || !alive(master));
+    let (mut rescue, port) = killed_core(&scratch, "ours");
     let stranger = Rosmaster::start_at(&scratch, port);
     stranger.client().set_param("/theirs", 1);
     rescue.start_again();
     rescue.wait_serving();
-    assert_eq!(rescue.client().param("/ours"), Some(1.into()));
+    assert_eq!(rescue.client().param("/kept"), Some("ours".into()));
     assert_eq!(rescue.client().param("/theirs"), None);
-    assert_eq!(stranger.client().param("/ours"), None);
+    assert_eq!(stranger.client().param("/kept"), None);
     assert_eq!(rescue.terminate().code(), Some(0));
     assert!(alive(stranger.pid()), "it is not ours to end");
 }
@@ -330,15 +287,10 @@ fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
 #[test]
 fn the_old_port_of_the_master_may_become_our_own() {
     let scratch = Scratch::new();
-    let mut rescue = core(&scratch);
-    rescue.client().set_param("/kept", 1);
-    let (master, port) = master_of(&rescue);
-    rescue.kill();
-    signal(master, Signal::KILL);
-    eventually("the master is dead", || !alive(master));
+    let (_rescue, port) = killed_core(&scratch, "yes");
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
     let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
-    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
 }
 
 #[test]

@@ -1,29 +1,42 @@
-//! A real rosmaster that is made to die (`tests/sick/rosmaster`), and what rosrescue says of it.
+//! A real rosmaster that is made to die (`tests/failing/rosmaster`), and what rosrescue says of it.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
+use rustix::process::Signal;
+
+use super::patience::eventually;
+use super::process::signal;
+use super::rescue::{Rescue, Setup};
 use super::rpc::Client;
-use super::scratch::Scratch;
+use super::scratch::{Scratch, free_port};
+use super::state::State;
 
 /// The program.
-pub(crate) const SICK_ROSMASTER: &str =
-    concat!(env!("CARGO_MANIFEST_DIR"), "/tests/sick/rosmaster");
+pub(crate) const FAILING_ROSMASTER: &str =
+    concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/rosmaster");
 
 /// What masters die of: a file that they read at their start.
 #[derive(Debug)]
-pub(crate) struct Sickness {
+pub(crate) struct Failures {
     pub(crate) file: PathBuf,
 }
 
-impl Sickness {
+impl Failures {
     /// None yet.
     pub(crate) fn new(scratch: &Scratch) -> Self {
         Self {
-            file: scratch.path("sickness"),
+            file: scratch.path("failures"),
         }
+    }
+
+    /// `rosrescue core` with a rosmaster that fails so.
+    pub(crate) fn core(&self, scratch: &Scratch, master_port: u16) -> Setup {
+        Setup::core(scratch, master_port)
+            .args(["--no-rosout", "--rosmaster", FAILING_ROSMASTER])
+            .env("FAILURES", &self.file)
     }
 
     /// From the next start on, masters die of this.
@@ -34,7 +47,7 @@ impl Sickness {
     }
 
     /// From the next start on, masters live.
-    pub(crate) fn cure(&self) {
+    pub(crate) fn clear(&self) {
         fs::remove_file(&self.file).unwrap();
     }
 
@@ -55,20 +68,78 @@ impl Sickness {
     }
 }
 
+/// rosrescue with a rosmaster that can be made to fail.
+#[derive(Debug)]
+pub(crate) struct Failing {
+    pub(crate) rescue: Rescue,
+    pub(crate) master_port: u16,
+    pub(crate) failures: Failures,
+    pub(crate) scratch: Scratch,
+}
+
+impl Failing {
+    /// `rosrescue core`, without rosout.
+    #[track_caller]
+    pub(crate) fn core(options: &[&str]) -> Self {
+        Self::start(|scratch, port, failures| failures.core(scratch, port).args(options))
+    }
+
+    /// What `setup` makes of a master's port.
+    #[track_caller]
+    pub(crate) fn start(setup: impl FnOnce(&Scratch, u16, &Failures) -> Setup) -> Self {
+        let scratch = Scratch::new();
+        let failures = Failures::new(&scratch);
+        let master_port = free_port();
+        Self {
+            rescue: setup(&scratch, master_port, &failures).start(),
+            master_port,
+            failures,
+            scratch,
+        }
+    }
+
+    pub(crate) fn client(&self) -> Client {
+        self.rescue.client()
+    }
+
+    /// A client of the real master.
+    pub(crate) fn bare(&self) -> Client {
+        Client::new(self.master_port)
+    }
+
+    /// The state of the real master, once roscore's parameters are in it.
+    #[track_caller]
+    pub(crate) fn state(&self) -> State {
+        eventually("the parameters of core are set", || {
+            let keys = ["/rosversion", "/rosdistro", "/run_id"];
+            keys.iter().all(|key| self.client().param(key).is_some())
+        });
+        State::read(&self.bare())
+    }
+
+    /// SIGKILL to the real master; its process id.
+    #[track_caller]
+    pub(crate) fn kill_master(&self) -> u32 {
+        let pid = self.bare().master_pid().expect("a master");
+        signal(pid, Signal::KILL);
+        pid
+    }
+}
+
 /// A process that starts masters in a fraction of the time.
 #[derive(Debug)]
-pub(crate) struct Zygote {
+pub(crate) struct Forkserver {
     child: Child,
     orders: ChildStdin,
     answers: BufReader<ChildStdout>,
 }
 
-impl Zygote {
+impl Forkserver {
     pub(crate) fn new(scratch: &Scratch) -> Self {
-        let mut command = Command::new(SICK_ROSMASTER);
+        let mut command = Command::new(FAILING_ROSMASTER);
         scratch.prepare(&mut command);
         let mut child = command
-            .arg("--zygote")
+            .arg("--forkserver")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -88,8 +159,8 @@ impl Zygote {
     }
 
     /// Starts a master on `port` that dies of this, if it is not empty; gives its process id.
-    pub(crate) fn start(&mut self, port: u16, sickness: &str) -> u32 {
-        let order = format!("start {port} {sickness}");
+    pub(crate) fn start(&mut self, port: u16, failures: &str) -> u32 {
+        let order = format!("start {port} {failures}");
         self.order(order.trim_end()).parse().unwrap()
     }
 
@@ -104,7 +175,7 @@ impl Zygote {
     }
 }
 
-impl Drop for Zygote {
+impl Drop for Forkserver {
     fn drop(&mut self) {
         // Its masters end with the scratch folder.
         let _ = self.child.kill();

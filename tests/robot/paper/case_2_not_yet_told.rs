@@ -4,7 +4,9 @@
 use std::ops::RangeInclusive;
 use std::thread;
 
-use crate::support::{FakeNode, Heard, Library, Mode, Node, Robot, eventually, status};
+use crate::support::{
+    FakeNode, Heard, Library, Mode, Node, Robot, eventually, in_both_modes, status,
+};
 use rosrescue::xmlrpc::Value;
 
 const TOPIC: &str = "/chatter";
@@ -155,46 +157,26 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
     robot.kill_master();
 }
 
-// A core restarts its master at once for the first five deaths within a minute.
+in_both_modes!(a_publisher_comes, a_publisher_leaves);
 
-#[test]
-fn registration_in_core_mode_before_and_at_the_first_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Registration, "3", 0..=3);
+fn a_publisher_comes(mode: Mode) {
+    at_every_callback(mode, Change::Registration, "3");
+}
+
+/// As in the paper.
+fn a_publisher_leaves(mode: Mode) {
+    at_every_callback(mode, Change::Unregistration, "3");
 }
 
 #[test]
-fn registration_in_core_mode_at_the_last_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Registration, "3", 4..=6);
+fn with_more_threads_than_callbacks() {
+    at_every_callback(Mode::Core, Change::Registration, "16");
+    at_every_callback(Mode::Core, Change::Unregistration, "16");
 }
 
-#[test]
-fn registration_with_more_threads_than_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Registration, "16", 0..=3);
-    the_master_dies_at(Mode::Core, Change::Registration, "16", 4..=6);
-}
-
-#[test]
-fn registration_in_proxy_mode() {
-    the_master_dies_at(Mode::Proxy, Change::Registration, "3", 0..=6);
-}
-
-#[test]
-fn unregistration_in_core_mode_before_and_at_the_first_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Unregistration, "3", 0..=3);
-}
-
-#[test]
-fn unregistration_in_core_mode_at_the_last_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Unregistration, "3", 4..=6);
-}
-
-#[test]
-fn unregistration_with_more_threads_than_callbacks() {
-    the_master_dies_at(Mode::Core, Change::Unregistration, "16", 0..=3);
-    the_master_dies_at(Mode::Core, Change::Unregistration, "16", 4..=6);
-}
-
-#[test]
-fn unregistration_in_proxy_mode() {
-    the_master_dies_at(Mode::Proxy, Change::Unregistration, "3", 0..=6);
+/// A core restarts its master at once for the first five deaths within a minute: there are two of them.
+fn at_every_callback(mode: Mode, change: Change, workers: &str) {
+    for points in [0..=3, 4..=6] {
+        the_master_dies_at(mode, change, workers, points);
+    }
 }

@@ -1,0 +1,51 @@
+//! Nodes that could not be reached are whole as soon as they can be. `tests/timing/unreachable.rs` has whom they delay.
+
+use std::time::Duration;
+
+use crate::support::{
+    FakeNode, Library, Netns, Node, Scratch, Setup, eventually, free_port, holds, names, status,
+};
+
+/// Real nodes behind a cable that is cut during an outage, and mended later.
+#[test]
+fn a_node_that_can_be_reached_again_is_whole() {
+    let net = Netns::new();
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
+    let rescue = setup.args(["--node-timeout", "1000"]).start();
+    let client = rescue.client();
+    let port = rescue.port();
+    let nodes = [(2, Library::Rospy), (3, Library::Roscpp)].map(|(host, library)| {
+        let mut command = library.command(&scratch, port, "listener");
+        let name = format!("__name:={}", format!("{library:?}").to_lowercase());
+        command
+            .arg(name)
+            .env("ROS_IP", net.far(host))
+            .env("ROS_MASTER_URI", format!("http://{}:{port}", net.near()));
+        Node::run(&mut net.inside(&command))
+    });
+    for host in [2, 3] {
+        net.cut(host);
+    }
+    let dead = client.master_pid().expect("a master");
+    crate::support::signal(dead, rustix::process::Signal::KILL);
+    let publisher = FakeNode::start("/publisher");
+    publisher.publish(&client, "/chatter", "std_msgs/String");
+    let unreachable = || names(&status(&client)["unreachable"]);
+    eventually("both are unreachable", || {
+        unreachable() == ["/roscpp", "/rospy"]
+    });
+    let knows = |node: &Node| {
+        let updates = node.updates("/chatter");
+        updates.last() == Some(&vec![publisher.api.clone()])
+    };
+    // Longer than the supervised rosmaster tries.
+    assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
+    for host in [2, 3] {
+        net.mend(host);
+    }
+    eventually("both know the publisher", || nodes.iter().all(knows));
+    eventually("nobody is unreachable any more", || {
+        unreachable().is_empty()
+    });
+}
