@@ -30,4 +30,8 @@ else
     echo "tests/run.sh: no cargo-deny: dependencies are not checked (cargo install --locked cargo-deny)" >&2
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
-cargo test --locked
+
+# Tests with real ROS wait for processes most of the time: twice as many at once as there are cores. Those
+# that measure times (tests/timing) run one at a time in any case.
+threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
+RUST_TEST_THREADS=$threads cargo test --locked

@@ -1,0 +1,23 @@
+# The few commands, for those who have `just`. Nothing needs it: each is a line to type.
+
+# Release build
+build:
+    cargo build --release --locked
+
+# Checks without ROS, some two minutes
+quick:
+    tests/quick.sh
+
+# Every check; installs what is missing of ROS 1 (needs root)
+test:
+    tests/run.sh
+
+# The tables of docs/benchmarks.md
+bench:
+    cargo bench --bench pauses
+    cargo bench --bench table1
+    cargo bench --bench throughput
+
+# A rescue to look at, with a real rosmaster and nodes
+quickstart:
+    examples/quickstart.sh
