@@ -34,11 +34,12 @@ fn nothing_acknowledged_is_lost(library: Library, mode: Mode) {
     };
     let mut done = 0;
     while Instant::now() < end || done < 5 {
+        let master = robot.master_pid();
         let stop = AtomicBool::new(false);
         let what = thread::scope(|scope| {
             let finish = Finish(&stop);
             let writing = scope.spawn(|| writer.write(&stop));
-            let what = kill(&mut robot, &mut dice);
+            let what = kill(&mut robot, master, &mut dice);
             drop(finish);
             if what != "the master" {
                 robot.rescue.start_again();
@@ -49,7 +50,10 @@ fn nothing_acknowledged_is_lost(library: Library, mode: Mode) {
             writing.join().expect("the writer failed");
             what
         });
-        robot.await_gate();
+        match what {
+            "rosrescue" => robot.await_gate(),
+            _ => robot.await_recovery(master),
+        }
         done += 1;
         let when = format!("after round {done} ({what} killed; seed {seed})");
         assert_ledger(&writer.ledger, &robot.state(), &when);
@@ -67,7 +71,7 @@ fn nothing_acknowledged_is_lost(library: Library, mode: Mode) {
 }
 
 /// Kills one of them or both at any instant of the next 60 ms, and says whom.
-fn kill(robot: &mut Robot, dice: &mut Dice) -> &'static str {
+fn kill(robot: &mut Robot, master: u32, dice: &mut Dice) -> &'static str {
     thread::sleep(Duration::from_micros(dice.below(60_000)));
     let gap = Duration::from_micros(dice.below(5_000));
     match dice.below(4) {
@@ -86,7 +90,6 @@ fn kill(robot: &mut Robot, dice: &mut Dice) -> &'static str {
             "the master, then rosrescue"
         }
         _ => {
-            let master = robot.master_pid();
             robot.rescue.kill();
             thread::sleep(gap);
             robot.kill_master_at_once(master);
