@@ -46,8 +46,8 @@ use real::Rosmaster;
 use script::{Script, Step, shrink, simpler};
 use stage::Failure;
 
-const SEQUENCES: u64 = 150;
-const CRASH_SEQUENCES: u64 = 40;
+const SEQUENCES: u64 = 100;
+const CRASH_SEQUENCES: u64 = 30;
 const CALLS: u64 = 200;
 const CRASHES: u64 = 3;
 /// A core takes a while to start.
