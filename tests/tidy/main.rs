@@ -217,6 +217,33 @@ fn the_core_does_no_io() {
     assert!(seen > CORE.len());
 }
 
+/// The modules, each above all that it may import: `docs/decisions/0020`.
+#[rustfmt::skip]
+const LAYERS: [&str; 25] = [
+    "clock", "wait", "xmlrpc", "master", "replay", "lifecycle", "health", "checkpoint", "cli", "ros_env",
+    "config", "resolver", "gate", "status", "ledger", "upstream", "write_queue", "guardian", "process", "nodes",
+    "recovery", "roscore", "server", "app", "main",
+];
+
+#[test]
+fn modules_import_downward_only() {
+    let source = root().join("src");
+    for file in rust_files(&source) {
+        let Some(code) = code(&file) else { continue };
+        let relative = file.strip_prefix(&source).unwrap().with_extension("");
+        let module = relative.iter().next().unwrap().to_str().unwrap().to_owned();
+        if module == "lib" {
+            continue;
+        }
+        let layer = |name: &str| LAYERS.iter().position(|of| *of == name);
+        let own = layer(&module).unwrap_or_else(|| panic!("{module} is in no layer"));
+        for name in named(&code, "crate") {
+            let of = layer(name).unwrap_or_else(|| panic!("{name} is in no layer"));
+            assert!(of <= own, "{} imports {name}", file.display());
+        }
+    }
+}
+
 /// Decisions hang on the monotonic clock: the wall clock is read in one place, for people.
 #[test]
 fn only_the_clock_reads_the_wall_clock() {
