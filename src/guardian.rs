@@ -62,8 +62,12 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
     let mut worker = Worker::start(listeners)?;
+    let mut asked = None;
     loop {
-        let end = worker.attend(&signals, || restarts.stop());
+        let end = worker.attend(&signals, |signal| {
+            restarts.stop();
+            asked = Some(signal);
+        });
         let pause = match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
             Next::Exit(status) => return Ok(status),
             Next::Restart { pause } => pause,
@@ -79,7 +83,7 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         }
         let stop;
         (worker, stop) = start_again(listeners, &signals, pause)?;
-        if let Some(signal) = stop {
+        if let Some(signal) = stop.or(asked) {
             restarts.stop();
             worker.pass_on(signal);
         }
@@ -170,7 +174,7 @@ impl Worker {
     }
 
     /// Waits for its end, and passes signals on until then; `stopping` is told of them.
-    fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut()) -> End {
+    fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut(i32)) -> End {
         loop {
             match signals.recv() {
                 Ok(SIGCHLD) => {
@@ -179,7 +183,7 @@ impl Worker {
                     }
                 }
                 Ok(signal) => {
-                    stopping();
+                    stopping(signal);
                     self.pass_on(signal);
                 }
                 // The thread that sends them has panicked.

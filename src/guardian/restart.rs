@@ -15,6 +15,8 @@ const PAUSE_LEAST: Duration = Duration::from_millis(500);
 /// it.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
+/// The signal that no worker can answer.
+const SIGKILL: i32 = 9;
 /// The exit status of a Rust program that panicked.
 const PANIC: i32 = 101;
 
@@ -68,10 +70,12 @@ pub struct Restarts {
     /// Whether any worker has served.
     served: bool,
     stopping: bool,
+    /// A worker has been started to end what a killed one has left.
+    cleaning: bool,
 }
 
 impl Restarts {
-    /// A signal asks for the end: no worker is started again.
+    /// A signal asks for the end: no worker is started again, but for one that ends what a killed one has left.
     pub fn stop(&mut self) {
         self.stopping = true;
     }
@@ -83,6 +87,11 @@ impl Restarts {
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
         match end {
+            End::Signal(SIGKILL) if self.stopping && !self.cleaning => {
+                self.cleaning = true;
+                let pause = Duration::ZERO;
+                Next::Restart { pause }
+            }
             _ if self.stopping => Next::Exit(end.status()),
             End::Code(0) => Next::Exit(0),
             End::Code(code) if code != PANIC && !self.served => Next::Exit(code),
@@ -163,5 +172,9 @@ mod tests {
         ] {
             assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
         }
+        // The one that was to stop has left its master; so may the one after it, but only once.
+        let pause = Duration::ZERO;
+        assert_eq!(restarts.ended(KILLED, true, now), Next::Restart { pause });
+        assert_eq!(restarts.ended(KILLED, true, now), Next::Exit(137));
     }
 }

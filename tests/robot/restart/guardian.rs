@@ -281,6 +281,24 @@ fn a_stop_right_after_a_death_ends_everything() {
     }
 }
 
+/// The worker is killed before it has done what the signal asks for.
+#[test]
+fn a_stop_and_a_death_at_once_end_everything() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    let dead = worker(&scratch);
+    crate::support::stop(dead);
+    rescue.signal(Signal::TERM);
+    eventually("the signal has been passed on", || {
+        let status = fs::read_to_string(format!("/proc/{dead}/status")).unwrap();
+        let pending = status.lines().find(|line| line.starts_with("ShdPnd:"));
+        pending.is_some_and(|line| line.trim_end().ends_with("4000"))
+    });
+    signal(dead, Signal::KILL);
+    assert_eq!(rescue.wait().code(), Some(0));
+    assert_eq!(scratch.survivors(), vec![]);
+}
+
 #[test]
 fn a_second_signal_ends_both_at_once() {
     let scratch = Scratch::new();
