@@ -233,6 +233,9 @@ fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     rescue.kill();
     signal(master, Signal::KILL);
     eventually("the master is dead", || !alive(master));
+    eventually("its port is free", || {
+        TcpListener::bind(("127.0.0.1", port)).is_ok()
+    });
     (rescue, port)
 }
 
@@ -287,7 +290,14 @@ fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
 #[test]
 fn the_old_port_of_the_master_may_become_our_own() {
     let scratch = Scratch::new();
-    let (_rescue, port) = killed_core(&scratch, "yes");
+    // Not one of the kernel's choice: those go to anybody's connection.
+    let port = free_port();
+    let mut rescue = Setup::core(&scratch, port).arg("--no-rosout").start();
+    rescue.client().set_param("/kept", "yes");
+    let (master, _) = master_of(&rescue);
+    rescue.kill();
+    signal(master, Signal::KILL);
+    eventually("the master is dead", || !alive(master));
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
     let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
