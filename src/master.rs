@@ -1,10 +1,10 @@
 //! The Master and Parameter API as a pure state machine.
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
-//! * [`kind`]: what a call may do.
+//! * [`Request`]: a call, parsed once; its [`Method`] and its [`Kind`].
 //!
 //! Everything follows rosmaster 1.15.15 under Python 3.11, function by function; its quirks are
-//! kept, because clients see them.
+//! kept, because clients see them. Only texts of errors that no ROS client provokes are our own.
 
 pub(crate) mod api;
 pub(crate) mod checks;
@@ -14,8 +14,9 @@ pub(crate) mod multicall;
 pub(crate) mod names;
 mod notice;
 pub(crate) mod params;
-pub(crate) mod python;
 pub(crate) mod registry;
+mod request;
+pub(crate) mod returnable;
 pub(crate) mod snapshot;
 pub(crate) mod state;
 mod tell;
@@ -23,10 +24,12 @@ mod tell;
 mod tests;
 mod updates;
 
-pub use api::{Applied, is_success};
-pub use kind::{Kind, is_answerable, kind, writes};
+pub use api::{Applied, Method, is_success};
+pub use kind::Kind;
+pub use multicall::entry_reply;
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
+pub use request::{AsRequest, Entry, Request, is_answerable, kind, writes};
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{is_plain_topic, param_update, publisher_update, registrant, shutdown};

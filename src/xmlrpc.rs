@@ -12,5 +12,6 @@ mod value;
 
 pub use decode::{MAX_DEPTH, decode_call, decode_reply};
 pub use encode::{ListWriter, encode_call, encode_reply};
+pub(crate) use encode::{MAX_REPLY_DEPTH, TOO_DEEP, refusal};
 pub use error::DecodeError;
 pub use value::{Call, Reply, Struct, Value};

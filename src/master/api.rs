@@ -1,80 +1,125 @@
-//! The Master API: `rosmaster/master_api.py`, and the dispatcher in front of it.
+//! The methods of the Master API, and the dispatcher in front of them.
 
-use super::{Kind, Master, Notice, NoticeSink, python};
-use crate::xmlrpc::{Call, Reply, Value};
+use super::{AsRequest, Kind, Master, Notice, NoticeSink, Request, returnable};
+use crate::xmlrpc::{Reply, Value};
 
 /// What a method returns: status code, message, value.
 pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 
-/// Why a method ends early.
+/// Why a method ends early. The texts after the first word are our own, but for those that clients meet.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Failure {
     /// A check refuses a parameter: the text is the message.
     Refused(String),
-    /// A Python `TypeError`.
-    Type(String),
-    /// Any other Python exception.
-    Internal(String),
+    /// A Python `TypeError`: code -1.
+    Type(&'static str),
+    /// Any other Python exception: code 0.
+    Internal(&'static str),
 }
 
-/// One method of the Master API.
-pub(crate) struct Method {
-    name: &'static str,
-    pub(crate) kind: Kind,
+/// What a method is called with.
+pub(crate) struct Args<'a> {
+    pub(crate) caller_id: &'a str,
+    /// Those after the caller id.
+    params: &'a [Value],
+    pub(crate) notices: &'a mut dyn NoticeSink,
+}
+
+impl<'a> Args<'a> {
+    pub(crate) fn params<const N: usize>(&self) -> Result<&'a [Value; N], Failure> {
+        self.params.try_into().map_err(|_| bad_arity())
+    }
+}
+
+/// What is known of a method of the Master API.
+struct Spec {
+    kind: Kind,
     /// Number of parameters, the caller id included.
     arity: usize,
     /// The value that goes with an error.
     error: fn() -> Value,
-    run: fn(&mut Master, &str, &[Value], &mut dyn NoticeSink) -> Answer,
+    run: fn(&mut Master, Args<'_>) -> Answer,
 }
 
+const MULTICALL: &str = "system.multicall";
+
 macro_rules! methods {
-    ($($name:literal $kind:ident $arity:literal $error:expr => $run:ident;)*) => {
-        &[$(Method { name: $name, kind: Kind::$kind, arity: $arity, error: || $error, run: Master::$run },)*]
+    ($($method:ident $name:literal $kind:ident $arity:literal $error:expr => $run:ident;)*) => {
+        /// A method of a master.
+        #[derive(Clone, Debug, PartialEq, Eq, Hash)]
+        pub enum Method {
+            $(#[doc = concat!("`", $name, "`.")] $method,)*
+            /// `system.multicall`, which CPython's `xmlrpc.server` brings along.
+            Multicall,
+            /// None that a rosmaster has.
+            Unknown(Box<str>),
+        }
+
+        impl Method {
+            /// The method of that name.
+            pub fn named(name: &str) -> Self {
+                match name {
+                    $($name => Self::$method,)*
+                    MULTICALL => Self::Multicall,
+                    _ => Self::Unknown(name.into()),
+                }
+            }
+
+            /// Its name on the wire.
+            pub fn name(&self) -> &str {
+                match self {
+                    $(Self::$method => $name,)*
+                    Self::Multicall => MULTICALL,
+                    Self::Unknown(name) => name,
+                }
+            }
+
+            fn spec(&self) -> Option<&'static Spec> {
+                match self {
+                    $(Self::$method => Some(const { &Spec {
+                        kind: Kind::$kind,
+                        arity: $arity,
+                        error: || $error,
+                        run: Master::$run,
+                    } }),)*
+                    Self::Multicall | Self::Unknown(_) => None,
+                }
+            }
+        }
     };
 }
 
-static METHODS: &[Method] = methods! {
-    "registerPublisher" Mutate 4 list() => register_publisher;
-    "registerSubscriber" Mutate 4 list() => register_subscriber;
-    "registerService" Mutate 4 0.into() => register_service;
-    "setParam" Mutate 3 0.into() => set_param;
-    "getParam" Read 2 0.into() => get_param;
-    "hasParam" Read 2 false.into() => has_param;
-    "lookupService" Read 2 "".into() => lookup_service;
-    "lookupNode" Read 2 "".into() => lookup_node;
-    "unregisterPublisher" Unregister 3 0.into() => unregister_publisher;
-    "unregisterSubscriber" Unregister 3 0.into() => unregister_subscriber;
-    "unregisterService" Unregister 3 0.into() => unregister_service;
-    "subscribeParam" Mutate 3 0.into() => subscribe_param;
-    "unsubscribeParam" Unregister 3 0.into() => unsubscribe_param;
-    "deleteParam" Mutate 2 0.into() => delete_param;
-    "searchParam" Read 2 0.into() => search_param;
-    "getParamNames" Read 1 list() => get_param_names;
-    "getSystemState" Read 1 vec![list(), list(), list()].into() => get_system_state;
-    "getPublishedTopics" Read 2 0.into() => get_published_topics;
-    "getTopicTypes" Read 1 list() => get_topic_types;
-    "getPid" Identity 1 (-1).into() => get_pid;
-    "getUri" Identity 1 "".into() => get_uri;
-    "shutdown" Shutdown 2 0.into() => shutdown;
-};
+methods! {
+    RegisterPublisher "registerPublisher" Mutate 4 list() => register_publisher;
+    RegisterSubscriber "registerSubscriber" Mutate 4 list() => register_subscriber;
+    RegisterService "registerService" Mutate 4 0.into() => register_service;
+    SetParam "setParam" Mutate 3 0.into() => set_param;
+    GetParam "getParam" Read 2 0.into() => get_param;
+    HasParam "hasParam" Read 2 false.into() => has_param;
+    LookupService "lookupService" Read 2 "".into() => lookup_service;
+    LookupNode "lookupNode" Read 2 "".into() => lookup_node;
+    UnregisterPublisher "unregisterPublisher" Unregister 3 0.into() => unregister_publisher;
+    UnregisterSubscriber "unregisterSubscriber" Unregister 3 0.into() => unregister_subscriber;
+    UnregisterService "unregisterService" Unregister 3 0.into() => unregister_service;
+    SubscribeParam "subscribeParam" Mutate 3 0.into() => subscribe_param;
+    UnsubscribeParam "unsubscribeParam" Unregister 3 0.into() => unsubscribe_param;
+    DeleteParam "deleteParam" Mutate 2 0.into() => delete_param;
+    SearchParam "searchParam" Read 2 0.into() => search_param;
+    GetParamNames "getParamNames" Read 1 list() => get_param_names;
+    GetSystemState "getSystemState" Read 1 vec![list(), list(), list()].into() => get_system_state;
+    GetPublishedTopics "getPublishedTopics" Read 2 0.into() => get_published_topics;
+    GetTopicTypes "getTopicTypes" Read 1 list() => get_topic_types;
+    GetPid "getPid" Identity 1 (-1).into() => get_pid;
+    GetUri "getUri" Identity 1 "".into() => get_uri;
+    Shutdown "shutdown" Shutdown 2 0.into() => shutdown;
+}
 
-/// Attributes of rosmaster's handler that can be named as a method, and their types.
-const NOT_CALLABLE: &[(&str, &str)] = &[
-    ("uri", "str"),
-    ("done", "bool"),
-    ("thread_pool", "MarkedThreadPool"),
-    ("ps_lock", "Condition"),
-    ("reg_manager", "RegistrationManager"),
-    ("publishers", "Registrations"),
-    ("subscribers", "Registrations"),
-    ("services", "Registrations"),
-    ("param_subscribers", "Registrations"),
-    ("topics_types", "dict"),
-    ("param_server", "ParamDictionary"),
-];
-
-const PARAM_UPDATE_TASK: [&str; 4] = ["caller_id", "caller_api", "param_key", "param_value"];
+impl Method {
+    /// What it may do. [`Kind::Unknown`] for a multicall, whose entries decide.
+    pub(crate) fn kind(&self) -> Kind {
+        self.spec().map_or(Kind::Unknown, |spec| spec.kind)
+    }
+}
 
 fn list() -> Value {
     Value::Array(Vec::new())
@@ -82,11 +127,6 @@ fn list() -> Value {
 
 pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
     Value::Array(texts.into_iter().map(Value::String).collect())
-}
-
-/// The method of that name.
-pub(crate) fn method(name: &str) -> Option<&'static Method> {
-    METHODS.iter().find(|method| method.name == name)
 }
 
 /// What a call answers, and which callbacks the master sends because of it.
@@ -100,27 +140,23 @@ pub struct Applied {
 }
 
 impl Master {
-    /// Answers `call` as rosmaster does, and changes as rosmaster does.
-    ///
-    /// Every method that can be called is answered: reads, refused parameters, `system.multicall`
-    /// (nested and malformed too) and unknown methods. `shutdown` is answered and changes nothing.
-    /// The one method whose answer depends on the network, `param_update_task` (a slip of
-    /// rosmaster's), is answered as if its callback had been taken, and sends none.
-    pub fn apply(&mut self, call: &Call) -> Applied {
+    /// Answers as rosmaster does, and changes as rosmaster does. `shutdown` is answered and changes nothing.
+    /// The texts of errors that only an odd client can provoke are our own.
+    pub fn apply(&mut self, call: &impl AsRequest) -> Applied {
         let mut notices = Vec::new();
         let reply = self.apply_telling(call, &mut notices);
         Applied { reply, notices }
     }
 
     /// Like [`Master::apply`], with the callbacks told to `notices`, which copies as much as it needs.
-    pub fn apply_telling(&mut self, call: &Call, notices: &mut dyn NoticeSink) -> Reply {
-        let reply = if call.method == super::multicall::METHOD {
-            self.run_multicall(&call.params, notices)
-        } else {
-            self.dispatch(&call.method, &call.params, notices)
+    pub fn apply_telling(&mut self, call: &impl AsRequest, notices: &mut dyn NoticeSink) -> Reply {
+        let request = &*call.as_request();
+        let result = match request.method() {
+            Method::Multicall => self.run_multicall(request.entries(), notices),
+            _ => self.dispatch(request, notices),
         };
-        match reply {
-            Ok(value) => match python::write_error(&value) {
+        match result {
+            Ok(value) => match returnable::reply_error(&value) {
                 None => Reply::Value(value),
                 Some(text) => fault(text),
             },
@@ -128,30 +164,32 @@ impl Master {
         }
     }
 
-    /// `_dispatch` of anything but a multicall; an error is the text of a fault.
+    /// Answers anything but a multicall. An error is the text of a fault.
     pub(crate) fn dispatch(
         &mut self,
-        name: &str,
-        params: &[Value],
+        request: &Request,
         notices: &mut dyn NoticeSink,
     ) -> Result<Value, String> {
-        let Some(method) = method(name) else {
-            return Err(unsupported(name, params.len()));
+        let Some(spec) = request.method().spec() else {
+            let name = request.method().name();
+            return Err(format!(
+                "<class 'Exception'>:method \"{name}\" is not supported"
+            ));
         };
-        let (code, message, value) = match self.validate_and_run(method, params, notices) {
+        let (code, message, value) = match self.validate_and_run(spec, request.params(), notices) {
             Ok((_, _, Value::Nil)) => {
                 let text = "Internal error (None value returned)".to_owned();
-                (-1, text, (method.error)())
+                (-1, text, (spec.error)())
             }
             Ok(answer) => answer,
-            Err(Failure::Refused(text)) => (-1, text, (method.error)()),
+            Err(Failure::Refused(text)) => (-1, text, (spec.error)()),
             Err(Failure::Type(text)) => (
                 -1,
                 format!("Error: invalid arguments: {text}"),
-                (method.error)(),
+                (spec.error)(),
             ),
             Err(Failure::Internal(text)) => {
-                (0, format!("Internal failure: {text}"), (method.error)())
+                (0, format!("Internal failure: {text}"), (spec.error)())
             }
         };
         Ok(Value::Array(vec![code.into(), message.into(), value]))
@@ -160,22 +198,25 @@ impl Master {
     /// `apivalidate`.
     fn validate_and_run(
         &mut self,
-        method: &Method,
+        spec: &Spec,
         params: &[Value],
         notices: &mut dyn NoticeSink,
     ) -> Answer {
         let Some((caller_id, rest)) = params.split_first() else {
-            return Err(Failure::Refused(
-                "missing required caller_id parameter".to_owned(),
-            ));
+            return refused("missing required caller_id parameter");
         };
-        if params.len() != method.arity {
+        if params.len() != spec.arity {
             return Err(bad_arity());
         }
         let Some(caller_id) = caller_id.as_str() else {
-            return Err(Failure::Refused("caller_id must be a string".to_owned()));
+            return refused("caller_id must be a string");
         };
-        (method.run)(self, caller_id, rest, notices)
+        let args = Args {
+            caller_id,
+            params: rest,
+            notices,
+        };
+        (spec.run)(self, args)
     }
 }
 
@@ -184,7 +225,11 @@ pub fn is_success(reply: &Reply) -> bool {
     matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
 }
 
-pub(crate) fn bad_arity() -> Failure {
+fn refused(text: &str) -> Answer {
+    Err(Failure::Refused(text.to_owned()))
+}
+
+fn bad_arity() -> Failure {
     Failure::Refused("Error: bad call arity".to_owned())
 }
 
@@ -193,38 +238,4 @@ pub(crate) fn fault(text: &str) -> Reply {
         code: 1,
         text: text.to_owned(),
     }
-}
-
-/// The fault of a name that is no method.
-pub(crate) fn unsupported(name: &str, arity: usize) -> String {
-    if let Some((_, kind)) = NOT_CALLABLE
-        .iter()
-        .find(|(attribute, _)| *attribute == name)
-    {
-        return format!("<class 'TypeError'>:'{kind}' object is not callable");
-    }
-    if name == "param_update_task" {
-        let missing = PARAM_UPDATE_TASK.get(arity..).unwrap_or_default();
-        return match missing {
-            [] if arity == 4 => {
-                "<class 'TypeError'>:cannot marshal None unless allow_none is enabled".to_owned()
-            }
-            [] => format!(
-                "<class 'TypeError'>:ROSMasterHandler.param_update_task() takes 5 positional arguments but {} were given",
-                arity + 1
-            ),
-            [one] => format!(
-                "<class 'TypeError'>:ROSMasterHandler.param_update_task() missing 1 required positional argument: '{one}'"
-            ),
-            [first, second] => format!(
-                "<class 'TypeError'>:ROSMasterHandler.param_update_task() missing 2 required positional arguments: '{first}' and '{second}'"
-            ),
-            [firsts @ .., last] => format!(
-                "<class 'TypeError'>:ROSMasterHandler.param_update_task() missing {} required positional arguments: '{}', and '{last}'",
-                missing.len(),
-                firsts.join("', '")
-            ),
-        };
-    }
-    format!("<class 'Exception'>:method \"{name}\" is not supported")
 }

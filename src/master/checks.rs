@@ -1,7 +1,7 @@
 //! The checks on parameters: `rosmaster/validators.py`, with its texts.
 
 use super::api::Failure;
-use super::{names, python};
+use super::names;
 use crate::xmlrpc::Value;
 
 type Checked<T> = Result<T, Failure>;
@@ -14,10 +14,8 @@ fn refuse<T>(what: &str, complaint: &str) -> Checked<T> {
 
 /// `non_empty_str('key')`.
 pub(crate) fn key(value: &Value) -> Checked<&str> {
-    if !python::is_true(value) {
-        return refuse("key", "must be specified and non-empty");
-    }
     match value.as_str() {
+        Some("") => refuse("key", "must be specified and non-empty"),
         Some(text) => Ok(text),
         None => refuse("key", "must be a string"),
     }

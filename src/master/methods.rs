@@ -1,54 +1,45 @@
 //! The methods of the Master API, one by one: the body of `rosmaster/master_api.py`.
 
-use super::api::{Answer, Failure, bad_arity, strings};
+use super::api::{Answer, Args, Failure, strings};
 use super::registry::Shared;
 use super::{Master, NoticeSink, checks, names};
 use crate::xmlrpc::{Struct, Value};
 
 impl Master {
-    pub(crate) fn get_pid(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn get_pid(&mut self, _: Args<'_>) -> Answer {
         Ok((1, String::new(), self.pid.into()))
     }
 
-    pub(crate) fn get_uri(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn get_uri(&mut self, _: Args<'_>) -> Answer {
         Ok((1, String::new(), self.uri.as_str().into()))
     }
 
-    pub(crate) fn shutdown(&mut self, _: &str, _: &[Value], _: &mut dyn NoticeSink) -> Answer {
+    pub(crate) fn shutdown(&mut self, _: Args<'_>) -> Answer {
         Ok((1, "shutdown".to_owned(), 0.into()))
     }
 
-    pub(crate) fn register_publisher(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let (topic, topic_type, api) = topic_params(params, caller_id)?;
+    pub(crate) fn register_publisher(&mut self, of: Args<'_>) -> Answer {
+        let caller_id = of.caller_id;
+        let (topic, topic_type, api) = topic_params(&of)?;
         let bumped = self
             .registry
             .register(Shared::Publishers, &topic, caller_id, api);
-        notify_bumped(caller_id, bumped, notices);
+        notify_bumped(caller_id, bumped, of.notices);
         if topic_type != "*" || !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
         }
-        let subscribers = self.notify_publishers(&topic, notices);
+        let subscribers = self.notify_publishers(&topic, of.notices);
         let message = format!("Registered [{caller_id}] as publisher of [{topic}]");
         Ok((1, message, strings(subscribers)))
     }
 
-    pub(crate) fn register_subscriber(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let (topic, topic_type, api) = topic_params(params, caller_id)?;
+    pub(crate) fn register_subscriber(&mut self, of: Args<'_>) -> Answer {
+        let (topic, topic_type, api) = topic_params(&of)?;
         let bumped = self
             .registry
-            .register(Shared::Subscribers, &topic, caller_id, api);
-        notify_bumped(caller_id, bumped, notices);
+            .register(Shared::Subscribers, &topic, of.caller_id, api);
+        notify_bumped(of.caller_id, bumped, of.notices);
         if topic_type != "*" && !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
@@ -57,80 +48,56 @@ impl Master {
         Ok((1, format!("Subscribed to [{topic}]"), strings(publishers)))
     }
 
-    pub(crate) fn register_service(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [service, service_api, api] = exactly(params)?;
+    pub(crate) fn register_service(&mut self, of: Args<'_>) -> Answer {
+        let caller_id = of.caller_id;
+        let [service, service_api, api] = of.params()?;
         let service = checks::resource("service", service, caller_id)?;
         let service_api = checks::api("service_api", service_api)?;
         let api = checks::api("caller_api", api)?;
         let bumped = self
             .registry
             .register_service(&service, caller_id, api, service_api);
-        notify_bumped(caller_id, bumped, notices);
+        notify_bumped(caller_id, bumped, of.notices);
         let message = format!("Registered [{caller_id}] as provider of [{service}]");
         Ok((1, message, 1.into()))
     }
 
-    pub(crate) fn unregister_publisher(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [topic, api] = exactly(params)?;
-        let topic = checks::resource("topic", topic, caller_id)?;
+    pub(crate) fn unregister_publisher(&mut self, of: Args<'_>) -> Answer {
+        let [topic, api] = of.params()?;
+        let topic = checks::resource("topic", topic, of.caller_id)?;
         let api = checks::api("caller_api", api)?;
-        let (message, done) = self
-            .registry
-            .unregister(Shared::Publishers, &topic, caller_id, api);
+        let (message, done) =
+            self.registry
+                .unregister(Shared::Publishers, &topic, of.caller_id, api);
         if done {
-            self.notify_publishers(&topic, notices);
+            self.notify_publishers(&topic, of.notices);
         }
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn unregister_subscriber(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [topic, api] = exactly(params)?;
-        let topic = checks::resource("topic", topic, caller_id)?;
+    pub(crate) fn unregister_subscriber(&mut self, of: Args<'_>) -> Answer {
+        let [topic, api] = of.params()?;
+        let topic = checks::resource("topic", topic, of.caller_id)?;
         let api = checks::api("caller_api", api)?;
-        let (message, done) = self
-            .registry
-            .unregister(Shared::Subscribers, &topic, caller_id, api);
+        let (message, done) =
+            self.registry
+                .unregister(Shared::Subscribers, &topic, of.caller_id, api);
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn unregister_service(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [service, service_api] = exactly(params)?;
-        let service = checks::resource("service", service, caller_id)?;
+    pub(crate) fn unregister_service(&mut self, of: Args<'_>) -> Answer {
+        let [service, service_api] = of.params()?;
+        let service = checks::resource("service", service, of.caller_id)?;
         let service_api = checks::api("service_api", service_api)?;
         let (message, done) = self
             .registry
-            .unregister_service(&service, caller_id, service_api);
+            .unregister_service(&service, of.caller_id, service_api);
         Ok((1, message, i32::from(done).into()))
     }
 
-    pub(crate) fn lookup_service(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [service] = exactly(params)?;
-        let service = checks::resource("service", service, caller_id)?;
+    pub(crate) fn lookup_service(&mut self, of: Args<'_>) -> Answer {
+        let [service] = of.params()?;
+        let service = checks::resource("service", service, of.caller_id)?;
         Ok(match self.registry.services.get(&service) {
             Some(entry) => {
                 let message = format!("rosrpc URI: [{}]", entry.api);
@@ -140,28 +107,18 @@ impl Master {
         })
     }
 
-    pub(crate) fn lookup_node(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [node] = exactly(params)?;
-        let node = checks::name("node", node, caller_id)?;
+    pub(crate) fn lookup_node(&mut self, of: Args<'_>) -> Answer {
+        let [node] = of.params()?;
+        let node = checks::name("node", node, of.caller_id)?;
         Ok(match self.registry.nodes.get(&node) {
             Some(found) => (1, "node api".to_owned(), found.api.as_str().into()),
             None => (-1, format!("unknown node [{node}]"), "".into()),
         })
     }
 
-    pub(crate) fn get_published_topics(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [subgraph] = exactly(params)?;
-        let mut subgraph = checks::subgraph(subgraph, caller_id)?;
+    pub(crate) fn get_published_topics(&mut self, of: Args<'_>) -> Answer {
+        let [subgraph] = of.params()?;
+        let mut subgraph = checks::subgraph(subgraph, of.caller_id)?;
         if !subgraph.is_empty() && !subgraph.ends_with('/') {
             subgraph.push('/');
         }
@@ -175,24 +132,14 @@ impl Master {
         ))
     }
 
-    pub(crate) fn get_topic_types(
-        &mut self,
-        _: &str,
-        _: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
+    pub(crate) fn get_topic_types(&mut self, _: Args<'_>) -> Answer {
         let pairs = self.topic_types.iter();
         let pairs = pairs.map(|(topic, topic_type)| pair(topic, topic_type));
         let message = "current system state".to_owned();
         Ok((1, message, Value::Array(pairs.collect())))
     }
 
-    pub(crate) fn get_system_state(
-        &mut self,
-        _: &str,
-        _: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
+    pub(crate) fn get_system_state(&mut self, _: Args<'_>) -> Answer {
         let shared = |kind| {
             let keys = self.registry.shared(kind).iter();
             let keys = keys.map(|(key, callers)| {
@@ -212,76 +159,53 @@ impl Master {
         Ok((1, "current system state".to_owned(), Value::Array(state)))
     }
 
-    pub(crate) fn set_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [key, value] = exactly(params)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+    pub(crate) fn set_param(&mut self, of: Args<'_>) -> Answer {
+        let [key, value] = of.params()?;
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         let value = checks::param_value(value)?;
         let changed = names::param_key(&key);
         let subscribers = &self.registry.param_subscribers;
-        let updates = self.params.set(&changed, value, caller_id, subscribers)?;
-        self.registry.notify_params(updates, notices);
+        let updates = self
+            .params
+            .set(&changed, value, of.caller_id, subscribers)?;
+        self.registry.notify_params(updates, of.notices);
         Ok((1, format!("parameter {key} set"), 0.into()))
     }
 
-    pub(crate) fn delete_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [key] = exactly(params)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+    pub(crate) fn delete_param(&mut self, of: Args<'_>) -> Answer {
+        let [key] = of.params()?;
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         let changed = names::param_key(&key);
         let subscribers = &self.registry.param_subscribers;
         Ok(match self.params.delete(&changed, subscribers)? {
             Some(updates) => {
-                self.registry.notify_params(updates, notices);
+                self.registry.notify_params(updates, of.notices);
                 (1, format!("parameter {key} deleted"), 0.into())
             }
             None => (-1, format!("parameter [{key}] is not set"), 0.into()),
         })
     }
 
-    pub(crate) fn get_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [key] = exactly(params)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+    pub(crate) fn get_param(&mut self, of: Args<'_>) -> Answer {
+        let [key] = of.params()?;
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         Ok(match self.params.get(&key) {
             Some(value) => (1, format!("Parameter [{key}]"), value),
             None => (-1, format!("Parameter [{key}] is not set"), 0.into()),
         })
     }
 
-    pub(crate) fn has_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [key] = exactly(params)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+    pub(crate) fn has_param(&mut self, of: Args<'_>) -> Answer {
+        let [key] = of.params()?;
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         let has = self.params.has(&key);
         Ok((1, key, has.into()))
     }
 
-    pub(crate) fn search_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [key] = exactly(params)?;
+    pub(crate) fn search_param(&mut self, of: Args<'_>) -> Answer {
+        let [key] = of.params()?;
         let key = checks::key(key)?;
-        Ok(match self.params.search(caller_id, key)? {
+        Ok(match self.params.search(of.caller_id, key)? {
             Some(found) => (1, format!("Found [{found}]"), found.into()),
             None => {
                 let text = format!("Cannot find parameter [{key}] in an upwards search");
@@ -290,12 +214,7 @@ impl Master {
         })
     }
 
-    pub(crate) fn get_param_names(
-        &mut self,
-        _: &str,
-        _: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
+    pub(crate) fn get_param_names(&mut self, _: Args<'_>) -> Answer {
         Ok((
             1,
             "Parameter names".to_owned(),
@@ -303,36 +222,27 @@ impl Master {
         ))
     }
 
-    pub(crate) fn subscribe_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        notices: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [api, key] = exactly(params)?;
+    pub(crate) fn subscribe_param(&mut self, of: Args<'_>) -> Answer {
+        let [api, key] = of.params()?;
         let api = checks::api("caller_api", api)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         let subscribed = names::param_key(&key);
         let value = self.params.get(&subscribed);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
         let kind = Shared::ParamSubscribers;
-        let bumped = self.registry.register(kind, &subscribed, caller_id, api);
-        notify_bumped(caller_id, bumped, notices);
+        let bumped = self.registry.register(kind, &subscribed, of.caller_id, api);
+        notify_bumped(of.caller_id, bumped, of.notices);
         Ok((1, format!("Subscribed to parameter [{key}]"), value))
     }
 
-    pub(crate) fn unsubscribe_param(
-        &mut self,
-        caller_id: &str,
-        params: &[Value],
-        _: &mut dyn NoticeSink,
-    ) -> Answer {
-        let [api, key] = exactly(params)?;
+    pub(crate) fn unsubscribe_param(&mut self, of: Args<'_>) -> Answer {
+        let [api, key] = of.params()?;
         let api = checks::api("caller_api", api)?;
-        let key = names::resolve(checks::key(key)?, caller_id);
+        let key = names::resolve(checks::key(key)?, of.caller_id);
         let subscribed = names::param_key(&key);
         let kind = Shared::ParamSubscribers;
-        self.registry.unregister(kind, &subscribed, caller_id, api);
+        self.registry
+            .unregister(kind, &subscribed, of.caller_id, api);
         Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
     }
 
@@ -347,20 +257,13 @@ impl Master {
     }
 }
 
-fn topic_params<'a>(
-    params: &'a [Value],
-    caller_id: &str,
-) -> Result<(String, &'a str, &'a str), Failure> {
-    let [topic, topic_type, api] = exactly(params)?;
+fn topic_params<'a>(of: &Args<'a>) -> Result<(String, &'a str, &'a str), Failure> {
+    let [topic, topic_type, api] = of.params()?;
     Ok((
-        checks::resource("topic", topic, caller_id)?,
+        checks::resource("topic", topic, of.caller_id)?,
         checks::topic_type(topic_type)?,
         checks::api("caller_api", api)?,
     ))
-}
-
-fn exactly<const N: usize>(params: &[Value]) -> Result<&[Value; N], Failure> {
-    params.try_into().map_err(|_| bad_arity())
 }
 
 fn pair(topic: &str, topic_type: &str) -> Value {

@@ -1,9 +1,9 @@
 //! The parameter server: `rosmaster/paramserver.py`.
 
 use super::api::Failure;
+use super::names;
 use super::registry::Registrations;
 use super::updates::{GONE, Update, updates};
-use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
 /// Levels of the tree that are kept. rosmaster takes any depth, by a long key as well as by a deep
@@ -90,7 +90,7 @@ impl Params {
         if key == "/" {
             let Value::Struct(_) = value else {
                 return Err(Failure::Type(
-                    "cannot set root of parameter tree to non-dictionary".to_owned(),
+                    "cannot set root of parameter tree to non-dictionary",
                 ));
             };
         }
@@ -112,7 +112,7 @@ impl Params {
         };
         match (path.split_last(), value) {
             (None, Value::Struct(tree)) => self.tree = tree,
-            (None, _) => return Err(Failure::Internal("list index out of range".to_owned())),
+            (None, _) => return Err(Failure::Internal("list index out of range")),
             (Some((last, namespaces)), value) => {
                 let tree = Some(&mut self.tree);
                 let members = namespaces
@@ -141,10 +141,10 @@ impl Params {
             Some(Found::Tree(members) | Found::Value(Value::Struct(members))) => {
                 members.contains_key(*last)
             }
-            Some(Found::Value(value)) => match python::delete_error(value, last) {
-                Some(text) => return Err(Failure::Type(text)),
-                None => false,
-            },
+            // Python finds part of a text, and an element of a list, and cannot delete them.
+            Some(Found::Value(Value::String(text))) if !text.contains(*last) => false,
+            Some(Found::Value(Value::Array(elements))) if !elements.iter().any(is(last)) => false,
+            Some(Found::Value(_)) => return Err(Failure::Type("this parameter is no namespace")),
         };
         if !holds {
             return Ok(None);
@@ -164,10 +164,10 @@ impl Params {
     /// `search_param`.
     pub(crate) fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, Failure> {
         if key.starts_with('~') {
-            return Err(Failure::Internal("invalid key".to_owned()));
+            return Err(Failure::Internal("invalid key"));
         }
         if !namespace.starts_with('/') {
-            return Err(Failure::Internal("namespace must be global".to_owned()));
+            return Err(Failure::Internal("namespace must be global"));
         }
         if key.starts_with('/') {
             return Ok(self.has(key).then(|| key.to_owned()));
@@ -265,6 +265,11 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
         Value::Struct(inner) => Some(inner),
         _ => None,
     }
+}
+
+/// Tells whether an element of a list equals `name`, as Python has it.
+fn is(name: &str) -> impl Fn(&Value) -> bool {
+    move |value| matches!(value, Value::String(text) | Value::DateTime(text) if text == name)
 }
 
 /// Whether arrays and structs are nested more than `levels` deep.

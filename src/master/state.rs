@@ -355,7 +355,7 @@ impl Registry {
     /// Queues the callbacks for changed parameters. A value that cannot be written is never sent.
     pub(crate) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
         for update in updates {
-            if super::python::param_error(update.value).is_some() {
+            if super::returnable::param_error(update.value).is_some() {
                 continue;
             }
             let nodes = update.nodes.iter();

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::registry::Shared;
-use super::{Master, names, python};
+use super::{Master, names, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id under which rosmaster calls nodes.
@@ -20,7 +20,7 @@ impl Master {
     pub fn param_update(&self, key: &str) -> Option<Call> {
         let value = self.params.get(key);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
-        if python::param_error(&value).is_some() {
+        if returnable::param_error(&value).is_some() {
             return None;
         }
         Some(param_update(key, value))

@@ -3,8 +3,8 @@
 use std::{collections::HashSet, sync::LazyLock};
 
 use super::api::Failure;
+use super::names;
 use super::registry::Registrations;
-use super::{names, python};
 use crate::xmlrpc::{Struct, Value};
 
 /// The value of what is gone, in a `paramUpdate`.
@@ -113,9 +113,10 @@ impl Below<'_> {
 /// Members whose names hold a slash are announced, and then not found.
 fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
-        Value::Struct(members) => members
-            .get(part)
-            .ok_or_else(|| Failure::Internal(python::repr(part))),
-        _ => Err(Failure::Type(python::subscript_error(value))),
+        Value::Struct(members) => {
+            let member = members.get(part);
+            member.ok_or(Failure::Internal("a member's name holds a slash"))
+        }
+        _ => Err(Failure::Type("a member's name holds a slash")),
     })
 }

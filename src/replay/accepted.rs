@@ -1,7 +1,6 @@
 //! Which of a call's mutations a master has executed, and whether a mirror agrees.
 
-use crate::master::multicall::{self, Entry};
-use crate::master::{Master, api};
+use crate::master::{AsRequest, Entry, Master, Method, Request, entry_reply, is_success};
 use crate::xmlrpc::{Call, Reply, Value};
 
 /// A mutating call, taken out of multicalls, that a master has answered.
@@ -16,27 +15,21 @@ pub struct Answered {
 }
 
 impl Answered {
-    /// How the answer of a mirror of that master to the same call compares. `live`: parameters may
-    /// have been written later in the same request. The value that `subscribeParam` answers may then
-    /// hold them already, for rosmaster writes the dictionary itself, when all has been run; what could not
-    /// be written may have been replaced by then.
+    /// Whether the answer of a mirror of that master to the same call leaves both in the same state and is
+    /// of the same value. Two refusals are alike, whatever they say. `live`: parameters may have been
+    /// written later in the same request. `subscribeParam` may answer them already, for rosmaster writes
+    /// the dictionary itself, when all has been run; what could not be written may have been replaced by then.
     pub fn compare(&self, mirror: &Reply, live: bool) -> Agreement {
-        let same = match (&self.reply, mirror) {
-            (Reply::Value(Value::Array(master)), mirror)
-                if live && self.call.method == "subscribeParam" =>
-            {
-                match mirror {
-                    Reply::Value(Value::Array(mirror)) => master.first() == mirror.first(),
-                    Reply::Fault { text, .. } => is_write_error(text) && self.executed,
-                    Reply::Value(_) => false,
-                }
-            }
-            (master, mirror) => master == mirror,
+        let live = live && self.call.method == "subscribeParam";
+        let same = match [&self.reply, mirror].map(is_success) {
+            [true, true] => live || self.reply == *mirror,
+            [true, false] => live,
+            [false, true] => false,
+            [false, false] => true,
         };
-        match (same, executed(&self.call.method, mirror)) {
-            (true, _) => Agreement::Same,
-            (false, Some(false)) if !self.executed => Agreement::OtherWords,
-            (false, _) => Agreement::Diverged,
+        match same && executed(&self.call.method, mirror) == Some(self.executed) {
+            true => Agreement::Same,
+            false => Agreement::Diverged,
         }
     }
 }
@@ -44,10 +37,8 @@ impl Answered {
 /// How two answers compare.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Agreement {
-    /// They are equal.
+    /// They are alike.
     Same,
-    /// Both refuse, and say so differently: no state has changed.
-    OtherWords,
     /// One of the two states is not what it should be.
     Diverged,
 }
@@ -69,7 +60,7 @@ pub struct Accepted {
 ///
 /// A multicall that fails as a whole has run up to the entry at fault. Of such a one this gives what
 /// `mirror`, the state before the call, would have accepted, and says that it is not certain.
-pub fn accepted(mirror: &Master, call: &Call, reply: &Reply) -> Accepted {
+pub fn accepted(mirror: &Master, call: &impl AsRequest, reply: &Reply) -> Accepted {
     let mut walk = Walk {
         mirror,
         model: None,
@@ -79,7 +70,7 @@ pub fn accepted(mirror: &Master, call: &Call, reply: &Reply) -> Accepted {
             certain: true,
         },
     };
-    walk.call(&call.method, &call.params, reply, multicall::DEEPEST);
+    walk.call(&call.as_request(), reply);
     walk.accepted
 }
 
@@ -92,43 +83,42 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    fn call(&mut self, method: &str, params: &[Value], reply: &Reply, levels: usize) {
-        if method == multicall::METHOD {
-            return match levels.checked_sub(1) {
-                Some(levels) => self.multicall(params, reply, levels),
-                None => self.accepted.certain = false,
-            };
+    fn call(&mut self, request: &Request, reply: &Reply) {
+        if *request.method() == Method::Multicall {
+            return self.multicall(request, reply);
         }
-        if !api::method(method).is_some_and(|method| method.kind.mutates()) {
+        if !request.kind().mutates() {
             return;
         }
-        match executed(method, reply) {
-            Some(executed) => self.accepted.calls.push(Answered {
-                call: Call::new(method, params.to_vec()),
-                reply: reply.clone(),
-                executed,
-            }),
+        match executed(request.method().name(), reply) {
+            Some(executed) => self.push(request, reply.clone(), executed),
             None => self.accepted.certain = false,
         }
     }
 
-    fn multicall(&mut self, params: &[Value], reply: &Reply, levels: usize) {
-        let Ok(entries) = multicall::entries(params) else {
-            return;
-        };
+    fn push(&mut self, request: &Request, reply: Reply, executed: bool) {
+        self.accepted.calls.push(Answered {
+            call: request.clone().into(),
+            reply,
+            executed,
+        });
+    }
+
+    fn multicall(&mut self, request: &Request, reply: &Reply) {
+        let entries = request.entries();
         let results = match reply {
             Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
-            Reply::Fault { .. } => return self.simulate(params, levels),
+            Reply::Fault { .. } => return self.simulate(request),
             // No rosmaster answers so: what has become of it only a look can show.
             Reply::Value(_) => {
                 self.accepted.certain = false;
                 return;
             }
         };
-        for (element, result) in entries.iter().zip(results) {
-            if let Entry::Call { method, params } = Entry::new(element) {
-                match multicall::entry_reply(result) {
-                    Some(reply) => self.call(method, &params, &reply, levels),
+        for (entry, result) in entries.iter().zip(results) {
+            if let Entry::Request(request) = entry {
+                match entry_reply(result) {
+                    Some(reply) => self.call(request, &reply),
                     None => self.accepted.certain = false,
                 }
             }
@@ -136,58 +126,29 @@ impl Walk<'_> {
     }
 
     /// Runs the entries in the mirror, because the master's reply does not say how they went.
-    fn simulate(&mut self, params: &[Value], levels: usize) {
-        let before = self.accepted.calls.len();
-        self.run(params, levels);
-        if self.accepted.calls.len() > before {
-            self.accepted.certain = false;
+    fn simulate(&mut self, request: &Request) {
+        for call in request.calls() {
+            if !call.kind().mutates() {
+                continue;
+            }
+            let reply = self.foretell(call);
+            if executed(call.method().name(), &reply) == Some(true) {
+                self.push(call, reply, true);
+                self.modelled += 1;
+                self.accepted.certain = false;
+            }
         }
     }
 
     /// What the mirror answers to a call after those that have been accepted. There may be many
     /// multicalls to simulate: the model goes on from one to the next.
-    fn foretell(&mut self, call: &Call) -> Reply {
+    fn foretell(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
             model.apply_telling(&answered.call, &mut ());
         }
         self.modelled = self.accepted.calls.len();
-        model.apply_telling(call, &mut ())
-    }
-
-    fn run(&mut self, params: &[Value], levels: usize) {
-        let Ok(entries) = multicall::entries(params) else {
-            return;
-        };
-        for element in entries.iter() {
-            match Entry::new(element) {
-                Entry::Malformed(_) => return,
-                Entry::Refused(_) => {}
-                Entry::Call { method, params } if method == multicall::METHOD => {
-                    if let Some(levels) = levels.checked_sub(1) {
-                        self.run(&params, levels);
-                    }
-                }
-                Entry::Call { method, params } => {
-                    let Some(kind) = api::method(method).map(|method| method.kind) else {
-                        continue;
-                    };
-                    if !kind.mutates() {
-                        continue;
-                    }
-                    let call = Call::new(method, params.to_vec());
-                    let reply = self.foretell(&call);
-                    if executed(method, &reply) == Some(true) {
-                        self.modelled += 1;
-                        self.accepted.calls.push(Answered {
-                            call,
-                            reply,
-                            executed: true,
-                        });
-                    }
-                }
-            }
-        }
+        model.apply_telling(request, &mut ())
     }
 }
 
@@ -241,7 +202,7 @@ mod tests {
     use crate::xmlrpc::Struct;
 
     #[test]
-    fn a_refusal_is_compared_too() {
+    fn two_refusals_are_alike_and_a_refusal_is_no_success() {
         let answer = |code: i32, text: &str, value: Value| {
             Reply::Value(vec![Value::from(code), text.into(), value].into())
         };
@@ -254,7 +215,7 @@ mod tests {
         assert_eq!(of.compare(&refused, false), Agreement::Same);
         assert_eq!(of.compare(&done, false), Agreement::Diverged);
         let other = answer(-1, "no such parameter", 0.into());
-        assert_eq!(of.compare(&other, false), Agreement::OtherWords);
+        assert_eq!(of.compare(&other, false), Agreement::Same);
     }
 
     #[test]
@@ -276,6 +237,16 @@ mod tests {
         assert_eq!(of.compare(&fault("TypeError"), true), Agreement::Same);
         assert_eq!(of.compare(&fault("TypeError"), false), Agreement::Diverged);
         assert_eq!(of.compare(&fault("Exception"), true), Agreement::Diverged);
+        // A `setParam` that has run and failed says so in its own words.
+        let failed = |text: &str| answer_with(0, &format!("Internal failure: {text}"));
+        let of = accepted(&Master::default(), &set("/a", 1), &failed("'x'"));
+        assert_eq!(of.calls[0].compare(&failed("y"), false), Agreement::Same);
+        let refused = answer_with(-1, "ERROR: parameter [key] must be a string");
+        assert_eq!(of.calls[0].compare(&refused, false), Agreement::Diverged);
+    }
+
+    fn answer_with(code: i32, text: &str) -> Reply {
+        Reply::Value(vec![Value::from(code), text.into(), 0.into()].into())
     }
 
     fn set(key: &str, value: impl Into<Value>) -> Call {
@@ -373,7 +344,7 @@ mod tests {
         let Reply::Value(Value::Array(answer)) = after.apply(&call).reply else {
             panic!()
         };
-        assert_eq!(answer[..2], [0.into(), "Internal failure: 'x'".into()]);
+        assert_eq!(answer[0], 0.into());
         assert_ne!(master, after);
         assert_eq!(of(&master, &call).calls.len(), 1);
     }

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use super::Token;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
-use crate::master::{CALLER_ID, Master, multicall, python};
+use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
 use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};
 
 /// Most mismatches that are told apart.
@@ -200,14 +200,15 @@ impl Plan {
     }
 
     fn write(target: &Master, found: &Master, before: Option<&Token>, token: &Token) -> Self {
-        let mut request = ListWriter::request(multicall::METHOD);
+        let mut request = ListWriter::request(Method::Multicall.name());
         let mut answer = ListWriter::answer();
-        let mut write = |call: Call, predicted: Reply| {
+        let mut write = |call: Request, predicted: Reply| {
             request.push(&call.into_entry());
             answer.push(&multicall::reply_entry(predicted));
         };
         // Tokens are no part of the mirror. They subscribe to what is not set.
         let aside = |call: Call| {
+            let call = Request::from(call);
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
         };
@@ -225,7 +226,7 @@ impl Plan {
         let Restore {
             mut model, skipped, ..
         } = Restore::run(target, emptied.as_ref().unwrap_or(found), &mut write);
-        for call in reads(&model, found) {
+        for call in reads(&model, found).into_iter().map(Request::from) {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
         }
@@ -286,11 +287,10 @@ impl Plan {
             (Reply::Fault { text, .. }, _) => return whole(text.clone()),
             _ => return whole("another number of results than of calls".to_owned()),
         };
-        let entries = call.params.first().and_then(Value::as_array);
         let mismatches: Vec<_> = (results.iter().zip(predicted))
-            .zip(entries.unwrap_or_default())
+            .zip(call.calls())
             .filter(|((result, predicted), _)| result != predicted)
-            .map(|(_, entry)| mismatch(entry))
+            .map(|(_, call)| mismatch(call))
             .take(MOST_MISMATCHES)
             .collect();
         if mismatches.is_empty() {
@@ -301,8 +301,8 @@ impl Plan {
     }
 
     /// Request and answer as values.
-    fn decode(&self) -> Result<(Call, Reply), DecodeError> {
-        let call = xmlrpc::decode_call(&self.request)?;
+    fn decode(&self) -> Result<(Request, Reply), DecodeError> {
+        let call = Request::decode(&self.request)?;
         Ok((call, xmlrpc::decode_reply(&self.answer)?))
     }
 }
@@ -313,7 +313,7 @@ fn reads(model: &Master, found: &Master) -> Vec<Call> {
     let own = |method| Call::new(method, vec![CALLER_ID.into()]);
     let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
     // A single value that cannot be returned would fault the whole multicall.
-    if python::is_writable(model.params()) {
+    if returnable::is_writable(model.params()) {
         calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
     }
     let nodes = found.registry.nodes.keys();
@@ -323,17 +323,14 @@ fn reads(model: &Master, found: &Master) -> Vec<Call> {
     calls
 }
 
-fn mismatch(entry: &Value) -> Mismatch {
-    let member = |name| entry.as_struct().and_then(|members| members.get(name));
-    let text = |value: Option<&Value>| value.and_then(Value::as_str).map(str::to_owned);
-    let params = member("params")
-        .and_then(Value::as_array)
-        .unwrap_or_default();
-    let method = text(member("methodName")).unwrap_or_default();
-    let subject = if method == "subscribeParam" { 2 } else { 1 };
+fn mismatch(call: &Request) -> Mismatch {
+    let subject = match call.method() {
+        Method::SubscribeParam => 2,
+        _ => 1,
+    };
     Mismatch::Entry {
-        subject: text(params.get(subject)),
-        caller_id: text(params.first()).unwrap_or_default(),
-        method,
+        method: call.method().name().to_owned(),
+        subject: call.text(subject).map(str::to_owned),
+        caller_id: call.caller().unwrap_or_default().to_owned(),
     }
 }

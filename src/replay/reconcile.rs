@@ -1,7 +1,7 @@
 //! What a master that was out of reach is to hold when it is reached again.
 
 use super::{Token, restore};
-use crate::master::{Master, multicall, names};
+use crate::master::{AsRequest, Entry, Master, Method, Request, names};
 use crate::xmlrpc::{Call, Value};
 
 /// What counts where a master of the present incarnation and the mirror differ.
@@ -50,12 +50,12 @@ pub fn may_hold(mirror: &Master, pending: &[Call]) -> Master {
 
 /// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another
 /// address adds nothing.
-fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
+fn additions(mirror: &Master, master: &Master) -> Vec<Request> {
     let mut calls = Vec::new();
     let tree = restore::merged(mirror.params(), master.params());
     if !tree.iter().eq(mirror.params()) {
-        let params = vec![names::CALLER_ID.into(), "/".into(), Value::Struct(tree)];
-        calls.push(Call::new("setParam", params));
+        let params = [names::CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+        calls.push(Request::new(Method::SetParam, params));
     }
     let api = |caller_id: &str| {
         let api = master.api_of(caller_id)?;
@@ -64,8 +64,16 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
     };
     let (ours, theirs) = (&mirror.registry, &master.registry);
     for (method, ours, theirs) in [
-        ("registerPublisher", &ours.publishers, &theirs.publishers),
-        ("registerSubscriber", &ours.subscribers, &theirs.subscribers),
+        (
+            Method::RegisterPublisher,
+            &ours.publishers,
+            &theirs.publishers,
+        ),
+        (
+            Method::RegisterSubscriber,
+            &ours.subscribers,
+            &theirs.subscribers,
+        ),
     ] {
         for (topic, callers) in theirs {
             let known = ours.get(topic).map_or(&[][..], Vec::as_slice);
@@ -74,7 +82,7 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
                 let name = names::name_for(topic, caller_id);
                 if let (Some(api), Some(name)) = (api(caller_id), name) {
                     let words = [caller_id, name.as_str(), topic_type.unwrap_or("*"), api];
-                    calls.push(Call::new(method, words.map(Value::from).into()));
+                    calls.push(Request::new(method.clone(), words));
                 }
             }
         }
@@ -84,8 +92,8 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
         if !ours.services.contains_key(service)
             && let (Some(api), Some(name)) = (api(&entry.node), name)
         {
-            let words = [entry.node.as_str(), name.as_str(), entry.api.as_str(), api];
-            calls.push(Call::new("registerService", words.map(Value::from).into()));
+            let words = [entry.node.as_str(), &name, &entry.api, api];
+            calls.push(Request::new(Method::RegisterService, words));
         }
     }
     calls
@@ -94,18 +102,19 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Call> {
 impl Master {
     /// Whether `call` would change the state: false only if every write in it, one after the other, is
     /// known to leave the state as it is. Unregistrations of what is not there change nothing.
-    pub fn would_change(&self, call: &Call) -> bool {
-        if call.method == multicall::METHOD {
-            let entries = call.entries();
-            return entries.is_empty() || entries.iter().any(|entry| self.would_change(entry));
-        }
-        !self.is_settled(call).unwrap_or(false)
+    pub fn would_change(&self, call: &impl AsRequest) -> bool {
+        let request = call.as_request();
+        let entries = request.entries();
+        !entries
+            .iter()
+            .all(|entry| matches!(entry, Entry::Request(_)))
+            || (request.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
     /// Whether the state already is what `call` leads to; none if that is not known.
-    fn is_settled(&self, call: &Call) -> Option<bool> {
-        let text = |index: usize| call.params.get(index)?.as_str();
-        let caller_id = text(0)?;
+    fn is_settled(&self, call: &Request) -> Option<bool> {
+        let text = |index| call.text(index);
+        let caller_id = call.caller()?;
         let name = |index| Some(names::resolve(text(index)?, caller_id));
         let key = |index| Some(names::param_key(&name(index)?));
         // The node as it is registered at the address that the call gives.
@@ -117,42 +126,42 @@ impl Master {
             let entry = self.registry.services.get(service);
             entry.is_some_and(|of| of.node == caller_id && Some(of.api.as_str()) == text(2))
         };
-        Some(match call.method.as_str() {
-            "registerPublisher" => {
+        Some(match call.method() {
+            Method::RegisterPublisher => {
                 let (topic, topic_type) = (name(1)?, text(2)?);
                 let same_type = topic_type == "*" || self.type_of(&topic) == Some(topic_type);
                 same_type && node(3)?.publications.contains(&topic)
             }
-            "registerSubscriber" => {
+            Method::RegisterSubscriber => {
                 let (topic, topic_type) = (name(1)?, text(2)?);
                 let typed = topic_type == "*" || self.type_of(&topic).is_some();
                 typed && node(3)?.subscriptions.contains(&topic)
             }
-            "registerService" => {
+            Method::RegisterService => {
                 let service = name(1)?;
                 node(3)?.services.contains(&service) && provides(&service)
             }
-            "subscribeParam" => node(1)?.param_subscriptions.contains(&key(2)?),
-            "unregisterPublisher" => {
+            Method::SubscribeParam => node(1)?.param_subscriptions.contains(&key(2)?),
+            Method::UnregisterPublisher => {
                 let topic = name(1)?;
                 !node(2).is_some_and(|node| node.publications.contains(&topic))
             }
-            "unregisterSubscriber" => {
+            Method::UnregisterSubscriber => {
                 let topic = name(1)?;
                 !node(2).is_some_and(|node| node.subscriptions.contains(&topic))
             }
-            "unregisterService" => !provides(&name(1)?),
-            "unsubscribeParam" => {
+            Method::UnregisterService => !provides(&name(1)?),
+            Method::UnsubscribeParam => {
                 let key = key(2)?;
                 !node(1).is_some_and(|node| node.param_subscriptions.contains(&key))
             }
-            "setParam" => {
-                let value = call.params.get(2)?;
+            Method::SetParam => {
+                let value = call.params().get(2)?;
                 // Another order of a struct's members is another state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }
-            "deleteParam" => !self.is_set(&name(1)?),
+            Method::DeleteParam => !self.is_set(&name(1)?),
             // Reads.
             _ => true,
         })

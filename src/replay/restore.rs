@@ -6,8 +6,8 @@ use super::Token;
 use super::plan::Skipped;
 use super::token::{HELPER, NO_API};
 use crate::master::names::{self, CALLER_ID};
-use crate::master::{Master, python};
-use crate::xmlrpc::{Call, Reply, Struct, Value};
+use crate::master::{Master, Method, Request, returnable};
+use crate::xmlrpc::{Reply, Struct, Value};
 
 /// Gives the calls that change state, each with its answer, to `write`; the model of the master after
 /// them.
@@ -23,7 +23,7 @@ pub(super) struct Restore<'a, W> {
     types_in: usize,
 }
 
-impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
+impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Brings a model of `found` to `target`.
     pub(super) fn run(target: &'a Master, found: &'a Master, write: W) -> Self {
         let mut restore = Self {
@@ -47,11 +47,11 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
         restore
     }
 
-    fn push(&mut self, method: &str, params: Vec<Value>) {
-        let call = Call::new(method, params);
-        let predicted = self.model.apply(&call).reply;
+    fn push(&mut self, method: Method, params: impl IntoIterator<Item = impl Into<Value>>) {
+        let request = Request::new(method, params);
+        let predicted = self.model.apply(&request).reply;
         self.count += 1;
-        (self.write)(call, predicted);
+        (self.write)(request, predicted);
     }
 
     fn params(&mut self) {
@@ -62,12 +62,12 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             // Even if it holds what a master cannot return: that stays where it is.
             return;
         }
-        let (tree, left_out) = python::writable(whole);
+        let (tree, left_out) = returnable::writable(whole);
         let keys = left_out.into_iter();
         self.skipped.extend(keys.map(|key| Skipped::Param { key }));
         if !tree.iter().eq(found) {
-            let params = vec![CALLER_ID.into(), "/".into(), Value::Struct(tree)];
-            self.push("setParam", params);
+            let params = [CALLER_ID.into(), "/".into(), Value::Struct(tree)];
+            self.push(Method::SetParam, params);
         }
     }
 
@@ -153,16 +153,19 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             }
             let last = missing.pop();
             for (caller_id, name, api) in missing {
-                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
-                self.push("registerPublisher", params);
+                self.push(
+                    Method::RegisterPublisher,
+                    [caller_id, &name, topic_type, api],
+                );
             }
             for (caller_id, name, api) in put_back {
-                let params = vec![caller_id.into(), name.into(), "*".into(), api.into()];
-                self.push("registerSubscriber", params);
+                self.push(Method::RegisterSubscriber, [caller_id, &name, "*", api]);
             }
             if let Some((caller_id, name, api)) = last {
-                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
-                self.push("registerPublisher", params);
+                self.push(
+                    Method::RegisterPublisher,
+                    [caller_id, &name, topic_type, api],
+                );
             }
         }
     }
@@ -180,8 +183,7 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
         for caller_id in subscribers {
             let name = names::name_for(topic, caller_id);
             if let (Some(name), Some(api)) = (name, found.api_of(caller_id)) {
-                let params = vec![caller_id.as_str().into(), name.as_str().into(), api.into()];
-                self.push("unregisterSubscriber", params);
+                self.push(Method::UnregisterSubscriber, [caller_id, &name, api]);
                 out.push((caller_id.as_str(), name, api));
             }
         }
@@ -206,14 +208,8 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             match (owner, name) {
                 (Some(api), Some(name)) => {
                     self.lose(service, &losers);
-                    let caller_id = entry.node.as_str().into();
-                    let params = vec![
-                        caller_id,
-                        name.into(),
-                        entry.api.as_str().into(),
-                        api.into(),
-                    ];
-                    self.push("registerService", params);
+                    let params = [entry.node.as_str(), &name, &entry.api, api];
+                    self.push(Method::RegisterService, params);
                 }
                 (owner, _) => {
                     if owner.is_some() {
@@ -240,16 +236,13 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             && !self.model.registry.had_services
             && let Some((helper, name)) = self.helper("/rosrescue")
         {
-            self.take_and_give_up(helper, name);
+            self.take_and_give_up(&helper, &name);
         }
     }
 
-    fn take_and_give_up(&mut self, helper: String, service: String) {
-        let mut params = vec![helper.into(), service.into(), NO_API.into()];
-        let unregister = params.clone();
-        params.push(NO_API.into());
-        self.push("registerService", params);
-        self.push("unregisterService", unregister);
+    fn take_and_give_up(&mut self, helper: &str, service: &str) {
+        self.push(Method::RegisterService, [helper, service, NO_API, NO_API]);
+        self.push(Method::UnregisterService, [helper, service, NO_API]);
     }
 
     /// Whether a service has a provider in the new master. Then it and who lost it are left out.
@@ -288,8 +281,10 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             };
             match names::name_for(service, caller_id) {
                 Some(name) => {
-                    let params = vec![(*caller_id).into(), name.into(), NO_API.into(), api.into()];
-                    self.push("registerService", params);
+                    self.push(
+                        Method::RegisterService,
+                        [caller_id, name.as_str(), NO_API, api],
+                    );
                 }
                 None => self.skip_unnameable(service, caller_id),
             }
@@ -307,7 +302,7 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
         };
         self.lose(service, losers);
         if self.count > before {
-            self.take_and_give_up(helper, name);
+            self.take_and_give_up(&helper, &name);
         }
     }
 
@@ -322,8 +317,10 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             self.types_up_to(topic);
             let topic_type = self.topic_type(topic);
             for (caller_id, name, api) in missing {
-                let params = vec![caller_id.into(), name.into(), topic_type.into(), api.into()];
-                self.push("registerSubscriber", params);
+                self.push(
+                    Method::RegisterSubscriber,
+                    [caller_id, &name, topic_type, api],
+                );
             }
         }
     }
@@ -333,10 +330,7 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
         for (key, callers) in &target.registry.param_subscribers {
             let there = found.registry.param_subscribers.get(key);
             for (caller_id, name, api) in self.missing(key, callers, there, names::param_name_for) {
-                self.push(
-                    "subscribeParam",
-                    vec![caller_id.into(), api.into(), name.into()],
-                );
+                self.push(Method::SubscribeParam, [caller_id, api, &name]);
             }
         }
     }
@@ -391,9 +385,9 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             return self.skip_unnameable(topic, HELPER);
         };
         let (register, unregister) = if topic_type != "*" {
-            ("registerSubscriber", "unregisterSubscriber")
+            (Method::RegisterSubscriber, Method::UnregisterSubscriber)
         } else if !self.model.registry.subscribers.contains_key(topic) {
-            ("registerPublisher", "unregisterPublisher")
+            (Method::RegisterPublisher, Method::UnregisterPublisher)
         } else {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
@@ -404,24 +398,23 @@ impl<'a, W: FnMut(Call, Reply)> Restore<'a, W> {
             }
             return;
         };
-        let out = vec![helper.as_str().into(), name.as_str().into(), NO_API.into()];
-        let params = vec![helper.into(), name.into(), topic_type.into(), NO_API.into()];
-        self.push(register, params);
-        self.push(unregister, out);
+        self.push(register, [&helper, name.as_str(), topic_type, NO_API]);
+        self.push(unregister, [&helper, name.as_str(), NO_API]);
     }
 }
 
 /// The calls that empty a master that holds `found`, for one that is to hold `target` exactly: what
 /// would be told comes before nobody is left to be told of it. Parameters stay if they are right.
-pub(super) fn removal(found: &Master, target: &Master) -> Vec<Call> {
+pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
-    let (publishers, mut first): (Vec<_>, Vec<_>) =
-        calls.partition(|call| call.method == "unregisterPublisher");
+    let (publishers, mut first): (Vec<_>, Vec<_>) = calls
+        .map(Request::from)
+        .partition(|call| *call.method() == Method::UnregisterPublisher);
     if !found.params().iter().eq(target.params()) {
         let nothing = Value::Struct(Struct::new());
-        let params = vec![CALLER_ID.into(), "/".into(), nothing];
-        first.push(Call::new("setParam", params));
+        let params = [CALLER_ID.into(), "/".into(), nothing];
+        first.push(Request::new(Method::SetParam, params));
     }
     first.extend(publishers);
     first

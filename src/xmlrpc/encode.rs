@@ -11,7 +11,7 @@ use super::value::{Call, Reply, Struct, Value};
 /// How many arrays and structs inside each other rosmaster can still return. Its Python may go
 /// 1000 calls deep, and marshalling takes two a level. Measured with Python 3.11 on the real one,
 /// which marshals every reply from the same depth.
-const MAX_REPLY_DEPTH: usize = 492;
+pub(crate) const MAX_REPLY_DEPTH: usize = 492;
 
 /// Bytes in one line of base64: 76 characters.
 const BASE64_LINE: usize = 57;
@@ -307,22 +307,18 @@ impl Writer {
 }
 
 /// The text of the fault that rosmaster answers if this value is inside `depth` arrays and structs
-/// of a reply; the texts at the limit depend on what Python was doing when it was reached.
-fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
+/// of a reply.
+pub(crate) fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
     match value {
-        _ if depth > MAX_REPLY_DEPTH => {
-            Some("<class 'RecursionError'>:maximum recursion depth exceeded")
-        }
+        _ if depth > MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
         Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
-        Value::Double(_) if depth == MAX_REPLY_DEPTH => Some(
-            "<class 'RecursionError'>:maximum recursion depth exceeded while getting the repr of an object",
-        ),
-        Value::DateTime(_) if depth == MAX_REPLY_DEPTH => Some(CALLING),
-        Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(CALLING),
+        // Python calls more functions for these.
+        Value::Double(_) | Value::DateTime(_) if depth >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
+        Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         _ => None,
     }
 }
 
-const CALLING: &str =
-    "<class 'RecursionError'>:maximum recursion depth exceeded while calling a Python object";
+/// The fault of a reply that is nested too deep. What rosmaster says depends on what it was doing.
+pub(crate) const TOO_DEEP: &str = "<class 'RecursionError'>:maximum recursion depth exceeded";

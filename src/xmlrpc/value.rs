@@ -55,6 +55,23 @@ impl PartialEq for Value {
 impl Eq for Value {}
 
 impl Value {
+    /// About how much memory this takes, in bytes.
+    pub fn size(&self) -> usize {
+        let within = match self {
+            Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),
+            Self::Base64(bytes) => bytes.len(),
+            Self::Array(elements) => elements.iter().map(Self::size).sum(),
+            Self::Struct(members) => {
+                let members = members.iter();
+                let sizes =
+                    members.map(|(key, value)| size_of::<String>() + key.len() + value.size());
+                sizes.sum()
+            }
+            Self::Nil | Self::Bool(_) | Self::Int(_) | Self::Double(_) => 0,
+        };
+        size_of::<Self>() + within
+    }
+
     /// The text, if this is a string.
     pub fn as_str(&self) -> Option<&str> {
         match self {

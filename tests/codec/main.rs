@@ -12,7 +12,6 @@ mod cases;
 mod documents;
 mod fuzz_seeds;
 mod peer;
-mod shown;
 
 use std::fmt::Write;
 

@@ -2,12 +2,10 @@
 
     call HEX    what rosmaster makes of a request: `ok METHOD VALUES`, or `raise WHY`
     reply HEX   what a Python client makes of an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
-    repr HEX    `repr` of the text without what Unicode did not assign when this Python was made, and that text
     echo HEX    the answer, in hex, of a server whose method `echo` returns its parameter
 """
 import struct
 import sys
-import unicodedata
 import xmlrpc.client
 import xmlrpc.server
 
@@ -81,15 +79,10 @@ def echo(body):
     return server._marshaled_dispatch(body).hex()
 
 
-def shown(body):
-    known = "".join(c for c in body.decode() if unicodedata.category(c) != "Cn")
-    return "%s %s" % (repr(known).encode().hex(), known.encode().hex())
-
-
 for line in sys.stdin:
     verb, _, document = line.strip().partition(" ")
     try:
-        answer = {"call": call, "reply": reply, "repr": shown, "echo": echo}[verb](bytes.fromhex(document))
+        answer = {"call": call, "reply": reply, "echo": echo}[verb](bytes.fromhex(document))
     except Exception as error:
         answer = "raise %s %r" % (type(error).__name__, str(error)[:100])
     print(answer, flush=True)

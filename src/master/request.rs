@@ -1,0 +1,392 @@
+//! A call, parsed once: the method, its parameters, and the entries of a multicall.
+
+use std::borrow::Cow;
+
+use super::{Kind, Method, names, returnable};
+use crate::xmlrpc::{self, Call, DecodeError, Struct, Value};
+
+/// Multicalls inside multicalls that are looked into. A decoded document has no more, because each takes
+/// three of its levels.
+const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
+
+/// More parameters than any method takes.
+const TOO_MANY: usize = 5;
+
+/// A call of a master, parsed.
+///
+/// ```
+/// use rosrescue::master::{Kind, Method, Request};
+///
+/// let body = b"<methodCall><methodName>setParam</methodName><params>\
+///     <param><value>/node</value></param><param><value>/gain</value></param>\
+///     <param><value><int>3</int></value></param></params></methodCall>";
+/// let request = Request::decode(body)?;
+/// assert_eq!(request.method(), &Method::SetParam);
+/// assert_eq!(request.caller(), Some("/node"));
+/// assert_eq!(request.kind(), Kind::Mutate);
+/// # Ok::<(), rosrescue::xmlrpc::DecodeError>(())
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Request {
+    method: Method,
+    /// Of a multicall none: they are its entries.
+    params: Vec<Value>,
+    entries: Vec<Entry>,
+}
+
+/// One entry of a multicall.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Entry {
+    /// Something that is run.
+    Request(Request),
+    /// Something that gets a fault of its own, with this text.
+    Refused(&'static str),
+    /// Something that ends the multicall with a fault, after what came before it has run. Always the last.
+    Malformed(&'static str),
+}
+
+impl Request {
+    /// A call of `method`, which is no multicall.
+    pub fn new(method: Method, params: impl IntoIterator<Item = impl Into<Value>>) -> Self {
+        Self {
+            method,
+            params: params.into_iter().map(Into::into).collect(),
+            entries: Vec::new(),
+        }
+    }
+
+    /// `system.multicall` of `requests`, in order.
+    pub fn multicall(requests: impl IntoIterator<Item = Self>) -> Self {
+        Self {
+            method: Method::Multicall,
+            params: Vec::new(),
+            entries: requests.into_iter().map(Entry::Request).collect(),
+        }
+    }
+
+    /// Reads the body of a request.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`xmlrpc::decode_call`].
+    pub fn decode(body: &[u8]) -> Result<Self, DecodeError> {
+        xmlrpc::decode_call(body).map(Self::from)
+    }
+
+    fn parse(method: Method, params: Vec<Value>, depth: usize) -> Self {
+        let (params, entries) = match method {
+            Method::Multicall => (Vec::new(), entries(params, depth)),
+            _ => (params, Vec::new()),
+        };
+        Self {
+            method,
+            params,
+            entries,
+        }
+    }
+
+    /// The method.
+    pub fn method(&self) -> &Method {
+        &self.method
+    }
+
+    /// The parameters, the caller id first; none for a multicall.
+    pub fn params(&self) -> &[Value] {
+        &self.params
+    }
+
+    /// The entries of a multicall.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The caller id, if there is one.
+    pub fn caller(&self) -> Option<&str> {
+        self.text(0)
+    }
+
+    /// The parameter at `index`, if it is a text.
+    pub(crate) fn text(&self, index: usize) -> Option<&str> {
+        self.params.get(index)?.as_str()
+    }
+
+    /// This call, or all within a multicall that are none themselves, in order.
+    pub fn calls(&self) -> Vec<&Self> {
+        fn collect<'a>(request: &'a Request, found: &mut Vec<&'a Request>) {
+            if request.method != Method::Multicall {
+                found.push(request);
+            }
+            for entry in &request.entries {
+                if let Entry::Request(request) = entry {
+                    collect(request, found);
+                }
+            }
+        }
+        let mut found = Vec::with_capacity(self.entries.len().max(1));
+        collect(self, &mut found);
+        found
+    }
+
+    /// What it may do.
+    pub fn kind(&self) -> Kind {
+        if self.method != Method::Multicall {
+            return self.method.kind();
+        }
+        let kinds = self.entries.iter().enumerate();
+        let kinds = kinds.map(|(index, entry)| match entry {
+            Entry::Request(request) => request.kind(),
+            // What came before it has run, and the reply does not say how it went.
+            Entry::Malformed(_) if index > 0 => Kind::Mutate,
+            Entry::Refused(_) | Entry::Malformed(_) => Kind::Unknown,
+        });
+        kinds.reduce(Kind::join).unwrap_or(Kind::Read)
+    }
+
+    /// Whether the mirror may answer the call alone: it, and every entry of a multicall, is one of the
+    /// Master API, well formed and no `shutdown`, so that the model answers it as any master does; and a
+    /// master can be brought to what it leads to, which one cannot to a parameter that it could not return.
+    pub fn is_answerable(&self) -> bool {
+        match self.method {
+            Method::Multicall => self
+                .entries
+                .iter()
+                .all(|entry| matches!(entry, Entry::Request(request) if request.is_answerable())),
+            Method::SetParam => self.is_restorable(),
+            _ => !matches!(self.method.kind(), Kind::Unknown | Kind::Shutdown),
+        }
+    }
+
+    /// Whether this `setParam` sets what a master can return, or is refused.
+    fn is_restorable(&self) -> bool {
+        let [Value::String(caller_id), Value::String(key), value] = self.params.as_slice() else {
+            return true;
+        };
+        let key = names::resolve(key, caller_id);
+        returnable::is_readable_at(names::parts(&key).count(), value)
+    }
+
+    /// The address of the node that this call registers something for, with its caller id.
+    pub fn registrant(&self) -> Option<(&str, &str)> {
+        let at = match self.method {
+            Method::RegisterPublisher | Method::RegisterSubscriber | Method::RegisterService => 3,
+            Method::SubscribeParam => 1,
+            _ => return None,
+        };
+        Some((self.caller()?, self.text(at)?))
+    }
+
+    /// This call as an entry of a multicall on the wire.
+    pub(crate) fn into_entry(self) -> Value {
+        Call::from(self).into_entry()
+    }
+}
+
+impl From<Call> for Request {
+    fn from(call: Call) -> Self {
+        Self::parse(Method::named(&call.method), call.params, 0)
+    }
+}
+
+/// A [`Call`], or what was parsed of one.
+pub trait AsRequest {
+    /// The call as a request.
+    fn as_request(&self) -> Cow<'_, Request>;
+}
+
+impl AsRequest for Call {
+    fn as_request(&self) -> Cow<'_, Request> {
+        Cow::Owned(self.clone().into())
+    }
+}
+
+impl AsRequest for Request {
+    fn as_request(&self) -> Cow<'_, Request> {
+        Cow::Borrowed(self)
+    }
+}
+
+impl<T: AsRequest> AsRequest for &T {
+    fn as_request(&self) -> Cow<'_, Request> {
+        (*self).as_request()
+    }
+}
+
+/// [`Request::kind`].
+pub fn kind(call: &impl AsRequest) -> Kind {
+    call.as_request().kind()
+}
+
+/// [`Request::is_answerable`].
+pub fn is_answerable(call: &impl AsRequest) -> bool {
+    call.as_request().is_answerable()
+}
+
+/// The writes in `call`, taken out of multicalls, in order.
+pub fn writes(call: &impl AsRequest) -> Vec<Call> {
+    let request = call.as_request();
+    let writes = request
+        .calls()
+        .into_iter()
+        .filter(|call| call.kind().mutates());
+    writes.map(|call| call.clone().into()).collect()
+}
+
+/// What was malformed in a multicall is a nil.
+impl From<Request> for Call {
+    fn from(request: Request) -> Self {
+        let mut params = request.params;
+        if request.method == Method::Multicall {
+            let entries = request.entries.into_iter().map(|entry| match entry {
+                Entry::Request(request) => request.into_entry(),
+                Entry::Refused(_) | Entry::Malformed(_) => Value::Nil,
+            });
+            params = vec![Value::Array(entries.collect())];
+        }
+        Self::new(request.method.name(), params)
+    }
+}
+
+/// The entries of a multicall with these parameters, up to the first that is malformed.
+fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
+    let list = match <[Value; 1]>::try_from(params) {
+        Ok([list]) => items(list),
+        Err(_) => None,
+    };
+    let Some(list) = list else {
+        return vec![Entry::Malformed(
+            "<class 'TypeError'>:system.multicall takes one list",
+        )];
+    };
+    let mut entries = Vec::with_capacity(list.len());
+    for element in list {
+        entries.push(Entry::parse(element, depth));
+        if let Some(Entry::Malformed(_)) = entries.last() {
+            break;
+        }
+    }
+    entries
+}
+
+impl Entry {
+    fn parse(element: Value, depth: usize) -> Self {
+        let Value::Struct(mut members) = element else {
+            return Self::Malformed("<class 'TypeError'>:an entry of a multicall is no struct");
+        };
+        let mut member = |name| Struct::swap_remove(&mut members, name);
+        let (Some(name), Some(params)) = (member("methodName"), member("params")) else {
+            return Self::Malformed("<class 'KeyError'>:an entry lacks methodName or params");
+        };
+        let Value::String(name) = name else {
+            return Self::Refused("<class 'Exception'>:the name of a method is no string");
+        };
+        let Some(params) = items(params) else {
+            return Self::Refused("<class 'TypeError'>:the params of an entry are no list");
+        };
+        match Method::named(&name) {
+            Method::Multicall if depth >= MAX_NESTED => {
+                Self::Refused("<class 'RecursionError'>:too many multicalls inside each other")
+            }
+            method => Self::Request(Request::parse(method, params, depth + 1)),
+        }
+    }
+}
+
+/// What Python finds in a value that it takes for a list: of a text its characters, of a struct its
+/// keys. Of those no more are made than tell what becomes of the call.
+fn items(value: Value) -> Option<Vec<Value>> {
+    match value {
+        Value::Array(elements) => Some(elements),
+        Value::Struct(members) => {
+            let keys = members.into_keys().take(TOO_MANY);
+            Some(keys.map(Value::String).collect())
+        }
+        Value::String(text) => {
+            let characters = text.chars().take(TOO_MANY);
+            Some(characters.map(|c| Value::String(c.into())).collect())
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(method: &str) -> Request {
+        Request::from(Call::new(method, vec!["/n".into()]))
+    }
+
+    fn of(methods: &[&str]) -> Kind {
+        Request::multicall(methods.iter().map(|method| call(method))).kind()
+    }
+
+    fn multicall(list: Vec<Value>) -> Request {
+        Request::from(Call::new("system.multicall", vec![Value::Array(list)]))
+    }
+
+    #[test]
+    fn a_multicall_is_the_least_kind_above_its_entries() {
+        assert_eq!(of(&[]), Kind::Read);
+        assert_eq!(of(&["getPid"]), Kind::Identity);
+        assert_eq!(of(&["getPid", "getParam"]), Kind::Read);
+        assert_eq!(of(&["getParam", "unregisterPublisher"]), Kind::Unregister);
+        assert_eq!(of(&["getParam", "nonsense"]), Kind::Unknown);
+        assert_eq!(of(&["unregisterService", "nonsense"]), Kind::Mutate);
+        assert_eq!(of(&["unregisterService", "setParam"]), Kind::Mutate);
+        assert_eq!(of(&["setParam", "shutdown", "nonsense"]), Kind::Shutdown);
+        let inner = Request::multicall([call("subscribeParam")]);
+        let nested = Request::multicall([inner, call("getPid")]);
+        assert_eq!(nested.kind(), Kind::Mutate);
+    }
+
+    #[test]
+    fn what_only_a_master_could_know_is_told_apart() {
+        for method in ["registerService", "getPid", "unsubscribeParam"] {
+            assert!(call(method).is_answerable(), "{method}");
+        }
+        for method in ["shutdown", "nonsense", "system.listMethods"] {
+            assert!(!call(method).is_answerable(), "{method}");
+            let inner = Request::multicall([call("setParam"), call(method)]);
+            assert!(!Request::multicall([inner]).is_answerable(), "{method}");
+        }
+        let inner = Request::multicall([call("setParam"), call("getParam")]);
+        assert!(Request::multicall([inner]).is_answerable());
+        assert!(!multicall(vec![Value::Int(1)]).is_answerable());
+        let set = |value| Request::new(Method::SetParam, ["/n".into(), "/a".into(), value]);
+        assert!(set(Value::Int(1)).is_answerable());
+        assert!(!set(vec![Value::Nil].into()).is_answerable());
+    }
+
+    #[test]
+    fn a_malformed_multicall_with_anything_before_the_fault_may_have_changed_state() {
+        let good = call("getPid").into_entry();
+        let kind = |list| multicall(list).kind();
+        assert_eq!(kind(vec![Value::Int(1), good.clone()]), Kind::Unknown);
+        assert_eq!(kind(vec![good, Value::Int(1)]), Kind::Mutate);
+        let empty = Request::from(Call::new("system.multicall", vec![]));
+        assert_eq!(empty.kind(), Kind::Unknown);
+    }
+
+    #[test]
+    fn a_multicall_is_parsed_to_its_depth_and_comes_back_as_it_was() {
+        let nest =
+            |levels| (0..levels).fold(call("setParam"), |inner, _| Request::multicall([inner]));
+        let deepest = Call::from(nest(MAX_NESTED));
+        assert_eq!(Call::from(Request::from(deepest.clone())), deepest);
+        let deeper = Request::from(Call::from(nest(MAX_NESTED + 2)));
+        assert_eq!((deeper.calls().len(), deeper.kind()), (0, Kind::Unknown));
+        let calls = nest(3);
+        assert_eq!(calls.calls(), [&call("setParam")]);
+    }
+
+    #[test]
+    fn of_a_text_for_a_list_only_as_much_is_taken_as_matters() {
+        let text = Value::String("x".repeat(1 << 20));
+        let list = Request::from(Call::new("system.multicall", vec![text.clone()]));
+        assert!(matches!(list.entries(), [Entry::Malformed(_)]));
+        let members = [("methodName", "getParam".into()), ("params", text)];
+        let entry = Struct::from(members.map(|(key, value)| (key.to_owned(), value)));
+        let one = multicall(vec![Value::Struct(entry)]);
+        assert_eq!(one.calls()[0].params().len(), TOO_MANY);
+    }
+}

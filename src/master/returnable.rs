@@ -1,0 +1,163 @@
+//! Which values of parameters a master can return: `xmlrpc.client.dumps` cannot write all that it takes.
+
+use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
+
+/// The text of the fault that rosmaster answers instead of a reply that it cannot write.
+pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
+    error_within(reply, 0)
+}
+
+/// Like [`reply_error`] for a parameter's value, which travels in `[code, message, value]`.
+pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
+    error_within(value, 1)
+}
+
+fn error_within(value: &Value, depth: usize) -> Option<&'static str> {
+    let deeper = |value| error_within(value, depth + 1);
+    match value {
+        Value::Array(_) | Value::Struct(_) if depth >= MAX_REPLY_DEPTH => Some(xmlrpc::TOO_DEEP),
+        Value::Array(elements) => elements.iter().find_map(deeper),
+        Value::Struct(members) => members.values().find_map(deeper),
+        value => xmlrpc::refusal(value, depth),
+    }
+}
+
+/// Whether a reply that holds this value, inside so many `levels` less than the deepest, is a document
+/// with that value in it.
+fn is_returnable(value: &Value, levels: usize) -> bool {
+    error_within(value, MAX_REPLY_DEPTH - levels).is_none() && !holds_markup(value)
+}
+
+/// Whether a date's text breaks the reply's XML: CPython does not escape it.
+fn holds_markup(value: &Value) -> bool {
+    match value {
+        Value::DateTime(text) if text.contains(['<', '>', '&']) => {
+            let reply = Reply::Value(value.clone());
+            decode_reply(&encode_reply(&reply)).as_ref() != Ok(&reply)
+        }
+        Value::Array(elements) => elements.iter().any(holds_markup),
+        Value::Struct(members) => members.values().any(holds_markup),
+        _ => false,
+    }
+}
+
+/// Levels of a namespace within the tree that can be written in a multicall's result, where the tree
+/// lies in the result's list, the entry's, and the answer's.
+const DEEPEST_NAMESPACE: usize = MAX_REPLY_DEPTH - 4;
+
+/// Whether a multicall can return the whole tree.
+pub(crate) fn is_writable(tree: &Struct) -> bool {
+    tree.values().all(is_readable)
+}
+
+/// Whether a multicall can return a value of the tree.
+pub(crate) fn is_readable(value: &Value) -> bool {
+    is_returnable(value, DEEPEST_NAMESPACE)
+}
+
+/// Whether a multicall can return the whole tree with `value` at a key of so many `names`.
+pub(crate) fn is_readable_at(names: usize, value: &Value) -> bool {
+    let levels = DEEPEST_NAMESPACE.checked_sub(names.saturating_sub(1));
+    levels.is_some_and(|levels| is_returnable(value, levels))
+}
+
+/// The tree without what a master could take but never return, and the keys of what was left out.
+pub(crate) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
+    let mut left_out = Vec::new();
+    let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);
+    (kept, left_out)
+}
+
+fn keep_writable(tree: &Struct, path: &str, levels: usize, left_out: &mut Vec<String>) -> Struct {
+    let mut kept = Struct::with_capacity(tree.len());
+    for (key, value) in tree {
+        let path = format!("{path}/{key}");
+        let kept_value = match value {
+            _ if is_returnable(value, levels) => Some(value.clone()),
+            Value::Struct(members) if levels > 1 => Some(Value::Struct(keep_writable(
+                members,
+                &path,
+                levels - 1,
+                left_out,
+            ))),
+            _ => None,
+        };
+        match kept_value {
+            Some(value) => {
+                kept.insert(key.clone(), value);
+            }
+            None => left_out.push(path),
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn nested(depth: usize) -> Value {
+        (0..depth).fold(Value::Int(1), |value, _| Value::Array(vec![value]))
+    }
+
+    #[test]
+    fn a_parameter_of_491_levels_can_be_returned_and_one_of_492_cannot() {
+        assert_eq!(param_error(&nested(491)), None);
+        assert!(param_error(&nested(492)).is_some());
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_left_out_by_its_smallest_key() {
+        let poisoned = Struct::from([
+            (
+                "a".into(),
+                Value::Struct(Struct::from([
+                    ("big".into(), Value::BigInt("5000000000".into())),
+                    ("good".into(), Value::Int(1)),
+                ])),
+            ),
+            ("nil".into(), Value::Array(vec![Value::Nil])),
+        ]);
+        assert!(!is_writable(&poisoned));
+        let (kept, left_out) = writable(&poisoned);
+        assert_eq!(left_out, ["/a/big", "/nil"]);
+        let good = Struct::from([("good".into(), Value::Int(1))]);
+        assert_eq!(
+            Value::Struct(kept),
+            Value::Struct(Struct::from([("a".into(), Value::Struct(good))]))
+        );
+    }
+
+    #[test]
+    fn a_date_is_left_out_if_its_text_breaks_the_reply() {
+        let tree = |text: &str| {
+            let date = Value::Array(vec![Value::DateTime(text.to_owned())]);
+            Struct::from([("d".to_owned(), date)])
+        };
+        for fine in [
+            "",
+            "20240101T00:00:00",
+            "a > b",
+            "a&amp;b",
+            "&lt;",
+            "a\rb",
+            "]]",
+        ] {
+            assert!(is_writable(&tree(fine)), "{fine}");
+        }
+        for broken in [
+            "a<b",
+            "a & b",
+            "&nbsp;",
+            "]]>",
+            "a<!-- -->",
+            "</dateTime.iso8601></value><value>",
+        ] {
+            assert_eq!(
+                writable(&tree(broken)),
+                (Struct::new(), vec!["/d".to_owned()])
+            );
+            assert!(!is_writable(&tree(broken)), "{broken}");
+        }
+    }
+}
