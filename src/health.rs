@@ -14,8 +14,8 @@ pub use unreachable::Unreachable;
 use std::collections::BTreeMap;
 
 use crate::{
-    master::{self, Master},
-    xmlrpc::{Call, Value},
+    master::{self, Master, Method, Request},
+    xmlrpc::Value,
 };
 
 /// Topics that nodes of all kinds have: they tell no node from another.
@@ -164,22 +164,21 @@ pub struct Registration {
 
 impl Registration {
     /// The call by which the node itself would register it.
-    pub fn register(&self, node: &str, api: &str) -> Call {
+    pub fn register(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
-            true => "registerPublisher",
-            false => "registerSubscriber",
+            true => Method::RegisterPublisher,
+            false => Method::RegisterSubscriber,
         };
-        let words = [node, &self.topic, &self.topic_type, api];
-        Call::new(method, words.map(Value::from).into())
+        Request::new(method, [node, &self.topic, &self.topic_type, api])
     }
 
     /// The call by which the node itself would take it back.
-    pub fn unregister(&self, node: &str, api: &str) -> Call {
+    pub fn unregister(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
-            true => "unregisterPublisher",
-            false => "unregisterSubscriber",
+            true => Method::UnregisterPublisher,
+            false => Method::UnregisterSubscriber,
         };
-        Call::new(method, [node, &self.topic, api].map(Value::from).into())
+        Request::new(method, [node, &self.topic, api])
     }
 
     /// In words, such as `/talker publishes /chatter`.

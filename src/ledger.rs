@@ -26,10 +26,10 @@ use crate::{
         store::Store,
     },
     cli::SyncPolicy,
-    master::{self, Master},
-    replay::{self, Agreement, Answered, Token},
+    master::{Kind, Master, Method, Request},
+    replay::{self, Answered, Token},
     status::stats::Stats,
-    xmlrpc::{Call, Reply},
+    xmlrpc::Reply,
 };
 
 /// Most pending writes beside which unregistrations that take nothing away are kept.
@@ -61,7 +61,7 @@ pub struct Basis {
     /// Its version.
     pub version: u64,
     /// Writes that the present incarnation may not have run.
-    pub pending: Vec<Call>,
+    pub pending: Vec<Request>,
 }
 
 /// The mirror, the journal and what belongs to them.
@@ -106,7 +106,7 @@ impl Ledger {
     pub fn new(
         mirror: Master,
         session: Session,
-        pending: Vec<Call>,
+        pending: Vec<Request>,
         store: Option<Store>,
         sync: SyncPolicy,
         stats: &'static Stats,
@@ -149,7 +149,7 @@ impl Ledger {
     }
 
     /// What the master would answer to a read; none if it is a multicall that asks for too much.
-    pub fn answer(&self, read: &Call) -> Option<Reply> {
+    pub fn answer(&self, read: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let fits = mirror.fits(read, ANSWER_MOST);
         fits.then(|| mirror.apply_telling(read, &mut ()))
@@ -158,10 +158,10 @@ impl Ledger {
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it does. Nodes
     /// that a master would notify of it are notified. With the reply comes the journal's last record:
     /// what has changed nothing may be as new as that.
-    pub fn answer_idle(&self, now: Instant, write: &Call) -> Option<(Reply, Option<u64>)> {
+    pub fn answer_idle(&self, now: Instant, write: &Request) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         // An unregistration of what is not here may be of what is on its way to the master.
-        let idle = !master::writes(write).iter().any(is_unregistration)
+        let idle = !write.calls().into_iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         idle.then(|| {
@@ -208,7 +208,7 @@ impl Ledger {
         &self,
         now: Instant,
         incarnation: u64,
-        batch: &[(&Call, &Reply)],
+        batch: &[(&Request, &Reply)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
         if inner.session.incarnation != incarnation || inner.injecting {
@@ -221,17 +221,15 @@ impl Ledger {
             recorded.doubtful |= !accepted.certain;
             answered.extend(accepted.calls);
         }
-        let writes = |of: &Answered| matches!(of.call.method.as_str(), "setParam" | "deleteParam");
+        let writes =
+            |of: &Answered<'_>| matches!(of.call.method(), Method::SetParam | Method::DeleteParam);
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
         for (index, answered) in answered.into_iter().enumerate() {
-            let outcome = inner.apply(now, &answered.call, None, &self.news);
-            let agreement = answered.compare(&outcome, index < last_write);
-            if agreement != Agreement::Same {
+            let outcome = inner.apply(now, answered.call, None, &self.news);
+            if !answered.agrees(&outcome, index < last_write) {
                 self.stats.divergences.count();
                 inner.report_divergence(&answered, &outcome);
-            }
-            if agreement == Agreement::Diverged {
                 recorded.doubtful = true;
                 if !answered.executed {
                     // What the master refused is in no journal.
@@ -239,7 +237,7 @@ impl Ledger {
                 }
             }
             if answered.executed {
-                entries.push(Entry::call(answered.call));
+                entries.push(Entry::call(answered.call.clone().into()));
             }
         }
         if !entries.is_empty() {
@@ -252,16 +250,16 @@ impl Ledger {
     }
 
     /// What the master would answer to this call.
-    pub fn predict(&self, call: &Call) -> Reply {
+    pub fn predict(&self, call: &Request) -> Reply {
         let mut model = self.with_mirror(Clone::clone);
         model.apply_telling(call, &mut ())
     }
 
     /// Records and applies a call of our own before there is any master.
-    pub fn seed(&self, call: &Call) {
+    pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.news);
-        inner.append(&[Entry::call(call.clone())]);
+        inner.append(&[Entry::call(call.clone().into())]);
     }
 
     /// Answers a call of the Master API as the master would while it is away: records what it changes as
@@ -270,16 +268,19 @@ impl Ledger {
     ///
     /// None while a master is being brought to the mirror's state, or if the call reads too much besides:
     /// it has to wait.
-    pub fn stand_in(&self, now: Instant, call: &Call) -> Option<(Reply, Option<u64>)> {
+    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.news);
-        let mut writes = match reply {
+        let mut writes: Vec<&Request> = match reply {
             // Only its answer could not be written. What is refused once is refused again.
-            Reply::Fault { .. } => master::writes(call),
+            Reply::Fault { .. } => {
+                let writes = call.calls().into_iter();
+                writes.filter(|call| call.kind().mutates()).collect()
+            }
             Reply::Value(_) => {
                 let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
                 let executed = accepted.into_iter().filter(|of| of.executed);
@@ -298,12 +299,12 @@ impl Ledger {
         // A look that shows what it takes away would bring it back.
         inner.version += u64::from(!changes);
         self.stats.recorded.add(writes.len() as u64);
-        let entries = writes.iter().map(|call| Entry::Call {
-            call: call.clone(),
+        let entries = writes.iter().map(|&call| Entry::Call {
+            call: call.clone().into(),
             pending: true,
         });
         let seq = inner.append(&entries.collect::<Vec<_>>());
-        inner.add_pending(writes);
+        inner.add_pending(writes.into_iter().cloned());
         drop(inner);
         self.work.notify_one();
         Some((reply, seq))
@@ -371,8 +372,8 @@ impl Ledger {
 }
 
 /// Whether a call, if it is no multicall, takes something away that its caller registered.
-fn is_unregistration(call: &Call) -> bool {
-    master::kind(call) == master::Kind::Unregister
+fn is_unregistration(call: &Request) -> bool {
+    *call.method() != Method::Multicall && call.kind() == Kind::Unregister
 }
 
 impl Inner {
@@ -380,7 +381,7 @@ impl Inner {
     fn apply(
         &mut self,
         now: Instant,
-        call: &Call,
+        call: &Request,
         standing_in: Option<bool>,
         news: &Notify,
     ) -> Reply {
@@ -412,7 +413,7 @@ impl Inner {
         difference
     }
 
-    fn add_pending(&mut self, writes: Vec<Call>) {
+    fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
             // Should the present incarnation come back, it is brought to the mirror's state as one that
             // was succeeded.

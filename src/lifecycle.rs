@@ -141,6 +141,21 @@ impl Lifecycle {
     }
 
     /// Takes in what happened at `now`; answers what is to be done, in order.
+    ///
+    /// ```
+    /// use std::time::{Duration, Instant};
+    /// use rosrescue::lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision};
+    ///
+    /// let probing = Probing { interval: Duration::from_secs(1), count: 3 };
+    /// let mut lifecycle = Lifecycle::new(Supervision::Theirs, probing);
+    /// let now = Instant::now();
+    /// let start = Input::Start { left: false, restored: false };
+    /// assert_eq!(lifecycle.on(now, start), [Action::Connect]);
+    /// assert_eq!(lifecycle.on(now, Input::Connected), [Action::Examine]);
+    /// assert_eq!(lifecycle.on(now, Input::Examined { new: true }), [Action::OpenGate]);
+    /// let shut = Action::ShutGate(Cause::ConnectionLost);
+    /// assert_eq!(lifecycle.on(now, Input::ConnectionLost), [shut, Action::Connect]);
+    /// ```
     pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
         if self.phase == Phase::Stopped {
             return Vec::new();

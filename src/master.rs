@@ -29,7 +29,10 @@ pub use kind::Kind;
 pub use multicall::entry_reply;
 pub use names::CALLER_ID;
 pub use notice::{Notice, NoticeSink};
-pub use request::{AsRequest, Entry, Request, is_answerable, kind, writes};
+pub use request::{Entry, Request};
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
-pub use tell::{is_plain_topic, param_update, publisher_update, registrant, shutdown};
+pub use tell::{
+    MASTER, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update, publisher_update, question,
+    shutdown,
+};

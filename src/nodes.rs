@@ -24,10 +24,10 @@ use crate::{
         Ledger,
         activity::{Change, Notification, Owed},
     },
+    master,
     status::{report::HealthCheck, stats::Stats},
     wait,
     write_queue::WriteQueue,
-    xmlrpc::Call,
 };
 
 /// A node is asked for its process id so long after it last registered something: starting nodes
@@ -297,8 +297,7 @@ fn get_acquainted(nodes: &Arc<Nodes>) {
         let nodes = nodes.clone();
         tokio::spawn(async move {
             let permit = health_check::permit().await;
-            let call = Call::new("getPid", vec![crate::master::CALLER_ID.into()]);
-            let answer = client::ask_for(&api, &call, nodes.timeout).await;
+            let answer = client::ask_for(&api, &master::get_pid(), nodes.timeout).await;
             drop(permit);
             if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
                 nodes.ledger.with_activity(|_, activity| {

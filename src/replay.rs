@@ -14,7 +14,7 @@ mod reconcile;
 mod restore;
 mod token;
 
-pub use accepted::{Accepted, Agreement, Answered, accepted};
+pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Mismatch, Plan, Skipped};

@@ -15,14 +15,12 @@ use crate::nodes::client::{self, Sign};
 use crate::{
     gate,
     ledger::Ledger,
-    master::Kind,
+    master::{self, CALLER_ID, Method, Request},
     process::{self, Rosout},
     write_queue::WriteQueue,
-    xmlrpc::{Call, Reply, Value},
+    xmlrpc::{Reply, Value},
 };
 
-/// The caller id under which roscore's parameters are set; it leaves no trace in the master.
-const CALLER_ID: &str = "/rosrescue";
 /// How long `rosversion` may take: it is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
 /// Pause before a rosout that has ended is started again, as roslaunch's respawn has it. It doubles
@@ -51,17 +49,17 @@ pub struct Roscore {
     pub rosout: AtomicU32,
 }
 
-fn set(key: &str, value: &str) -> Call {
-    Call::new("setParam", vec![CALLER_ID.into(), key.into(), value.into()])
+fn set(key: &str, value: &str) -> Request {
+    Request::new(Method::SetParam, [CALLER_ID, key, value])
 }
 
 fn has(roscore: &Roscore, key: &str) -> bool {
-    let call = Call::new("hasParam", vec![CALLER_ID.into(), key.into()]);
+    let call = Request::new(Method::HasParam, [CALLER_ID, key]);
     let yes = Value::Bool(true);
     matches!(roscore.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
 }
 
-fn run_id(roscore: &Roscore) -> Call {
+fn run_id(roscore: &Roscore) -> Request {
     set("/run_id", &roscore.ledger.session().id)
 }
 
@@ -88,10 +86,8 @@ pub async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
             .flatten()
             .collect();
         if !calls.is_empty() {
-            roscore
-                .write_queue
-                .call(Call::multicall(calls), Kind::Mutate)
-                .await;
+            let calls = Request::multicall(calls);
+            roscore.write_queue.call(calls).await;
         }
     };
     let rosout = async {
@@ -115,7 +111,7 @@ async fn first_opening(roscore: &Roscore) {
 }
 
 /// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
-async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Call> {
+async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
     if has(roscore, key) {
         return None;
     }
@@ -169,8 +165,7 @@ async fn living_rosout(roscore: &Roscore) -> Option<u32> {
     let api = roscore
         .ledger
         .with_mirror(|mirror| mirror.api_of(ROSOUT).map(str::to_owned))?;
-    let call = Call::new("getPid", vec![CALLER_ID.into()]);
-    match client::ask_for(&api, &call, roscore.node_timeout).await {
+    match client::ask_for(&api, &master::get_pid(), roscore.node_timeout).await {
         (Sign::Alive, Some(Value::Int(pid))) => u32::try_from(pid).ok(),
         _ => None,
     }

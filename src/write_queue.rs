@@ -19,10 +19,10 @@ pub use self::worker::Worker;
 use crate::{
     gate,
     ledger::Ledger,
-    master::Kind,
+    master::Request,
     status::stats::Stats,
     upstream::Upstream,
-    xmlrpc::{self, Call, Reply},
+    xmlrpc::{self, Reply},
 };
 
 /// Calls between the clients and the queue. The worker never lets them wait.
@@ -49,26 +49,20 @@ impl WriteQueue {
     }
 
     /// Makes a call of rosrescue's own, recorded as any other. None if nobody answers.
-    pub async fn call(&self, call: Call, kind: Kind) -> Option<Reply> {
-        self.call_own(call, kind, None).await
+    pub async fn call(&self, call: Request) -> Option<Reply> {
+        self.call_own(call, None).await
     }
 
     /// As [`Self::call`]; the call is dropped, too, if `condition` no longer holds when it is its turn.
-    pub async fn call_if(&self, call: Call, kind: Kind, condition: Condition) -> Option<Reply> {
-        self.call_own(call, kind, Some(condition)).await
+    pub async fn call_if(&self, call: Request, condition: Condition) -> Option<Reply> {
+        self.call_own(call, Some(condition)).await
     }
 
-    async fn call_own(
-        &self,
-        call: Call,
-        kind: Kind,
-        condition: Option<Condition>,
-    ) -> Option<Reply> {
+    async fn call_own(&self, call: Request, condition: Option<Condition>) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
         let item = Item {
             raw: None,
             call: Some(Arc::new(call)),
-            kind,
             answer,
             condition,
         };

@@ -111,7 +111,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         seq: store.seq(),
         session: session.unwrap_or_default(),
         snapshot,
-        pending,
+        pending: pending.into_iter().map(Call::from).collect(),
     };
     store
         .begin(&expected)

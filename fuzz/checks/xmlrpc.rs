@@ -1,6 +1,6 @@
 //! What holds of any bytes that come as XML-RPC.
 
-use rosrescue::master::{self, Master};
+use rosrescue::master::{Master, Request};
 use rosrescue::replay;
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_call, encode_reply};
 
@@ -9,10 +9,12 @@ pub(crate) fn check(bytes: &[u8]) {
     if let Ok(call) = decode_call(bytes) {
         assert_eq!(decode_call(&encode_call(&call)), Ok(call.clone()));
         // Whatever it is, the mirror has an answer to it, and the answer can be sent.
-        master::kind(&call);
+        let request = Request::from(call);
+        request.kind();
+        request.is_answerable();
         let mut mirror = Master::default();
-        let reply = mirror.apply(&call).reply;
-        replay::accepted(&Master::default(), &call, &reply);
+        let reply = mirror.apply(&request).reply;
+        replay::accepted(&Master::default(), &request, &reply);
         assert!(decode_reply(&encode_reply(&reply)).is_ok(), "{reply:?}");
         assert_eq!(
             Master::from_snapshot(mirror.snapshot()).as_ref(),

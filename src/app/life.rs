@@ -9,11 +9,10 @@ use std::{
 use tokio::{task::JoinSet, time::timeout};
 
 use crate::{
-    master::{CALLER_ID, Master},
+    master::{self, Master},
     nodes::client::{self, Sign},
     resolver,
     ros_env::MasterUri,
-    xmlrpc::Call,
 };
 
 /// How long nodes have to show that a session goes on, and name servers to name their addresses.
@@ -23,7 +22,7 @@ const LIFE_SIGN: Duration = Duration::from_secs(1);
 /// nodes elsewhere count: none of its own processes has survived, and a process at the port of one
 /// is a stranger.
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
-    let call = Call::new("getPid", vec![CALLER_ID.into()]);
+    let call = master::get_pid();
     let mut questions = JoinSet::new();
     for (_, api) in state.nodes() {
         let (api, call) = (api.to_owned(), call.clone());

@@ -11,8 +11,7 @@ use crate::{
     },
     clock,
     config::Config,
-    master::Master,
-    xmlrpc::Call,
+    master::{Master, Request},
 };
 
 /// What was found at the start.
@@ -20,7 +19,7 @@ pub(super) struct Beginning {
     pub(super) mirror: Master,
     pub(super) session: Session,
     /// Writes that the session's last master may not have run.
-    pub(super) pending: Vec<Call>,
+    pub(super) pending: Vec<Request>,
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
     /// In words, for the person who started us.
@@ -110,7 +109,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             seq: open.seq(),
             session: session.clone(),
             snapshot: mirror.snapshot(),
-            pending: pending.clone(),
+            pending: pending.iter().cloned().map(Into::into).collect(),
         };
         if let Err(error) = open.begin(&checkpoint) {
             tracing::error!(

@@ -191,6 +191,20 @@ pub struct Decoded {
 
 /// The bytes of a fresh file that holds `checkpoint` and no record yet.
 ///
+/// ```
+/// use rosrescue::checkpoint::format::{self, Checkpoint, Entry, Record, Session};
+///
+/// let fresh = format::encode_checkpoint(&Checkpoint::default(), 1)?;
+/// let entry = Entry::Session(Session::default());
+/// let record = Record { seq: 1, entry };
+/// let line = format::encode_record(&record, fresh.stamp)?;
+///
+/// let file = format::decode(&[fresh.bytes, line].concat()).expect("our own file");
+/// assert_eq!(file.checkpoint, Ok(Checkpoint::default()));
+/// assert_eq!(file.records, [record]);
+/// # Ok::<(), format::EncodeError>(())
+/// ```
+///
 /// # Errors
 ///
 /// [`EncodeError::TooDeep`] for a parameter that is nested deeper than [`DEPTH_MAX`].

@@ -4,8 +4,7 @@
 
 use crate::{
     checkpoint::format::{Checkpoint, Entry, Record, Session},
-    master::Master,
-    xmlrpc::Call,
+    master::{Master, Request},
 };
 
 /// When a checkpoint is restored at start.
@@ -82,7 +81,7 @@ pub struct Rebuilt {
     /// The newest session.
     pub session: Option<Session>,
     /// The writes that have not reached the master yet, in order.
-    pub pending: Vec<Call>,
+    pub pending: Vec<Request>,
     /// Why the snapshot was left out: it is no state of a master.
     pub trouble: Option<String>,
 }
@@ -91,10 +90,10 @@ pub struct Rebuilt {
 pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
     let mut rebuilt = Rebuilt::default();
     // Each with the number of its record; those of the snapshot with the snapshot's.
-    let mut pending: Vec<(u64, Call)> = Vec::new();
+    let mut pending: Vec<(u64, Request)> = Vec::new();
     if let Some(checkpoint) = checkpoint {
         let writes = checkpoint.pending.into_iter();
-        pending.extend(writes.map(|call| (checkpoint.seq, call)));
+        pending.extend(writes.map(|call| (checkpoint.seq, call.into())));
         rebuilt.session = Some(checkpoint.session);
         match Master::from_snapshot(checkpoint.snapshot) {
             Ok(state) => rebuilt.mirror = state,
@@ -108,9 +107,10 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                 call,
                 pending: waits,
             } => {
-                rebuilt.mirror.apply(&call);
+                let request = Request::from(call);
+                rebuilt.mirror.apply_telling(&request, &mut ());
                 if waits {
-                    pending.push((seq, call));
+                    pending.push((seq, request));
                 }
             }
             Entry::Session(session) => {
@@ -128,6 +128,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::xmlrpc::Call;
 
     fn write(seq: u64, pending: bool) -> Record {
         let params = vec!["/n".into(), format!("/p{seq}").into(), 1.into()];
@@ -156,7 +157,7 @@ mod tests {
         };
         checkpoint.session.delivered = 3;
         let rebuilt = rebuild(Some(checkpoint), records.to_vec());
-        let name = |call: &Call| call.params[1].as_str().unwrap().to_owned();
+        let name = |call: &Request| call.params()[1].as_str().unwrap().to_owned();
         rebuilt.pending.iter().map(name).collect()
     }
 

@@ -1,10 +1,7 @@
 use super::*;
 
-fn call(method: &str, params: &[&str]) -> Call {
-    Call::new(
-        method,
-        params.iter().map(|text| Value::from(*text)).collect(),
-    )
+fn call(method: &str, params: &[&str]) -> Request {
+    Request::new(Method::named(method), params.iter().copied())
 }
 
 fn publish(master: &mut Master, node: &str, topic: &str, api: &str) {

@@ -9,7 +9,7 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 
 use crate::{
-    master::{self, Master, NoticeSink},
+    master::{self, Kind, Master, NoticeSink, Request},
     xmlrpc::{Call, Value},
 };
 
@@ -20,8 +20,6 @@ pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
 const NOTICES: usize = 4096;
 /// So many nodes may be remembered that are not registered any more.
 const NODES: usize = 1024;
-/// Levels of multicalls that are looked into.
-const LEVELS: usize = 8;
 
 /// Something that a node is notified of.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -172,12 +170,14 @@ impl Activity {
     pub(super) fn applied(
         &mut self,
         now: Instant,
-        call: &Call,
+        call: &Request,
         noticed: Noticed,
         registered: impl Fn(&str) -> bool,
     ) -> bool {
         let nobody_new = self.strangers.is_empty();
-        self.note(now, call, LEVELS);
+        for call in call.calls() {
+            self.note(now, call);
+        }
         if self.last_calls.len() > self.prune_at.max(NODES) {
             self.prune(registered);
         }
@@ -220,10 +220,8 @@ impl Activity {
     }
 
     /// The nodes that `call` takes the names of, as they are before it is applied.
-    pub(super) fn displaced_by(&self, mirror: &Master, call: &Call) -> Vec<Displaced> {
-        let entries = call.entries();
-        let calls = entries.iter().chain([call]);
-        let found = calls.filter_map(|call| {
+    pub(super) fn displaced_by(&self, mirror: &Master, call: &Request) -> Vec<Displaced> {
+        let found = call.calls().into_iter().filter_map(|call| {
             let (node, api) = mirror.displaced_by(call)?;
             let topics = mirror
                 .publications(&node)
@@ -238,20 +236,12 @@ impl Activity {
         found.collect()
     }
 
-    fn note(&mut self, now: Instant, call: &Call, levels: usize) {
-        if call.method == "system.multicall" {
-            for entry in call.entries() {
-                if levels > 0 {
-                    self.note(now, &entry, levels - 1);
-                }
-            }
-            return;
-        }
-        let Some(caller) = call.params.first().and_then(Value::as_str) else {
+    fn note(&mut self, now: Instant, call: &Request) {
+        let Some(caller) = call.caller() else {
             return;
         };
         self.count += 1;
-        if master::registrant(call).is_some() {
+        if call.registrant().is_some() {
             self.last_calls
                 .entry(caller.to_owned())
                 .or_default()
@@ -259,7 +249,7 @@ impl Activity {
             if self.strangers.len() < NOTICES {
                 self.strangers.insert(caller.to_owned(), now);
             }
-        } else if call.method.starts_with("un") {
+        } else if call.kind() == Kind::Unregister {
             self.last_calls
                 .entry(caller.to_owned())
                 .or_default()

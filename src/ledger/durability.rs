@@ -129,7 +129,13 @@ impl Inner {
         Checkpoint {
             seq: self.seq(),
             session: self.session.clone(),
-            pending: self.pending.calls().to_vec(),
+            pending: self
+                .pending
+                .calls()
+                .iter()
+                .cloned()
+                .map(Into::into)
+                .collect(),
             snapshot: self.mirror.snapshot(),
         }
     }

@@ -1,10 +1,10 @@
 //! Writes that the mirror has answered and the present incarnation may not have run.
 
-use crate::xmlrpc::{Call, Value};
+use crate::{master::Request, xmlrpc::Value};
 
 /// Most of them that are kept,
 const COUNT_MAX: usize = 10_000;
-/// and most bytes of text and data in them.
+/// and most bytes of memory, about.
 const BYTES_MAX: usize = 16 << 20;
 
 /// They are too many to tell what of a master's state is newer than the mirror's.
@@ -14,7 +14,7 @@ pub(super) struct TooMany;
 /// Pending writes, in the order in which they were answered. Bounded.
 #[derive(Debug, Default)]
 pub(super) struct PendingWrites {
-    calls: Vec<Call>,
+    calls: Vec<Request>,
     bytes: usize,
 }
 
@@ -24,9 +24,12 @@ impl PendingWrites {
     /// # Errors
     ///
     /// If they are too many: all are dropped then.
-    pub(super) fn extend(&mut self, calls: impl IntoIterator<Item = Call>) -> Result<(), TooMany> {
+    pub(super) fn extend(
+        &mut self,
+        calls: impl IntoIterator<Item = Request>,
+    ) -> Result<(), TooMany> {
         for call in calls {
-            self.bytes += call.params.iter().map(size).sum::<usize>();
+            self.bytes += call.params().iter().map(Value::size).sum::<usize>();
             self.calls.push(call);
         }
         if self.calls.len() > COUNT_MAX || self.bytes > BYTES_MAX {
@@ -36,11 +39,11 @@ impl PendingWrites {
         Ok(())
     }
 
-    pub(super) fn contains(&self, call: &Call) -> bool {
+    pub(super) fn contains(&self, call: &Request) -> bool {
         self.calls.contains(call)
     }
 
-    pub(super) fn calls(&self) -> &[Call] {
+    pub(super) fn calls(&self) -> &[Request] {
         &self.calls
     }
 
@@ -49,26 +52,14 @@ impl PendingWrites {
     }
 }
 
-/// Bytes that a value takes, about.
-fn size(value: &Value) -> usize {
-    size_of::<Value>()
-        + match value {
-            Value::String(text) | Value::DateTime(text) | Value::BigInt(text) => text.len(),
-            Value::Base64(bytes) => bytes.len(),
-            Value::Array(elements) => elements.iter().map(size).sum(),
-            Value::Struct(members) => members.iter().map(|(k, v)| k.len() + size(v)).sum(),
-            Value::Nil | Value::Bool(_) | Value::Int(_) | Value::Double(_) => 0,
-        }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::master::Method;
 
     #[test]
     fn too_many_or_too_large_writes_are_dropped() {
-        let write =
-            |text: String| Call::new("setParam", vec!["/n".into(), "/k".into(), text.into()]);
+        let write = |text: String| Request::new(Method::SetParam, ["/n", "/k", text.as_str()]);
         let mut pending = PendingWrites::default();
         for _ in 0..COUNT_MAX {
             pending.extend([write(String::new())]).unwrap();

@@ -30,8 +30,8 @@ fn cut(text: &str) -> &str {
 }
 
 impl Inner {
-    pub(super) fn report_divergence(&mut self, answered: &Answered, mirror: &Reply) {
-        let method = answered.call.method.as_str();
+    pub(super) fn report_divergence(&mut self, answered: &Answered<'_>, mirror: &Reply) {
+        let method = answered.call.method().name();
         if self.diverged.insert(method.to_owned()) {
             let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
             tracing::warn!(

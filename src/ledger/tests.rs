@@ -1,6 +1,9 @@
 use super::activity::NOTICE_MEMORY;
 use super::*;
-use crate::{checkpoint::store::StoreError, xmlrpc::Value};
+use crate::{
+    checkpoint::store::StoreError,
+    xmlrpc::{Call, Value},
+};
 
 fn ledger() -> Ledger {
     let stats = Box::leak(Box::default());
@@ -14,25 +17,22 @@ fn ledger() -> Ledger {
     )
 }
 
-fn pending(ledger: &Ledger) -> Vec<Call> {
+fn pending(ledger: &Ledger) -> Vec<Request> {
     ledger.lock().pending.calls().to_vec()
 }
 
-fn call(method: &str, params: &[&str]) -> Call {
-    Call::new(
-        method,
-        params.iter().map(|text| Value::from(*text)).collect(),
-    )
+fn call(method: &str, params: &[&str]) -> Request {
+    Request::new(Method::named(method), params.iter().copied())
 }
 
-fn publish(topic: &str) -> Call {
+fn publish(topic: &str) -> Request {
     call(
         "registerPublisher",
         &["/n", topic, "std_msgs/String", "http://n:1/"],
     )
 }
 
-fn answered(call: &Call, mirror: &mut Master) -> Reply {
+fn answered(call: &Request, mirror: &mut Master) -> Reply {
     mirror.apply(call).reply
 }
 
@@ -75,8 +75,13 @@ fn a_master_that_answers_otherwise_than_the_mirror_casts_doubt() {
 fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     let ledger = ledger();
     let now = Instant::now();
-    let set = |value: i32| Call::new("setParam", vec!["/n".into(), "/a".into(), value.into()]);
-    let answer = |call: &Call| ledger.stand_in(now, call).unwrap().0;
+    let set = |value: i32| {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/n"), "/a".into(), value.into()],
+        )
+    };
+    let answer = |call: &Request| ledger.stand_in(now, call).unwrap().0;
     assert_eq!(answer(&set(1)), answered(&set(1), &mut Master::default()));
     answer(&set(2));
     // What changes nothing needs no master, and what is refused never ran.
@@ -84,10 +89,13 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     answer(&call("deleteParam", &["/n", "/b"]));
     answer(&call("setParam", &["/n", "/"]));
     assert_eq!(pending(&ledger), [set(1), set(2)]);
-    assert_eq!(ledger.checkpoint().pending, [set(1), set(2)]);
+    assert_eq!(
+        ledger.checkpoint().pending,
+        [set(1), set(2)].map(Call::from)
+    );
     ledger.delivered();
     assert_eq!(pending(&ledger), []);
-    let multicall = Call::multicall([set(3), call("getPid", &["/n"]), set(3), set(4)]);
+    let multicall = Request::multicall([set(3), call("getPid", &["/n"]), set(3), set(4)]);
     answer(&multicall);
     assert_eq!(pending(&ledger), [set(3), set(3), set(4)]);
     let before = ledger.token();
@@ -99,8 +107,13 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
 fn too_many_pending_writes_make_another_incarnation_of_their_master() {
     let ledger = ledger();
     let before = ledger.token();
-    let set = |value: i32| Call::new("setParam", vec!["/n".into(), "/a".into(), value.into()]);
-    let many = Call::multicall((0..20_000).map(set));
+    let set = |value: i32| {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/n"), "/a".into(), value.into()],
+        )
+    };
+    let many = Request::multicall((0..20_000).map(set));
     assert!(ledger.stand_in(Instant::now(), &many).is_some());
     assert_eq!(pending(&ledger), []);
     assert_ne!(ledger.token(), before);
@@ -156,7 +169,7 @@ fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     let bye = call("unregisterPublisher", &["/n", "/gone", "http://n:1/"]);
     assert!(ledger.answer_idle(now, &watch).is_some());
     for calls in [vec![bye.clone()], vec![watch.clone(), bye.clone()]] {
-        assert_eq!(ledger.answer_idle(now, &Call::multicall(calls)), None);
+        assert_eq!(ledger.answer_idle(now, &Request::multicall(calls)), None);
     }
     assert_eq!(ledger.answer_idle(now, &bye), None);
 }
@@ -184,7 +197,7 @@ fn what_changes_nothing_leaves_no_trace() {
 fn what_the_master_refuses_and_the_mirror_would_do_casts_doubt() {
     let ledger = ledger();
     let now = Instant::now();
-    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), 1.into()]);
+    let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), 1.into()]);
     let reply = answered(&set, &mut Master::default());
     ledger.record(now, 0, &[(&set, &reply)]).unwrap();
     let delete = call("deleteParam", &["/n", "/a"]);
@@ -199,9 +212,9 @@ fn what_the_master_refuses_and_the_mirror_would_do_casts_doubt() {
 #[test]
 fn a_write_behind_a_subscription_is_no_divergence() {
     let ledger = ledger();
-    let set = |key: &str| Call::new("setParam", vec!["/n".into(), key.into(), 1.into()]);
+    let set = |key: &str| Request::new(Method::SetParam, [Value::from("/n"), key.into(), 1.into()]);
     let subscribe = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
-    let call = Call::multicall([set("/a/x"), subscribe, set("/a/y")]);
+    let call = Request::multicall([set("/a/x"), subscribe, set("/a/y")]);
     let reply = answered(&call, &mut Master::default());
     let recorded = ledger
         .record(Instant::now(), 0, &[(&call, &reply)])
@@ -254,7 +267,7 @@ fn reads_are_answered_together_within_limits() {
     let ledger = ledger();
     let now = Instant::now();
     let text = Value::String("x".repeat(1 << 20));
-    let set = Call::new("setParam", vec!["/n".into(), "/a".into(), text]);
+    let set = Request::new(Method::SetParam, [Value::from("/n"), "/a".into(), text]);
     for call in [&set, &publish("/t")] {
         let reply = ledger.with_mirror(|mirror| answered(call, &mut mirror.clone()));
         ledger.record(now, 0, &[(call, &reply)]).unwrap();
@@ -262,16 +275,16 @@ fn reads_are_answered_together_within_limits() {
     let read = || call("getParam", &["/n", "/"]);
     let reads = |count| (0..count).map(|_| read());
     let bye = || call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
-    let many = Call::multicall(reads(100_000));
-    let nested = Call::multicall([read(), many.clone()]);
-    let unregistering = Call::multicall([bye()].into_iter().chain(reads(100_000)));
+    let many = Request::multicall(reads(100_000));
+    let nested = Request::multicall([read(), many.clone()]);
+    let unregistering = Request::multicall([bye()].into_iter().chain(reads(100_000)));
     assert_eq!(ledger.answer(&many), None);
     assert_eq!(ledger.answer(&nested), None);
     assert_eq!(ledger.stand_in(now, &unregistering), None);
     assert_eq!(ledger.with_mirror(|mirror| mirror.counts().publishers), 1);
     assert!(ledger.answer(&read()).is_some());
-    assert!(ledger.answer(&Call::multicall(reads(60))).is_some());
-    let unregistering = Call::multicall([bye()].into_iter().chain(reads(60)));
+    assert!(ledger.answer(&Request::multicall(reads(60))).is_some());
+    let unregistering = Request::multicall([bye()].into_iter().chain(reads(60)));
     assert!(ledger.stand_in(now, &unregistering).is_some());
 }
 

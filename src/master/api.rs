@@ -1,19 +1,21 @@
 //! The methods of the Master API, and the dispatcher in front of them.
 
-use super::{AsRequest, Kind, Master, Notice, NoticeSink, Request, returnable};
+use std::fmt;
+
+use super::{Kind, Master, Notice, NoticeSink, Request, returnable};
 use crate::xmlrpc::{Reply, Value};
 
 /// What a method returns: status code, message, value.
 pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 
-/// Why a method ends early. The texts after the first word are our own, but for those that clients meet.
+/// Why a method ends early.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Failure {
     /// A check refuses a parameter: the text is the message.
     Refused(String),
-    /// A Python `TypeError`: code -1.
+    /// Where rosmaster raises a `TypeError`: code -1, and a text of our own.
     Type(&'static str),
-    /// Any other Python exception: code 0.
+    /// Where it raises anything else: code 0.
     Internal(&'static str),
 }
 
@@ -114,6 +116,12 @@ methods! {
     Shutdown "shutdown" Shutdown 2 0.into() => shutdown;
 }
 
+impl fmt::Display for Method {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
 impl Method {
     /// What it may do. [`Kind::Unknown`] for a multicall, whose entries decide.
     pub(crate) fn kind(&self) -> Kind {
@@ -141,16 +149,28 @@ pub struct Applied {
 
 impl Master {
     /// Answers as rosmaster does, and changes as rosmaster does. `shutdown` is answered and changes nothing.
-    /// The texts of errors that only an odd client can provoke are our own.
-    pub fn apply(&mut self, call: &impl AsRequest) -> Applied {
+    /// The texts of errors that no ROS client provokes are our own.
+    ///
+    /// ```
+    /// use rosrescue::master::{Master, Method, Notice, Request, is_success};
+    ///
+    /// let mut master = Master::default();
+    /// let subscribe = ["/listener", "/chatter", "std_msgs/String", "http://robot:2/"];
+    /// master.apply(&Request::new(Method::RegisterSubscriber, subscribe));
+    /// let publish = ["/talker", "/chatter", "std_msgs/String", "http://robot:1/"];
+    /// let applied = master.apply(&Request::new(Method::RegisterPublisher, publish));
+    /// assert!(is_success(&applied.reply));
+    /// // The master tells the subscriber.
+    /// assert!(matches!(&applied.notices[..], [Notice::PublisherUpdate { to, .. }] if to == "http://robot:2/"));
+    /// ```
+    pub fn apply(&mut self, request: &Request) -> Applied {
         let mut notices = Vec::new();
-        let reply = self.apply_telling(call, &mut notices);
+        let reply = self.apply_telling(request, &mut notices);
         Applied { reply, notices }
     }
 
     /// Like [`Master::apply`], with the callbacks told to `notices`, which copies as much as it needs.
-    pub fn apply_telling(&mut self, call: &impl AsRequest, notices: &mut dyn NoticeSink) -> Reply {
-        let request = &*call.as_request();
+    pub fn apply_telling(&mut self, request: &Request, notices: &mut dyn NoticeSink) -> Reply {
         let result = match request.method() {
             Method::Multicall => self.run_multicall(request.entries(), notices),
             _ => self.dispatch(request, notices),

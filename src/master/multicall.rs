@@ -1,7 +1,7 @@
 //! `system.multicall`, which CPython's `xmlrpc.server` brings along.
 
 use super::api::fault;
-use super::{AsRequest, Entry, Kind, Master, Method, NoticeSink, Request, names};
+use super::{Entry, Kind, Master, Method, NoticeSink, Request, names};
 use crate::xmlrpc::{Reply, Struct, Value};
 
 impl Master {
@@ -56,8 +56,7 @@ impl Master {
 
     /// Whether all that the reads in a multicall answer takes no more than `most` bytes of memory, about.
     /// Each answer is made and dropped. What is no multicall fits always.
-    pub fn fits(&mut self, call: &impl AsRequest, mut most: usize) -> bool {
-        let request = &*call.as_request();
+    pub fn fits(&mut self, request: &Request, mut most: usize) -> bool {
         if *request.method() != Method::Multicall {
             return true;
         }

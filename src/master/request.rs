@@ -1,7 +1,5 @@
 //! A call, parsed once: the method, its parameters, and the entries of a multicall.
 
-use std::borrow::Cow;
-
 use super::{Kind, Method, names, returnable};
 use crate::xmlrpc::{self, Call, DecodeError, Struct, Value};
 
@@ -165,7 +163,7 @@ impl Request {
         returnable::is_readable_at(names::parts(&key).count(), value)
     }
 
-    /// The address of the node that this call registers something for, with its caller id.
+    /// Caller id and address of the node that this call registers something for.
     pub fn registrant(&self) -> Option<(&str, &str)> {
         let at = match self.method {
             Method::RegisterPublisher | Method::RegisterSubscriber | Method::RegisterService => 3,
@@ -185,50 +183,6 @@ impl From<Call> for Request {
     fn from(call: Call) -> Self {
         Self::parse(Method::named(&call.method), call.params, 0)
     }
-}
-
-/// A [`Call`], or what was parsed of one.
-pub trait AsRequest {
-    /// The call as a request.
-    fn as_request(&self) -> Cow<'_, Request>;
-}
-
-impl AsRequest for Call {
-    fn as_request(&self) -> Cow<'_, Request> {
-        Cow::Owned(self.clone().into())
-    }
-}
-
-impl AsRequest for Request {
-    fn as_request(&self) -> Cow<'_, Request> {
-        Cow::Borrowed(self)
-    }
-}
-
-impl<T: AsRequest> AsRequest for &T {
-    fn as_request(&self) -> Cow<'_, Request> {
-        (*self).as_request()
-    }
-}
-
-/// [`Request::kind`].
-pub fn kind(call: &impl AsRequest) -> Kind {
-    call.as_request().kind()
-}
-
-/// [`Request::is_answerable`].
-pub fn is_answerable(call: &impl AsRequest) -> bool {
-    call.as_request().is_answerable()
-}
-
-/// The writes in `call`, taken out of multicalls, in order.
-pub fn writes(call: &impl AsRequest) -> Vec<Call> {
-    let request = call.as_request();
-    let writes = request
-        .calls()
-        .into_iter()
-        .filter(|call| call.kind().mutates());
-    writes.map(|call| call.clone().into()).collect()
 }
 
 /// What was malformed in a multicall is a nil.
@@ -253,9 +207,7 @@ fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
         Err(_) => None,
     };
     let Some(list) = list else {
-        return vec![Entry::Malformed(
-            "<class 'TypeError'>:system.multicall takes one list",
-        )];
+        return vec![Entry::Malformed("system.multicall takes one list")];
     };
     let mut entries = Vec::with_capacity(list.len());
     for element in list {
@@ -270,21 +222,21 @@ fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
 impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
         let Value::Struct(mut members) = element else {
-            return Self::Malformed("<class 'TypeError'>:an entry of a multicall is no struct");
+            return Self::Malformed("an entry of a multicall is no struct");
         };
         let mut member = |name| Struct::swap_remove(&mut members, name);
         let (Some(name), Some(params)) = (member("methodName"), member("params")) else {
-            return Self::Malformed("<class 'KeyError'>:an entry lacks methodName or params");
+            return Self::Malformed("an entry of a multicall lacks methodName or params");
         };
         let Value::String(name) = name else {
-            return Self::Refused("<class 'Exception'>:the name of a method is no string");
+            return Self::Refused("the name of a method is no string");
         };
         let Some(params) = items(params) else {
-            return Self::Refused("<class 'TypeError'>:the params of an entry are no list");
+            return Self::Refused("the params of an entry are no list");
         };
         match Method::named(&name) {
             Method::Multicall if depth >= MAX_NESTED => {
-                Self::Refused("<class 'RecursionError'>:too many multicalls inside each other")
+                Self::Refused("too many multicalls inside each other")
             }
             method => Self::Request(Request::parse(method, params, depth + 1)),
         }
@@ -305,6 +257,15 @@ fn items(value: Value) -> Option<Vec<Value>> {
             Some(characters.map(|c| Value::String(c.into())).collect())
         }
         _ => None,
+    }
+}
+
+#[cfg(test)]
+impl Request {
+    /// This multicall with a malformed entry behind the others.
+    pub(crate) fn malformed(mut self) -> Self {
+        self.entries.push(Entry::Malformed("malformed"));
+        self
     }
 }
 

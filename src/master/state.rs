@@ -6,13 +6,13 @@ use indexmap::IndexMap;
 use serde::Serialize;
 use thiserror::Error;
 
-use super::names;
 use super::notice::NoticeSink;
 use super::params::Params;
 use super::registry::{Node, Registry, Shared};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
-use crate::xmlrpc::{Call, Struct};
+use super::{Method, Request, names};
+use crate::xmlrpc::Struct;
 
 /// A complete master without IO: rosmaster's state, and its answers through [`Master::apply`].
 ///
@@ -198,31 +198,31 @@ impl Master {
     ///
     /// A reference that it keeps by a service that another node took over cannot be taken back;
     /// rosmaster has no call for it.
-    pub fn unregister_calls(&self, caller_id: &str) -> Vec<Call> {
+    pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();
         };
         let api = node.api.as_str();
-        let shared = |method: &'static str, topics: &indexmap::IndexSet<String>| {
+        let mut calls = Vec::new();
+        for (method, topics) in [
+            (Method::UnregisterPublisher, &node.publications),
+            (Method::UnregisterSubscriber, &node.subscriptions),
+        ] {
             let names = topics
                 .iter()
                 .filter_map(|topic| names::name_for(topic, caller_id));
-            names
-                .map(|name| Call::new(method, vec![caller_id.into(), name.into(), api.into()]))
-                .collect::<Vec<_>>()
-        };
-        let mut calls = shared("unregisterPublisher", &node.publications);
-        calls.extend(shared("unregisterSubscriber", &node.subscriptions));
+            calls.extend(names.map(|name| Request::new(method.clone(), [caller_id, &name, api])));
+        }
         calls.extend(node.services.iter().filter_map(|service| {
             let entry = self.registry.services.get(service)?;
             let name = names::name_for(service, caller_id).filter(|_| entry.node == caller_id)?;
-            let params = vec![caller_id.into(), name.into(), entry.api.as_str().into()];
-            Some(Call::new("unregisterService", params))
+            let params = [caller_id, &name, &entry.api];
+            Some(Request::new(Method::UnregisterService, params))
         }));
         calls.extend(node.param_subscriptions.iter().filter_map(|key| {
             let name = names::param_name_for(key, caller_id)?;
-            let params = vec![caller_id.into(), api.into(), name.into()];
-            Some(Call::new("unsubscribeParam", params))
+            let params = [caller_id, api, &name];
+            Some(Request::new(Method::UnsubscribeParam, params))
         }));
         calls
     }

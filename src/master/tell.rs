@@ -3,11 +3,13 @@
 use std::sync::Arc;
 
 use super::registry::Shared;
-use super::{Master, names, returnable};
+use super::{CALLER_ID, Master, Method, Request, names, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id under which rosmaster calls nodes.
-const MASTER: &str = "/master";
+pub const MASTER: &str = "/master";
+/// The method by which a node is told of a topic's publishers.
+pub const PUBLISHER_UPDATE: &str = "publisherUpdate";
 
 impl Master {
     /// The `publisherUpdate` with the full list of a topic's publishers.
@@ -77,10 +79,10 @@ impl Master {
             .any(|node| self.api_of(node) == Some(api))
     }
 
-    /// Whether a `call` that registers something would take the name of a node at another address:
+    /// Whether `call` registers something and would take the name of a node at another address:
     /// the master would shut that node down. The node, and the address that it has.
-    pub fn displaced_by(&self, call: &Call) -> Option<(String, String)> {
-        let (node, api) = registrant(call)?;
+    pub fn displaced_by(&self, call: &Request) -> Option<(String, String)> {
+        let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
         Some((node.to_owned(), held.to_owned()))
     }
@@ -90,7 +92,7 @@ impl Master {
 pub fn publisher_update(topic: &str, publishers: &[String]) -> Call {
     let publishers = publishers.iter().cloned().map(Value::String);
     let list = Value::Array(publishers.collect());
-    Call::new("publisherUpdate", vec![MASTER.into(), topic.into(), list])
+    Call::new(PUBLISHER_UPDATE, vec![MASTER.into(), topic.into(), list])
 }
 
 /// The `paramUpdate` with this value.
@@ -100,7 +102,10 @@ pub fn param_update(key: &str, value: Value) -> Call {
 
 /// The `shutdown` to a node whose name another one has taken.
 pub fn shutdown(node: &str) -> Call {
-    Call::new("shutdown", vec![MASTER.into(), bump_reason(node).into()])
+    Call::new(
+        Method::Shutdown.name(),
+        vec![MASTER.into(), bump_reason(node).into()],
+    )
 }
 
 /// What rosmaster says to such a node.
@@ -108,17 +113,14 @@ pub(crate) fn bump_reason(node: &str) -> String {
     format!("[{node}] Reason: new node registered with same name")
 }
 
-/// Caller id and address of the node that `call` registers something for.
-pub fn registrant(call: &Call) -> Option<(&str, &str)> {
-    let at = match call.method.as_str() {
-        "registerPublisher" | "registerSubscriber" | "registerService" => 3,
-        "subscribeParam" => 1,
-        _ => return None,
-    };
-    Some((
-        call.params.first()?.as_str()?,
-        call.params.get(at)?.as_str()?,
-    ))
+/// A question to a node or a master: a method whose only parameter is who asks.
+pub fn question(method: &str) -> Call {
+    Call::new(method, vec![CALLER_ID.into()])
+}
+
+/// Asks a node or a master for its process id.
+pub fn get_pid() -> Call {
+    question(Method::GetPid.name())
 }
 
 /// Whether a node can have registered a topic of this name as it is: global and canonical.
@@ -133,11 +135,8 @@ pub fn is_plain_topic(topic: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn call(method: &str, params: &[&str]) -> Call {
-        Call::new(
-            method,
-            params.iter().map(|text| Value::from(*text)).collect(),
-        )
+    fn call(method: &str, params: &[&str]) -> Request {
+        Request::new(Method::named(method), params.iter().copied())
     }
 
     #[test]
@@ -156,7 +155,10 @@ mod tests {
         assert_eq!(told.len(), 1);
         assert!(master.subscribes("http://s:1/", "/t") && !master.subscribes("http://p:1/", "/t"));
 
-        let set = Call::new("setParam", vec!["/x".into(), "/a/b".into(), 7.into()]);
+        let set = Request::new(
+            Method::SetParam,
+            [Value::from("/x"), "/a/b".into(), 7.into()],
+        );
         let told = master.apply(&set).notices;
         let super::super::Notice::ParamUpdate { key, value, .. } = told.first().unwrap() else {
             panic!("{told:?}");

@@ -7,7 +7,7 @@ use tokio::{net::TcpStream, time::timeout};
 
 use crate::{
     health::Claims,
-    master::CALLER_ID,
+    master::{self, question},
     resolver,
     ros_env::MasterUri,
     upstream::Connection,
@@ -65,15 +65,15 @@ pub struct Interview {
 /// what it publishes and subscribes, with as much time again. `getName` would tell more, but roscpp
 /// has none.
 pub async fn interview(api: &str, limit: Duration) -> Interview {
-    let ask = |method: &str| Call::new(method, vec![CALLER_ID.into()]);
-    let (sign, pid) = ask_for(api, &ask("getPid"), limit).await;
+    let (sign, pid) = ask_for(api, &master::get_pid(), limit).await;
     let mut interview = Interview {
         sign,
         pid: pid.as_ref().and_then(Value::as_int),
         claims: None,
     };
     if sign == Sign::Alive {
-        let (publications, subscriptions) = (ask("getPublications"), ask("getSubscriptions"));
+        let (publications, subscriptions) =
+            (question("getPublications"), question("getSubscriptions"));
         let answers = tokio::join!(
             ask_for(api, &publications, limit),
             ask_for(api, &subscriptions, limit)

@@ -27,11 +27,11 @@ use crate::{
     gate::State,
     health::{Name, Reconciliation, Registration, Verdict, judge},
     ledger::activity::Activity,
-    master::{self, CALLER_ID, Kind, Master},
+    master::{self, CALLER_ID, Kind, Master, Method, Request},
     replay::Token,
     ros_env::MasterUri,
     write_queue::batch::{self, Condition},
-    xmlrpc::{Call, Reply},
+    xmlrpc::Reply,
 };
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
@@ -103,9 +103,9 @@ pub(crate) async fn after_recovery(
 
 /// Returns when the writes that are queued now have been answered.
 async fn barrier(nodes: &Nodes) {
-    let last = Call::new("getPid", vec![CALLER_ID.into()]);
+    let last = Request::new(Method::GetPid, [CALLER_ID]);
     // Its answer does not matter.
-    nodes.write_queue.call(last, Kind::Mutate).await;
+    nodes.write_queue.call(last).await;
 }
 
 /// Asks every node, all at the same time.
@@ -335,13 +335,13 @@ impl Findings {
             for one in &reconciliation.extra {
                 if confirmed(|reconciliation| &reconciliation.extra, one) {
                     let call = one.unregister(node, api);
-                    reconcile(nodes, one, condition, call, Kind::Unregister, outcome).await;
+                    reconcile(nodes, one, condition, call, outcome).await;
                 }
             }
             for one in &reconciliation.missing {
                 if certain || confirmed(|reconciliation| &reconciliation.missing, one) {
                     let call = one.register(node, api);
-                    reconcile(nodes, one, condition, call, Kind::Mutate, outcome).await;
+                    reconcile(nodes, one, condition, call, outcome).await;
                 }
             }
         }
@@ -353,16 +353,13 @@ async fn reconcile(
     nodes: &Nodes,
     one: &Registration,
     condition: &Condition,
-    call: Call,
-    kind: Kind,
+    call: Request,
     outcome: &mut CheckResult,
 ) {
     // In a multicall it goes alone: it must not displace anybody.
-    let alone = Call::multicall([call]);
-    let reply = nodes
-        .write_queue
-        .call_if(alone, kind, condition.clone())
-        .await;
+    let kind = call.kind();
+    let alone = Request::multicall([call]);
+    let reply = nodes.write_queue.call_if(alone, condition.clone()).await;
     let Some(reply) = reply else { return };
     if is_done(&reply) {
         let sign = if kind == Kind::Mutate { '+' } else { '-' };
@@ -394,10 +391,7 @@ async fn remove(nodes: &Nodes, name: &Name, api: &str) -> bool {
         return false;
     };
     let node = name.node.clone();
-    let (call, condition) = (Call::multicall(calls), Condition { node, last_calls });
-    let reply = nodes
-        .write_queue
-        .call_if(call, Kind::Unregister, condition)
-        .await;
+    let (call, condition) = (Request::multicall(calls), Condition { node, last_calls });
+    let reply = nodes.write_queue.call_if(call, condition).await;
     reply.is_some()
 }

@@ -130,9 +130,9 @@ fn latest(notification: Notification) -> Option<Notification> {
         return Some(notification);
     };
     let subject = call.params.get(1).and_then(Value::as_str)?;
-    Some(match call.method.as_str() {
-        "publisherUpdate" => Notification::Topic(subject.to_owned()),
-        _ => Notification::Param(subject.into()),
+    Some(match call.method == master::PUBLISHER_UPDATE {
+        true => Notification::Topic(subject.to_owned()),
+        false => Notification::Param(subject.into()),
     })
 }
 

@@ -14,7 +14,7 @@ use crate::{
     gate::{State, Tx},
     ledger::{Basis, Ledger},
     lifecycle::{Input, Probing, Supervision},
-    master::{Counts, Master},
+    master::{Counts, Master, Method, Request},
     replay::{self, Authority, Bears, Inspection, Plan, Token},
     status::stats::Stats,
     upstream::{
@@ -310,7 +310,10 @@ impl Examiner {
                 examination.outcome = outcome;
                 let state = replay::reconcile(&mirror, &found, &pending, authority);
                 // No look shows who subscribes parameters.
-                let hidden = |call: &crate::xmlrpc::Call| call.method.ends_with("bscribeParam");
+                let hidden = |call: &Request| {
+                    let method = call.method();
+                    matches!(method, Method::SubscribeParam | Method::UnsubscribeParam)
+                };
                 if state == found && !pending.iter().any(hidden) {
                     self.ledger.delivered();
                     say_difference(&self.ledger.adopt(state));

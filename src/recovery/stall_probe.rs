@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::examine::Examiner;
-use crate::{master::CALLER_ID, xmlrpc::Call};
+use crate::master;
 
 impl Examiner {
     /// Asks the master for signs of life, over connections of their own, and returns when it has given
@@ -11,7 +11,7 @@ impl Examiner {
     /// each connection in a thread of its own, so that one which works answers others meanwhile.
     pub(super) async fn silence(&self) -> Duration {
         let (probing, patience) = (self.probing, self.probe_timeout);
-        let sign_of_life = Call::new("getPid", vec![CALLER_ID.into()]);
+        let sign_of_life = master::get_pid();
         let mut missed = 0;
         while missed < probing.count {
             if missed == 0 {

@@ -1,53 +1,42 @@
 //! Which of a call's mutations a master has executed, and whether a mirror agrees.
 
-use crate::master::{AsRequest, Entry, Master, Method, Request, entry_reply, is_success};
-use crate::xmlrpc::{Call, Reply, Value};
+use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
+use crate::xmlrpc::{Reply, Value};
 
 /// A mutating call, taken out of multicalls, that a master has answered.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Answered {
+pub struct Answered<'a> {
     /// The call.
-    pub call: Call,
+    pub call: &'a Request,
     /// The master's answer.
     pub reply: Reply,
     /// Whether the master has changed its state by it.
     pub executed: bool,
 }
 
-impl Answered {
+impl Answered<'_> {
     /// Whether the answer of a mirror of that master to the same call leaves both in the same state and is
     /// of the same value. Two refusals are alike, whatever they say. `live`: parameters may have been
     /// written later in the same request. `subscribeParam` may answer them already, for rosmaster writes
     /// the dictionary itself, when all has been run; what could not be written may have been replaced by then.
-    pub fn compare(&self, mirror: &Reply, live: bool) -> Agreement {
-        let live = live && self.call.method == "subscribeParam";
+    pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
+        let method = self.call.method();
+        let live = live && *method == Method::SubscribeParam;
         let same = match [&self.reply, mirror].map(is_success) {
             [true, true] => live || self.reply == *mirror,
             [true, false] => live,
             [false, true] => false,
             [false, false] => true,
         };
-        match same && executed(&self.call.method, mirror) == Some(self.executed) {
-            true => Agreement::Same,
-            false => Agreement::Diverged,
-        }
+        same && executed(method, mirror) == Some(self.executed)
     }
-}
-
-/// How two answers compare.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Agreement {
-    /// They are alike.
-    Same,
-    /// One of the two states is not what it should be.
-    Diverged,
 }
 
 /// The mutating calls, taken out of multicalls, that a master has answered.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Accepted {
+pub struct Accepted<'a> {
     /// The calls in the order of their execution.
-    pub calls: Vec<Answered>,
+    pub calls: Vec<Answered<'a>>,
     /// Whether that is known for certain. If not, the master's state has to be read again.
     pub certain: bool,
 }
@@ -60,7 +49,7 @@ pub struct Accepted {
 ///
 /// A multicall that fails as a whole has run up to the entry at fault. Of such a one this gives what
 /// `mirror`, the state before the call, would have accepted, and says that it is not certain.
-pub fn accepted(mirror: &Master, call: &impl AsRequest, reply: &Reply) -> Accepted {
+pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accepted<'a> {
     let mut walk = Walk {
         mirror,
         model: None,
@@ -70,41 +59,41 @@ pub fn accepted(mirror: &Master, call: &impl AsRequest, reply: &Reply) -> Accept
             certain: true,
         },
     };
-    walk.call(&call.as_request(), reply);
+    walk.call(call, reply);
     walk.accepted
 }
 
-struct Walk<'a> {
-    mirror: &'a Master,
+struct Walk<'m, 'a> {
+    mirror: &'m Master,
     /// The mirror after the first `modelled` calls of `accepted`, once somebody has to know.
     model: Option<Master>,
     modelled: usize,
-    accepted: Accepted,
+    accepted: Accepted<'a>,
 }
 
-impl Walk<'_> {
-    fn call(&mut self, request: &Request, reply: &Reply) {
+impl<'a> Walk<'_, 'a> {
+    fn call(&mut self, request: &'a Request, reply: &Reply) {
         if *request.method() == Method::Multicall {
             return self.multicall(request, reply);
         }
         if !request.kind().mutates() {
             return;
         }
-        match executed(request.method().name(), reply) {
+        match executed(request.method(), reply) {
             Some(executed) => self.push(request, reply.clone(), executed),
             None => self.accepted.certain = false,
         }
     }
 
-    fn push(&mut self, request: &Request, reply: Reply, executed: bool) {
+    fn push(&mut self, call: &'a Request, reply: Reply, executed: bool) {
         self.accepted.calls.push(Answered {
-            call: request.clone().into(),
+            call,
             reply,
             executed,
         });
     }
 
-    fn multicall(&mut self, request: &Request, reply: &Reply) {
+    fn multicall(&mut self, request: &'a Request, reply: &Reply) {
         let entries = request.entries();
         let results = match reply {
             Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
@@ -126,13 +115,13 @@ impl Walk<'_> {
     }
 
     /// Runs the entries in the mirror, because the master's reply does not say how they went.
-    fn simulate(&mut self, request: &Request) {
+    fn simulate(&mut self, request: &'a Request) {
         for call in request.calls() {
             if !call.kind().mutates() {
                 continue;
             }
             let reply = self.foretell(call);
-            if executed(call.method().name(), &reply) == Some(true) {
+            if executed(call.method(), &reply) == Some(true) {
                 self.push(call, reply, true);
                 self.modelled += 1;
                 self.accepted.certain = false;
@@ -145,7 +134,7 @@ impl Walk<'_> {
     fn foretell(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
-            model.apply_telling(&answered.call, &mut ());
+            model.apply_telling(answered.call, &mut ());
         }
         self.modelled = self.accepted.calls.len();
         model.apply_telling(request, &mut ())
@@ -158,10 +147,10 @@ impl Walk<'_> {
 ///
 /// * to `setParam`, when it fails in working out the callbacks (a struct with slashes in its keys),
 /// * to `subscribeParam` of a nil, and of anything that holds a value that it cannot write.
-fn executed(method: &str, reply: &Reply) -> Option<bool> {
+fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     let answer = match reply {
         Reply::Value(Value::Array(answer)) => answer.as_slice(),
-        Reply::Fault { text, .. } if method == "subscribeParam" && is_write_error(text) => {
+        Reply::Fault { text, .. } if *method == Method::SubscribeParam && is_write_error(text) => {
             return Some(true);
         }
         _ => return None,
@@ -171,12 +160,12 @@ fn executed(method: &str, reply: &Reply) -> Option<bool> {
     };
     Some(match (code, method) {
         (1, _) => true,
-        (_, "setParam") => {
+        (_, Method::SetParam) => {
             message.starts_with("Internal failure: ")
                 || (message.starts_with("Error: invalid arguments: ")
                     && !message.contains("cannot set root of parameter tree"))
         }
-        (_, "subscribeParam") => message == "Internal error (None value returned)",
+        (_, Method::SubscribeParam) => message == "Internal error (None value returned)",
         _ => false,
     })
 }
@@ -206,70 +195,74 @@ mod tests {
         let answer = |code: i32, text: &str, value: Value| {
             Reply::Value(vec![Value::from(code), text.into(), value].into())
         };
-        let delete = Call::new("deleteParam", vec!["/n".into(), "/a".into()]);
+        let delete = Request::new(Method::DeleteParam, [Value::from("/n"), "/a".into()]);
         let refused = answer(-1, "parameter [/a] is not set", 0.into());
         let done = answer(1, "parameter /a deleted", 0.into());
         let of = accepted(&Master::default(), &delete, &refused)
             .calls
             .remove(0);
-        assert_eq!(of.compare(&refused, false), Agreement::Same);
-        assert_eq!(of.compare(&done, false), Agreement::Diverged);
+        assert!(of.agrees(&refused, false));
+        assert!(!of.agrees(&done, false));
         let other = answer(-1, "no such parameter", 0.into());
-        assert_eq!(of.compare(&other, false), Agreement::Same);
+        assert!(of.agrees(&other, false));
     }
 
     #[test]
     fn what_is_written_behind_a_subscription_may_be_seen_by_it() {
         let answer =
             |value: i32| Reply::Value(vec![Value::from(1), "".into(), value.into()].into());
-        let params = vec!["/n".into(), "http://n/".into(), "/a".into()];
-        let subscribe = Call::new("subscribeParam", params);
+        let params = [Value::from("/n"), "http://n/".into(), "/a".into()];
+        let subscribe = Request::new(Method::SubscribeParam, params);
         let of = accepted(&Master::default(), &subscribe, &answer(2))
             .calls
             .remove(0);
-        assert_eq!(of.compare(&answer(1), true), Agreement::Same);
-        assert_eq!(of.compare(&answer(1), false), Agreement::Diverged);
+        assert!(of.agrees(&answer(1), true));
+        assert!(!of.agrees(&answer(1), false));
         // What could not have been written has been replaced.
         let fault = |class: &str| Reply::Fault {
             code: 1,
             text: format!("<class '{class}'>:cannot marshal it"),
         };
-        assert_eq!(of.compare(&fault("TypeError"), true), Agreement::Same);
-        assert_eq!(of.compare(&fault("TypeError"), false), Agreement::Diverged);
-        assert_eq!(of.compare(&fault("Exception"), true), Agreement::Diverged);
+        assert!(of.agrees(&fault("TypeError"), true));
+        assert!(!of.agrees(&fault("TypeError"), false));
+        assert!(!of.agrees(&fault("Exception"), true));
         // A `setParam` that has run and failed says so in its own words.
         let failed = |text: &str| answer_with(0, &format!("Internal failure: {text}"));
-        let of = accepted(&Master::default(), &set("/a", 1), &failed("'x'"));
-        assert_eq!(of.calls[0].compare(&failed("y"), false), Agreement::Same);
+        let set = set("/a", 1);
+        let of = accepted(&Master::default(), &set, &failed("'x'"));
+        assert!(of.calls[0].agrees(&failed("y"), false));
         let refused = answer_with(-1, "ERROR: parameter [key] must be a string");
-        assert_eq!(of.calls[0].compare(&refused, false), Agreement::Diverged);
+        assert!(!of.calls[0].agrees(&refused, false));
     }
 
     fn answer_with(code: i32, text: &str) -> Reply {
         Reply::Value(vec![Value::from(code), text.into(), 0.into()].into())
     }
 
-    fn set(key: &str, value: impl Into<Value>) -> Call {
-        Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
+    fn set(key: &str, value: impl Into<Value>) -> Request {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/n"), key.into(), value.into()],
+        )
     }
 
     fn watched(keys: &[&str]) -> Master {
         let mut master = Master::default();
         for key in keys {
-            let params = vec!["/n".into(), "http://n/".into(), (*key).into()];
-            master.apply(&Call::new("subscribeParam", params));
+            let params = [Value::from("/n"), "http://n/".into(), (*key).into()];
+            master.apply(&Request::new(Method::SubscribeParam, params));
         }
         master
     }
 
     /// The calls that have been executed.
-    fn executed(accepted: Accepted) -> Vec<Call> {
+    fn executed(accepted: Accepted<'_>) -> Vec<Request> {
         let executed = accepted.calls.into_iter().filter(|of| of.executed);
-        executed.map(|of| of.call).collect()
+        executed.map(|of| of.call.clone()).collect()
     }
 
     /// What is accepted of `call`, by what the model itself answers.
-    fn of(master: &Master, call: &Call) -> Accepted {
+    fn of<'a>(master: &Master, call: &'a Request) -> Accepted<'a> {
         let reply = master.clone().apply(call).reply;
         accepted(master, call, &reply)
     }
@@ -280,17 +273,17 @@ mod tests {
         assert_eq!(executed(of(&master, &set("/a", 1))), [set("/a", 1)]);
         assert_eq!(executed(of(&master, &set("/", 1))), []);
         assert_eq!(executed(of(&master, &set("/a", Value::Nil))), []);
-        let read = Call::new("getParamNames", vec!["/n".into()]);
+        let read = Request::new(Method::GetParamNames, [Value::from("/n")]);
         assert_eq!(
-            of(&master, &Call::multicall([read.clone(), read])).calls,
+            of(&master, &Request::multicall([read.clone(), read])).calls,
             []
         );
     }
 
     #[test]
     fn entries_are_judged_one_by_one() {
-        let inner = Call::multicall([set("/b", 2), set("/", 3)]);
-        let call = Call::multicall([set("/a", 1), set("", 1), inner]);
+        let inner = Request::multicall([set("/b", 2), set("/", 3)]);
+        let call = Request::multicall([set("/a", 1), set("", 1), inner]);
         let found = of(&Master::default(), &call);
         assert!(found.certain);
         assert_eq!(executed(found), [set("/a", 1), set("/b", 2)]);
@@ -298,10 +291,7 @@ mod tests {
 
     #[test]
     fn what_came_before_a_malformed_entry_has_run() {
-        let mut call = Call::multicall([set("/a", 1), set("/b", 2)]);
-        if let Some(Value::Array(entries)) = call.params.first_mut() {
-            entries.insert(1, Value::Int(0));
-        }
+        let call = Request::multicall([set("/a", 1)]).malformed();
         let found = of(&Master::default(), &call);
         assert_eq!(found.calls.len(), 1);
         assert!(!found.certain);
@@ -312,21 +302,17 @@ mod tests {
     fn many_multicalls_that_fail_inside_a_long_one_take_no_longer_than_their_entries() {
         let count = 20_000;
         let sets = (0..count).map(|index| set(&format!("/p{index}"), 1));
-        let fails = (0..count).map(|index| {
-            let mut call = Call::multicall([set("/q", index), set("/", index)]);
-            if let Some(Value::Array(entries)) = call.params.first_mut() {
-                entries.push(Value::Int(5));
-            }
-            call
-        });
-        let found = of(&Master::default(), &Call::multicall(sets.chain(fails)));
+        let fails = (0..count)
+            .map(|index| Request::multicall([set("/q", index), set("/", index)]).malformed());
+        let call = Request::multicall(sets.chain(fails));
+        let found = of(&Master::default(), &call);
         assert!(!found.certain);
         assert_eq!(executed(found).len(), 40_000);
     }
 
     #[test]
     fn nothing_is_made_of_a_reply_that_is_none_to_a_multicall() {
-        let call = Call::multicall([set("/a", 1)]);
+        let call = Request::multicall([set("/a", 1)]);
         for value in [Value::Int(1), Value::Array(vec![])] {
             let found = accepted(&Master::default(), &call, &Reply::Value(value));
             assert_eq!((found.calls, found.certain), (vec![], false));
@@ -358,8 +344,9 @@ mod tests {
             Value::Struct(Struct::from([("x".to_owned(), Value::Nil)])),
         ));
         for key in ["/p", "/n/x"] {
-            let params = vec!["/n".into(), "http://n/".into(), key.into()];
-            let found = of(&master, &Call::new("subscribeParam", params));
+            let params = [Value::from("/n"), "http://n/".into(), key.into()];
+            let call = Request::new(Method::SubscribeParam, params);
+            let found = of(&master, &call);
             assert_eq!((found.calls.len(), found.certain), (1, true), "{key}");
         }
     }

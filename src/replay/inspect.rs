@@ -7,8 +7,8 @@ use thiserror::Error;
 
 use super::{Bears, Token};
 use crate::master::names::{self, CALLER_ID};
-use crate::master::{Master, ServiceEntry, Snapshot, SnapshotNode};
-use crate::xmlrpc::{Call, Reply, Struct, Value};
+use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
+use crate::xmlrpc::{Reply, Struct, Value};
 
 /// Why a reply to a look is not that of a master.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
@@ -37,7 +37,7 @@ pub enum NotAMaster {
     )]
     Form {
         /// The method.
-        method: &'static str,
+        method: Method,
     },
 }
 
@@ -76,24 +76,24 @@ impl Inspection {
 
     /// The look itself: one multicall of `getPid`, `lookupNode` of the token and its session, `getSystemState`,
     /// `getTopicTypes` and `getParam('/')`. Changes nothing.
-    pub fn call(token: &Token) -> Call {
-        let params = Call::new("getParam", vec![CALLER_ID.into(), "/".into()]);
-        Call::multicall(Self::reads(token).into_iter().chain([params]))
+    pub fn call(token: &Token) -> Request {
+        let params = Request::new(Method::GetParam, [CALLER_ID, "/"]);
+        Request::multicall(Self::reads(token).into_iter().chain([params]))
     }
 
     /// The look at a master whose parameters cannot be read.
-    pub fn call_without_params(token: &Token) -> Call {
-        Call::multicall(Self::reads(token))
+    pub fn call_without_params(token: &Token) -> Request {
+        Request::multicall(Self::reads(token))
     }
 
-    fn reads(token: &Token) -> [Call; 5] {
-        let read = |method| Call::new(method, vec![CALLER_ID.into()]);
+    fn reads(token: &Token) -> [Request; 5] {
+        let read = |method| Request::new(method, [CALLER_ID]);
         [
-            read("getPid"),
+            read(Method::GetPid),
             token.lookup(),
             token.lookup_session(),
-            read("getSystemState"),
-            read("getTopicTypes"),
+            read(Method::GetSystemState),
+            read(Method::GetTopicTypes),
         ]
     }
 
@@ -106,35 +106,38 @@ impl Inspection {
     pub fn decode(reply: &Reply) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
         let [pid, token, session, state, types, params @ ..] = results else {
-            return Err(form("system.multicall"));
+            return Err(form(Method::Multicall));
         };
         let success = |result, method| match answer(result) {
             Some((1, value)) => Ok(value),
             _ => Err(form(method)),
         };
-        let pid = success(pid, "getPid")?
+        let pid = success(pid, Method::GetPid)?
             .as_int()
-            .ok_or_else(|| form("getPid"))?;
-        let found = |result| Ok(answer(result).ok_or_else(|| form("lookupNode"))?.0 == 1);
+            .ok_or_else(|| form(Method::GetPid))?;
+        let found = |result| Ok(answer(result).ok_or_else(|| form(Method::LookupNode))?.0 == 1);
         let bears = match (found(token)?, found(session)?) {
             (true, _) => Bears::Present,
             (false, true) => Bears::Earlier,
             (false, false) => Bears::Nothing,
         };
-        let state = success(state, "getSystemState")?.as_array();
+        let state = success(state, Method::GetSystemState)?.as_array();
         let Some([publishers, subscribers, services]) = state else {
-            return Err(form("getSystemState"));
+            return Err(form(Method::GetSystemState));
         };
-        let lists = |value| lists(value).ok_or_else(|| form("getSystemState"));
+        let lists = |value| lists(value).ok_or_else(|| form(Method::GetSystemState));
         let services = lists(services)?.into_iter().map(|(service, mut nodes)| {
             let provider = nodes.pop().filter(|_| nodes.is_empty());
-            Ok((service, provider.ok_or_else(|| form("getSystemState"))?))
+            Ok((
+                service,
+                provider.ok_or_else(|| form(Method::GetSystemState))?,
+            ))
         });
         let params = match params {
             [] => None,
             [params, ..] => {
-                let tree = success(params, "getParam")?.as_struct();
-                Some(tree.ok_or_else(|| form("getParam"))?.clone())
+                let tree = success(params, Method::GetParam)?.as_struct();
+                Some(tree.ok_or_else(|| form(Method::GetParam))?.clone())
             }
         };
         Ok(Self {
@@ -143,8 +146,8 @@ impl Inspection {
             publishers: lists(publishers)?,
             subscribers: lists(subscribers)?,
             services: services.collect::<Result<_, NotAMaster>>()?,
-            topic_types: pairs(success(types, "getTopicTypes")?)
-                .ok_or_else(|| form("getTopicTypes"))?,
+            topic_types: pairs(success(types, Method::GetTopicTypes)?)
+                .ok_or_else(|| form(Method::GetTopicTypes))?,
             params,
         })
     }
@@ -183,14 +186,14 @@ impl Inspection {
 
     /// Asks for every address: `lookupNode` of each node that the look shows or `previous` knows,
     /// `lookupService` of each service. None if there is nothing to ask.
-    pub fn second_call(&self, previous: &Master) -> Option<Call> {
+    pub fn second_call(&self, previous: &Master) -> Option<Request> {
         let nodes = self.nodes(previous).into_iter();
-        let nodes = nodes.filter_map(|node| lookup("lookupNode", node));
+        let nodes = nodes.filter_map(|node| lookup(Method::LookupNode, node));
         let services = self.services.keys();
-        let services = services.filter_map(|service| lookup("lookupService", service));
+        let services = services.filter_map(|service| lookup(Method::LookupService, service));
         let mut calls = nodes.chain(services).peekable();
         calls.peek()?;
-        Some(Call::multicall(calls))
+        Some(Request::multicall(calls))
     }
 
     /// The model of what that master holds.
@@ -213,8 +216,8 @@ impl Inspection {
             None => &[],
         }
         .iter();
-        let mut address = |method, name: &str, fallback: Option<&str>| {
-            if lookup(method, name).is_none() {
+        let mut address = |method: Method, name: &str, fallback: Option<&str>| {
+            if lookup(method.clone(), name).is_none() {
                 return Ok(fallback.map(str::to_owned));
             }
             match results.next().and_then(answer) {
@@ -233,7 +236,7 @@ impl Inspection {
             ..Snapshot::default()
         };
         for caller_id in self.nodes(previous) {
-            if let Some(api) = address("lookupNode", caller_id, previous.api_of(caller_id))? {
+            if let Some(api) = address(Method::LookupNode, caller_id, previous.api_of(caller_id))? {
                 let node = SnapshotNode {
                     api,
                     taken_over_services: Vec::new(),
@@ -245,7 +248,7 @@ impl Inspection {
             let known = previous.registry.services.get(service);
             let known = known.filter(|known| known.node == *provider);
             let api = address(
-                "lookupService",
+                Method::LookupService,
                 service,
                 known.map(|known| known.api.as_str()),
             )?;
@@ -270,7 +273,7 @@ impl Inspection {
             }
         }
         keep_references(&mut found, previous);
-        Master::from_snapshot(found).map_err(|_| form("getSystemState"))
+        Master::from_snapshot(found).map_err(|_| form(Method::GetSystemState))
     }
 }
 
@@ -322,19 +325,19 @@ fn only(
 }
 
 /// A lookup of `name`, if any call can name it.
-pub(super) fn lookup(method: &'static str, name: &str) -> Option<Call> {
+pub(super) fn lookup(method: Method, name: &str) -> Option<Request> {
     let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
-    Some(Call::new(method, vec![caller_id.into(), name.into()]))
+    Some(Request::new(method, [caller_id, name]))
 }
 
-fn form(method: &'static str) -> NotAMaster {
+fn form(method: Method) -> NotAMaster {
     NotAMaster::Form { method }
 }
 
 /// The results of a multicall.
 fn results(reply: &Reply) -> Result<&[Value], NotAMaster> {
     match reply {
-        Reply::Value(value) => value.as_array().ok_or_else(|| form("system.multicall")),
+        Reply::Value(value) => value.as_array().ok_or_else(|| form(Method::Multicall)),
         Reply::Fault { text, .. } => {
             let text = text.clone();
             Err(if super::accepted::is_write_error(&text) {

@@ -8,7 +8,7 @@ use super::Token;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
 use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
-use crate::xmlrpc::{self, Call, DecodeError, ListWriter, Reply, Value};
+use crate::xmlrpc::{self, DecodeError, ListWriter, Reply, Value};
 
 /// Most mismatches that are told apart.
 const MOST_MISMATCHES: usize = 20;
@@ -44,6 +44,23 @@ const MOST_MISMATCHES: usize = 20;
 ///
 /// Call and answer are text from the start. As values those of a thousand nodes take ten times as much,
 /// and the C library keeps most of what was once taken for so many small pieces.
+///
+/// # Example
+///
+/// ```
+/// use rosrescue::master::{Master, Method, Request};
+/// use rosrescue::replay::{Plan, Token};
+///
+/// let mut before = Master::default();
+/// before.apply(&Request::new(Method::SetParam, ["/node", "/robot", "r2d2"]));
+///
+/// let mut new = Master::default();
+/// let plan = Plan::new(&before, &new, &Token::new("session", 1));
+/// let reply = new.apply(&Request::decode(plan.request())?).reply;
+/// assert_eq!(plan.verify(&reply), Ok(()));
+/// assert_eq!(new.params(), before.params());
+/// # Ok::<(), rosrescue::xmlrpc::DecodeError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Plan {
     request: Bytes,
@@ -207,8 +224,7 @@ impl Plan {
             answer.push(&multicall::reply_entry(predicted));
         };
         // Tokens are no part of the mirror. They subscribe to what is not set.
-        let aside = |call: Call| {
-            let call = Request::from(call);
+        let aside = |call: Request| {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
         };
@@ -226,7 +242,7 @@ impl Plan {
         let Restore {
             mut model, skipped, ..
         } = Restore::run(target, emptied.as_ref().unwrap_or(found), &mut write);
-        for call in reads(&model, found).into_iter().map(Request::from) {
+        for call in reads(&model, found) {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
         }
@@ -309,17 +325,17 @@ impl Plan {
 
 /// Reads that show everything a master in the target state can show, but for addresses that it was
 /// given in the same call.
-fn reads(model: &Master, found: &Master) -> Vec<Call> {
-    let own = |method| Call::new(method, vec![CALLER_ID.into()]);
-    let mut calls = vec![own("getSystemState"), own("getTopicTypes")];
+fn reads(model: &Master, found: &Master) -> Vec<Request> {
+    let own = |method| Request::new(method, [CALLER_ID]);
+    let mut calls = vec![own(Method::GetSystemState), own(Method::GetTopicTypes)];
     // A single value that cannot be returned would fault the whole multicall.
     if returnable::is_writable(model.params()) {
-        calls.push(Call::new("getParam", vec![CALLER_ID.into(), "/".into()]));
+        calls.push(Request::new(Method::GetParam, [CALLER_ID, "/"]));
     }
     let nodes = found.registry.nodes.keys();
-    calls.extend(nodes.filter_map(|node| lookup("lookupNode", node)));
+    calls.extend(nodes.filter_map(|node| lookup(Method::LookupNode, node)));
     let services = found.registry.services.keys();
-    calls.extend(services.filter_map(|service| lookup("lookupService", service)));
+    calls.extend(services.filter_map(|service| lookup(Method::LookupService, service)));
     calls
 }
 

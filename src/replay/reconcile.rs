@@ -1,8 +1,8 @@
 //! What a master that was out of reach is to hold when it is reached again.
 
 use super::{Token, restore};
-use crate::master::{AsRequest, Entry, Master, Method, Request, names};
-use crate::xmlrpc::{Call, Value};
+use crate::master::{Entry, Master, Method, Request, names};
+use crate::xmlrpc::Value;
 
 /// What counts where a master of the present incarnation and the mirror differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,7 +17,12 @@ pub enum Authority {
 /// The state that `held`, what a master of the present incarnation holds, and `mirror` come to.
 /// `pending` are the writes that the mirror has answered and the master may not have run; one that it
 /// has run may be among them, for running it twice leads to the same state.
-pub fn reconcile(mirror: &Master, held: &Master, pending: &[Call], authority: Authority) -> Master {
+pub fn reconcile(
+    mirror: &Master,
+    held: &Master,
+    pending: &[Request],
+    authority: Authority,
+) -> Master {
     let mut theirs = held.clone();
     for call in pending {
         theirs.apply_telling(call, &mut ());
@@ -34,15 +39,16 @@ pub fn reconcile(mirror: &Master, held: &Master, pending: &[Call], authority: Au
 
 /// What a master of the present incarnation may hold beside what can be read of it: the subscriptions of
 /// parameters that `mirror` has, and those that a pending write takes away.
-pub fn may_hold(mirror: &Master, pending: &[Call]) -> Master {
+pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        let text = |index: usize| call.params.get(index).and_then(Value::as_str);
         // One that has moved on has taken nothing along.
-        let known = text(0).and_then(|caller_id| mirror.api_of(caller_id));
-        if call.method == "unsubscribeParam" && known.is_none_or(|known| text(1) == Some(known)) {
-            let call = Call::new("subscribeParam", call.params.clone());
-            master.apply_telling(&call, &mut ());
+        let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
+        if *call.method() == Method::UnsubscribeParam
+            && known.is_none_or(|known| call.text(1) == Some(known))
+        {
+            let params = call.params().iter().cloned();
+            master.apply_telling(&Request::new(Method::SubscribeParam, params), &mut ());
         }
     }
     master
@@ -102,13 +108,12 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Request> {
 impl Master {
     /// Whether `call` would change the state: false only if every write in it, one after the other, is
     /// known to leave the state as it is. Unregistrations of what is not there change nothing.
-    pub fn would_change(&self, call: &impl AsRequest) -> bool {
-        let request = call.as_request();
-        let entries = request.entries();
+    pub fn would_change(&self, call: &Request) -> bool {
+        let entries = call.entries();
         !entries
             .iter()
             .all(|entry| matches!(entry, Entry::Request(_)))
-            || (request.calls().iter()).any(|call| self.is_settled(call) != Some(true))
+            || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
     /// Whether the state already is what `call` leads to; none if that is not known.
@@ -172,23 +177,23 @@ impl Master {
 mod tests {
     use super::*;
 
-    fn call(method: &str, params: &[&str]) -> Call {
-        Call::new(
-            method,
-            params.iter().map(|text| Value::from(*text)).collect(),
+    fn call(method: &str, params: &[&str]) -> Request {
+        Request::new(Method::named(method), params.iter().copied())
+    }
+
+    fn set(key: &str, value: i32) -> Request {
+        Request::new(
+            Method::SetParam,
+            [Value::from("/n"), key.into(), value.into()],
         )
     }
 
-    fn set(key: &str, value: i32) -> Call {
-        Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
-    }
-
-    fn publish(node: &str, topic: &str) -> Call {
+    fn publish(node: &str, topic: &str) -> Request {
         let api = format!("http:/{node}:1/");
         call("registerPublisher", &[node, topic, "x/Y", &api])
     }
 
-    fn after(calls: &[Call]) -> Master {
+    fn after(calls: &[Request]) -> Master {
         let mut master = Master::default();
         for call in calls {
             master.apply(call);
@@ -283,10 +288,10 @@ mod tests {
             assert!(!master.would_change(call), "{call:?}");
             assert!(Master::default().would_change(call), "{call:?}");
         }
-        assert!(!master.would_change(&Call::multicall(state.clone())));
-        let tree = Call::new(
-            "setParam",
-            vec!["/n".into(), "/k".into(), Value::Array(vec![])],
+        assert!(!master.would_change(&Request::multicall(state.clone())));
+        let tree = Request::new(
+            Method::SetParam,
+            [Value::from("/n"), "/k".into(), Value::Array(vec![])],
         );
         for change in [
             set("/k", 2),
@@ -310,7 +315,7 @@ mod tests {
             changed.apply(&change);
             assert_ne!(changed, master, "{change:?}");
             assert!(
-                !changed.would_change(&change) || change.params.len() == 3,
+                !changed.would_change(&change) || change.params().len() == 3,
                 "{change:?}"
             );
         }

@@ -408,9 +408,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
-    let (publishers, mut first): (Vec<_>, Vec<_>) = calls
-        .map(Request::from)
-        .partition(|call| *call.method() == Method::UnregisterPublisher);
+    let (publishers, mut first): (Vec<_>, Vec<_>) =
+        calls.partition(|call| *call.method() == Method::UnregisterPublisher);
     if !found.params().iter().eq(target.params()) {
         let nothing = Value::Struct(Struct::new());
         let params = [CALLER_ID.into(), "/".into(), nothing];

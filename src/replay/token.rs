@@ -1,8 +1,8 @@
 //! The incarnation token: what we leave in a master to know this very process again.
 
 use crate::{
-    master,
-    xmlrpc::{Call, Reply},
+    master::{self, Method, Request},
+    xmlrpc::Reply,
 };
 
 /// The namespace of tokens. Without a leading slash no node's name and no parameter that
@@ -56,22 +56,22 @@ impl Token {
     }
 
     /// The calls that leave it, in order: a master that bears the number has all of it.
-    pub fn leave(&self) -> [Call; 2] {
-        [&self.session, &self.name].map(|name| subscription("subscribeParam", name))
+    pub fn leave(&self) -> [Request; 2] {
+        [&self.session, &self.name].map(|name| subscription(Method::SubscribeParam, name))
     }
 
     /// The call that takes the number away.
-    pub fn remove(&self) -> Call {
-        subscription("unsubscribeParam", &self.name)
+    pub fn remove(&self) -> Request {
+        subscription(Method::UnsubscribeParam, &self.name)
     }
 
     /// The call that looks for the number: answered with code 1 if it is there.
-    pub fn lookup(&self) -> Call {
+    pub fn lookup(&self) -> Request {
         lookup(&self.name)
     }
 
     /// The call that looks for the session.
-    pub(super) fn lookup_session(&self) -> Call {
+    pub(super) fn lookup_session(&self) -> Request {
         lookup(&self.session)
     }
 
@@ -86,12 +86,12 @@ impl Token {
     }
 }
 
-fn subscription(method: &'static str, name: &str) -> Call {
-    Call::new(method, vec![name.into(), NO_API.into(), "~".into()])
+fn subscription(method: Method, name: &str) -> Request {
+    Request::new(method, [name, NO_API, "~"])
 }
 
-fn lookup(name: &str) -> Call {
-    Call::new("lookupNode", vec![name.into(), "~".into()])
+fn lookup(name: &str) -> Request {
+    Request::new(Method::LookupNode, [name, "~"])
 }
 
 #[cfg(test)]
@@ -99,13 +99,18 @@ mod tests {
     use super::*;
     use crate::{master::Master, xmlrpc::Value};
 
-    fn reads() -> Vec<Call> {
+    fn reads() -> Vec<Request> {
         let none = ["getSystemState", "getTopicTypes", "getParamNames"];
-        let mut calls: Vec<Call> = none.map(|name| Call::new(name, vec!["/x".into()])).into();
-        calls.push(Call::new("getParam", vec!["/x".into(), "/".into()]));
-        calls.push(Call::new(
-            "getPublishedTopics",
-            vec!["/x".into(), "".into()],
+        let mut calls: Vec<Request> = none
+            .map(|name| Request::new(Method::named(name), [Value::from("/x")]))
+            .into();
+        calls.push(Request::new(
+            Method::GetParam,
+            [Value::from("/x"), "/".into()],
+        ));
+        calls.push(Request::new(
+            Method::GetPublishedTopics,
+            [Value::from("/x"), "".into()],
         ));
         calls
     }
@@ -147,13 +152,15 @@ mod tests {
             ("/rosrescue/a", 1.into()),
             ("rosrescue/a/b", 1.into()),
         ] {
-            let outcome =
-                master.apply(&Call::new("setParam", vec!["/x".into(), key.into(), value]));
+            let outcome = master.apply(&Request::new(
+                Method::SetParam,
+                [Value::from("/x"), key.into(), value],
+            ));
             assert_eq!(outcome.notices, []);
         }
-        let outcome = master.apply(&Call::new(
-            "deleteParam",
-            vec!["/x".into(), "/rosrescue".into()],
+        let outcome = master.apply(&Request::new(
+            Method::DeleteParam,
+            [Value::from("/x"), "/rosrescue".into()],
         ));
         assert_eq!(outcome.notices, []);
     }

@@ -10,7 +10,7 @@ use hyper::{
     header::{CONTENT_TYPE, HOST, ORIGIN},
 };
 
-use crate::xmlrpc::{Call, Value};
+use crate::master::{MASTER, Request};
 
 /// A request that is turned away.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -116,8 +116,8 @@ pub fn may_shut_down(peer: IpAddr) -> bool {
 
 /// Whether a `shutdown` is what a master sends to a node when another one takes its name. Here it
 /// arrives if somebody registered our address as a node's, from whatever computer.
-pub fn is_for_a_node(call: &Call) -> bool {
-    call.params.first().and_then(Value::as_str) == Some("/master")
+pub fn is_for_a_node(call: &Request) -> bool {
+    call.caller() == Some(MASTER)
 }
 
 #[cfg(test)]

@@ -17,14 +17,13 @@ use super::{
 use crate::{
     gate::{self, State},
     ledger::Ledger,
-    master::{self, Kind},
+    master::{Kind, Method, Request},
     status::stats::Stats,
     upstream::{Head, pool::Pool},
     write_queue::{
         WriteQueue,
         batch::{Answer, Item},
     },
-    xmlrpc::Call,
 };
 
 /// The connection is closed without an answer. A node asks again after that, whereas an error that
@@ -66,11 +65,13 @@ impl Calls {
         peer: SocketAddr,
         head: Head,
         body: Bytes,
-        call: Option<Call>,
+        call: Option<Request>,
     ) -> Result<HttpReply, Closed> {
-        let kind = call.as_ref().map_or(Kind::Mutate, master::kind);
+        let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         match (&call, kind) {
-            (Some(call), Kind::Identity) if call.method == "getUri" || !self.gate.is_open() => {
+            (Some(call), Kind::Identity)
+                if *call.method() == Method::GetUri || !self.gate.is_open() =>
+            {
                 let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
                 Ok(xml(&reply))
             }
@@ -88,7 +89,7 @@ impl Calls {
                 self.read(head, body, call.as_ref(), kind).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-                self.write(head, body, call.map(Arc::new), kind).await
+                self.write(head, body, call.map(Arc::new)).await
             }
         }
     }
@@ -98,7 +99,7 @@ impl Calls {
         &self,
         head: Head,
         body: Bytes,
-        call: Option<&Call>,
+        call: Option<&Request>,
         kind: Kind,
     ) -> Result<HttpReply, Closed> {
         let from_mirror = || {
@@ -169,8 +170,7 @@ impl Calls {
         &self,
         head: Head,
         body: Bytes,
-        call: Option<Arc<Call>>,
-        kind: Kind,
+        call: Option<Arc<Request>>,
     ) -> Result<HttpReply, Closed> {
         if self.gate.state() == State::Injecting
             && let Some(reply) = self.answer_idle(call.as_deref()).await
@@ -181,7 +181,6 @@ impl Calls {
         let item = Item {
             raw: Some((head, body)),
             call: call.clone(),
-            kind,
             answer,
             condition: None,
         };
@@ -189,7 +188,7 @@ impl Calls {
         let call = call.as_deref();
         let mut gate = self.gate.clone();
         let mut held = std::pin::pin!(async {
-            let answerable = call.is_some_and(master::is_answerable);
+            let answerable = call.is_some_and(Request::is_answerable);
             loop {
                 gate.shut_for(self.hold).await;
                 // An injection ends by itself, and the mirror answers if it fails.
@@ -238,8 +237,8 @@ impl Calls {
     }
 
     /// The mirror's answer to a write that changes nothing; none if it does.
-    async fn answer_idle(&self, call: Option<&Call>) -> Option<HttpReply> {
-        let call = call.filter(|call| master::is_answerable(call))?;
+    async fn answer_idle(&self, call: Option<&Request>) -> Option<HttpReply> {
+        let call = call.filter(|call| call.is_answerable())?;
         let (reply, seq) = self.ledger.answer_idle(Instant::now(), call)?;
         // What made it idle may not be on the disk yet.
         if let Some(seq) = self.ledger.to_await(seq) {

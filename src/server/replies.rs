@@ -8,28 +8,29 @@ use hyper::{
 };
 
 use crate::{
+    master::Request,
     upstream::RawReply,
     write_queue::batch,
-    xmlrpc::{self, Call, Reply, Value},
+    xmlrpc::{self, Reply, Value},
 };
 
 /// What hyper sends.
 pub type HttpReply = Response<Full<Bytes>>;
 
 /// A master's reply out of a batch, or the mirror's, with our address for the master's own.
-pub(super) fn made(uri: &str, call: Option<&Call>, reply: &Reply) -> HttpReply {
-    let ours = call.filter(|call| batch::asks_uri(call));
-    let ours = ours.and_then(|call| batch::rewrite_uri(call, reply, uri));
-    xml(ours.as_ref().unwrap_or(reply))
+pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
+    match call.filter(|call| batch::asks_uri(call)) {
+        Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),
+        None => xml(reply),
+    }
 }
 
 /// A master's reply, with our address for its own.
-pub(super) fn forwarded(uri: &str, call: Option<&Call>, raw: RawReply) -> HttpReply {
+pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> HttpReply {
     if let Some(call) = call.filter(|call| batch::asks_uri(call))
-        && let Ok(reply) = xmlrpc::decode_reply(&raw.body)
-        && let Some(rewritten) = batch::rewrite_uri(call, &reply, uri)
+        && let Ok(reply @ Reply::Value(_)) = xmlrpc::decode_reply(&raw.body)
     {
-        return xml(&rewritten);
+        return xml(&batch::with_uri(call, reply, uri));
     }
     plain(raw)
 }

@@ -14,8 +14,9 @@ use super::{
     replies::{HttpReply, text, xml},
 };
 use crate::{
+    master,
     upstream::{Head, INSTANCE_HEADER},
-    xmlrpc::{self, Call, Reply, Value},
+    xmlrpc::Reply,
 };
 
 /// Said to another computer of a body that rosrescue cannot decode. The master may know how to, and
@@ -109,13 +110,9 @@ async fn post(
     };
     server.stats.calls.count();
     if let Some(call) = &call {
-        let caller_id = call
-            .params
-            .first()
-            .and_then(Value::as_str)
-            .unwrap_or_default();
+        let caller_id = call.caller().unwrap_or_default();
         server.clients.called(peer, caller_id);
-        tracing::debug!(%peer, method = call.method, caller_id, "call");
+        tracing::debug!(%peer, method = call.method().name(), caller_id, "call");
     } else {
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
@@ -138,11 +135,11 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
 }
 
 /// What a body says, if it says it in a way that we know.
-async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<Call>, BodyError> {
+async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<master::Request>, BodyError> {
     if body.len() <= body::SMALL {
-        return Ok(xmlrpc::decode_call(&body).ok());
+        return Ok(master::Request::decode(&body).ok());
     }
     body::room_for_values(&body, room).await?;
-    let work = move || xmlrpc::decode_call(&body).ok();
+    let work = move || master::Request::decode(&body).ok();
     Ok(tokio::task::spawn_blocking(work).await.ok().flatten())
 }

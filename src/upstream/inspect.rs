@@ -3,9 +3,8 @@
 use thiserror::Error;
 
 use super::{CallError, Connection};
-use crate::xmlrpc::Call;
 use crate::{
-    master::Master,
+    master::{Master, Request},
     replay::{Inspection, NotAMaster, Token},
 };
 
@@ -23,13 +22,13 @@ pub enum InspectError {
 
 /// The first look; without the parameters if the master cannot return one of them.
 pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspection, InspectError> {
-    let whole = look(connection, &Inspection::call(token)).await;
+    let whole = look(connection, Inspection::call(token)).await;
     match whole {
         Err(InspectError::NotAMaster(
             NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
-        )) => look(connection, &Inspection::call_without_params(token)).await,
+        )) => look(connection, Inspection::call_without_params(token)).await,
         Err(error) if is_broken_document(&error) => {
-            let rest = look(connection, &Inspection::call_without_params(token)).await;
+            let rest = look(connection, Inspection::call_without_params(token)).await;
             // A server that speaks no XML-RPC may have closed the connection.
             rest.map_err(|_| error)
         }
@@ -37,8 +36,8 @@ pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspect
     }
 }
 
-async fn look(connection: &mut Connection, call: &Call) -> Result<Inspection, InspectError> {
-    Ok(Inspection::decode(&connection.call(call).await?)?)
+async fn look(connection: &mut Connection, call: Request) -> Result<Inspection, InspectError> {
+    Ok(Inspection::decode(&connection.call(&call.into()).await?)?)
 }
 
 /// Whether a parameter may have broken the document: a master does not escape a date's text.
@@ -60,7 +59,7 @@ pub async fn second(
         );
     }
     let second = match first.second_call(previous) {
-        Some(call) => Some(connection.call(&call).await?),
+        Some(call) => Some(connection.call(&call.into()).await?),
         None => None,
     };
     Ok(first.into_master(second.as_ref(), previous)?)

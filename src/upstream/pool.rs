@@ -61,7 +61,7 @@ pub(crate) async fn verified(
     mut connection: Connection,
     token: &Token,
 ) -> Result<Connection, VerifyError> {
-    match Token::is_found(&connection.call(&token.lookup()).await?) {
+    match Token::is_found(&connection.call(&token.lookup().into()).await?) {
         true => Ok(connection),
         false => Err(VerifyError::OtherIncarnation),
     }

@@ -10,8 +10,8 @@ use crate::{
     upstream::{Head, RawReply},
 };
 use crate::{
-    master::Kind,
-    xmlrpc::{self, Call, Reply, Struct, Value},
+    master::{Entry, Kind, Method, Request, entry_reply},
+    xmlrpc::{self, Reply, Value},
 };
 
 /// Most calls in a batch. A compact multicall costs the master some 40 us a call, so that nobody
@@ -37,9 +37,7 @@ pub struct Item {
     /// The client's bytes; none for a call of our own.
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
-    pub call: Option<Arc<Call>>,
-    /// What sort of call it is.
-    pub kind: Kind,
+    pub call: Option<Arc<Request>>,
     /// Where the answer goes.
     pub answer: oneshot::Sender<Answer>,
     /// Of a call of our own: what it stands on.
@@ -72,26 +70,16 @@ impl Item {
         let Some(call) = &self.call else {
             return "a request that rosrescue cannot decode".to_owned();
         };
-        let caller_id = call.params.first().and_then(Value::as_str);
-        format!("{:.100} of {:.200}", call.method, caller_id.unwrap_or("?"))
+        let caller_id = call.caller().unwrap_or("?");
+        format!("{:.100} of {caller_id:.200}", call.method().name())
     }
 
     /// Whether it may share a batch with others. Only calls whose reply holds no parameter value: a
     /// value that the master cannot return would spoil the replies of all.
     fn may_share(&self) -> bool {
-        let shareable = |call: &Arc<Call>| {
-            matches!(
-                call.method.as_str(),
-                "registerPublisher"
-                    | "registerSubscriber"
-                    | "registerService"
-                    | "unregisterPublisher"
-                    | "unregisterSubscriber"
-                    | "unregisterService"
-                    | "unsubscribeParam"
-                    | "setParam"
-                    | "deleteParam"
-            )
+        let shareable = |call: &Arc<Request>| {
+            let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
+            !shows && call.kind().mutates()
         };
         let plain = self
             .raw
@@ -132,14 +120,17 @@ pub fn outbound(items: &[Item]) -> (Head, Bytes) {
     {
         return (head.clone(), body.clone());
     }
-    let mut calls = items
-        .iter()
-        .filter_map(|item| item.call.as_deref().cloned());
-    let call = match (items.len(), calls.next()) {
-        (1, Some(call)) => call,
-        (_, first) => Call::multicall(first.into_iter().chain(calls)),
+    let calls = items.iter().filter_map(|item| item.call.as_deref());
+    let call = match items {
+        [
+            Item {
+                call: Some(call), ..
+            },
+        ] => Request::clone(call),
+        _ => Request::multicall(calls.cloned()),
     };
-    (Head::default(), Bytes::from(xmlrpc::encode_call(&call)))
+    let body = xmlrpc::encode_call(&call.into());
+    (Head::default(), Bytes::from(body))
 }
 
 /// The replies to `count` calls that travelled together; none if the master did not answer each.
@@ -147,97 +138,39 @@ pub fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     let Reply::Value(Value::Array(results)) = reply else {
         return None;
     };
-    let replies: Vec<_> = results.iter().map(unpack_one).collect::<Option<_>>()?;
+    let replies: Vec<_> = results.iter().map(entry_reply).collect::<Option<_>>()?;
     (replies.len() == count).then_some(replies)
 }
 
-/// One result of a multicall: `[value]`, or a struct that is a fault.
-pub fn unpack_one(result: &Value) -> Option<Reply> {
-    match result {
-        Value::Array(one) => match one.as_slice() {
-            [value] => Some(Reply::Value(value.clone())),
-            _ => None,
-        },
-        Value::Struct(fault) => {
-            let code = fault.get("faultCode")?.as_int()?;
-            let text = fault.get("faultString")?.as_str()?.to_owned();
-            Some(Reply::Fault { code, text })
-        }
-        _ => None,
-    }
-}
-
 /// Whether the master writes its own address into the reply: `getUri`, alone or in a multicall.
-pub fn asks_uri(call: &Call) -> bool {
-    fn asks(method: Option<&Value>, params: Option<&Value>) -> bool {
-        match method.and_then(Value::as_str) {
-            Some("getUri") => true,
-            Some("system.multicall") => {
-                let entries = params.and_then(Value::as_array).and_then(<[Value]>::first);
-                entries.is_some_and(|entries| entries.as_array().is_some_and(any))
-            }
-            _ => false,
-        }
-    }
-    fn any(entries: &[Value]) -> bool {
-        let mut entries = entries.iter().filter_map(Value::as_struct);
-        entries.any(|entry| asks(entry.get("methodName"), entry.get("params")))
-    }
-    match call.method.as_str() {
-        "getUri" => true,
-        "system.multicall" => call
-            .params
-            .first()
-            .and_then(Value::as_array)
-            .is_some_and(any),
-        _ => false,
-    }
+pub fn asks_uri(call: &Request) -> bool {
+    let mut calls = call.calls().into_iter();
+    calls.any(|call| *call.method() == Method::GetUri)
 }
 
 /// Puts our own address where the master wrote its own: into replies to `getUri`, alone or in a
-/// multicall. None if there is nothing to change.
-pub fn rewrite_uri(call: &Call, reply: &Reply, uri: &str) -> Option<Reply> {
-    let Reply::Value(value) = reply else {
-        return None;
-    };
-    rewrite(&call.method, &call.params, value, uri).map(Reply::Value)
-}
-
-fn rewrite(method: &str, params: &[Value], value: &Value, uri: &str) -> Option<Value> {
-    match method {
-        "getUri" => rewritten(value, uri),
-        "system.multicall" => {
-            let entries = params.first()?.as_array()?;
-            let mut results = value.as_array()?.to_vec();
-            let mut changed = false;
-            for (entry, result) in entries.iter().zip(&mut results) {
-                let entry = entry.as_struct();
-                let member = |name| entry.and_then(|entry: &Struct| entry.get(name));
-                if let Some(method) = member("methodName").and_then(Value::as_str)
-                    && let Value::Array(one) = result
-                    && let [value] = one.as_mut_slice()
-                {
-                    let params = member("params").and_then(Value::as_array);
-                    if let Some(new) = rewrite(method, params.unwrap_or_default(), value, uri) {
-                        *value = new;
-                        changed = true;
-                    }
-                }
-            }
-            changed.then_some(Value::Array(results))
-        }
-        _ => None,
+/// multicall.
+pub fn with_uri(call: &Request, mut reply: Reply, uri: &str) -> Reply {
+    if let Reply::Value(value) = &mut reply {
+        write_uri(call, value, uri);
     }
+    reply
 }
 
-fn rewritten(value: &Value, uri: &str) -> Option<Value> {
-    match value.as_array()? {
-        [code @ Value::Int(1), message, Value::String(_)] => Some(Value::Array(vec![
-            code.clone(),
-            message.clone(),
-            Value::from(uri),
-        ])),
-        _ => None,
+fn write_uri(call: &Request, value: &mut Value, uri: &str) {
+    let Value::Array(values) = value else { return };
+    if *call.method() == Method::GetUri
+        && let [Value::Int(1), _, own @ Value::String(_)] = values.as_mut_slice()
+    {
+        *own = uri.into();
+    }
+    for (entry, result) in call.entries().iter().zip(values) {
+        if let Entry::Request(call) = entry
+            && let Value::Array(one) = result
+            && let [value] = one.as_mut_slice()
+        {
+            write_uri(call, value, uri);
+        }
     }
 }
 

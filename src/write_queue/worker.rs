@@ -18,11 +18,11 @@ use super::{
 };
 use crate::{
     gate::{self, State},
-    master::{self, Master},
+    master::{Master, Method, Request},
     status::stats::Stats,
     upstream::{Connection, RawReply, inspect::InspectError},
     wait,
-    xmlrpc::{self, Call, Reply},
+    xmlrpc::{self, Reply},
 };
 
 /// Pause before a batch that was not sent is tried again while the gate stays open.
@@ -386,10 +386,7 @@ impl Worker {
                 let _ = item.answer.send(Answer::Close);
                 continue;
             }
-            let call = item
-                .call
-                .as_deref()
-                .filter(|call| master::is_answerable(call));
+            let call = item.call.as_deref().filter(|call| call.is_answerable());
             match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
                 Some((reply, seq)) => {
                     self.stats.stood_in.count();
@@ -429,8 +426,7 @@ impl Worker {
 }
 
 /// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.
-fn subscribes_params(call: &Call) -> bool {
-    let entries = call.entries();
-    let mut calls = entries.iter().chain([call]);
-    calls.any(|call| call.method == "subscribeParam")
+fn subscribes_params(call: &Request) -> bool {
+    let mut calls = call.calls().into_iter();
+    calls.any(|call| *call.method() == Method::SubscribeParam)
 }

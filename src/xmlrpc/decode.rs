@@ -24,6 +24,17 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Reads a request.
 ///
+/// ```
+/// use rosrescue::xmlrpc::{Value, decode_call};
+///
+/// let call = decode_call(
+///     b"<methodCall><methodName>getPid</methodName>\
+///       <params><param><value>/me</value></param></params></methodCall>",
+/// )?;
+/// assert_eq!((call.method.as_str(), call.params), ("getPid", vec![Value::from("/me")]));
+/// # Ok::<(), rosrescue::xmlrpc::DecodeError>(())
+/// ```
+///
 /// # Errors
 ///
 /// Where CPython raises, and in the few cases that are named at [`DecodeError`].

@@ -38,6 +38,13 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
 ///
 /// A value that it cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes the
 /// fault that it answers then. Like there, a date's text is not escaped.
+///
+/// ```
+/// use rosrescue::xmlrpc::{Reply, Value, decode_reply, encode_reply};
+///
+/// let reply = Reply::Value(vec![Value::from(1), "".into(), 42.into()].into());
+/// assert_eq!(decode_reply(&encode_reply(&reply)), Ok(reply));
+/// ```
 pub fn encode_reply(reply: &Reply) -> Vec<u8> {
     match reply {
         Reply::Value(value) => {

@@ -172,20 +172,6 @@ impl Call {
             ("params".to_owned(), Value::Array(self.params)),
         ]))
     }
-
-    /// The well-formed entries of a multicall; nothing for any other call.
-    pub fn entries(&self) -> Vec<Self> {
-        let list = match (self.method.as_str(), self.params.as_slice()) {
-            ("system.multicall", [Value::Array(list)]) => list.as_slice(),
-            _ => &[],
-        };
-        let entries = list.iter().filter_map(|entry| {
-            let entry = entry.as_struct()?;
-            let method = entry.get("methodName")?.as_str()?;
-            Some(Self::new(method, entry.get("params")?.as_array()?.to_vec()))
-        });
-        entries.collect()
-    }
 }
 
 /// One answer.

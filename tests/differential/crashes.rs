@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, is_answerable};
+use rosrescue::master::{Master, Request};
 use rosrescue::replay::{Inspection, Plan, Skipped, Token};
 use rosrescue::xmlrpc::Call;
 use rustix::process::Signal;
@@ -99,14 +99,13 @@ impl Rig {
         let mut model = Master::default();
         while self.supervised && !is_complete(&model) {
             assert!(Instant::now() < deadline, "core is never complete");
-            let look = wire
-                .call(&Inspection::call(&Token::new("none", 1)))
-                .unwrap();
+            let look = Inspection::call(&Token::new("none", 1));
+            let look = wire.call(&look.into()).unwrap();
             let look = Inspection::decode(&look).unwrap();
             let nothing = Master::default();
             let second = look
                 .second_call(&nothing)
-                .map(|call| wire.call(&call).unwrap());
+                .map(|call| wire.call(&call.into()).unwrap());
             // A rosout that registers between the two looks is seen by the next.
             model = look
                 .into_master(second.as_ref(), &nothing)
@@ -218,8 +217,9 @@ pub(crate) fn run(
                 let call = stage.real(call);
                 let by = by % CLIENTS;
                 let mut after = stage.model.clone();
-                after.apply(&call);
-                if stage.away && !is_answerable(&call) {
+                let request = Request::from(call.clone());
+                after.apply(&request);
+                if stage.away && !request.is_answerable() {
                     // It waits for a master.
                     rig.revive();
                 }
@@ -245,7 +245,7 @@ pub(crate) fn run(
                 // The call that is under way may be part of the state.
                 if let (true, Some(Step::Call { call, .. })) = (during, script.steps.get(nth + 1)) {
                     let mut after = stage.model.clone();
-                    after.apply(&stage.real(call));
+                    after.apply(&stage.real(call).into());
                     skipped.extend(self::skipped(&after));
                 }
                 if !skipped.is_empty() {

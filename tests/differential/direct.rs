@@ -1,6 +1,6 @@
 //! The model against a bare rosmaster.
 
-use rosrescue::master::{Master, Notice};
+use rosrescue::master::{Master, Notice, Request};
 use rosrescue::replay::{Bears, Inspection, NotAMaster, Plan, Skipped, Token, difference};
 use rosrescue::xmlrpc::{Call, decode_call};
 
@@ -113,7 +113,7 @@ fn succeed(
     let reply = stage.wires[0].call(&call)?;
     plan.verify(&reply)
         .map_err(|mismatches| format!("the injection: {mismatches:?}"))?;
-    let notices = stage.model.clone().apply(&call).notices;
+    let notices = stage.model.clone().apply(&call.into()).notices;
     let is_complete = |notice: &Notice| match notice {
         Notice::PublisherUpdate {
             topic, publishers, ..
@@ -148,10 +148,12 @@ fn succeed(
 /// A look at the real master, with the model as the state known before, must show the model.
 fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     let mark = Token::new("none", 1);
-    let look = match Inspection::decode(&wire.call(&Inspection::call(&mark))?) {
-        Err(NotAMaster::ParamsUnreadable { .. }) => {
-            Inspection::decode(&wire.call(&Inspection::call_without_params(&mark))?)
-        }
+    let mut look = |call: Request| {
+        wire.call(&call.into())
+            .map(|reply| Inspection::decode(&reply))
+    };
+    let look = match look(Inspection::call(&mark))? {
+        Err(NotAMaster::ParamsUnreadable { .. }) => look(Inspection::call_without_params(&mark))?,
         look => look,
     };
     let look = look.map_err(|error| error.to_string())?;
@@ -159,7 +161,7 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
         return Err("a mark that nobody left".to_owned());
     }
     let second = match look.second_call(model) {
-        Some(call) => Some(wire.call(&call)?),
+        Some(call) => Some(wire.call(&call.into())?),
         None => None,
     };
     let found = look

@@ -246,7 +246,7 @@ mod tests {
         let mut model = Master::default();
         let mut register = |method: &str, node: &str, api: &str| {
             let params = vec![node.into(), "/t".into(), "a/B".into(), api.into()];
-            model.apply(&Call::new(method, params));
+            model.apply(&Call::new(method, params).into());
         };
         register("registerPublisher", "/p1", "http://p1");
         register("registerPublisher", "/p2", "http://p2");

@@ -47,7 +47,7 @@ fn what_is_within_an_item_is_left_out_too() {
 
 /// A master with a mistake: it never lets go of a subscriber.
 fn wrong(model: &mut Master, call: &Call) -> Option<rosrescue::xmlrpc::Reply> {
-    (call.method != "unregisterSubscriber").then(|| model.apply(call).reply)
+    (call.method != "unregisterSubscriber").then(|| model.apply(&call.clone().into()).reply)
 }
 
 /// Whether the wrong master is found out by an answer to one of the calls.
@@ -55,7 +55,7 @@ fn is_found_out(steps: &[Step]) -> bool {
     let (mut right, mut mistaken) = (Master::default(), Master::default());
     steps.iter().any(|step| match step {
         Step::Call { call, .. } => {
-            let reply = right.apply(call).reply;
+            let reply = right.apply(&call.clone().into()).reply;
             wrong(&mut mistaken, call).is_some_and(|other| other != reply)
         }
         _ => false,

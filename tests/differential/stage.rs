@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Notice};
+use rosrescue::master::{Master, Notice, Request};
 use rosrescue::replay::{accepted, difference};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
@@ -72,7 +72,8 @@ impl<'n> Stage<'n> {
         risky: bool,
     ) -> Result<(), Failure> {
         let before = self.model.clone();
-        let outcome = self.model.apply(call);
+        let request = Request::from(call.clone());
+        let outcome = self.model.apply(&request);
         if !alike(&outcome.reply, reply) {
             return Err(format!(
                 "answered\n  {reply:?}\ninstead of\n  {:?}",
@@ -80,10 +81,10 @@ impl<'n> Stage<'n> {
             ));
         }
         self.note(&outcome.notices, risky);
-        let accepted = accepted(&before, call, reply);
+        let accepted = accepted(&before, &request, reply);
         let mut mirror = before;
         for answered in accepted.calls.iter().filter(|of| of.executed) {
-            mirror.apply(&answered.call);
+            mirror.apply(answered.call);
         }
         let words = difference(&mirror, &self.model);
         match words.is_empty() {
@@ -207,7 +208,7 @@ impl<'n> Stage<'n> {
                 .map(|service| one("/test", "lookupService", service)),
         );
         for call in calls {
-            let (expected, found) = (model.apply(&call).reply, wire.call(&call)?);
+            let (expected, found) = (model.apply(&call.clone().into()).reply, wire.call(&call)?);
             if !alike(&expected, &found) {
                 return Err(format!(
                     "{call:?} answered\n  {found:?}\ninstead of\n  {expected:?}"

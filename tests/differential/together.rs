@@ -10,7 +10,7 @@
 
 use std::net::TcpListener;
 
-use rosrescue::master::{Kind, kind};
+use rosrescue::master::Request;
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
 use crate::dice::{Cast, Dice};
@@ -274,7 +274,7 @@ fn play(seed: u64, unreturnable: bool) {
     let mutating = scripts
         .iter()
         .flatten()
-        .filter(|call| matches!(kind(call), Kind::Mutate | Kind::Unregister));
+        .filter(|call| Request::from((*call).clone()).kind().mutates());
     let (shared, alone): (Vec<_>, Vec<_>) =
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
     let batches = usize::try_from(counter("batches")).unwrap() - alone.len();

@@ -1,15 +1,15 @@
 use super::*;
+use crate::master::Method;
 
-fn call(method: &str, params: &[&str]) -> Call {
-    let params = params.iter().map(|text| Value::from(*text));
-    Call::new(method, params.collect())
+fn call(method: &str, params: &[&str]) -> Request {
+    Request::new(Method::named(method), params.iter().copied())
 }
 
-fn publish(node: &str, topic: &str) -> Call {
+fn publish(node: &str, topic: &str) -> Request {
     call("registerPublisher", &[node, topic, "x/Y", "http://n:1/"])
 }
 
-fn apply(activity: &mut Activity, now: Instant, call: &Call) {
+fn apply(activity: &mut Activity, now: Instant, call: &Request) {
     activity.applied(now, call, Noticed::default(), |_| true);
 }
 
@@ -25,7 +25,11 @@ fn a_process_id_is_sure_until_the_node_registers_again() {
     let gone = call("unregisterPublisher", &["/a", "/t", "http://n:1/"]);
     apply(&mut activity, now, &gone);
     assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, false)));
-    apply(&mut activity, now, &Call::multicall([publish("/a", "/u")]));
+    apply(
+        &mut activity,
+        now,
+        &Request::multicall([publish("/a", "/u")]),
+    );
     assert_eq!(activity.pid_of("/a", "http://n:1/"), Some((7, true)));
     // An answer to a question that was asked before is too old.
     activity.remember_pid("/a", "http://n:1/", registered, 8);
@@ -45,7 +49,7 @@ fn a_new_node_is_to_be_asked_once_after_its_last_registration() {
     assert_eq!(activity.take_strangers(start + second), none);
 }
 
-fn subscribed() -> (Master, Call) {
+fn subscribed() -> (Master, Request) {
     let mut master = Master::default();
     let subscribe = call("registerSubscriber", &["/s", "/t", "*", "http://s:1/"]);
     master.apply(&subscribe);
@@ -101,7 +105,7 @@ fn who_is_displaced_is_known_with_what_it_did() {
         pid: Some(7),
         topics: vec!["/t".to_owned()],
     };
-    for again in [again.clone(), Call::multicall([again])] {
+    for again in [again.clone(), Request::multicall([again])] {
         let mut noticed = Noticed::new(false);
         noticed.displaced = activity.displaced_by(&master, &again);
         assert_eq!(noticed.displaced, std::slice::from_ref(&expected));

@@ -6,16 +6,19 @@ mod params;
 mod planning;
 mod quirks;
 
-use super::{Master, Notice};
+use super::{Master, Method, Notice, Request};
 use crate::xmlrpc::{Call, Reply, Struct, Value};
 
 /// A call with text parameters.
-pub(super) fn call(method: &str, params: &[&str]) -> Call {
-    Call::new(method, params.iter().map(|text| (*text).into()).collect())
+pub(super) fn call(method: &str, params: &[&str]) -> Request {
+    Request::new(Method::named(method), params.iter().copied())
 }
 
-pub(super) fn set(key: &str, value: impl Into<Value>) -> Call {
-    Call::new("setParam", vec!["/set".into(), key.into(), value.into()])
+pub(super) fn set(key: &str, value: impl Into<Value>) -> Request {
+    Request::new(
+        Method::SetParam,
+        [Value::from("/set"), key.into(), value.into()],
+    )
 }
 
 pub(super) fn tree<const N: usize>(members: [(&str, Value); N]) -> Value {
@@ -24,22 +27,22 @@ pub(super) fn tree<const N: usize>(members: [(&str, Value); N]) -> Value {
     ))
 }
 
-pub(super) fn publish(node: &str, topic: &str, topic_type: &str) -> Call {
+pub(super) fn publish(node: &str, topic: &str, topic_type: &str) -> Request {
     call("registerPublisher", &[node, topic, topic_type, &api(node)])
 }
 
-pub(super) fn subscribe(node: &str, topic: &str, topic_type: &str) -> Call {
+pub(super) fn subscribe(node: &str, topic: &str, topic_type: &str) -> Request {
     call("registerSubscriber", &[node, topic, topic_type, &api(node)])
 }
 
-pub(super) fn provide(node: &str, service: &str) -> Call {
+pub(super) fn provide(node: &str, service: &str) -> Request {
     call(
         "registerService",
         &[node, service, &format!("rosrpc://h{node}"), &api(node)],
     )
 }
 
-pub(super) fn watch(node: &str, key: &str) -> Call {
+pub(super) fn watch(node: &str, key: &str) -> Request {
     call("subscribeParam", &[node, &api(node), key])
 }
 
@@ -48,7 +51,7 @@ pub(super) fn api(node: &str) -> String {
 }
 
 /// A master after these calls.
-pub(super) fn after(calls: impl IntoIterator<Item = Call>) -> Master {
+pub(super) fn after(calls: impl IntoIterator<Item = Request>) -> Master {
     let mut master = Master::default();
     for call in calls {
         master.apply(&call);
@@ -57,7 +60,7 @@ pub(super) fn after(calls: impl IntoIterator<Item = Call>) -> Master {
 }
 
 /// Code, message and value of the answer.
-pub(super) fn answer(master: &mut Master, call: &Call) -> (i32, String, Value) {
+pub(super) fn answer(master: &mut Master, call: &Request) -> (i32, String, Value) {
     match master.apply(call).reply {
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(code), Value::String(message), value] => {
@@ -69,11 +72,11 @@ pub(super) fn answer(master: &mut Master, call: &Call) -> (i32, String, Value) {
     }
 }
 
-pub(super) fn message(master: &mut Master, call: &Call) -> (i32, String) {
+pub(super) fn message(master: &mut Master, call: &Request) -> (i32, String) {
     let (code, message, _) = answer(master, call);
     (code, message)
 }
 
-pub(super) fn notices(master: &mut Master, call: &Call) -> Vec<Notice> {
+pub(super) fn notices(master: &mut Master, call: &Request) -> Vec<Notice> {
     master.apply(call).notices
 }

@@ -35,9 +35,9 @@ fn deleting_below_a_value_changes_nothing() {
 fn reading_a_relative_key_forgets_its_first_part() {
     // Only a caller without a leading slash can resolve to such a key.
     let mut master = Master::default();
-    master.apply(&Call::new(
-        "setParam",
-        vec!["a/n".into(), "k".into(), 1.into()],
+    master.apply(&Request::new(
+        Method::SetParam,
+        [Value::from("a/n"), "k".into(), 1.into()],
     ));
     assert_eq!(
         message(&mut master, &call("getParam", &["/n", "/a/k"])).0,
@@ -120,7 +120,7 @@ fn a_multicall_shows_a_namespace_as_it_is_at_the_end() {
         set("/a", tree([("z", 3.into())])),
         get,
     ];
-    let Reply::Value(Value::Array(results)) = master.apply(&Call::multicall(calls)).reply else {
+    let Reply::Value(Value::Array(results)) = master.apply(&Request::multicall(calls)).reply else {
         panic!("no results")
     };
     let value = |index: usize| match results[index].as_array() {

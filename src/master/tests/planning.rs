@@ -1,7 +1,7 @@
 use super::*;
 use crate::xmlrpc::{decode_call, encode_call, encode_reply};
 use crate::{
-    master::{Kind, kind},
+    master::Kind,
     replay::{Mismatch, Plan, Skipped, Token, difference},
 };
 
@@ -10,10 +10,10 @@ fn token() -> Token {
 }
 
 /// The multicall that the plan sends.
-fn sent(plan: &Plan) -> Call {
+fn sent(plan: &Plan) -> Request {
     let call = decode_call(plan.request()).unwrap();
     assert_eq!(plan.request(), &encode_call(&call));
-    call
+    call.into()
 }
 
 /// Runs the plan on a model of the new master: what that holds then, and what it has sent.
@@ -25,7 +25,10 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     assert!(Token::is_found(&master.apply(&token().lookup()).reply));
     let [session, _] = token().leave();
     master.apply(&token().remove());
-    master.apply(&Call::new("unsubscribeParam", session.params));
+    master.apply(&Request::new(
+        Method::UnsubscribeParam,
+        session.params().to_vec(),
+    ));
     assert_eq!(&master, plan.expected());
     (master, outcome.notices)
 }
@@ -42,8 +45,9 @@ fn restores(target: &Master) -> Plan {
 }
 
 fn entries(plan: &Plan) -> Vec<String> {
-    let entries = sent(plan).entries().into_iter();
-    entries.map(|entry| entry.method).collect()
+    let sent = sent(plan);
+    let names = sent.calls().into_iter().map(|call| call.method().name());
+    names.map(str::to_owned).collect()
 }
 
 fn count(plan: &Plan, method: &str) -> usize {
@@ -61,7 +65,7 @@ fn an_empty_state_needs_only_reads_and_the_token() {
         "subscribeParam",
     ];
     assert_eq!(entries(&plan), names);
-    assert_eq!(kind(&sent(&plan)), Kind::Mutate);
+    assert_eq!(sent(&plan).kind(), Kind::Mutate);
 }
 
 #[test]

@@ -9,7 +9,7 @@ fn checks_complain_in_rosmasters_words_and_order() {
         (call("getPid", &[]), "missing required caller_id parameter"),
         (call("getPid", &["/n", "x"]), "Error: bad call arity"),
         (
-            Call::new("getPid", vec![1.into()]),
+            Request::new(Method::GetPid, [Value::from(1)]),
             "caller_id must be a string",
         ),
         (
@@ -17,7 +17,7 @@ fn checks_complain_in_rosmasters_words_and_order() {
             "ERROR: parameter [key] must be specified and non-empty",
         ),
         (
-            Call::new("getParam", vec!["/n".into(), 1.into()]),
+            Request::new(Method::GetParam, [Value::from("/n"), 1.into()]),
             "ERROR: parameter [key] must be a string",
         ),
         (
@@ -193,13 +193,13 @@ fn subscribers_are_told_at_every_registration_and_only_at_real_unregistrations()
 #[test]
 fn a_malformed_entry_faults_the_whole_multicall_after_the_ones_before_it_ran() {
     let mut master = Master::default();
-    let entry = |members: [(&str, Value); 1]| tree(members);
-    let mut good = Call::multicall([set("/a", 1)]);
-    if let Some(Value::Array(entries)) = good.params.first_mut() {
-        entries.push(entry([("params", Value::Array(vec![]))]));
-        entries.push(Value::Int(1));
-    }
-    let reply = master.apply(&good).reply;
+    let list = vec![
+        set("/a", 1).into_entry(),
+        tree([("params", Value::Array(vec![]))]),
+        set("/b", 1).into_entry(),
+    ];
+    let call = Call::new("system.multicall", vec![Value::Array(list)]);
+    let reply = master.apply(&call.into()).reply;
     assert!(matches!(reply, Reply::Fault { .. }), "{reply:?}");
     assert_eq!(master.counts().params, 1);
 }

@@ -1,11 +1,11 @@
 use super::*;
+use crate::xmlrpc::Struct;
 
-fn item(call: Call) -> Item {
-    let body = Bytes::from(xmlrpc::encode_call(&call));
+fn item(call: Request) -> Item {
+    let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));
     Item {
         raw: Some((Head::default(), body)),
         call: Some(Arc::new(call)),
-        kind: Kind::Mutate,
         answer: oneshot::channel().0,
         condition: None,
     }
@@ -31,11 +31,14 @@ fn a_node_knows_better_only_by_the_contrary() {
     }
 }
 
-fn set(key: &str, value: impl Into<Value>) -> Call {
-    Call::new("setParam", vec!["/n".into(), key.into(), value.into()])
+fn set(key: &str, value: impl Into<Value>) -> Request {
+    Request::new(
+        Method::SetParam,
+        [Value::from("/n"), key.into(), value.into()],
+    )
 }
 
-fn packed(calls: Vec<Call>) -> Vec<usize> {
+fn packed(calls: Vec<Request>) -> Vec<usize> {
     let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
     let mut sizes = Vec::new();
     while !queue.is_empty() {
@@ -46,9 +49,9 @@ fn packed(calls: Vec<Call>) -> Vec<usize> {
 
 #[test]
 fn calls_that_may_share_are_one_batch_and_keep_their_order() {
-    let subscribe = Call::new(
-        "subscribeParam",
-        vec!["/n".into(), "http://n:1/".into(), "/k".into()],
+    let subscribe = Request::new(
+        Method::SubscribeParam,
+        [Value::from("/n"), "http://n:1/".into(), "/k".into()],
     );
     let calls = vec![set("/a", 1), set("/b", 2), subscribe, set("/c", 3)];
     assert_eq!(packed(calls), [2, 1, 1]);
@@ -70,8 +73,8 @@ fn a_single_call_goes_out_as_its_own_bytes() {
     odd.raw = Some((Head::default(), body.clone()));
     assert_eq!(outbound(&[odd]).1, body);
     let (_, both) = outbound(&[item(set("/a", 1)), item(set("/b", 2))]);
-    let expected = Call::multicall([set("/a", 1), set("/b", 2)]);
-    assert_eq!(xmlrpc::decode_call(&both).unwrap(), expected);
+    let expected = Request::multicall([set("/a", 1), set("/b", 2)]);
+    assert_eq!(Request::decode(&both).unwrap(), expected);
 }
 
 #[test]
@@ -108,10 +111,10 @@ fn replies_come_apart_only_when_each_is_there() {
 #[test]
 fn the_masters_own_address_becomes_ours() {
     let answer = |uri: &str| Value::Array(vec![1.into(), "".into(), uri.into()]);
-    let call = Call::new("getUri", vec!["/n".into()]);
-    let reply = rewrite_uri(&call, &Reply::Value(answer("http://m:1/")), "http://us:2/");
-    assert_eq!(reply, Some(Reply::Value(answer("http://us:2/"))));
-    let both = Call::multicall([Call::new("getPid", vec!["/n".into()]), call]);
+    let call = Request::new(Method::GetUri, [Value::from("/n")]);
+    let reply = with_uri(&call, Reply::Value(answer("http://m:1/")), "http://us:2/");
+    assert_eq!(reply, Reply::Value(answer("http://us:2/")));
+    let both = Request::multicall([Request::new(Method::GetPid, [Value::from("/n")]), call]);
     let results = |uri: &str| {
         let pid = Value::Array(vec![1.into(), "".into(), 42.into()]);
         Reply::Value(Value::Array(vec![
@@ -119,15 +122,18 @@ fn the_masters_own_address_becomes_ours() {
             vec![answer(uri)].into(),
         ]))
     };
-    let reply = rewrite_uri(&both, &results("http://m:1/"), "http://us:2/");
-    assert_eq!(reply, Some(results("http://us:2/")));
-    let nested = Call::multicall([both.clone()]);
+    let reply = with_uri(&both, results("http://m:1/"), "http://us:2/");
+    assert_eq!(reply, results("http://us:2/"));
+    let nested = Request::multicall([both.clone()]);
     let within = |reply: Reply| match reply {
         Reply::Value(value) => Reply::Value(vec![Value::Array(vec![value])].into()),
         fault => fault,
     };
-    let reply = rewrite_uri(&nested, &within(results("http://m:1/")), "http://us:2/");
-    assert_eq!(reply, Some(within(results("http://us:2/"))));
+    let reply = with_uri(&nested, within(results("http://m:1/")), "http://us:2/");
+    assert_eq!(reply, within(results("http://us:2/")));
     assert!(asks_uri(&both) && asks_uri(&nested));
-    assert!(!asks_uri(&Call::multicall([Call::new("getPid", vec![])])));
+    assert!(!asks_uri(&Request::multicall([Request::new(
+        Method::GetPid,
+        ["/n"]
+    )])));
 }
