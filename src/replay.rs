@@ -17,6 +17,6 @@ mod token;
 pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;
 pub use inspect::{Inspection, NotAMaster};
-pub use plan::{Mismatch, Plan, Skipped};
+pub use plan::{Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
 pub use token::{Bears, Token};

@@ -385,7 +385,7 @@ impl Examiner {
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
-            examination.mismatches = mismatches.iter().map(ToString::to_string).collect();
+            examination.mismatches = mismatches;
             tracing::error!(
                 round,
                 mismatches = ?examination.mismatches,

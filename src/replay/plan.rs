@@ -8,7 +8,7 @@ use super::Token;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
 use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
-use crate::xmlrpc::{self, DecodeError, ListWriter, Reply, Value};
+use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
 /// Most mismatches that are told apart.
 const MOST_MISMATCHES: usize = 20;
@@ -158,49 +158,6 @@ impl fmt::Display for Skipped {
     }
 }
 
-/// An answer that is not what the model predicted. Holds no values.
-#[derive(Clone, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Mismatch {
-    /// The call as a whole was answered with a fault, or with another number of results.
-    Whole {
-        /// The fault's text, or what is wrong with the results.
-        text: String,
-    },
-    /// One entry.
-    Entry {
-        /// The method.
-        method: String,
-        /// Topic, service, parameter or node, if the method has one.
-        subject: Option<String>,
-        /// The caller id.
-        caller_id: String,
-    },
-}
-
-impl fmt::Display for Mismatch {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Whole { text } => write!(f, "the injection as a whole was answered: {text}"),
-            Self::Entry {
-                method,
-                subject: None,
-                ..
-            } => {
-                write!(f, "{method} was answered otherwise than predicted")
-            }
-            Self::Entry {
-                method,
-                subject: Some(subject),
-                caller_id,
-            } => write!(
-                f,
-                "{method} of `{subject}` by `{caller_id}` was answered otherwise than predicted"
-            ),
-        }
-    }
-}
-
 impl Plan {
     /// The plan that brings a master that holds `found` to `target` and leaves `token`.
     ///
@@ -283,16 +240,15 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// The entries that were not, up to 20 of them.
-    pub fn verify(&self, reply: &Reply) -> Result<(), Vec<Mismatch>> {
-        let whole = |text: String| Err(vec![Mismatch::Whole { text }]);
-        let (call, predicted) = match self.decode() {
-            Ok(both) => both,
-            Err(error) => {
-                return whole(format!(
-                    "otherwise than predicted, which was no XML: {error}"
-                ));
-            }
+    /// A sentence for each entry that was not, up to 20 of them. They hold no values.
+    pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
+        let whole = |text: &str| {
+            let sentence = format!("the injection as a whole was answered: {text}");
+            Err(vec![sentence])
+        };
+        let call = Request::decode(&self.request);
+        let (Ok(call), Ok(predicted)) = (call, xmlrpc::decode_reply(&self.answer)) else {
+            return whole("otherwise than predicted");
         };
         let (results, predicted) = match (reply, &predicted) {
             (Reply::Value(Value::Array(results)), Reply::Value(Value::Array(predicted)))
@@ -300,8 +256,8 @@ impl Plan {
             {
                 (results, predicted)
             }
-            (Reply::Fault { text, .. }, _) => return whole(text.clone()),
-            _ => return whole("another number of results than of calls".to_owned()),
+            (Reply::Fault { text, .. }, _) => return whole(text),
+            _ => return whole("another number of results than of calls"),
         };
         let mismatches: Vec<_> = (results.iter().zip(predicted))
             .zip(call.calls())
@@ -314,12 +270,6 @@ impl Plan {
         } else {
             Err(mismatches)
         }
-    }
-
-    /// Request and answer as values.
-    fn decode(&self) -> Result<(Request, Reply), DecodeError> {
-        let call = Request::decode(&self.request)?;
-        Ok((call, xmlrpc::decode_reply(&self.answer)?))
     }
 }
 
@@ -339,14 +289,15 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     calls
 }
 
-fn mismatch(call: &Request) -> Mismatch {
-    let subject = match call.method() {
+/// What is said of a call that was answered otherwise than predicted.
+fn mismatch(call: &Request) -> String {
+    let method = call.method();
+    let at = match method {
         Method::SubscribeParam => 2,
         _ => 1,
     };
-    Mismatch::Entry {
-        method: call.method().name().to_owned(),
-        subject: call.text(subject).map(str::to_owned),
-        caller_id: call.caller().unwrap_or_default().to_owned(),
-    }
+    let subject = call.text(at).map_or_else(String::new, |subject| {
+        format!(" of `{subject}` by `{}`", call.caller().unwrap_or_default())
+    });
+    format!("{method}{subject} was answered otherwise than predicted")
 }

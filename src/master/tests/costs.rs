@@ -1,7 +1,7 @@
 //! What a call may cost: no more than a master that answers it, however it is made.
 
 use super::*;
-use crate::master::{NoticeSink, Request};
+use crate::master::NoticeSink;
 
 /// Whom a value goes to, and where it lies in memory.
 #[derive(Default)]
@@ -18,7 +18,7 @@ fn the_value_of_a_parameter_is_not_copied_for_its_subscribers() {
     let watched = |key: &'static str| (0..5000).map(move |node| watch(&format!("/n{node}"), key));
     let mut master = after(watched("/k").chain(watched("/k/x/y")));
     let inner = tree([("y", "text".into())]);
-    let call = Request::from(set("/k", tree([("x", inner)])));
+    let call = set("/k", tree([("x", inner)]));
     let value = &call.params()[2];
     let text = &value.as_struct().unwrap()["x"].as_struct().unwrap()["y"];
     let mut lent = Lent::default();
