@@ -90,7 +90,7 @@ struct Inner {
     whole: Whole,
     pending: PendingWrites,
     activity: Activity,
-    diverged: HashSet<String>,
+    diverged: HashSet<Method>,
     /// A master is being brought to the mirror's state, which must not change meanwhile.
     injecting: bool,
     doubted: bool,

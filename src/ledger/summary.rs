@@ -2,6 +2,7 @@
 
 use super::Inner;
 use crate::{
+    master::Method,
     replay::Answered,
     xmlrpc::{Reply, Value},
 };
@@ -10,9 +11,9 @@ use crate::{
 const LOGGED_REPLY: usize = 300;
 
 /// A reply for the log. Values of parameters are nobody's business there.
-pub(super) fn summary(method: &str, reply: &Reply) -> String {
+fn summary(method: &Method, reply: &Reply) -> String {
     let text = match reply {
-        Reply::Value(Value::Array(answer)) if method.ends_with("Param") => {
+        Reply::Value(Value::Array(answer)) if *method == Method::SubscribeParam => {
             let said = answer.get(..2).unwrap_or_default();
             format!("{said:?} and a value")
         }
@@ -31,15 +32,15 @@ fn cut(text: &str) -> &str {
 
 impl Inner {
     pub(super) fn report_divergence(&mut self, answered: &Answered<'_>, mirror: &Reply) {
-        let method = answered.call.method().name();
-        if self.diverged.insert(method.to_owned()) {
+        let method = answered.call.method();
+        if self.diverged.insert(method.clone()) {
             let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
             tracing::warn!(
-                method,
+                %method,
                 mirror,
                 master,
                 "the mirror's reply differs from the master's; the mirror is made anew from the \
-                 master if their states can differ (said once for each method)"
+                 master (said once for each method)"
             );
         }
     }

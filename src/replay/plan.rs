@@ -235,7 +235,7 @@ impl Plan {
         &self.skipped
     }
 
-    /// Whether every entry was answered as the model predicted. Not needed for a reply that is
+    /// Whether every entry was answered as the model predicted, refusals in whatever words. Not needed for a reply that is
     /// [`Self::answer`] to the byte.
     ///
     /// # Errors
@@ -261,7 +261,7 @@ impl Plan {
         };
         let mismatches: Vec<_> = (results.iter().zip(predicted))
             .zip(call.calls())
-            .filter(|((result, predicted), _)| result != predicted)
+            .filter(|((result, predicted), _)| !is_alike(result, predicted))
             .map(|(_, call)| mismatch(call))
             .take(MOST_MISMATCHES)
             .collect();
@@ -287,6 +287,13 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     let services = found.registry.services.keys();
     calls.extend(services.filter_map(|service| lookup(Method::LookupService, service)));
     calls
+}
+
+/// Whether an entry was answered as predicted. Of a refusal the code counts, and not the text.
+fn is_alike(result: &Value, predicted: &Value) -> bool {
+    let code = |entry: &Value| entry.as_array()?.first()?.as_array()?.first()?.as_int();
+    let refused = code(predicted).filter(|code| *code != 1);
+    result == predicted || refused.is_some() && refused == code(result)
 }
 
 /// What is said of a call that was answered otherwise than predicted.

@@ -357,6 +357,33 @@ fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
 }
 
 #[test]
+fn a_refusal_in_other_words_is_as_predicted() {
+    // Some members have slashes in their names, and somebody subscribes there.
+    let target = after([set("/k", tree([("x/y", 1.into())]))]);
+    let found = after([watch("/n", "/k/x/y")]);
+    let plan = Plan::new(&target, &found, &token());
+    let Reply::Value(mut results) = found.clone().apply(&sent(&plan)).reply else {
+        panic!("no results")
+    };
+    let answer = |results: &mut Value, at: usize, to: Value| {
+        let Value::Array(results) = results else {
+            return;
+        };
+        let Value::Array(one) = &mut results[0] else {
+            return;
+        };
+        let Value::Array(answer) = &mut one[0] else {
+            return;
+        };
+        answer[at] = to;
+    };
+    answer(&mut results, 1, "Internal failure: 'x'".into());
+    assert_eq!(plan.verify(&Reply::Value(results.clone())), Ok(()));
+    answer(&mut results, 0, 1.into());
+    assert!(plan.verify(&Reply::Value(results)).is_err());
+}
+
+#[test]
 fn a_difference_is_told_in_words_without_values() {
     let a = after([
         publish("/p", "/t", "a/B"),
