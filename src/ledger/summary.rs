@@ -36,7 +36,7 @@ impl Inner {
         if self.diverged.insert(method.clone()) {
             let [master, mirror] = [&answered.reply, mirror].map(|reply| summary(method, reply));
             tracing::warn!(
-                %method,
+                method = method.name(),
                 mirror,
                 master,
                 "the mirror's reply differs from the master's; the mirror is made anew from the \
