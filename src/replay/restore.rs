@@ -21,12 +21,17 @@ pub(super) struct Restore<'a, W> {
     found: &'a Master,
     /// How many of the target's topic types are in.
     types_in: usize,
+    /// Whether the new master's topic types begin the target's; if not, their order is lost.
+    ordered: bool,
 }
 
 impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Brings a model of `found` to `target`.
     pub(super) fn run(target: &'a Master, found: &'a Master, write: W) -> Self {
+        let known = found.topic_types.keys();
+        let first = target.topic_types.keys().take(known.len());
         let mut restore = Self {
+            ordered: known.eq(first),
             write,
             count: 0,
             model: found.clone(),
@@ -335,10 +340,9 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Brings in the types that stand before that of a topic about to be registered. Where the new
-    /// master has types of its own, the order is lost already.
+    /// Brings in the types that stand before that of a topic about to be registered.
     fn types_up_to(&mut self, topic: &str) {
-        if self.found.topic_types.is_empty()
+        if self.ordered
             && !self.model.topic_types.contains_key(topic)
             && let Some(index) = self.target.topic_types.get_index_of(topic)
         {

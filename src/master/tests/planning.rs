@@ -356,6 +356,20 @@ fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
     assert!(plan.verify(&Reply::Value(Value::Array(vec![]))).is_err());
 }
 
+/// As of a topic that came and went while the master hung.
+#[test]
+fn a_type_without_a_topic_keeps_its_place_in_a_master_that_is_emptied_first() {
+    let mut target = after([
+        publish("/p", "/old", "a/B"),
+        publish("/p", "/gone", "a/B"),
+        publish("/p", "/new", "a/B"),
+    ]);
+    target.apply(&call("unregisterPublisher", &["/p", "/gone", &api("/p")]));
+    let held = after([publish("/p", "/old", "a/B")]);
+    let plan = Plan::replace(&target, &held, &Token::new("m", 0), &token());
+    assert_eq!(plan.expected(), &target);
+}
+
 #[test]
 fn a_refusal_in_other_words_is_as_predicted() {
     // Some members have slashes in their names, and somebody subscribes there.
