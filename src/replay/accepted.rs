@@ -120,7 +120,7 @@ impl<'a> Walk<'_, 'a> {
             if !call.kind().mutates() {
                 continue;
             }
-            let reply = self.foretell(call);
+            let reply = self.predict(call);
             if executed(call.method(), &reply) == Some(true) {
                 self.push(call, reply, true);
                 self.modelled += 1;
@@ -131,7 +131,7 @@ impl<'a> Walk<'_, 'a> {
 
     /// What the mirror answers to a call after those that have been accepted. There may be many
     /// multicalls to simulate: the model goes on from one to the next.
-    fn foretell(&mut self, request: &Request) -> Reply {
+    fn predict(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
             model.apply_telling(answered.call, &mut ());
