@@ -62,10 +62,7 @@ pub enum RunError {
         "--master {master} is this rosrescue itself: give the address of the real rosmaster, and \
          serve another one with --listen"
     )]
-    Loop {
-        /// The address.
-        master: MasterUri,
-    },
+    Loop { master: MasterUri },
     /// Cannot happen with what the kernel gives as an id.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),

@@ -38,15 +38,12 @@ pub enum UsageError {
         "{variable}: `{given}` is not a host name or an address; write one, as in robot or 10.0.0.7"
     )]
     Host {
-        /// The variable.
         variable: &'static str,
-        /// What it holds.
         given: String,
     },
     /// `--listen` is not an address.
     #[error("--listen: `{given}` is not an address; write {form}")]
     Listen {
-        /// What was given.
         given: String,
         /// What the option takes.
         form: &'static str,
@@ -56,7 +53,6 @@ pub enum UsageError {
     Seconds {
         /// The option.
         option: &'static str,
-        /// What was given.
         given: f64,
         /// The largest value.
         most: f64,
@@ -65,10 +61,7 @@ pub enum UsageError {
     #[error(
         "--master-port {port} is the port that nodes use; the real master needs one of its own"
     )]
-    SamePort {
-        /// The port.
-        port: u16,
-    },
+    SamePort { port: u16 },
 }
 
 /// What rosrescue runs with.
@@ -78,11 +71,8 @@ pub struct Config {
     pub listen: Vec<SocketAddr>,
     /// What others use as `ROS_MASTER_URI`.
     pub advertised: MasterUri,
-    /// Where the master is, or how to run it.
     pub master: MasterConfig,
-    /// The checkpoint file.
     pub checkpoint: PathBuf,
-    /// When to restore it at start.
     pub restore: Restore,
     /// When the journal is forced to the disk.
     pub sync: SyncPolicy,
@@ -140,7 +130,6 @@ pub struct SupervisedConfig {
     pub numworkers: u32,
     /// Its socket timeout in seconds; none if 0.
     pub timeout: f64,
-    /// Whether to run rosout.
     pub rosout: bool,
     /// Where it keeps its log, and we the log configuration that it is given.
     pub log_dir: PathBuf,
@@ -204,7 +193,6 @@ impl Config {
         )
     }
 
-    /// The option that chooses the port.
     pub fn port_option(&self) -> &'static str {
         match self.master {
             MasterConfig::Supervised(_) => "-p",

@@ -36,7 +36,7 @@ struct Gate {
 }
 
 /// A gate that is shut, in two halves.
-pub fn gate() -> (Tx, Rx) {
+pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
         shut_since: Some(Instant::now()),
@@ -46,11 +46,11 @@ pub fn gate() -> (Tx, Rx) {
 
 /// Opens and shuts the gate.
 #[derive(Debug, Clone)]
-pub struct Tx(watch::Sender<Gate>);
+pub(crate) struct Tx(watch::Sender<Gate>);
 
 impl Tx {
     /// Changes the state; waiters see it at once. The same state again wakes nobody.
-    pub fn set(&self, state: State) {
+    pub(crate) fn set(&self, state: State) {
         self.0.send_if_modified(|gate| {
             if gate.state == state {
                 return false;
@@ -65,8 +65,7 @@ impl Tx {
         });
     }
 
-    /// The state now.
-    pub fn state(&self) -> State {
+    pub(crate) fn state(&self) -> State {
         self.0.borrow().state
     }
 }
@@ -76,7 +75,6 @@ impl Tx {
 pub struct Rx(watch::Receiver<Gate>);
 
 impl Rx {
-    /// The state now.
     pub fn state(&self) -> State {
         self.0.borrow().state
     }

@@ -238,7 +238,6 @@ fn reap(worker: Option<u32>) -> Option<End> {
     end
 }
 
-/// The signals that come, one by one.
 fn receive_signals() -> io::Result<Receiver<i32>> {
     let mut wanted = vec![SIGCHLD, SIGINT, SIGQUIT, SIGTERM];
     if !is_hangup_ignored() {

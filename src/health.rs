@@ -8,8 +8,8 @@ mod backoff;
 mod repeats;
 mod unreachable;
 
-pub use repeats::Repeats;
-pub use unreachable::Unreachable;
+pub(crate) use repeats::Repeats;
+pub(crate) use unreachable::Unreachable;
 
 use std::collections::BTreeMap;
 
@@ -33,7 +33,7 @@ type Topics = BTreeMap<String, String>;
 
 /// What a node says that it publishes and subscribes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Claims {
+pub(crate) struct Claims {
     publications: Topics,
     subscriptions: Topics,
 }
@@ -42,7 +42,7 @@ impl Claims {
     /// Reads what `getPublications` and `getSubscriptions` return: lists of topic and type. None
     /// unless every entry is one that could be registered as it is: then it is not known what the
     /// node means.
-    pub fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
+    pub(crate) fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
         Some(Self {
             publications: topics(publications)?,
             subscriptions: topics(subscriptions)?,
@@ -50,7 +50,7 @@ impl Claims {
     }
 
     /// Whether it has one of these topics that not every node has.
-    pub fn shares(&self, topics: &[String]) -> bool {
+    pub(crate) fn shares(&self, topics: &[String]) -> bool {
         let mut own = self.all().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
     }
@@ -76,7 +76,7 @@ fn topics(list: &Value) -> Option<Topics> {
 
 /// What the node behind a port is to a name that is registered with that port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub(crate) enum Verdict {
     /// There is evidence that it bears this name.
     Itself,
     /// There is evidence that it is another one.
@@ -87,7 +87,7 @@ pub enum Verdict {
 
 /// A name that is registered with a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Name {
+pub(crate) struct Name {
     /// The caller id.
     pub node: String,
     /// The process id that was behind the port when somebody last asked.
@@ -101,7 +101,7 @@ pub struct Name {
 
 /// Judges each of `names`, which are registered with the same port. `pid` and `claims` are what is
 /// said behind it now.
-pub fn judge(
+pub(crate) fn judge(
     mirror: &Master,
     names: &[Name],
     pid: Option<i32>,
@@ -156,7 +156,7 @@ pub fn judge(
 
 /// One registration of a node.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Registration {
+pub(crate) struct Registration {
     publishes: bool,
     topic: String,
     topic_type: String,
@@ -164,7 +164,7 @@ pub struct Registration {
 
 impl Registration {
     /// The call by which the node itself would register it.
-    pub fn register(&self, node: &str, api: &str) -> Request {
+    pub(crate) fn register(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::RegisterPublisher,
             false => Method::RegisterSubscriber,
@@ -173,7 +173,7 @@ impl Registration {
     }
 
     /// The call by which the node itself would take it back.
-    pub fn unregister(&self, node: &str, api: &str) -> Request {
+    pub(crate) fn unregister(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::UnregisterPublisher,
             false => Method::UnregisterSubscriber,
@@ -182,7 +182,7 @@ impl Registration {
     }
 
     /// In words, such as `/talker publishes /chatter`.
-    pub fn describe(&self, node: &str) -> String {
+    pub(crate) fn describe(&self, node: &str) -> String {
         let verb = match self.publishes {
             true => "publishes",
             false => "subscribes",
@@ -191,14 +191,14 @@ impl Registration {
     }
 
     /// Whether the two are the same but for the type.
-    pub fn is_same(&self, other: &Self) -> bool {
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
         self.publishes == other.publishes && self.topic == other.topic
     }
 }
 
 /// In what the mirror differs from what a node says.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Reconciliation {
+pub(crate) struct Reconciliation {
     /// What the node has and the mirror lacks.
     pub missing: Vec<Registration>,
     /// What the mirror has and the node lacks. To be believed only if it stays so: a node may
@@ -208,7 +208,7 @@ pub struct Reconciliation {
 
 impl Reconciliation {
     /// The difference for `node`. Services are left alone: nodes cannot be asked for theirs.
-    pub fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
+    pub(crate) fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
         let mut reconciliation = Self::default();
         let publications: Vec<&str> = mirror.publications(node).collect();
         let subscriptions: Vec<&str> = mirror.subscriptions(node).collect();
@@ -240,7 +240,7 @@ impl Reconciliation {
     }
 
     /// Whether there is nothing to mend.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.missing.is_empty() && self.extra.is_empty()
     }
 }

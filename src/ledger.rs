@@ -3,8 +3,8 @@
 //! The lock also orders both against the moment at which a new incarnation takes over: a reply of
 //! the old master that arrives after its state was taken for the injection is not acknowledged.
 
-pub mod activity;
-pub mod checkpointer;
+pub(crate) mod activity;
+pub(crate) mod checkpointer;
 mod durability;
 mod injection;
 mod pending;
@@ -56,9 +56,7 @@ pub struct Recorded {
 /// What an injection starts from.
 #[derive(Debug)]
 pub struct Basis {
-    /// The mirror's state.
     pub mirror: Master,
-    /// Its version.
     pub version: u64,
     /// Writes that the present incarnation may not have run.
     pub pending: Vec<Request>,
@@ -143,7 +141,6 @@ impl Ledger {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Looks at the mirror.
     pub fn with_mirror<T>(&self, look: impl FnOnce(&Master) -> T) -> T {
         look(&self.lock().mirror)
     }
@@ -182,12 +179,10 @@ impl Ledger {
         inner.set_identity((pid, uri));
     }
 
-    /// The session as it is recorded.
     pub fn session(&self) -> Session {
         self.lock().session.clone()
     }
 
-    /// Changes the session and records it.
     pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
         self.lock().update_session(change);
         self.work.notify_one();

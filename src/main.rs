@@ -16,7 +16,7 @@ use rosrescue::{
         self,
         handover::{Guard, Sockets},
     },
-    server::listener,
+    listener,
 };
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;

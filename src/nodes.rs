@@ -1,8 +1,8 @@
 //! What is known of the nodes beyond their registrations, and the watch over it.
 
-pub mod client;
-pub mod health_check;
-pub mod notifications;
+pub(crate) mod client;
+pub(crate) mod health_check;
+pub(crate) mod notifications;
 
 use std::{
     collections::HashSet,
@@ -84,7 +84,6 @@ impl Nodes {
             .unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the node at `api` is unreachable.
     pub fn is_unreachable(&self, api: &str) -> bool {
         self.lock().contains(api)
     }
@@ -156,7 +155,7 @@ impl Drop for CheckUnderWay {
 
 /// Watches over the nodes for as long as it is polled: sends notifications, asks unreachable nodes again, gets
 /// acquainted with new nodes, and makes the health check that is due.
-pub async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
+pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
     let mut repeats = Repeats::<Change>::default();

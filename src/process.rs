@@ -18,10 +18,10 @@ use tokio::process::{Child, Command};
 use crate::{config::SupervisedConfig, guardian::handover};
 
 mod orphan;
-pub mod pidfd;
+pub(crate) mod pidfd;
 mod rosout;
 
-pub use rosout::Rosout;
+pub(crate) use rosout::Rosout;
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
@@ -62,20 +62,13 @@ pub enum ProcessError {
     NoRosmaster,
     /// `--rosmaster` names no program.
     #[error("--rosmaster: `{}` is not a program that can be run", path.display())]
-    NotAProgram {
-        /// What was named.
-        path: PathBuf,
-    },
+    NotAProgram { path: PathBuf },
     /// The port of the master is taken.
     #[error("--master-port: port {port} on loopback is in use; choose another one")]
-    PortInUse {
-        /// The port.
-        port: u16,
-    },
+    PortInUse { port: u16 },
     /// The system would not start it.
     #[error("cannot start `{}`: {source}", program.display())]
     Spawn {
-        /// The program.
         program: PathBuf,
         /// What the system said.
         source: io::Error,
@@ -84,7 +77,7 @@ pub enum ProcessError {
 
 /// Starts rosmasters.
 #[derive(Debug)]
-pub struct Rosmaster {
+pub(crate) struct Rosmaster {
     program: PathBuf,
     config: SupervisedConfig,
     /// What the last one wrote to stdout and stderr.
@@ -96,7 +89,7 @@ pub struct Rosmaster {
 
 impl Rosmaster {
     /// Finds the program. Files for it will lie beside `checkpoint`.
-    pub fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
+    pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
         let program = match &config.rosmaster {
             Some(path) if is_program(path) => path.clone(),
             Some(path) => return Err(ProcessError::NotAProgram { path: path.clone() }),
@@ -112,7 +105,7 @@ impl Rosmaster {
     }
 
     /// Where its port should be: the given one, else `remembered` if that is free, else a free one.
-    pub fn choose_port(&self, remembered: Option<u16>) -> Result<u16, ProcessError> {
+    pub(crate) fn choose_port(&self, remembered: Option<u16>) -> Result<u16, ProcessError> {
         if let Some(port) = self.config.port {
             return if is_free(port) {
                 Ok(port)
@@ -132,7 +125,7 @@ impl Rosmaster {
 
     /// The rosmaster that an earlier rosrescue with this checkpoint left behind at `port`. Any that
     /// does not listen there has never served, or never will: it is ended.
-    pub fn left_behind(&self, port: Option<u16>) -> Option<u32> {
+    pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<u32> {
         let mut all = orphan::find(&orphan::owner(&self.checkpoint));
         all.retain(|pid| !runs(*pid, "rosout"));
         let serves = |pid: &u32| port.is_some_and(|port| orphan::listens(*pid, port));
@@ -152,7 +145,7 @@ impl Rosmaster {
     }
 
     /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
-    pub fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
+    pub(crate) fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
         command.arg("--core").arg("-p").arg(port.to_string());
         command.arg("-w").arg(self.config.numworkers.to_string());
@@ -196,7 +189,7 @@ impl Rosmaster {
     }
 
     /// The end of what the last rosmaster wrote, for the message that it died early.
-    pub fn last_words(&self) -> String {
+    pub(crate) fn last_words(&self) -> String {
         tail_of(&self.output)
     }
 }
@@ -261,7 +254,7 @@ fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
 
 /// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `ended` resolves when it
 /// has ended.
-pub async fn stop(pid: u32, ended: impl Future) {
+pub(crate) async fn stop(pid: u32, ended: impl Future) {
     let mut ended = std::pin::pin!(ended);
     for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
         signal_process(pid, signal);
@@ -273,14 +266,14 @@ pub async fn stop(pid: u32, ended: impl Future) {
 }
 
 /// Sends a signal; a process that is not there needs none.
-pub fn signal_process(pid: u32, signal: Signal) {
+pub(crate) fn signal_process(pid: u32, signal: Signal) {
     if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
         let _ = kill_process(pid, signal);
     }
 }
 
 /// Whether a process with this pid exists.
-pub fn is_alive(pid: u32) -> bool {
+pub(crate) fn is_alive(pid: u32) -> bool {
     i32::try_from(pid)
         .ok()
         .and_then(Pid::from_raw)
@@ -289,7 +282,7 @@ pub fn is_alive(pid: u32) -> bool {
 
 /// Whether the process `pid` runs a program of this name, judged by its command line: a pid that we
 /// remember may be somebody else's by now.
-pub fn runs(pid: u32, name: &str) -> bool {
+pub(crate) fn runs(pid: u32, name: &str) -> bool {
     let command_line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     command_line.split(|byte| *byte == 0).any(|argument| {
         let argument = String::from_utf8_lossy(argument);
@@ -300,7 +293,7 @@ pub fn runs(pid: u32, name: &str) -> bool {
 }
 
 /// Returns when the process `pid`, which is no child of ours, has ended.
-pub async fn ended(pid: u32) {
+pub(crate) async fn ended(pid: u32) {
     if orphan::ended(pid).await.is_err() {
         while is_alive(pid) {
             tokio::time::sleep(Duration::from_millis(100)).await;
@@ -309,7 +302,7 @@ pub async fn ended(pid: u32) {
 }
 
 /// How a process ended, in words.
-pub fn describe(status: ExitStatus) -> String {
+pub(crate) fn describe(status: ExitStatus) -> String {
     use std::os::unix::process::ExitStatusExt;
     match (status.code(), status.signal()) {
         (Some(code), _) => format!("exit status {code}"),
@@ -319,7 +312,11 @@ pub fn describe(status: ExitStatus) -> String {
 }
 
 /// What `program` prints within `limit`, as roslaunch's `command=` would take it.
-pub async fn output_of(program: &str, arguments: &[&str], limit: Duration) -> Option<String> {
+pub(crate) async fn output_of(
+    program: &str,
+    arguments: &[&str],
+    limit: Duration,
+) -> Option<String> {
     let mut command = command(&find_program(program, &["bin"])?);
     command
         .args(arguments)

@@ -1,7 +1,7 @@
 //! Watches the master and brings it back: the shell around [`crate::lifecycle`].
 
-pub mod examine;
-pub mod master_process;
+pub(crate) mod examine;
+pub(crate) mod master_process;
 mod reporting;
 mod stall_probe;
 mod thread_exit;
@@ -43,7 +43,7 @@ type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
 type Ended = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Carries out what the lifecycle decides.
-pub struct Driver {
+pub(crate) struct Driver {
     examiner: Examiner,
     write_queue: WriteQueue,
     slow: Arc<Notify>,
@@ -68,7 +68,7 @@ pub struct Driver {
 impl Driver {
     /// A driver that examines masters by `examiner`, and starts them itself with `process`. `slow` is notified
     /// when a master has not answered a call for longer than it should take.
-    pub fn new(
+    pub(crate) fn new(
         examiner: Examiner,
         write_queue: WriteQueue,
         slow: Arc<Notify>,
@@ -105,7 +105,7 @@ impl Driver {
     /// # Errors
     ///
     /// If no master can be started at all.
-    pub async fn run(
+    pub(crate) async fn run(
         mut self,
         restored: bool,
         stop: CancellationToken,

@@ -31,7 +31,7 @@ fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Fo
 /// # Errors
 ///
 /// If it has none, or nobody can tell.
-pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(vec![SocketAddr::new(address, port)]);
     }

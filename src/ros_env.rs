@@ -23,10 +23,7 @@ pub enum UriError {
     #[error(
         "`{uri}` is not the URI of a master; write http://HOST:PORT/, as in http://localhost:11311/"
     )]
-    Malformed {
-        /// What was given.
-        uri: String,
-    },
+    Malformed { uri: String },
 }
 
 /// The address of a master.

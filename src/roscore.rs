@@ -28,11 +28,10 @@ const VERSION_TIME: Duration = Duration::from_secs(20);
 const RESPAWN: Duration = Duration::from_secs(1);
 /// The longest of these pauses.
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
-/// The node that rosout is.
 const ROSOUT: &str = "/rosout";
 
 /// What its duties need.
-pub struct Roscore {
+pub(crate) struct Roscore {
     /// Whether the parameters are set already.
     pub ledger: Arc<Ledger>,
     /// The way to the master.
@@ -65,14 +64,14 @@ fn run_id(roscore: &Roscore) -> Request {
 
 /// Gives a new session its run id before there is a master: it is injected with the rest, so that
 /// no roslaunch ever sees a master without one. Not if there may be a master that has one.
-pub fn seed_run_id(roscore: &Roscore) {
+pub(crate) fn seed_run_id(roscore: &Roscore) {
     if !has(roscore, "/run_id") {
         roscore.ledger.seed(&run_id(roscore));
     }
 }
 
 /// Does the rest once the master is there, until `stop`; then ends rosout.
-pub async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
+pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
     let duties = async {
         // They take their time: while the master starts, too.
         let versions = tokio::join!(

@@ -1,15 +1,15 @@
 //! What clients talk to: listener, admission, calls and pages.
 
-pub mod admission;
-pub mod body;
-pub mod calls;
-pub mod clients;
-pub mod deadlines;
-pub mod idle;
+pub(crate) mod admission;
+pub(crate) mod body;
+pub(crate) mod calls;
+pub(crate) mod clients;
+pub(crate) mod deadlines;
+pub(crate) mod idle;
 pub mod listener;
-pub mod pages;
-pub mod replies;
-pub mod service;
+pub(crate) mod pages;
+pub(crate) mod replies;
+pub(crate) mod service;
 
 use std::sync::Arc;
 
@@ -26,7 +26,6 @@ pub struct Server {
     pub instance: String,
     /// Notified when a request of our own came back to us: the master's address is our own.
     pub looped: Arc<Notify>,
-    /// Who is connected.
     pub clients: Arc<Clients>,
     /// Those of them without a request.
     pub idle: Idle,
@@ -34,9 +33,7 @@ pub struct Server {
     pub max_body: usize,
     /// Memory for large bodies, in KiB.
     pub bodies: Semaphore,
-    /// What is counted.
     pub stats: &'static Stats,
-    /// Answers calls.
     pub calls: Calls,
     /// Answers people and monitors.
     pub pages: Pages,

@@ -1,7 +1,7 @@
 //! The status: plain data for people and monitors, which others fill. Nothing waits on it.
 
-pub mod report;
-pub mod stats;
+pub(crate) mod report;
+pub(crate) mod stats;
 
 use std::{
     fmt,
@@ -19,9 +19,7 @@ pub struct Facts {
     pub deaths: u64,
     /// Masters examined since the start.
     pub recoveries: u64,
-    /// The report of the last recovery.
     pub last_recovery: Option<Report>,
-    /// Who guards this process.
     pub guarded: Guarded,
 }
 
@@ -92,7 +90,6 @@ impl Board {
         self.lock().clone()
     }
 
-    /// Changes them.
     pub fn update<T>(&self, change: impl FnOnce(&mut Facts) -> T) -> T {
         change(&mut self.lock())
     }

@@ -1,8 +1,8 @@
 //! Connections to the master.
 
 mod connection;
-pub mod inspect;
-pub mod pool;
+pub(crate) mod inspect;
+pub(crate) mod pool;
 pub(crate) mod sockets;
 
 use std::{io, net::SocketAddr, time::Duration};
@@ -13,7 +13,7 @@ use socket2::{SockRef, TcpKeepalive};
 use thiserror::Error;
 use tokio::{net::TcpStream, sync::watch, time::timeout};
 
-pub use self::connection::Connection;
+pub(crate) use self::connection::Connection;
 use crate::{
     resolver,
     ros_env::MasterUri,
@@ -27,7 +27,7 @@ const MAX_REPLY: usize = 512 << 20;
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
 /// Each request to the master bears it, so that a proxy that is pointed at itself notices.
-pub const INSTANCE_HEADER: &str = "x-rosrescue-instance";
+pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 
 /// A connection that could not be made.
 #[derive(Debug, Error)]
@@ -35,14 +35,10 @@ pub const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 pub enum ConnectError {
     /// Nothing listens there.
     #[error("nothing listens at {master}")]
-    Refused {
-        /// Where.
-        master: String,
-    },
+    Refused { master: String },
     /// There is no way there, or no answer.
     #[error("cannot reach {master}: {source}")]
     Unreachable {
-        /// Where.
         master: String,
         /// What the system said.
         source: io::Error,
@@ -64,12 +60,7 @@ pub enum CallError {
     BrokenReply(Box<dyn std::error::Error + Send + Sync>),
     /// The reply is whole, but no XML-RPC; only for calls of our own.
     #[error("the master's reply is no XML-RPC (HTTP status {status}): {reason}")]
-    NotXmlRpc {
-        /// The HTTP status.
-        status: StatusCode,
-        /// What is wrong with it.
-        reason: String,
-    },
+    NotXmlRpc { status: StatusCode, reason: String },
 }
 
 /// The parts of a client's request that matter to the master, besides the body.
@@ -101,18 +92,14 @@ impl RawReply {
 /// A whole reply of the master.
 #[derive(Clone, Debug)]
 pub struct RawReply {
-    /// The HTTP status.
     pub status: StatusCode,
     /// The words behind the status, if they are not the usual ones.
     pub reason: Option<ReasonPhrase>,
-    /// The master's headers.
     pub headers: HeaderMap,
-    /// The body, unchanged.
     pub body: Bytes,
 }
 
 impl RawReply {
-    /// The reply to a call of our own.
     pub fn decode(&self) -> Result<Reply, CallError> {
         xmlrpc::decode_reply(&self.body).map_err(|error| CallError::NotXmlRpc {
             status: self.status,
@@ -163,7 +150,6 @@ impl Upstream {
         }
     }
 
-    /// Where the master is.
     pub fn address(&self) -> MasterUri {
         self.address.borrow().clone()
     }

@@ -3,7 +3,7 @@
 use tokio::time::Instant;
 
 /// Sleeps until `deadline`; for ever without one.
-pub async fn until(deadline: Option<Instant>) {
+pub(crate) async fn until(deadline: Option<Instant>) {
     match deadline {
         Some(deadline) => tokio::time::sleep_until(deadline).await,
         None => std::future::pending().await,
@@ -11,7 +11,7 @@ pub async fn until(deadline: Option<Instant>) {
 }
 
 /// What `future` comes to; never without one. Cancel safe: the future stays where it is.
-pub async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
+pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
     match future {
         Some(future) => future.await,
         None => std::future::pending().await,
@@ -19,7 +19,7 @@ pub async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
 }
 
 /// The next tick of an interval; for ever without one. Cancel safe.
-pub async fn tick(interval: &mut Option<tokio::time::Interval>) {
+pub(crate) async fn tick(interval: &mut Option<tokio::time::Interval>) {
     match interval {
         Some(interval) => {
             interval.tick().await;

@@ -2,7 +2,7 @@
 //! order in which the master ran them. Those that queue up meanwhile go together. While the master is
 //! away the mirror answers them, in the same order.
 
-pub mod batch;
+pub(crate) mod batch;
 mod outdated;
 mod round_trip;
 mod worker;
@@ -15,7 +15,7 @@ use tokio::{
 };
 
 use self::batch::{Answer, Condition, Item};
-pub use self::worker::Worker;
+pub(crate) use self::worker::Worker;
 use crate::{
     gate,
     ledger::Ledger,
@@ -83,7 +83,7 @@ impl WriteQueue {
 
 /// Makes a write queue; the second part is to be run. `resync_interval`: how often the master is compared
 /// with the mirror, if it is to be.
-pub fn write_queue(
+pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
     gate: gate::Rx,

@@ -59,7 +59,6 @@ pub struct Session {
 pub enum Entry {
     /// A write that was answered with success.
     Call {
-        /// The write.
         call: Call,
         /// Whether the mirror answered it and no master had run it yet.
         pending: bool,
@@ -81,7 +80,6 @@ impl Entry {
 pub struct Record {
     /// Its number: one more than that of the record before, over all generations of the file.
     pub seq: u64,
-    /// What happened.
     pub entry: Entry,
 }
 
@@ -90,7 +88,6 @@ pub struct Record {
 pub struct Checkpoint {
     /// Number of the last record whose effect `snapshot` contains; 0 if there was none.
     pub seq: u64,
-    /// The session.
     pub session: Session,
     /// The master's state.
     pub snapshot: Snapshot,
@@ -146,7 +143,6 @@ pub enum SnapshotError {
     Truncated {
         /// Bytes according to the first line.
         expected: u64,
-        /// Bytes that there are.
         found: u64,
     },
     /// Some byte differs.
@@ -154,7 +150,6 @@ pub enum SnapshotError {
     Checksum {
         /// According to the first line.
         expected: u32,
-        /// Of the bytes that there are.
         found: u32,
     },
     /// The bytes are those that were written, and yet do not make a snapshot.

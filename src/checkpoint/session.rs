@@ -76,9 +76,7 @@ pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
 /// What a checkpoint and the records after it make.
 #[derive(Debug, Default)]
 pub struct Rebuilt {
-    /// The master's state.
     pub mirror: Master,
-    /// The newest session.
     pub session: Option<Session>,
     /// The writes that have not reached the master yet, in order.
     pub pending: Vec<Request>,

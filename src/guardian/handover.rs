@@ -46,12 +46,7 @@ pub enum HandoverError {
         "socket {number} that was passed to rosrescue is no TCP socket that listens: {source}; a \
          socket unit needs ListenStream= with a port, and Accept=no"
     )]
-    NotAListener {
-        /// Its number.
-        number: RawFd,
-        /// What is wrong with it.
-        source: io::Error,
-    },
+    NotAListener { number: RawFd, source: io::Error },
     /// The link to the guardian is missing.
     #[error("the guardian's link cannot be used: {0}")]
     Link(io::Error),
@@ -73,9 +68,7 @@ pub enum Guard {
     Nobody,
     /// systemd, or another supervisor with its protocol.
     Systemd,
-    /// The guardian.
     Guardian {
-        /// Its process.
         pid: u32,
         /// Closes when it ends.
         link: UnixStream,

@@ -15,7 +15,6 @@ impl Backoff {
         Self { next, pause }
     }
 
-    /// When it is to be done next.
     pub(super) fn next(&self) -> Instant {
         self.next
     }

@@ -27,7 +27,7 @@ const LIFE: Duration = Duration::from_secs(300);
 
 /// What has changed, and when it is to be told.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Repeats<K: Ord> {
+pub(crate) struct Repeats<K: Ord> {
     of: BTreeMap<K, Wait>,
 }
 
@@ -51,7 +51,7 @@ impl<K: Ord> Default for Repeats<K> {
 
 impl<K: Ord + Clone> Repeats<K> {
     /// `key` has changed.
-    pub fn changed(&mut self, key: K, now: Instant) {
+    pub(crate) fn changed(&mut self, key: K, now: Instant) {
         let before = self.of.get(&key);
         let untold = before.and_then(|wait| wait.untold).unwrap_or(now);
         let wait = Wait {
@@ -65,7 +65,7 @@ impl<K: Ord + Clone> Repeats<K> {
 
     /// What is to be told now. `holding_up`: there are nodes that do not answer. While all do, the
     /// master notifies nodes itself.
-    pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
+    pub(crate) fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
             if wait.backoff.next() > now {
@@ -83,7 +83,7 @@ impl<K: Ord + Clone> Repeats<K> {
     }
 
     /// When something is to be told next.
-    pub fn next(&self) -> Option<Instant> {
+    pub(crate) fn next(&self) -> Option<Instant> {
         self.of.values().map(|wait| wait.backoff.next()).min()
     }
 }

@@ -14,13 +14,13 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
 /// The addresses that are unreachable, and when each is to be asked again.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Unreachable {
+pub(crate) struct Unreachable {
     of: BTreeMap<String, Backoff>,
 }
 
 impl Unreachable {
     /// The node at `api` did not answer just now. Answers whether that is new.
-    pub fn add(&mut self, api: &str, now: Instant) -> bool {
+    pub(crate) fn add(&mut self, api: &str, now: Instant) -> bool {
         if self.of.contains_key(api) {
             return false;
         }
@@ -30,27 +30,26 @@ impl Unreachable {
     }
 
     /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
-    pub fn remove(&mut self, api: &str) -> bool {
+    pub(crate) fn remove(&mut self, api: &str) -> bool {
         self.of.remove(api).is_some()
     }
 
     /// Drops those that are not registered any more.
-    pub fn retain(&mut self, registered: impl Fn(&str) -> bool) {
+    pub(crate) fn retain(&mut self, registered: impl Fn(&str) -> bool) {
         self.of.retain(|api, _| registered(api));
     }
 
     /// Whether the node at `api` is unreachable.
-    pub fn contains(&self, api: &str) -> bool {
+    pub(crate) fn contains(&self, api: &str) -> bool {
         self.of.contains_key(api)
     }
 
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.of.is_empty()
     }
 
     /// Those to be asked now; the next time comes after a longer pause.
-    pub fn due(&mut self, now: Instant) -> Vec<String> {
+    pub(crate) fn due(&mut self, now: Instant) -> Vec<String> {
         let mut due = Vec::new();
         for (api, backoff) in &mut self.of {
             if backoff.next() <= now {
@@ -62,7 +61,7 @@ impl Unreachable {
     }
 
     /// When somebody is to be asked next.
-    pub fn next(&self) -> Option<Instant> {
+    pub(crate) fn next(&self) -> Option<Instant> {
         self.of.values().map(Backoff::next).min()
     }
 }

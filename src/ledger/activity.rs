@@ -23,7 +23,7 @@ const NODES: usize = 1024;
 
 /// Something that a node is notified of.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Notification {
+pub(crate) enum Notification {
     /// What a master would have sent at that moment.
     Call(Arc<Call>),
     /// The full list of a topic's publishers, as it is when it is sent.
@@ -44,9 +44,7 @@ pub enum Change {
 /// A node whose name another one has taken at another address: it is to shut down.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Displaced {
-    /// Its name.
     pub node: String,
-    /// Its address.
     pub api: String,
     /// The process id that was last seen behind the address.
     pub pid: Option<i32>,

@@ -28,7 +28,7 @@ const BETWEEN: Duration = Duration::from_secs(10);
 
 /// Keeps the checkpoint of `ledger` at `path` until `stop`, and forces it to the disk every `sync_interval`,
 /// unless the ledger's policy has it otherwise.
-pub async fn run(
+pub(crate) async fn run(
     ledger: Arc<Ledger>,
     path: PathBuf,
     sync_interval: Duration,

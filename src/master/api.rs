@@ -58,7 +58,6 @@ macro_rules! methods {
         }
 
         impl Method {
-            /// The method of that name.
             pub fn named(name: &str) -> Self {
                 match name {
                     $($name => Self::$method,)*
@@ -67,7 +66,6 @@ macro_rules! methods {
                 }
             }
 
-            /// Its name on the wire.
             pub fn name(&self) -> &str {
                 match self {
                     $(Self::$method => $name,)*

@@ -9,7 +9,6 @@ pub enum Notice {
     PublisherUpdate {
         /// Address of the subscriber.
         to: String,
-        /// The topic.
         topic: String,
         /// Addresses of all its publishers.
         publishers: Vec<String>,
@@ -27,7 +26,6 @@ pub enum Notice {
     Shutdown {
         /// The old node's address.
         to: String,
-        /// The reason given.
         reason: String,
     },
 }
@@ -41,7 +39,6 @@ pub trait NoticeSink {
     /// A [`Notice::ParamUpdate`] to each of these addresses.
     fn param_update(&mut self, _to: &[String], _key: &str, _value: &Value) {}
 
-    /// A [`Notice::Shutdown`].
     fn shutdown(&mut self, _to: &str, _reason: &str) {}
 }
 

@@ -83,7 +83,6 @@ impl Request {
         }
     }
 
-    /// The method.
     pub fn method(&self) -> &Method {
         &self.method
     }
@@ -93,17 +92,14 @@ impl Request {
         &self.params
     }
 
-    /// The entries of a multicall.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The caller id, if there is one.
     pub fn caller(&self) -> Option<&str> {
         self.text(0)
     }
 
-    /// The parameter at `index`, if it is a text.
     pub(crate) fn text(&self, index: usize) -> Option<&str> {
         self.params.get(index)?.as_str()
     }

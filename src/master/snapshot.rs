@@ -23,7 +23,6 @@ pub struct Snapshot {
     pub had_services: bool,
     /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as the master's do.
     pub param_subscribers: IndexMap<String, Vec<String>>,
-    /// The parameter tree.
     pub params: Struct,
 }
 

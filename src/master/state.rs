@@ -36,7 +36,6 @@ pub struct Counts {
     pub publishers: usize,
     /// Subscribers of topics, each topic counted.
     pub subscribers: usize,
-    /// Services.
     pub services: usize,
     /// Parameters that are no namespaces.
     pub params: usize,
@@ -73,7 +72,6 @@ pub enum InvalidSnapshot {
     UnknownNode {
         /// Topic, service or parameter key.
         key: String,
-        /// The node.
         caller_id: String,
     },
     /// A node twice in one list.
@@ -81,7 +79,6 @@ pub enum InvalidSnapshot {
     Twice {
         /// Topic or parameter key.
         key: String,
-        /// The node.
         caller_id: String,
     },
     /// A list without nodes.
@@ -92,32 +89,18 @@ pub enum InvalidSnapshot {
     },
     /// A node that nothing refers to.
     #[error("the node `{caller_id}` has no registration: remove it")]
-    EmptyNode {
-        /// The node.
-        caller_id: String,
-    },
+    EmptyNode { caller_id: String },
     /// A node without an address.
     #[error("the node `{caller_id}` has no api: add it, or remove the node and its registrations")]
-    NoApi {
-        /// The node.
-        caller_id: String,
-    },
+    NoApi { caller_id: String },
     /// A topic with publishers and no type.
     #[error("the published topic `{topic}` has no type: add one, `*` if it is not known")]
-    NoType {
-        /// The topic.
-        topic: String,
-    },
+    NoType { topic: String },
     /// A service that was taken from the node that has it.
     #[error(
         "the service `{service}` is listed as taken over from its own provider `{caller_id}`: remove it there"
     )]
-    NotTakenOver {
-        /// The service.
-        service: String,
-        /// The node.
-        caller_id: String,
-    },
+    NotTakenOver { service: String, caller_id: String },
 }
 
 impl Master {
@@ -338,7 +321,6 @@ impl Master {
         })
     }
 
-    /// The parameter tree.
     pub fn params(&self) -> &Struct {
         self.params.tree()
     }

@@ -19,7 +19,7 @@ const MAX_REPLY: usize = 16 << 20;
 
 /// What a node said to a question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sign {
+pub(crate) enum Sign {
     /// It answered.
     Alive,
     /// Its port refuses: the process is gone.
@@ -29,12 +29,12 @@ pub enum Sign {
 }
 
 /// Makes `call` to the node at `api` and waits for a sign of life for at most `limit`.
-pub async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
+pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
     ask_for(api, call, limit).await.0
 }
 
 /// As [`ask`], with the value that the node returned.
-pub async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
+pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
     let Ok(address) = MasterUri::parse(api) else {
         return (Sign::Silent, None);
     };
@@ -52,10 +52,8 @@ pub async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<V
 
 /// What a node says of itself.
 #[derive(Debug)]
-pub struct Interview {
-    /// Whether it lives.
+pub(crate) struct Interview {
     pub sign: Sign,
-    /// Its process id.
     pub pid: Option<i32>,
     /// What it publishes and subscribes, if it can be asked.
     pub claims: Option<Claims>,
@@ -64,7 +62,7 @@ pub struct Interview {
 /// Asks the node at `api` for its process id, which must come within `limit`, and if it lives for
 /// what it publishes and subscribes, with as much time again. `getName` would tell more, but roscpp
 /// has none.
-pub async fn interview(api: &str, limit: Duration) -> Interview {
+pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
     let (sign, pid) = ask_for(api, &master::get_pid(), limit).await;
     let mut interview = Interview {
         sign,

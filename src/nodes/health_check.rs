@@ -53,7 +53,6 @@ pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
 #[derive(Debug)]
 pub(crate) struct CheckResult {
     pub(crate) sign: Sign,
-    /// Who was registered there.
     pub(crate) names: Vec<String>,
     pub(crate) removed: Vec<String>,
     pub(crate) reconciled: Vec<String>,
@@ -109,7 +108,7 @@ async fn barrier(nodes: &Nodes) {
 }
 
 /// Asks every node, all at the same time.
-pub async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
+pub(crate) async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
     collect(begin_visits(nodes)).await
 }
 

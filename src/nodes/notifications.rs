@@ -38,7 +38,7 @@ const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 
 /// The notifications under way.
 #[derive(Debug)]
-pub struct Notifications {
+pub(crate) struct Notifications {
     /// What each address is still to be told; an entry for each that is being told something.
     pending: Mutex<HashMap<String, VecDeque<Notification>>>,
     permits: Semaphore,
@@ -62,7 +62,7 @@ impl Notifications {
 }
 
 /// Tells every subscriber of `topic` its publishers. Answers whether there are subscribers.
-pub fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
+pub(crate) fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     let subscribers = nodes
         .ledger
         .with_mirror(|mirror| mirror.subscribers_of(topic));
@@ -73,7 +73,7 @@ pub fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
 }
 
 /// Tells the node at `api` of every topic and every parameter that it subscribes.
-pub fn tell_all(nodes: &Arc<Nodes>, api: &str) {
+pub(crate) fn tell_all(nodes: &Arc<Nodes>, api: &str) {
     let notifications = nodes.ledger.with_mirror(|mirror| {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
         let notifications = names.flat_map(|(name, _)| {
@@ -94,7 +94,7 @@ pub fn tell_all(nodes: &Arc<Nodes>, api: &str) {
 
 /// Notifies the node at `api`, unless it is unreachable: those are told everything as soon as they
 /// answer. Who does not take a notification becomes unreachable.
-pub fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
+pub(crate) fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
     if nodes.is_unreachable(api) {
         return;
     }
@@ -195,7 +195,7 @@ fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Ar
 
 /// Tells a node whose name another one has taken to shut down, as a master does, but never another node
 /// that has its address by now.
-pub fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
+pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
     tokio::spawn(async move {
         for seconds in SHUTDOWN_PAUSES {

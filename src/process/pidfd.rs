@@ -11,7 +11,7 @@ use tokio::net::unix::pipe::Receiver;
 /// # Errors
 ///
 /// What the system says: nobody has this id, or the kernel cannot watch it.
-pub fn open(id: i32, flags: PidfdFlags) -> io::Result<Receiver> {
+pub(crate) fn open(id: i32, flags: PidfdFlags) -> io::Result<Receiver> {
     let id = Pid::from_raw(id).ok_or(io::ErrorKind::InvalidInput)?;
     Receiver::from_owned_fd_unchecked(pidfd_open(id, flags)?)
 }

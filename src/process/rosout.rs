@@ -15,7 +15,7 @@ use super::{
 
 /// Starts rosouts.
 #[derive(Debug)]
-pub struct Rosout {
+pub(crate) struct Rosout {
     program: PathBuf,
     /// What the last one wrote to stderr.
     output: PathBuf,
@@ -25,7 +25,7 @@ pub struct Rosout {
 
 impl Rosout {
     /// Finds the program, if there is one. A file for its last words will lie beside `checkpoint`.
-    pub fn find(checkpoint: &Path) -> Option<Self> {
+    pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
             Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
         })?;
@@ -38,14 +38,14 @@ impl Rosout {
 
     /// The rosout that an earlier rosrescue with this checkpoint left behind. It may not have
     /// registered yet.
-    pub fn left_behind(&self) -> Option<u32> {
+    pub(crate) fn left_behind(&self) -> Option<u32> {
         let mut all = orphan::find(&self.owner).into_iter();
         all.find(|pid| runs(*pid, "rosout"))
     }
 
     /// Starts one as a node of the master at `uri`. It outlives us: dropping the child does not end
     /// it.
-    pub fn spawn(&self, uri: &str) -> io::Result<Child> {
+    pub(crate) fn spawn(&self, uri: &str) -> io::Result<Child> {
         let stderr = create(&self.output).map_or_else(|_| Stdio::null(), Stdio::from);
         self.command(uri).stderr(stderr).spawn()
     }
@@ -63,7 +63,7 @@ impl Rosout {
     }
 
     /// The end of what the last one wrote.
-    pub fn last_words(&self) -> String {
+    pub(crate) fn last_words(&self) -> String {
         tail_of(&self.output)
     }
 }

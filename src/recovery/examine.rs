@@ -37,13 +37,10 @@ const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 /// A master that could not be examined.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum ExamineError {
+pub(crate) enum ExamineError {
     /// It does not answer.
     #[error("no answer within {limit:?}")]
-    Silent {
-        /// The deadline.
-        limit: Duration,
-    },
+    Silent { limit: Duration },
     /// A call of ours failed, or what answers is no master.
     #[error(transparent)]
     Look(#[from] InspectError),
@@ -57,7 +54,7 @@ impl From<CallError> for ExamineError {
 
 impl ExamineError {
     /// What it means for the lifecycle.
-    pub fn as_input(&self) -> Input {
+    pub(crate) fn as_input(&self) -> Input {
         match self {
             Self::Silent { .. } => Input::Unreachable,
             Self::Look(InspectError::Call(
@@ -70,12 +67,11 @@ impl ExamineError {
 
 /// What an examination came to.
 #[derive(Debug)]
-pub struct Examination {
+pub(crate) struct Examination {
     /// How the master came to hold the state.
     pub outcome: Outcome,
     /// The master's process id.
     pub pid: i32,
-    /// What it holds.
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
@@ -89,7 +85,7 @@ pub struct Examination {
 
 /// How an examination is to go.
 #[derive(Debug)]
-pub struct Manner {
+pub(crate) struct Manner {
     /// What is known of the master.
     pub known: Known,
     /// The injection into an empty master, made ready.
@@ -98,7 +94,7 @@ pub struct Manner {
 
 /// An injection, made ready.
 #[derive(Debug)]
-pub struct Prepared {
+pub(crate) struct Prepared {
     /// Of the mirror; none if it was made for this very moment.
     basis: Option<(u64, Token)>,
     plan: Plan,
@@ -107,7 +103,7 @@ pub struct Prepared {
 }
 
 /// Makes the injection into an empty master ready, beside everything else.
-pub fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
+pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
     tokio::task::spawn_blocking(move || {
         let (version, target, token) = ledger.next();
         let plan = Plan::new(&target, &Master::default(), &token);
@@ -121,7 +117,7 @@ pub fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
 
 /// What is known of a master before it is examined.
 #[derive(Clone, Copy, Debug)]
-pub enum Known {
+pub(crate) enum Known {
     /// Nothing.
     Nothing,
     /// If it bears the token, this process has served it before.
@@ -130,10 +126,7 @@ pub enum Known {
     InjectedIfPresent,
     /// This process has just started it, as the successor of one that it served, on a loopback port
     /// that was free: it is empty. That saves a look, and reading back would show if it were not.
-    New {
-        /// Its process id.
-        pid: i32,
-    },
+    New { pid: i32 },
 }
 
 /// What is to be brought to a master, and how.
@@ -146,10 +139,9 @@ struct Target {
 
 /// Examines masters, and opens the gate to one that holds the mirror's state.
 #[derive(Clone)]
-pub struct Examiner {
+pub(crate) struct Examiner {
     /// Whose state a master is brought to.
     pub ledger: Arc<Ledger>,
-    /// Where the master is.
     pub upstream: Arc<Upstream>,
     /// Tells everybody whether calls pass.
     pub gate: Tx,
@@ -159,7 +151,6 @@ pub struct Examiner {
     pub probing: Probing,
     /// How long a probe may take.
     pub probe_timeout: Duration,
-    /// What is counted.
     pub stats: &'static Stats,
 }
 
@@ -182,7 +173,7 @@ impl Examiner {
     }
 
     /// Examines the master behind `connection`.
-    pub async fn examine(
+    pub(crate) async fn examine(
         &self,
         connection: &mut Connection,
         manner: Manner,

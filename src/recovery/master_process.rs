@@ -14,7 +14,7 @@ type End = (u32, String);
 
 /// The master that we start, and end.
 #[derive(Debug)]
-pub struct MasterProcess {
+pub(crate) struct MasterProcess {
     rosmaster: Rosmaster,
     /// Port of the last master; tried first, so that whoever looks finds it where it was.
     port: Option<u16>,
@@ -28,7 +28,7 @@ pub struct MasterProcess {
 
 impl MasterProcess {
     /// Starts masters with `rosmaster`; the last one was at `port`, and may be there still.
-    pub fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
         let left = rosmaster.left_behind(port);
         let this = Self {
             rosmaster,
@@ -48,7 +48,7 @@ impl MasterProcess {
     }
 
     /// Whether a master of an earlier rosrescue is there.
-    pub fn is_left(&self) -> bool {
+    pub(crate) fn is_left(&self) -> bool {
         self.current.is_some()
     }
 
@@ -62,7 +62,11 @@ impl MasterProcess {
     }
 
     /// Starts a master, and tells where it is.
-    pub fn spawn(&mut self, ledger: &Ledger, upstream: &Upstream) -> Result<(), ProcessError> {
+    pub(crate) fn spawn(
+        &mut self,
+        ledger: &Ledger,
+        upstream: &Upstream,
+    ) -> Result<(), ProcessError> {
         let port = self.rosmaster.choose_port(self.port)?;
         let address = MasterUri {
             host: "127.0.0.1".to_owned(),
@@ -90,12 +94,12 @@ impl MasterProcess {
     }
 
     /// The process id of a master that was started and not asked for before.
-    pub fn take_new(&mut self) -> Option<i32> {
+    pub(crate) fn take_new(&mut self) -> Option<i32> {
         self.new.take()
     }
 
     /// Returns when the master has ended. Cancel safe.
-    pub async fn exited(&mut self) {
+    pub(crate) async fn exited(&mut self) {
         let how = self.gone().await;
         tracing::warn!(pid = self.current, how, "rosmaster has ended");
         self.current = None;
@@ -114,8 +118,7 @@ impl MasterProcess {
         }
     }
 
-    /// Kills the master.
-    pub fn kill(&self) {
+    pub(crate) fn kill(&self) {
         // Until its end is told nobody else can have its process id; of one that was left to us that
         // holds but for the moment between the two.
         if let Some(pid) = self.current {
@@ -125,14 +128,14 @@ impl MasterProcess {
     }
 
     /// Ends the master in order.
-    pub async fn stop(mut self) {
+    pub(crate) async fn stop(mut self) {
         if let Some(pid) = self.current {
             process::stop(pid, self.gone()).await;
         }
     }
 
     /// The end of what the last master wrote.
-    pub fn last_words(&self) -> String {
+    pub(crate) fn last_words(&self) -> String {
         self.rosmaster.last_words()
     }
 }

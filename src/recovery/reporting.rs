@@ -18,9 +18,7 @@ const REPEAT: Duration = Duration::from_secs(10);
 /// The time since which calls have not passed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Outage {
-    /// Why.
     pub cause: &'static str,
-    /// Since when.
     pub since: Instant,
     wall: f64,
     port_open: Option<Instant>,

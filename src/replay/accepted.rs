@@ -6,7 +6,6 @@ use crate::xmlrpc::{Reply, Value};
 /// A mutating call, taken out of multicalls, that a master has answered.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Answered<'a> {
-    /// The call.
     pub call: &'a Request,
     /// The master's answer.
     pub reply: Reply,

@@ -18,27 +18,18 @@ pub enum NotAMaster {
     #[error(
         "the look was answered with a fault, `{text}`: this is no rosmaster, or it is in trouble"
     )]
-    Fault {
-        /// The fault's text.
-        text: String,
-    },
+    Fault { text: String },
     /// The parameters cannot be read, because one of them cannot be returned: look again with
     /// [`Inspection::call_without_params`].
     #[error(
         "the master holds a parameter that it cannot return ({text}): look again without parameters"
     )]
-    ParamsUnreadable {
-        /// The fault's text.
-        text: String,
-    },
+    ParamsUnreadable { text: String },
     /// An answer has another form than a master's.
     #[error(
         "the answer to {method} has another form than a master's: check that the upstream address is that of a rosmaster"
     )]
-    Form {
-        /// The method.
-        method: Method,
-    },
+    Form { method: Method },
 }
 
 /// What a first look at a master shows.

@@ -76,7 +76,6 @@ pub struct Plan {
 pub enum Skipped {
     /// A node that is there under another address.
     Node {
-        /// The node.
         caller_id: String,
         /// Its address in the state.
         api: String,
@@ -85,7 +84,6 @@ pub enum Skipped {
     },
     /// A service that has a provider.
     Service {
-        /// The service.
         service: String,
         /// The provider in the state.
         caller_id: String,
@@ -93,30 +91,14 @@ pub enum Skipped {
         found: String,
     },
     /// The reference of a node by a service that another node took over.
-    Reference {
-        /// The node.
-        caller_id: String,
-        /// The service.
-        service: String,
-    },
+    Reference { caller_id: String, service: String },
     /// The type `*` of a topic without publishers that has subscribers in the new master.
-    Type {
-        /// The topic.
-        topic: String,
-    },
+    Type { topic: String },
     /// A parameter that the master would take and could not return, alone or in one reply with the
     /// whole tree.
-    Param {
-        /// The parameter.
-        key: String,
-    },
+    Param { key: String },
     /// A registration whose key no name leads to.
-    Unnameable {
-        /// The key.
-        key: String,
-        /// The node.
-        caller_id: String,
-    },
+    Unnameable { key: String, caller_id: String },
 }
 
 impl fmt::Display for Skipped {

@@ -14,7 +14,7 @@ use crate::master::{MASTER, Request};
 
 /// A request that is turned away.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Refusal {
+pub(crate) struct Refusal {
     /// The HTTP status to answer.
     pub status: StatusCode,
     /// Why, for the person who reads it.
@@ -32,7 +32,7 @@ const BROWSER_TYPES: [&str; 3] = [
 ///
 /// A browser says with every POST of a page where the page is from (`null` if it keeps that to
 /// itself); no ROS client does. It may lack a content type, as that of a typed array does.
-pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     for origin in headers.get_all(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
         let origin = String::from_utf8_lossy(origin.as_bytes());
@@ -72,7 +72,7 @@ pub fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> 
 ///
 /// The domains that this computer is in (`robot.local`, `robot.example.com`) are not known here, so
 /// any may stand behind its host name: the status page changes nothing.
-pub fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+pub(crate) fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
         let has_domain = |own: &&String| {
@@ -110,13 +110,13 @@ fn check_name(headers: &HeaderMap, is_known: impl Fn(&str) -> bool) -> Result<()
 }
 
 /// Whether a call from `peer` may shut the master down.
-pub fn may_shut_down(peer: IpAddr) -> bool {
+pub(crate) fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
 }
 
 /// Whether a `shutdown` is what a master sends to a node when another one takes its name. Here it
 /// arrives if somebody registered our address as a node's, from whatever computer.
-pub fn is_for_a_node(call: &Request) -> bool {
+pub(crate) fn is_for_a_node(call: &Request) -> bool {
     call.caller() == Some(MASTER)
 }
 

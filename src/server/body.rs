@@ -14,7 +14,7 @@ use crate::xmlrpc::Value;
 
 /// Larger bodies, in bytes, need room in memory and are decoded outside the runtime's threads: so much
 /// takes some 0.3 ms.
-pub const SMALL: usize = 64 << 10;
+pub(crate) const SMALL: usize = 64 << 10;
 /// Every body is given this time, and a second more for each [`RATE`] bytes that have arrived. No pause
 /// in it may be longer.
 const TIME: Duration = Duration::from_secs(10);
@@ -26,12 +26,9 @@ static LAST: Semaphore = Semaphore::const_new(1);
 
 /// Why there is no body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BodyError {
+pub(crate) enum BodyError {
     /// It is larger than this limit, in bytes.
-    TooLarge {
-        /// The limit.
-        limit: usize,
-    },
+    TooLarge { limit: usize },
     /// It broke off, or is no HTTP.
     Broken,
     /// Its bytes came too slowly.
@@ -43,7 +40,7 @@ pub enum BodyError {
 /// Room in memory for one body; given back on drop. What is announced costs nothing: a body takes
 /// twice what has arrived of it.
 #[derive(Debug)]
-pub struct Room<'a> {
+pub(crate) struct Room<'a> {
     /// In KiB.
     pool: &'a Semaphore,
     held: Option<SemaphorePermit<'a>>,
@@ -52,7 +49,7 @@ pub struct Room<'a> {
 
 impl<'a> Room<'a> {
     /// No room yet, of `pool`'s, which counts KiB.
-    pub fn of(pool: &'a Semaphore) -> Self {
+    pub(crate) fn of(pool: &'a Semaphore) -> Self {
         Self {
             pool,
             held: None,
@@ -92,7 +89,7 @@ fn time_for(bytes: usize) -> Duration {
 }
 
 /// Reads a body of at most `limit` bytes, and takes `room` for it as it arrives.
-pub async fn read(
+pub(crate) async fn read(
     mut body: Incoming,
     limit: usize,
     room: &mut Room<'_>,
@@ -135,7 +132,7 @@ pub async fn read(
 
 /// Takes room for what a large body says when it is taken apart: of short values that is many times
 /// their text.
-pub async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
+pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
     const OPEN: &[u8] = b"<value";
     let searched = text.clone();
     let count = move || {

@@ -38,7 +38,6 @@ const PATIENCE: Duration = Duration::from_millis(100);
 /// Why a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "so many answers at once are left to the master";
 
-/// What calls are answered with.
 pub struct Calls {
     /// Whether they pass to the master.
     pub gate: gate::Rx,
@@ -50,7 +49,6 @@ pub struct Calls {
     pub write_queue: WriteQueue,
     /// Notified when the master has not answered a call for longer than it should take.
     pub slow: Arc<Notify>,
-    /// What is counted.
     pub stats: &'static Stats,
     /// Our own address, which stands in replies for the master's.
     pub uri: String,

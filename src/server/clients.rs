@@ -23,7 +23,6 @@ struct Seen {
 /// One connection.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Client {
-    /// Where it comes from.
     pub peer: String,
     /// The caller id of its last call, if it is long its beginning.
     pub caller_id: String,
@@ -41,7 +40,6 @@ impl Clients {
         }
     }
 
-    /// A call came from `peer`.
     pub fn called(&self, peer: SocketAddr, caller_id: &str) {
         let end = caller_id.char_indices().nth(CALLER_ID);
         let caller_id = end.map_or(caller_id, |(end, _)| caller_id.split_at(end).0);

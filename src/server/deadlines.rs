@@ -30,7 +30,7 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 
 /// Where a connection stands between requests.
 #[derive(Clone, Debug, Default)]
-pub struct Deadlines {
+pub(crate) struct Deadlines {
     place: Arc<AtomicU8>,
 }
 
@@ -41,17 +41,17 @@ const REPLYING: u8 = 3;
 
 impl Deadlines {
     /// The head has been read; the body and the answer have limits of their own.
-    pub fn serving(&self) {
+    pub(crate) fn serving(&self) {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
     /// There is an answer. Once it has been sent, the next byte begins a head.
-    pub fn replying(&self) {
+    pub(crate) fn replying(&self) {
         self.place.store(REPLYING, Ordering::Relaxed);
     }
 
     /// No request has begun since the last answer was sent.
-    pub fn is_idle(&self) -> bool {
+    pub(crate) fn is_idle(&self) -> bool {
         self.is(IDLE)
     }
 
@@ -62,7 +62,7 @@ impl Deadlines {
 
 /// A stream that keeps `deadlines`, and is one of the idle ones between requests.
 #[derive(Debug)]
-pub struct Timed<'a, S> {
+pub(crate) struct Timed<'a, S> {
     stream: S,
     deadlines: Deadlines,
     deadline: Pin<Box<Sleep>>,
@@ -76,7 +76,7 @@ pub struct Timed<'a, S> {
 
 impl<'a, S> Timed<'a, S> {
     /// `stream` before its first request. `close` is told when `idle` has too many.
-    pub fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
+    pub(crate) fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
             deadlines,

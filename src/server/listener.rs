@@ -46,7 +46,6 @@ pub enum ListenError {
         address.port(), address.ip()
     )]
     InUse {
-        /// The address.
         address: SocketAddr,
         /// The option that chooses it.
         option: &'static str,
@@ -54,7 +53,6 @@ pub enum ListenError {
     /// Any other reason.
     #[error("cannot listen at {address}: {source}; choose another one with {option}")]
     Other {
-        /// The address.
         address: SocketAddr,
         /// The option that chooses what is wrong with it.
         option: &'static str,

@@ -31,7 +31,6 @@ use crate::{
 pub struct Pages {
     /// What nodes use as `ROS_MASTER_URI`.
     pub uri: String,
-    /// The checkpoint's path.
     pub checkpoint: String,
     /// The master's address.
     pub upstream: Arc<Upstream>,
@@ -39,18 +38,14 @@ pub struct Pages {
     pub gate: gate::Rx,
     /// The mirror, and whether it is recorded.
     pub ledger: Arc<Ledger>,
-    /// Which nodes are unreachable.
     pub nodes: Arc<Nodes>,
     /// Deaths and recoveries.
     pub board: Arc<Board>,
-    /// Who is connected.
     pub clients: Arc<Clients>,
-    /// What was counted.
     pub stats: &'static Stats,
 }
 
 impl Pages {
-    /// The page at `path`.
     pub fn page(&self, path: &str) -> HttpReply {
         let status = self.status();
         match path {
@@ -136,7 +131,6 @@ struct Status {
     unprotected: Option<String>,
     /// Whether another process keeps the port, and starts rosrescue again, when it dies.
     guarded: bool,
-    /// In words, which one.
     guarded_by: String,
     /// What the mirror holds.
     state: Counts,
@@ -144,7 +138,6 @@ struct Status {
     unreachable: Vec<String>,
     /// Masters examined since the start.
     recoveries: u64,
-    /// The last one.
     last_recovery: Option<Report>,
     /// Connections of clients, at most a thousand of them.
     clients: Vec<Client>,

@@ -15,7 +15,7 @@ use crate::{
 };
 
 /// What hyper sends.
-pub type HttpReply = Response<Full<Bytes>>;
+pub(crate) type HttpReply = Response<Full<Bytes>>;
 
 /// A master's reply out of a batch, or the mirror's, with our address for the master's own.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {

@@ -25,7 +25,7 @@ const UNDECODED: &str = "rosrescue cannot decode this request, and takes such fr
                          computer only; send XML-RPC in UTF-8, without a document type";
 
 /// Answers one request.
-pub async fn serve(
+pub(crate) async fn serve(
     server: Arc<Server>,
     peer: SocketAddr,
     deadlines: Deadlines,

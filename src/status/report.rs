@@ -132,7 +132,7 @@ pub(crate) fn ms(duration: Duration) -> f64 {
 
 /// What the health check after a recovery found.
 #[derive(Debug, Default)]
-pub struct HealthCheck {
+pub(crate) struct HealthCheck {
     /// From the open gate to its end.
     pub duration: Duration,
     /// Nodes that are dead and have been taken out, through the master, so that others are told.

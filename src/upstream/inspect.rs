@@ -11,7 +11,7 @@ use crate::{
 /// A look that showed nothing.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum InspectError {
+pub(crate) enum InspectError {
     /// The connection failed.
     #[error(transparent)]
     Call(#[from] CallError),
@@ -21,7 +21,10 @@ pub enum InspectError {
 }
 
 /// The first look; without the parameters if the master cannot return one of them.
-pub async fn first(connection: &mut Connection, token: &Token) -> Result<Inspection, InspectError> {
+pub(crate) async fn first(
+    connection: &mut Connection,
+    token: &Token,
+) -> Result<Inspection, InspectError> {
     let whole = look(connection, Inspection::call(token)).await;
     match whole {
         Err(InspectError::NotAMaster(
@@ -46,7 +49,7 @@ fn is_broken_document(error: &InspectError) -> bool {
 }
 
 /// The second look, and with it the state that the master holds.
-pub async fn second(
+pub(crate) async fn second(
     first: Inspection,
     connection: &mut Connection,
     previous: &Master,

@@ -49,7 +49,7 @@ pub enum VerifyError {
 /// Connects and makes sure that the incarnation behind the connection is the one that was brought
 /// to the mirror's state. Nothing else may be said on a new connection first: the master may have
 /// died and come back between two looks.
-pub async fn connect_verified(
+pub(crate) async fn connect_verified(
     upstream: &Upstream,
     token: &Token,
 ) -> Result<Connection, VerifyError> {

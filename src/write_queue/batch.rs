@@ -22,7 +22,7 @@ const BYTES_MAX: usize = 1 << 20;
 
 /// The answer to a call in the queue.
 #[derive(Debug)]
-pub enum Answer {
+pub(crate) enum Answer {
     /// The master's reply as it came.
     Raw(RawReply),
     /// A reply that we write out: the mirror's, or one out of a batch.
@@ -33,7 +33,7 @@ pub enum Answer {
 
 /// A call in the queue.
 #[derive(Debug)]
-pub struct Item {
+pub(crate) struct Item {
     /// The client's bytes; none for a call of our own.
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
@@ -48,7 +48,6 @@ pub struct Item {
 /// unregistered for it. A node that does the contrary itself meanwhile knows better.
 #[derive(Clone, Debug)]
 pub struct Condition {
-    /// The node.
     pub node: String,
     /// Its last last_calls then.
     pub last_calls: LastCalls,
@@ -66,7 +65,7 @@ impl Condition {
 
 impl Item {
     /// The method and the caller id, for messages.
-    pub fn describe(&self) -> String {
+    pub(crate) fn describe(&self) -> String {
         let Some(call) = &self.call else {
             return "a request that rosrescue cannot decode".to_owned();
         };
@@ -94,7 +93,7 @@ impl Item {
 }
 
 /// Takes the next batch from the front of `queue`: one call, or several that may share.
-pub fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
+pub(crate) fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
     let mut items: Vec<_> = queue.pop_front().into_iter().collect();
     let mut bytes = items.first().map_or(0, Item::weight);
     while items.first().is_some_and(Item::may_share)
@@ -110,7 +109,7 @@ pub fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
 }
 
 /// What goes out for `items`: the client's own bytes if it is one call.
-pub fn outbound(items: &[Item]) -> (Head, Bytes) {
+pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     if let [
         Item {
             raw: Some((head, body)),
@@ -134,7 +133,7 @@ pub fn outbound(items: &[Item]) -> (Head, Bytes) {
 }
 
 /// The replies to `count` calls that travelled together; none if the master did not answer each.
-pub fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
+pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     let Reply::Value(Value::Array(results)) = reply else {
         return None;
     };
@@ -143,14 +142,14 @@ pub fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
 }
 
 /// Whether the master writes its own address into the reply: `getUri`, alone or in a multicall.
-pub fn asks_uri(call: &Request) -> bool {
+pub(crate) fn asks_uri(call: &Request) -> bool {
     let mut calls = call.calls().into_iter();
     calls.any(|call| *call.method() == Method::GetUri)
 }
 
 /// Puts our own address where the master wrote its own: into replies to `getUri`, alone or in a
 /// multicall.
-pub fn with_uri(call: &Request, mut reply: Reply, uri: &str) -> Reply {
+pub(crate) fn with_uri(call: &Request, mut reply: Reply, uri: &str) -> Reply {
     if let Reply::Value(value) = &mut reply {
         write_uri(call, value, uri);
     }

@@ -44,7 +44,7 @@ struct InFlight {
 }
 
 /// Drains the write queue.
-pub struct Worker {
+pub(crate) struct Worker {
     link: Link,
     gate: gate::Rx,
     stats: &'static Stats,
@@ -110,7 +110,7 @@ impl Worker {
     }
 
     /// Runs until every [`WriteQueue`](super::WriteQueue) is gone.
-    pub async fn run(mut self) {
+    pub(crate) async fn run(mut self) {
         let mut gate = self.gate.clone();
         let mut resync = self.resync_interval.map(tokio::time::interval);
         loop {

@@ -15,7 +15,6 @@ pub enum DecodeError {
     Syntax {
         /// Where in the body, after a byte order mark.
         at: usize,
-        /// What is wrong there.
         what: &'static str,
     },
     /// CPython would take it, but no known ROS client sends it; not decoding beats decoding wrongly.
@@ -23,21 +22,16 @@ pub enum DecodeError {
     Unsupported {
         /// Where in the body, after a byte order mark.
         at: usize,
-        /// What it is.
         what: &'static str,
     },
     /// The XML declaration names another encoding than UTF-8, US-ASCII or ISO-8859-1.
     #[error("encoding {name:?} is not decoded here; forward the body as it came")]
-    Encoding {
-        /// The name in the declaration.
-        name: String,
-    },
+    Encoding { name: String },
     /// The bytes are not in the document's encoding.
     #[error("byte {at} is not {encoding}; forward the body as it came")]
     NotText {
         /// Where in the body, after a byte order mark.
         at: usize,
-        /// The document's encoding.
         encoding: &'static str,
     },
     /// Arrays and structs, or elements, lie inside each other beyond the limit.
@@ -45,7 +39,6 @@ pub enum DecodeError {
     TooDeep {
         /// Where in the body, after a byte order mark.
         at: usize,
-        /// The limit.
         limit: usize,
     },
     /// A `<value>` holds an element that is no type.
@@ -61,7 +54,6 @@ pub enum DecodeError {
     BadText {
         /// Behind the end of the element.
         at: usize,
-        /// The type.
         tag: &'static str,
         /// The text, cut to a few characters.
         text: String,

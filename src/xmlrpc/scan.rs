@@ -17,9 +17,7 @@ use super::error::DecodeError;
 
 /// One event. An empty element is a start and an end.
 pub(super) enum Event<'a> {
-    /// A start tag.
     Start(BytesStart<'a>),
-    /// An end tag.
     End(BytesEnd<'a>),
     /// A piece of text; its line ends are already made `\n` where XML's rule counts.
     Text(Cow<'a, str>),

@@ -27,7 +27,6 @@ enum Open {
     },
 }
 
-/// Reads one document.
 pub(super) fn read(text: &str) -> Result<Value, String> {
     // A document adds a few levels of its own around the deepest value.
     let nesting = DEPTH_MAX + 8;

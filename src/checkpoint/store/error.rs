@@ -19,39 +19,28 @@ pub enum OpenError {
         holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
     )]
     Locked {
-        /// The checkpoint.
         path: PathBuf,
         /// The process that holds the lock, if it left its number.
         holder: Option<u32>,
     },
     /// Something else is there.
     #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
-    NotACheckpoint {
-        /// The file.
-        path: PathBuf,
-    },
+    NotACheckpoint { path: PathBuf },
     /// A later rosrescue wrote it.
     #[error(
         "`{}` was written in checkpoint format {version} by a newer rosrescue; use that one, or move the file away",
         path.display()
     )]
-    NewerVersion {
-        /// The file.
-        path: PathBuf,
-        /// Its format.
-        version: u32,
-    },
+    NewerVersion { path: PathBuf, version: u32 },
     /// The operating system refused.
     #[error(
         "cannot {doing} `{}`: {source}; make it readable and writable for this user or choose another file with --checkpoint",
         path.display()
     )]
     Io {
-        /// What was tried.
         doing: &'static str,
         /// On which file or folder.
         path: PathBuf,
-        /// What it said.
         source: io::Error,
     },
 }
@@ -76,30 +65,17 @@ impl OpenError {
 pub enum StoreError {
     /// An earlier failure, or no [`begin`](super::Store::begin) yet.
     #[error("`{}` records nothing: {reason}", path.display())]
-    Unprotected {
-        /// The checkpoint.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    Unprotected { path: PathBuf, reason: String },
     /// The operating system refused.
     #[error("cannot {doing} `{}`: {source}", path.display())]
     Io {
-        /// What was tried.
         doing: &'static str,
-        /// On which file.
         path: PathBuf,
-        /// What it said.
         source: io::Error,
     },
     /// Somebody else changed the file.
     #[error("`{}` was changed by somebody else: {change}", path.display())]
-    Changed {
-        /// The checkpoint.
-        path: PathBuf,
-        /// How.
-        change: Change,
-    },
+    Changed { path: PathBuf, change: Change },
     /// Another rosrescue took the lock after ours had been removed.
     #[error(
         "`{}` is in use by another rosrescue{} now; stop one of the two",
@@ -107,7 +83,6 @@ pub enum StoreError {
         holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
     )]
     Taken {
-        /// The checkpoint.
         path: PathBuf,
         /// The process that holds the lock, if it left its number.
         holder: Option<u32>,
@@ -128,10 +103,7 @@ pub enum StoreError {
     /// A generation that is no longer wanted: a later one was begun, the file was set aside, or too
     /// much was recorded while it was written.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
-    Overtaken {
-        /// The checkpoint.
-        path: PathBuf,
-    },
+    Overtaken { path: PathBuf },
     /// What should be written cannot be.
     #[error(transparent)]
     Encode(#[from] EncodeError),

@@ -18,7 +18,6 @@ pub(super) struct Active<S: Storage> {
     pub(super) generation: u64,
     pub(super) snapshot_bytes: u64,
     pub(super) journal_bytes: u64,
-    /// Which file it is.
     pub(super) id: FileId,
     /// The check sum of all that was written.
     pub(super) crc: u32,

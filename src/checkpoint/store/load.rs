@@ -28,7 +28,6 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// The newest session.
     pub fn session(&self) -> Option<&Session> {
         let later = self
             .records

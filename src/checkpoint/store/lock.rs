@@ -71,7 +71,6 @@ impl DiskLock {
         Ok(lock_file(path)?.map(|file| self.file = file))
     }
 
-    /// The lock file's.
     pub(super) fn id(&self) -> io::Result<FileId> {
         Ok(FileId::of(&self.file.metadata()?))
     }

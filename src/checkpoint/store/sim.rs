@@ -89,7 +89,6 @@ struct World {
 #[derive(Clone, Default)]
 pub(super) struct SimFs(Arc<Mutex<World>>);
 
-/// An open file.
 pub(super) struct SimFile(usize);
 
 impl SimFile {

@@ -15,7 +15,6 @@ use super::lock::{self, DiskLock};
 pub struct FileId {
     /// The file system.
     pub device: u64,
-    /// The file on it.
     pub inode: u64,
 }
 
@@ -47,9 +46,7 @@ fn is_absence(error: &io::Error) -> bool {
 /// What shows whether somebody else has written to a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileStatus {
-    /// Which file it is.
     pub id: FileId,
-    /// Its length in bytes.
     pub length: u64,
     /// When it was written last, in nanoseconds; only ever compared with itself.
     pub modified: i128,
@@ -96,7 +93,6 @@ pub trait Storage: Clone + Send + Sync + 'static {
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>>;
     /// The CRC-32C of the first `length` bytes at `path`.
     fn checksum(&self, path: &Path, length: u64) -> io::Result<u32>;
-    /// Removes a name.
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Returns when the names in `folder` are on the medium.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;

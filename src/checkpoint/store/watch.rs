@@ -29,7 +29,6 @@ pub enum Change {
     Length {
         /// Bytes that we wrote.
         expected: u64,
-        /// Bytes that there are.
         found: u64,
     },
     /// Overwritten in place.
