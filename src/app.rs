@@ -35,7 +35,7 @@ mod notify;
 mod startup;
 
 use self::{
-    notify::Told,
+    notify::Source,
     startup::{Beginning, begin, kernel_id},
 };
 
@@ -173,7 +173,7 @@ pub async fn run(
         board.clone(),
         process,
     );
-    let told = Told {
+    let told = Source {
         board: board.clone(),
         ledger: ledger.clone(),
         gate: gate.clone(),

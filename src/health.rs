@@ -80,7 +80,7 @@ pub(crate) enum Verdict {
     /// There is evidence that it bears this name.
     Itself,
     /// There is evidence that it is another one.
-    Stranger,
+    Another,
     /// There is no evidence.
     Unknown,
 }
@@ -123,9 +123,9 @@ pub(crate) fn judge(
     let last_fitting = fitting.map(|(name, _)| name.registered).max();
     let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
         None => Verdict::Unknown,
-        Some((0, _)) => Verdict::Stranger,
+        Some((0, _)) => Verdict::Another,
         // It shares topics with the one that came after it.
-        Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Stranger,
+        Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Another,
         Some(_) => Verdict::Itself,
     };
     // Who took a port may have been asked in the name of the one before.
@@ -134,10 +134,10 @@ pub(crate) fn judge(
     let verdicts = names.iter().zip(&matches);
     let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
         (Some(known), Some(pid)) if known == pid => match by_topics(name, found) {
-            Verdict::Stranger if last_of_pid > Some(name.registered) => Verdict::Stranger,
+            Verdict::Another if last_of_pid > Some(name.registered) => Verdict::Another,
             _ => Verdict::Itself,
         },
-        (Some(_), Some(_)) if !name.registered_since => Verdict::Stranger,
+        (Some(_), Some(_)) if !name.registered_since => Verdict::Another,
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
@@ -147,7 +147,7 @@ pub(crate) fn judge(
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
         for (name, verdict) in names.iter().zip(&mut verdicts) {
             if *verdict == Verdict::Unknown && name.registered < last {
-                *verdict = Verdict::Stranger;
+                *verdict = Verdict::Another;
             }
         }
     }

@@ -73,7 +73,7 @@ pub struct Ledger {
     /// Wakes the checkpointer.
     pub work: Notify,
     /// Wakes those who notify nodes.
-    pub news: Notify,
+    pub outbox_changed: Notify,
 }
 
 struct Inner {
@@ -132,7 +132,7 @@ impl Ledger {
             durable: watch::channel(0).0,
             attempted: watch::channel(0).0,
             work: Notify::new(),
-            news: Notify::new(),
+            outbox_changed: Notify::new(),
         }
     }
 
@@ -162,7 +162,7 @@ impl Ledger {
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
         idle.then(|| {
-            let reply = inner.apply(now, write, Some(false), &self.news);
+            let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
             (reply, inner.last_seq())
         })
     }
@@ -221,7 +221,7 @@ impl Ledger {
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
         for (index, answered) in answered.into_iter().enumerate() {
-            let outcome = inner.apply(now, answered.call, None, &self.news);
+            let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
                 self.stats.divergences.count();
                 inner.report_divergence(&answered, &outcome);
@@ -253,7 +253,7 @@ impl Ledger {
     /// Records and applies a call of our own before there is any master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
-        inner.apply(Instant::now(), call, None, &self.news);
+        inner.apply(Instant::now(), call, None, &self.outbox_changed);
         inner.append(&[Entry::call(call.clone().into())]);
     }
 
@@ -269,7 +269,7 @@ impl Ledger {
             return None;
         }
         let changes = inner.mirror.would_change(call);
-        let reply = inner.apply(now, call, Some(changes), &self.news);
+        let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
             // Only its answer could not be written. What is refused once is refused again.
             Reply::Fault { .. } => {
@@ -378,7 +378,7 @@ impl Inner {
         now: Instant,
         call: &Request,
         standing_in: Option<bool>,
-        news: &Notify,
+        outbox_changed: &Notify,
     ) -> Reply {
         let mut noticed = Noticed::new(standing_in.is_some());
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
@@ -386,7 +386,7 @@ impl Inner {
         self.version += u64::from(standing_in.unwrap_or(true));
         let registered = |node: &str| self.mirror.api_of(node).is_some();
         if self.activity.applied(now, call, noticed, registered) {
-            news.notify_one();
+            outbox_changed.notify_one();
         }
         reply
     }

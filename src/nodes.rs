@@ -32,7 +32,7 @@ use crate::{
 
 /// A node is asked for its process id so long after it last registered something: starting nodes
 /// have better to do.
-const ACQUAINTANCE: Duration = Duration::from_secs(2);
+const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
 /// How long the master must have been away before what it may have owed its nodes is told by us: most
 /// that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
@@ -108,11 +108,11 @@ impl Nodes {
         }
         tracing::debug!(api, "a node does not answer");
         self.changed.notify_one();
-        if self.update_telling() {
+        if self.update_notifying() {
             // What changed before, the master may be about to tell this very node first.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
-            self.ledger.news.notify_one();
+            self.ledger.outbox_changed.notify_one();
         }
     }
 
@@ -120,25 +120,25 @@ impl Nodes {
     pub(super) fn clear(&self, api: &str) -> bool {
         let was = self.lock().remove(api);
         if was {
-            self.update_telling();
+            self.update_notifying();
         }
         was
     }
 
     /// We tell changes beside the master as long as somebody is unreachable, or may be. Answers whether that begins.
-    fn update_telling(&self) -> bool {
+    fn update_notifying(&self) -> bool {
         // One lock around the other, here and nowhere else: the last word is the latest.
         let unreachable = self.lock();
-        let telling = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
+        let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger
-            .with_activity(|_, activity| activity.set_telling(telling))
-            && telling
+            .with_activity(|_, activity| activity.set_notifying(notifying))
+            && notifying
     }
 
     /// We tell changes beside the master until the result is dropped: nobody knows yet who is unreachable.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
-        nodes.update_telling();
+        nodes.update_notifying();
         CheckUnderWay(nodes.clone())
     }
 }
@@ -149,7 +149,7 @@ pub(super) struct CheckUnderWay(Arc<Nodes>);
 impl Drop for CheckUnderWay {
     fn drop(&mut self) {
         self.0.checks.fetch_sub(1, Ordering::Relaxed);
-        self.0.update_telling();
+        self.0.update_notifying();
     }
 }
 
@@ -166,10 +166,10 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
         let next = nodes.lock().next().map(Into::into);
         let new = nodes
             .ledger
-            .with_activity(|_, activity| activity.next_stranger());
-        let acquaint_at = new.map(|since| (since + ACQUAINTANCE).into());
+            .with_activity(|_, activity| activity.next_unidentified());
+        let identify_at = new.map(|since| (since + IDENTIFY_AFTER).into());
         tokio::select! {
-            () = nodes.ledger.news.notified() => empty_outbox(&nodes, &mut repeats),
+            () = nodes.ledger.outbox_changed.notified() => empty_outbox(&nodes, &mut repeats),
             () = gate.changed() => match gate.look() {
                 State::StandingIn if !owed_told => {
                     owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
@@ -179,7 +179,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
             },
             () = wait::until(owed_at) => {
                 (owed_at, owed_told) = (None, true);
-                tell_owed(&nodes, Instant::now());
+                notify_owed(&nodes, Instant::now());
             }
             () = wait::until(next) => ask_unreachable(&nodes),
             () = wait::until(repeats.next().map(Into::into)) => {
@@ -191,7 +191,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
             }
             // An unreachable node that is new may be due before the others.
             () = nodes.changed.notified() => {}
-            () = wait::until(acquaint_at) => get_acquainted(&nodes),
+            () = wait::until(identify_at) => identify_new_nodes(&nodes),
             () = wait::tick(&mut reaping) => {
                 if nodes.gate.is_open() {
                     let check = reap(nodes.clone());
@@ -218,7 +218,7 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
 }
 
 /// Tells what a master that went away at `outage` may not have told before. The topics of it.
-pub(super) fn tell_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
+pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let Owed {
         mut topics,
         params,
@@ -226,7 +226,7 @@ pub(super) fn tell_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     } = nodes
         .ledger
         .with_activity(|_, activity| activity.take_owed(outage));
-    topics.retain(|topic| notifications::tell_subscribers(nodes, topic));
+    topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
     for (api, key) in params {
         notifications::send(nodes, &api, Notification::Param(key));
     }
@@ -240,7 +240,7 @@ fn tell(nodes: &Arc<Nodes>, change: Change) {
     match change {
         Change::Param(api, key) => notifications::send(nodes, &api, Notification::Param(key)),
         Change::Topic(topic) => {
-            notifications::tell_subscribers(nodes, &topic);
+            notifications::notify_subscribers(nodes, &topic);
         }
     }
 }
@@ -255,7 +255,7 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
         unreachable.retain(|api| registered.contains(api));
         unreachable.due(Instant::now())
     };
-    nodes.update_telling();
+    nodes.update_notifying();
     for api in due {
         let nodes = nodes.clone();
         tokio::spawn(async move {
@@ -279,12 +279,12 @@ fn say(outcome: &CheckResult, what: &str) {
 
 /// Asks nodes that have registered lately for their process ids: another one at the same port will
 /// be another node.
-fn get_acquainted(nodes: &Arc<Nodes>) {
-    let Some(before) = Instant::now().checked_sub(ACQUAINTANCE) else {
+fn identify_new_nodes(nodes: &Arc<Nodes>) {
+    let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
         return;
     };
     let new = nodes.ledger.with_activity(|mirror, activity| {
-        let new = activity.take_strangers(before).into_iter();
+        let new = activity.take_unidentified(before).into_iter();
         let new = new.filter_map(|name| {
             let api = mirror.api_of(&name)?.to_owned();
             let registered = activity.last_calls(&name).registered;

@@ -137,7 +137,7 @@ impl Driver {
             if matches!(input, Input::SpawnFailed { .. })
                 && let Some(error) = self.spawn_error.take()
             {
-                self.say(format!("cannot start a master: {error}"));
+                self.log_once(format!("cannot start a master: {error}"));
             }
             if input == Input::Stop {
                 return Ok(self.process);
@@ -176,7 +176,7 @@ impl Driver {
                 () = wait::for_some(self.ended.as_mut()) => {
                     if !self.examiner.gate.state().is_open() {
                         let master = self.examiner.upstream.address();
-                        self.say_waiting(&format!("{master} closes the connection unasked"));
+                        self.log_waiting(&format!("{master} closes the connection unasked"));
                     }
                     return Input::ConnectionLost;
                 }
@@ -292,7 +292,7 @@ impl Driver {
                 Some(Input::Connected)
             }
             Done::NotConnected(error) => {
-                self.say_waiting(&error.to_string());
+                self.log_waiting(&error.to_string());
                 Some(match error {
                     ConnectError::Refused { .. } => Input::Refused,
                     ConnectError::Unreachable { .. } => Input::Unreachable,
@@ -316,11 +316,11 @@ impl Driver {
                 let master = self.examiner.upstream.address();
                 let input = error.as_input();
                 if input == Input::NotAMaster {
-                    self.say(format!(
+                    self.log_once(format!(
                         "what answers at {master} is not a ROS master: {error}"
                     ));
                 } else {
-                    self.say(format!(
+                    self.log_once(format!(
                         "the master at {master} could not be examined: {error}"
                     ));
                 }

@@ -21,7 +21,7 @@ use crate::{
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Begins to tell them. `stop` is told as the begin of the end.
-pub(super) fn start(guard: Guard, told: Told, stop: CancellationToken) {
+pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
@@ -39,13 +39,13 @@ pub(super) fn start(guard: Guard, told: Told, stop: CancellationToken) {
 
 /// What they are told.
 #[derive(Clone)]
-pub(super) struct Told {
+pub(super) struct Source {
     pub(super) board: Arc<Board>,
     pub(super) ledger: Arc<Ledger>,
     pub(super) gate: gate::Rx,
 }
 
-impl Told {
+impl Source {
     fn line(&self) -> String {
         let unprotected = self.ledger.unprotected();
         self.board.read().line(self.gate.is_open(), unprotected)
@@ -59,7 +59,7 @@ impl Told {
 }
 
 /// Tells the guardian when calls are answered, and people when the guardian is gone.
-async fn follow_guardian(pid: u32, link: StdLink, told: Told) {
+async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
@@ -88,7 +88,7 @@ async fn follow_guardian(pid: u32, link: StdLink, told: Told) {
     );
 }
 
-async fn report_ready(told: Told) {
+async fn report_ready(told: Source) {
     told.answers().await;
     let line = told.line();
     send(&[NotifyState::Ready, NotifyState::Status(&line)]);
@@ -96,7 +96,7 @@ async fn report_ready(told: Told) {
 
 /// Tells systemd the state in a line, and feeds its watchdog. That takes a timer and a thread of the
 /// runtime, and the locks of the board and of the mirror: what calls need, too.
-async fn report_status(told: Told, stop: CancellationToken) {
+async fn report_status(told: Source, stop: CancellationToken) {
     // Twice as often as necessary, as systemd asks for.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));

@@ -43,14 +43,14 @@ fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<V
 
 #[test]
 fn another_process_id_is_another_node() {
-    use Verdict::{Itself, Stranger};
-    assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Stranger, Itself]);
+    use Verdict::{Another, Itself};
+    assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);
     // One process may well bear two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
     // But it may have been asked before it registered, in the name of the one before it.
     let of_b = claims(&["/tb"], &[]);
     let both = verdicts([Some(2), Some(2)], 2, Some(&of_b));
-    assert_eq!(both, [Stranger, Itself]);
+    assert_eq!(both, [Another, Itself]);
     // The process id outweighs the topics: it is that node, whatever it has done since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
@@ -68,18 +68,18 @@ fn a_node_that_registered_since_may_be_another_process() {
     };
     assert_eq!(judge(1, "/new"), [Verdict::Itself], "the same process");
     assert_eq!(judge(2, "/ta"), [Verdict::Itself], "restarted");
-    assert_eq!(judge(2, "/new"), [Verdict::Stranger]);
+    assert_eq!(judge(2, "/new"), [Verdict::Another]);
 }
 
 #[test]
 fn other_topics_are_another_node() {
-    use Verdict::{Itself, Stranger, Unknown};
+    use Verdict::{Another, Itself, Unknown};
     let of_b = claims(&["/rosout", "/tb"], &["/clock"]);
-    assert_eq!(verdicts([None, None], 1, Some(&of_b)), [Stranger, Itself]);
+    assert_eq!(verdicts([None, None], 1, Some(&of_b)), [Another, Itself]);
     let neither = claims(&["/tc"], &[]);
     assert_eq!(
         verdicts([None, None], 1, Some(&neither)),
-        [Stranger, Stranger]
+        [Another, Another]
     );
     // What all nodes have is no evidence, and neither is nothing.
     let common = claims(&["/rosout"], &["/clock", "/tf"]);
@@ -89,7 +89,7 @@ fn other_topics_are_another_node() {
 
 #[test]
 fn of_two_that_share_topics_the_one_that_fits_is_there() {
-    use Verdict::{Itself, Stranger};
+    use Verdict::{Another, Itself};
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
         publish(&mut master, node, topic, "http://n:1/");
@@ -100,7 +100,7 @@ fn of_two_that_share_topics_the_one_that_fits_is_there() {
         let said = claims(publications, &["/shared"]);
         judge(&master, &names, Some(1), Some(&said))
     };
-    assert_eq!(judge(&["/tb"]), [Stranger, Itself]);
+    assert_eq!(judge(&["/tb"]), [Another, Itself]);
     assert_eq!(judge(&["/ta", "/tb"]), [Itself, Itself], "two names");
     assert_eq!(judge(&[]), [Itself, Itself], "who of them is not clear");
 }
@@ -115,7 +115,7 @@ fn a_port_has_one_node_behind_it() {
         let names = [name("/a", None, a), name("/b", None, b)];
         judge(&master, &names, Some(1), Some(&said))
     };
-    assert_eq!(judge(1, 2), [Verdict::Stranger, Verdict::Itself]);
+    assert_eq!(judge(1, 2), [Verdict::Another, Verdict::Itself]);
     // A process that took a second name, or an order that is not known: kept.
     assert_eq!(judge(2, 1), [Verdict::Unknown, Verdict::Itself]);
     assert_eq!(judge(0, 0), [Verdict::Unknown, Verdict::Itself]);

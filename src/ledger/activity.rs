@@ -112,11 +112,11 @@ pub struct Activity {
     prune_at: usize,
     pids: HashMap<String, Pid>,
     /// Nodes that registered and have not been asked for their process id since, and when.
-    strangers: IndexMap<String, Instant>,
+    unidentified: IndexMap<String, Instant>,
     /// Nodes that a master was to shut down, and when.
     displaced: Vec<(Instant, Displaced)>,
     /// Whether changes that a master tells are collected.
-    telling: bool,
+    notifying: bool,
     outbox: Outbox,
 }
 
@@ -172,7 +172,7 @@ impl Activity {
         noticed: Noticed,
         registered: impl Fn(&str) -> bool,
     ) -> bool {
-        let nobody_new = self.strangers.is_empty();
+        let nobody_new = self.unidentified.is_empty();
         for call in call.calls() {
             self.note(now, call);
         }
@@ -180,7 +180,7 @@ impl Activity {
             self.prune(registered);
         }
         let standing_in = noticed.calls.is_some();
-        let telling = self.telling && !standing_in;
+        let notifying = self.notifying && !standing_in;
         let noted = Noted {
             at: now,
             told: standing_in,
@@ -191,13 +191,13 @@ impl Activity {
             outbox.calls.extend(calls);
         }
         for topic in noticed.topics {
-            if telling && outbox.changes.len() < NOTICES {
+            if notifying && outbox.changes.len() < NOTICES {
                 outbox.changes.insert(Change::Topic(topic.clone()));
             }
             self.topics.insert(topic, noted);
         }
         for (to, key) in noticed.params {
-            if telling && outbox.changes.len() < NOTICES {
+            if notifying && outbox.changes.len() < NOTICES {
                 outbox
                     .changes
                     .insert(Change::Param(to.clone(), key.clone()));
@@ -210,11 +210,11 @@ impl Activity {
             self.displaced
                 .extend(noticed.displaced.into_iter().map(|it| (now, it)));
         }
-        let news = outbox.len() > before || (nobody_new && !self.strangers.is_empty());
+        let changed = outbox.len() > before || (nobody_new && !self.unidentified.is_empty());
         forget(&mut self.topics, now);
         forget(&mut self.params, now);
         self.displaced.retain(|(at, _)| is_recent(*at, now));
-        news
+        changed
     }
 
     /// The nodes that `call` takes the names of, as they are before it is applied.
@@ -244,8 +244,8 @@ impl Activity {
                 .entry(caller.to_owned())
                 .or_default()
                 .registered = self.count;
-            if self.strangers.len() < NOTICES {
-                self.strangers.insert(caller.to_owned(), now);
+            if self.unidentified.len() < NOTICES {
+                self.unidentified.insert(caller.to_owned(), now);
             }
         } else if call.kind() == Kind::Unregister {
             self.last_calls
@@ -258,7 +258,7 @@ impl Activity {
     fn prune(&mut self, registered: impl Fn(&str) -> bool) {
         self.last_calls.retain(|node, _| registered(node));
         self.pids.retain(|node, _| registered(node));
-        self.strangers.retain(|node, _| registered(node));
+        self.unidentified.retain(|node, _| registered(node));
         self.prune_at = 2 * self.last_calls.len();
     }
 
@@ -299,11 +299,11 @@ impl Activity {
     }
 
     /// Collects what a master tells from now on, or no longer. Answers whether that changes anything.
-    pub fn set_telling(&mut self, telling: bool) -> bool {
-        if !telling {
+    pub fn set_notifying(&mut self, notifying: bool) -> bool {
+        if !notifying {
             self.outbox.changes.clear();
         }
-        std::mem::replace(&mut self.telling, telling) != telling
+        std::mem::replace(&mut self.notifying, notifying) != notifying
     }
 
     /// What nodes are to be notified of.
@@ -338,7 +338,7 @@ impl Activity {
     /// `registered` numbers.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
         if self.last_calls(node).registered == registered {
-            self.strangers.shift_remove(node);
+            self.unidentified.shift_remove(node);
             let api = api.to_owned();
             let pid = Pid {
                 api,
@@ -357,16 +357,16 @@ impl Activity {
     }
 
     /// When the node registered that nobody has asked for its process id for longest.
-    pub fn next_stranger(&self) -> Option<Instant> {
-        self.strangers.values().min().copied()
+    pub fn next_unidentified(&self) -> Option<Instant> {
+        self.unidentified.values().min().copied()
     }
 
     /// Nodes that last registered something at `before` or earlier, and have not been asked for
     /// their process id since. Each is named once.
-    pub fn take_strangers(&mut self, before: Instant) -> Vec<String> {
+    pub fn take_unidentified(&mut self, before: Instant) -> Vec<String> {
         let ripe = |_: &String, at: &mut Instant| *at <= before;
         let mut taken = Vec::new();
-        self.strangers.retain(|node, at| {
+        self.unidentified.retain(|node, at| {
             let ripe = ripe(node, at);
             if ripe {
                 taken.push(node.clone());

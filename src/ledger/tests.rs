@@ -356,7 +356,7 @@ async fn what_was_adopted_is_waited_for_until_a_checkpoint_was_attempted() {
 }
 
 #[test]
-fn topics_are_remembered_while_a_dead_master_may_owe_the_news() {
+fn topics_are_remembered_while_a_dead_master_may_owe_notifications() {
     let ledger = ledger();
     let start = Instant::now();
     let subscribe = call(

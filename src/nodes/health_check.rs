@@ -83,9 +83,9 @@ pub(crate) async fn after_recovery(
             nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
-            super::tell_owed(&nodes, outage)
+            super::notify_owed(&nodes, outage)
         }
-        _ => super::tell_owed(&nodes, outage),
+        _ => super::notify_owed(&nodes, outage),
     };
     notified.sort();
     let visits = begin_visits(&nodes);
@@ -204,7 +204,7 @@ async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResul
             Sign::Alive => {
                 if nodes.clear(api) {
                     // Whatever was to be told meanwhile.
-                    notifications::tell_all(nodes, api);
+                    notifications::notify_of_all(nodes, api);
                 }
             }
         }
@@ -244,7 +244,7 @@ struct Asked {
 /// What an answer means.
 #[derive(Default)]
 struct Findings {
-    strangers: Vec<Name>,
+    others: Vec<Name>,
     reconciliations: Vec<(Condition, Verdict, Reconciliation)>,
 }
 
@@ -274,8 +274,8 @@ impl Asked {
                 {
                     continue;
                 }
-                if verdict == Verdict::Stranger {
-                    findings.strangers.push(name.clone());
+                if verdict == Verdict::Another {
+                    findings.others.push(name.clone());
                     continue;
                 }
                 if let Some(pid) = *pid {
@@ -305,15 +305,15 @@ impl Asked {
 impl Findings {
     fn is_settled(&self) -> bool {
         let mut reconciliations = self.reconciliations.iter();
-        self.strangers.is_empty()
+        self.others.is_empty()
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
     /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
     /// first: what we register for a node counts as its own deed, and ends what else was found.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
-        for name in &self.strangers {
-            let mut earlier = before.strangers.iter();
+        for name in &self.others {
+            let mut earlier = before.others.iter();
             let again =
                 earlier.any(|found| found.node == name.node && found.registered == name.registered);
             if again && remove(nodes, name, api).await {

@@ -62,7 +62,7 @@ impl Notifications {
 }
 
 /// Tells every subscriber of `topic` its publishers. Answers whether there are subscribers.
-pub(crate) fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
+pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     let subscribers = nodes
         .ledger
         .with_mirror(|mirror| mirror.subscribers_of(topic));
@@ -73,7 +73,7 @@ pub(crate) fn tell_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
 }
 
 /// Tells the node at `api` of every topic and every parameter that it subscribes.
-pub(crate) fn tell_all(nodes: &Arc<Nodes>, api: &str) {
+pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, api: &str) {
     let notifications = nodes.ledger.with_mirror(|mirror| {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
         let notifications = names.flat_map(|(name, _)| {

@@ -114,17 +114,17 @@ impl Driver {
         }
     }
 
-    pub(super) fn say_waiting(&mut self, what: &str) {
+    pub(super) fn log_waiting(&mut self, what: &str) {
         // A child that is about to listen needs no message.
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
-            self.say(format!("waiting for the master: {what}"));
+            self.log_once(format!("waiting for the master: {what}"));
         }
     }
 
     /// Warns, at most once in [`REPEAT`] for the same text.
-    pub(super) fn say(&mut self, text: String) {
+    pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
         let again = self
             .said

@@ -44,9 +44,9 @@ fn a_new_node_is_to_be_asked_once_after_its_last_registration() {
     apply(&mut activity, start, &publish("/a", "/t"));
     apply(&mut activity, start + second, &publish("/a", "/u"));
     let none = Vec::<String>::new();
-    assert_eq!(activity.take_strangers(start), none);
-    assert_eq!(activity.take_strangers(start + second), ["/a"]);
-    assert_eq!(activity.take_strangers(start + second), none);
+    assert_eq!(activity.take_unidentified(start), none);
+    assert_eq!(activity.take_unidentified(start + second), ["/a"]);
+    assert_eq!(activity.take_unidentified(start + second), none);
 }
 
 fn subscribed() -> (Master, Request) {
@@ -69,7 +69,7 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
     // The first time a node is new, too.
     assert!(apply(&mut activity, false));
     assert!(!apply(&mut activity, false));
-    activity.set_telling(true);
+    activity.set_notifying(true);
     assert!(apply(&mut activity, false));
     let changes = activity.take_outbox().changes;
     assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
@@ -119,7 +119,7 @@ fn who_is_displaced_is_known_with_what_it_did() {
 fn a_key_is_kept_once_for_all_its_subscribers() {
     let now = Instant::now();
     let mut activity = Activity::default();
-    activity.set_telling(true);
+    activity.set_notifying(true);
     let subscribers: Vec<_> = (0..NOTICES)
         .map(|port| format!("http://s:{port}/"))
         .collect();
