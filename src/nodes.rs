@@ -30,11 +30,10 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// A node is asked for its process id so long after it last registered something: starting nodes
-/// have better to do.
+/// A node is asked for its process id this long after its last registration: starting nodes are busy.
 const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
-/// How long the master must have been away before what it may have owed its nodes is told by us: most
-/// that only closed an idle connection are back by then.
+/// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most
+/// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
 /// What is known of the nodes beyond their registrations.
@@ -45,18 +44,17 @@ pub struct Nodes {
     stats: &'static Stats,
     /// How long a node may take to answer.
     timeout: Duration,
-    /// Notifications under way.
     pub(super) notifications: Notifications,
     unreachable: Mutex<Unreachable>,
     /// Recoveries whose health check is not over.
     checks: AtomicUsize,
-    /// Nodes that are being asked, or are about to be, and have not answered yet.
+    /// Nodes that have not been asked yet, or have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
 
 impl Nodes {
-    /// Of the nodes that `ledger` knows. `timeout`: how long one may take to answer.
+    /// `ledger` knows the nodes. `timeout`: how long one may take to answer.
     pub fn new(
         ledger: Arc<Ledger>,
         gate: gate::Rx,
@@ -90,7 +88,7 @@ impl Nodes {
 
     /// The names of the nodes that are unreachable.
     pub fn unreachable(&self) -> Vec<String> {
-        // No lock is held while the other one is taken.
+        // Never hold both locks here.
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| unreachable.contains(api));
@@ -109,14 +107,14 @@ impl Nodes {
         tracing::debug!(api, "a node does not answer");
         self.changed.notify_one();
         if self.update_notifying() {
-            // What changed before, the master may be about to tell this very node first.
+            // The master may be about to notify this very node of recent changes, before all others.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
             self.ledger.outbox_changed.notify_one();
         }
     }
 
-    /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
+    /// The node at `api` has answered, or is gone. Returns whether it was unreachable.
     pub(super) fn clear(&self, api: &str) -> bool {
         let was = self.lock().remove(api);
         if was {
@@ -125,9 +123,10 @@ impl Nodes {
         was
     }
 
-    /// We tell changes beside the master as long as somebody is unreachable, or may be. Answers whether that begins.
+    /// rosrescue notifies nodes beside the master while a node is unreachable, or a check is under way.
+    /// Returns whether that begins now.
     fn update_notifying(&self) -> bool {
-        // One lock around the other, here and nowhere else: the last word is the latest.
+        // Nested locks, only here: otherwise an older result could be stored last.
         let unreachable = self.lock();
         let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger
@@ -135,7 +134,8 @@ impl Nodes {
             && notifying
     }
 
-    /// We tell changes beside the master until the result is dropped: nobody knows yet who is unreachable.
+    /// rosrescue notifies nodes beside the master until the result is dropped: it is not known yet which
+    /// nodes are unreachable.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
         nodes.update_notifying();
@@ -153,14 +153,14 @@ impl Drop for CheckUnderWay {
     }
 }
 
-/// Watches over the nodes for as long as it is polled: sends notifications, asks unreachable nodes again, gets
-/// acquainted with new nodes, and makes the health check that is due.
+/// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again, identifies
+/// new nodes, and runs the regular health check.
 pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
     let mut repeats = Repeats::<Change>::default();
     let mut gate = nodes.gate.clone();
-    // When to tell what the master that is away may have owed, and whether it has been told.
+    // When to send what the absent master may not have sent, and whether that is done.
     let (mut owed_at, mut owed_told) = (None, false);
     loop {
         let next = nodes.lock().next().map(Into::into);
@@ -189,7 +189,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
                     tell(&nodes, change);
                 }
             }
-            // An unreachable node that is new may be due before the others.
+            // A new unreachable node may be due before the others.
             () = nodes.changed.notified() => {}
             () = wait::until(identify_at) => identify_new_nodes(&nodes),
             () = wait::tick(&mut reaping) => {
@@ -217,7 +217,7 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
     }
 }
 
-/// Tells what a master that went away at `outage` may not have told before. The topics of it.
+/// Sends the notifications that a master lost at `outage` may not have sent. Returns their topics.
 pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let Owed {
         mut topics,
@@ -277,8 +277,8 @@ fn say(outcome: &CheckResult, what: &str) {
     tracing::info!(?names, ?removed, ?reconciled, "{what}");
 }
 
-/// Asks nodes that have registered lately for their process ids: another one at the same port will
-/// be another node.
+/// Asks newly registered nodes for their process ids. A different process id at the same port will mean a
+/// different node.
 fn identify_new_nodes(nodes: &Arc<Nodes>) {
     let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
         return;

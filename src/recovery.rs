@@ -31,7 +31,7 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// What a step under way ends in. Steps exclude one another.
+/// The result of a step. At most one step runs at a time.
 enum Done {
     Connected(Connection),
     NotConnected(ConnectError),
@@ -56,7 +56,7 @@ pub(crate) struct Driver {
     connection: Option<Connection>,
     /// Resolves when the connection to the master ends.
     ended: Option<Ended>,
-    /// Resolves when a thread of the master ends; told once of each master.
+    /// Resolves when a thread of the master ends, once for each master.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
@@ -66,8 +66,8 @@ pub(crate) struct Driver {
 }
 
 impl Driver {
-    /// A driver that examines masters by `examiner`, and starts them itself with `process`. `slow` is notified
-    /// when a master has not answered a call for longer than it should take.
+    /// A driver that examines masters with `examiner` and starts them with `process`. `slow` is notified when
+    /// a master takes too long to answer a call.
     pub(crate) fn new(
         examiner: Examiner,
         write_queue: WriteQueue,
@@ -100,11 +100,11 @@ impl Driver {
         }
     }
 
-    /// Watches the master until `stop`. `restored`: the mirror comes from a checkpoint whose session goes on.
+    /// Watches the master until `stop`. `restored`: the mirror is from a checkpoint whose session continues.
     ///
     /// # Errors
     ///
-    /// If no master can be started at all.
+    /// If no master can be started.
     pub(crate) async fn run(
         mut self,
         restored: bool,
@@ -149,7 +149,7 @@ impl Driver {
         }
     }
 
-    /// What was under way with the master is over.
+    /// The master has died: drops the step under way.
     fn note_death(&mut self, input: Input) {
         if !matches!(
             input,
@@ -202,12 +202,12 @@ impl Driver {
         }
     }
 
-    /// Does it; answers with what it came to, if that is known at once.
+    /// Carries out `action`. Returns its result if that is known at once.
     fn carry_out(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
                 self.disconnect();
-                // Whatever comes of it: the one before may have gone to a master that died then.
+                // Always prepared anew: the previous plan may have gone to a master that died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));
@@ -236,7 +236,7 @@ impl Driver {
                 self.step = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
-                // A probe that was missed goes on: its answer counts whenever it comes.
+                // A late probe continues: its answer counts whenever it comes.
                 self.probe_deadline =
                     Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
                 if self.step.is_none() {
@@ -252,7 +252,7 @@ impl Driver {
             Action::ShutGate(cause) => self.shut_gate(cause),
             Action::OpenGate => self.open_gate(),
             Action::Spawn => return self.spawn(),
-            // Its caller has done it.
+            // Handled by the caller.
             Action::GiveUp => {}
             Action::Kill => {
                 self.disconnect();
@@ -301,7 +301,7 @@ impl Driver {
             Done::Examined(connection, Ok(examination)) => {
                 let outcome = examination.outcome;
                 if outcome == Outcome::Resumed {
-                    // Somebody may have written past us.
+                    // Another process may have written to the master directly.
                     self.examiner.ledger.doubt();
                 } else {
                     self.thread_ended = thread_of(&connection, examination.pid);
@@ -326,9 +326,9 @@ impl Driver {
                 }
                 Some(input)
             }
-            // Another incarnation is there, and nobody has closed the connection to the one before.
+            // Another incarnation answers, although the connection to the previous one is still open.
             Done::Probed(Err(VerifyError::OtherIncarnation)) => Some(Input::ConnectionLost),
-            // Missed. If the master has just died, the connection before tells of it.
+            // No answer. If the master has just died, the older connection will end and show it.
             Done::Probed(Err(_)) => None,
             Done::Probed(Ok(fresh)) => {
                 self.probe_deadline = None;
@@ -338,16 +338,16 @@ impl Driver {
         }
     }
 
-    /// Keeps `connection` as the sentinel. It is renewed with each probe, because the kernel closes
-    /// the descriptors of a dying process one by one, the newest first, and a master has one for
-    /// each node that it has ever called.
+    /// Keeps `connection` to notice the master's end. Renewed with each probe: the kernel closes the
+    /// descriptors of a dying process one by one, the newest first, and a master has one for each node that it
+    /// has ever called.
     fn watch(&mut self, connection: Connection) {
         self.ended = Some(Box::pin(connection.ended()));
         self.connection = Some(connection);
     }
 
     fn disconnect(&mut self) {
-        // An injection that was under way has failed.
+        // An injection under way has failed.
         if !self.examiner.gate.state().is_open() {
             self.keep_shut();
         }
@@ -357,7 +357,7 @@ impl Driver {
         self.probe_deadline = None;
     }
 
-    /// Lets nothing pass; the mirror stands in if it may.
+    /// Shuts the gate. The mirror stands in if it may.
     fn keep_shut(&self) {
         self.examiner.ledger.end_injection();
         self.examiner.gate.set(match self.lifecycle.may_stand_in() {
@@ -376,7 +376,7 @@ impl Driver {
             self.disconnect();
         }
         tracing::warn!(cause = cause.as_str(), "standing in for the master");
-        // What was prepared before is of another time.
+        // The prepared injection is outdated.
         self.prepared = None;
     }
 
@@ -400,7 +400,8 @@ impl Driver {
     }
 }
 
-/// The end of a thread of the master `pid`, if it is on this computer and the kernel can tell.
+/// Resolves at the end of a thread of the master `pid`. None if it runs elsewhere or the kernel cannot watch
+/// threads.
 fn thread_of(connection: &Connection, pid: i32) -> Option<Ended> {
     let is_master = |pid| connection.is_local() && process::runs(pid, "rosmaster");
     u32::try_from(pid).ok().filter(|pid| is_master(*pid))?;

@@ -14,17 +14,17 @@ use crate::{
     xmlrpc::{Call, Reply, Value},
 };
 
-/// Largest reply that is taken from a node, in bytes.
+/// Largest accepted reply of a node, in bytes.
 const MAX_REPLY: usize = 16 << 20;
 
-/// What a node said to a question.
+/// A node's reaction to a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Sign {
     /// It answered.
     Alive,
-    /// Its port refuses: the process is gone.
+    /// Its port refuses connections: the process is gone.
     Dead,
-    /// No answer in time, or none that makes sense. That is no proof of death.
+    /// No answer in time, or no valid one. That is no proof of death.
     Silent,
 }
 
@@ -50,18 +50,17 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, O
         .unwrap_or((Sign::Silent, None))
 }
 
-/// What a node says of itself.
+/// What a node reports of itself.
 #[derive(Debug)]
 pub(crate) struct Interview {
     pub sign: Sign,
     pub pid: Option<i32>,
-    /// What it publishes and subscribes, if it can be asked.
+    /// What it publishes and subscribes, if known.
     pub claims: Option<Claims>,
 }
 
-/// Asks the node at `api` for its process id, which must come within `limit`, and if it lives for
-/// what it publishes and subscribes, with as much time again. `getName` would tell more, but roscpp
-/// has none.
+/// Asks the node at `api` for its process id, within `limit`. If it answers, also for what it publishes and
+/// subscribes, within `limit` again. `getName` would help more, but roscpp lacks it.
 pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
     let (sign, pid) = ask_for(api, &master::get_pid(), limit).await;
     let mut interview = Interview {
@@ -94,7 +93,7 @@ async fn connect(address: &MasterUri) -> Result<Connection, Sign> {
                 return connection.await.map_err(|_| Sign::Silent);
             }
             Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,
-            // Where one of its addresses cannot be reached, it may live there.
+            // An address cannot be reached: the node may live there.
             Err(_) => return Err(Sign::Silent),
         }
     }
@@ -108,7 +107,7 @@ async fn put(connection: &mut Connection, call: &Call) -> (Sign, Option<Value>) 
             let success = answer.next() == Some(Value::Int(1));
             (Sign::Alive, answer.nth(1).filter(|_| success))
         }
-        // A method that it does not have.
+        // The node lacks the method.
         Ok(Reply::Fault { .. }) => (Sign::Alive, None),
         Ok(Reply::Value(_)) | Err(_) => (Sign::Silent, None),
     }

@@ -1,8 +1,8 @@
-//! The health check: which nodes still live, whether they are the ones that registered, and in what the
-//! mirror differs from what they say.
+//! The health check: which nodes live, whether they are the ones that registered, and where the mirror
+//! differs from what they report.
 //!
-//! Nothing here may hold up a call: a roscpp node that is itself waiting for its registration
-//! cannot answer us before that call is through.
+//! Nothing here may delay a call: a roscpp node that waits for its registration cannot answer rosrescue
+//! before that call is done.
 
 use std::{
     collections::BTreeSet,
@@ -36,20 +36,20 @@ use crate::{
 
 /// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
 const AT_ONCE: usize = 64;
-/// Pause before a node is asked again about what is to be taken from it.
+/// Pause before a node is asked again, to confirm what is to be removed from it.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
-/// Most questions to a node whose answers keep changing.
+/// Most questions to a node with changing answers.
 const QUESTIONS: u32 = 4;
 
 static PERMITS: Semaphore = Semaphore::const_new(AT_ONCE);
 
-/// The right to ask a node.
+/// Permission to ask a node.
 pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
     // Never closed.
     PERMITS.acquire().await.ok()
 }
 
-/// What a visit to one port came to.
+/// The result of asking one port.
 #[derive(Debug)]
 pub(crate) struct CheckResult {
     pub(crate) sign: Sign,
@@ -58,28 +58,28 @@ pub(crate) struct CheckResult {
     pub(crate) reconciled: Vec<String>,
 }
 
-/// What follows a recovery that took place since `outage`, beside traffic: who was not notified
-/// is told, and all nodes are asked. None if the next recovery has begun meanwhile.
+/// Follows a recovery from `outage`, beside traffic: sends the notifications that were missed, and asks all
+/// nodes. None if the next recovery has begun meanwhile.
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
     outcome: Outcome,
 ) -> Option<HealthCheck> {
     let under_way = Nodes::begin_check(&nodes);
-    // As if somebody did not answer, until the questions have been put.
+    // Counts as an unanswered question until the nodes are asked.
     let waiting = Waiting::new(&nodes);
     let mut gate = nodes.gate.clone();
     gate.wait_for(|state| matches!(state, State::Open { .. }))
         .await;
     let start = Instant::now();
     let incarnation = nodes.ledger.incarnation();
-    // Queued calls first: what nodes say in them is newer than what they say to us.
+    // Queued calls first: they are newer than a node's answers.
     barrier(&nodes).await;
     let mut notified = match outcome {
-        // A master that lives on notifies nodes itself.
+        // A master that was never away notifies nodes itself.
         Outcome::Adopted => Vec::new(),
         Outcome::Reconciled => {
-            // It may tell now what it knew before.
+            // It may send old notifications now.
             nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
@@ -103,7 +103,7 @@ pub(crate) async fn after_recovery(
 /// Returns when the writes that are queued now have been answered.
 async fn barrier(nodes: &Nodes) {
     let last = Request::new(Method::GetPid, [CALLER_ID]);
-    // Its answer does not matter.
+    // The answer does not matter.
     nodes.write_queue.call(last).await;
 }
 
@@ -116,7 +116,7 @@ fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
     let apis: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
         let apis = nodes.map(|(_, api)| api.to_owned());
-        // What nobody can call, the master cannot either.
+        // Addresses that rosrescue cannot call, the master cannot call either.
         apis.filter(|api| MasterUri::parse(api).is_ok()).collect()
     });
     let mut visits = JoinSet::new();
@@ -203,7 +203,7 @@ async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResul
             }
             Sign::Alive => {
                 if nodes.clear(api) {
-                    // Whatever was to be told meanwhile.
+                    // Notifications that were held back meanwhile.
                     notifications::notify_of_all(nodes, api);
                 }
             }
@@ -235,13 +235,13 @@ impl Drop for Waiting {
     }
 }
 
-/// The names at a port before the question, with the numbers of their last last_calls.
+/// The names at a port before the question, and when each last unregistered something.
 struct Asked {
     names: Vec<Name>,
     unregistered: Vec<u64>,
 }
 
-/// What an answer means.
+/// What an answer implies.
 #[derive(Default)]
 struct Findings {
     others: Vec<Name>,
@@ -260,7 +260,7 @@ impl Asked {
         })
     }
 
-    /// The verdict, for nodes that have registered nothing since the question.
+    /// The findings about nodes that have registered nothing since the question.
     fn findings(&self, nodes: &Nodes, api: &str, interview: &Interview) -> Findings {
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();
@@ -281,7 +281,7 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // Of two who may be meant, neither is reconciled.
+                // With two candidates neither is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
@@ -309,8 +309,9 @@ impl Findings {
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
-    /// Does what is sure; what is to be taken from a node must have been found before, too. It is taken
-    /// first: what we register for a node counts as its own deed, and ends what else was found.
+    /// Applies what is certain. A removal must have been found by the previous question, too. Removals come
+    /// first: a registration that rosrescue makes for a node counts as the node's own, and voids its other
+    /// findings.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.others {
             let mut earlier = before.others.iter();
@@ -347,7 +348,7 @@ impl Findings {
     }
 }
 
-/// Makes a call for a node, unless the node itself has done the contrary by the time at which it travels.
+/// Makes a call for a node, unless the node itself does the opposite before the call is sent.
 async fn reconcile(
     nodes: &Nodes,
     one: &Registration,
@@ -355,7 +356,7 @@ async fn reconcile(
     call: Request,
     outcome: &mut CheckResult,
 ) {
-    // In a multicall it goes alone: it must not displace anybody.
+    // In a multicall it may not displace another node.
     let kind = call.kind();
     let alone = Request::multicall([call]);
     let reply = nodes.write_queue.call_if(alone, condition.clone()).await;
@@ -368,17 +369,16 @@ async fn reconcile(
     }
 }
 
-/// Whether the one entry of a multicall was answered with success: a node may claim a type that no
-/// master takes.
+/// Whether the single entry of a multicall succeeded. A node may claim a type that the master refuses.
 fn is_done(reply: &Reply) -> bool {
     let replies = batch::unpack(reply, 1).unwrap_or_default();
     replies.iter().any(master::is_success)
 }
 
-/// Unregisters a node as it would have done itself. Not if it has another address by now, or has
-/// registered something since it was asked: then it has come back.
+/// Unregisters a node as it would do itself. Not if it has come back since it was asked: its address is
+/// different, or it has registered something.
 async fn remove(nodes: &Nodes, name: &Name, api: &str) -> bool {
-    // What it has on its way to the master comes first.
+    // Its queued calls come first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(&name.node);

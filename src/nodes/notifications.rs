@@ -1,9 +1,9 @@
 //! Notifications to nodes that the master would send, has not sent, or will send late.
 //!
-//! Each node gets its own in order, one at a time, and one that does not answer delays nobody else.
-//! A node does nothing with a list of publishers that it knows already; a stale one could make it
-//! drop links. So what is repeated is read from the mirror at the moment at which it is sent, and one
-//! that has become stale on its way is followed by another.
+//! Each node gets its notifications in order, one at a time; a node that does not answer delays no other. A
+//! node ignores a list of publishers that it knows already, but a stale list could make it drop links. So a
+//! repeated notification takes its content from the mirror when it is sent, and if that changes on the way,
+//! another one follows.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -25,21 +25,21 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// Nodes that are notified at the same time. Each takes a file descriptor.
+/// Nodes notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
-/// A node that takes longer gives its place to the next one: living nodes answer within milliseconds.
+/// A node that takes longer yields its place to the next one: living nodes answer within milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
-/// Nodes beside those that are still waited for. The packets to some computer vanish, and it had many.
+/// Further slow nodes that may be waited for: many nodes on a computer whose packets vanish.
 const SLOW: usize = 128;
-/// A node that takes its notifications so much slower than they come gets the latest of each.
+/// When more notifications wait for a node, it gets only the latest of each kind.
 const QUEUE_MAX: usize = 256;
-/// Pauses before a node that is to shut down and does not answer is asked again.
+/// Pauses before asking a node again to shut down, if it does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 
 /// The notifications under way.
 #[derive(Debug)]
 pub(crate) struct Notifications {
-    /// What each address is still to be told; an entry for each that is being told something.
+    /// Waiting notifications by address. An address being notified has an entry, which may be empty.
     pending: Mutex<HashMap<String, VecDeque<Notification>>>,
     permits: Semaphore,
     slow: Semaphore,
@@ -61,7 +61,7 @@ impl Notifications {
     }
 }
 
-/// Tells every subscriber of `topic` its publishers. Answers whether there are subscribers.
+/// Notifies every subscriber of `topic`. Returns whether there are any.
 pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     let subscribers = nodes
         .ledger
@@ -72,13 +72,13 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     !subscribers.is_empty()
 }
 
-/// Tells the node at `api` of every topic and every parameter that it subscribes.
+/// Notifies the node at `api` of every topic and parameter that it subscribes.
 pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, api: &str) {
     let notifications = nodes.ledger.with_mirror(|mirror| {
         let names = mirror.nodes().filter(|(_, at)| *at == api);
         let notifications = names.flat_map(|(name, _)| {
             let topics = mirror.subscriptions(name).map(str::to_owned);
-            // What is not set, and may never have been, is nothing to tell.
+            // Nothing to send for a parameter that is not set, and may never have been.
             let keys = mirror.param_subscriptions(name);
             let keys = keys.filter(|key| mirror.is_set(key)).map(Arc::from);
             topics
@@ -92,8 +92,8 @@ pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, api: &str) {
     }
 }
 
-/// Notifies the node at `api`, unless it is unreachable: those are told everything as soon as they
-/// answer. Who does not take a notification becomes unreachable.
+/// Notifies the node at `api`, unless it is unreachable: such a node gets everything once it answers. A node
+/// that does not take a notification becomes unreachable.
 pub(crate) fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
     if nodes.is_unreachable(api) {
         return;
@@ -124,7 +124,7 @@ fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
     }
 }
 
-/// What stands for a notification and all others like it.
+/// One notification that replaces all others of its kind; it takes its content when it is sent.
 fn latest(notification: Notification) -> Option<Notification> {
     let Notification::Call(call) = notification else {
         return Some(notification);
@@ -179,7 +179,7 @@ async fn deliver(nodes: Arc<Nodes>, api: String) {
     }
 }
 
-/// What is to be said to the node at `api` now; none if it does not concern that node any more.
+/// The call to send to the node at `api` now; none if it no longer concerns that node.
 fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Arc<Call>> {
     match notification {
         Notification::Call(call) => Some(call.clone()),
@@ -193,7 +193,7 @@ fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Ar
     }
 }
 
-/// Tells a node whose name another one has taken to shut down, as a master does, but never another node
+/// Asks a node to shut down because another one has taken its name, as a master does. Never a different node
 /// that has its address by now.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
@@ -236,7 +236,7 @@ fn is_taken(nodes: &Nodes, api: &str) -> bool {
         .with_mirror(|mirror| mirror.nodes().any(|(_, at)| at == api))
 }
 
-/// Whether the node behind the address is the one that was displaced. Without evidence it is not.
+/// Whether the node at the address is the displaced one. Without evidence it is not.
 fn is_itself(displaced: &Displaced, pid: Option<i32>, claims: Option<&Claims>) -> bool {
     match (displaced.pid, pid) {
         (Some(known), Some(pid)) => known == pid,

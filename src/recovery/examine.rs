@@ -26,22 +26,20 @@ use crate::{
 
 /// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
-/// Most rounds of comparing and mending a master that differs from what was injected.
+/// Most rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
-/// How long the end of calls of closed connections is waited for. A `setParam` of 60,000 keys takes
-/// some 10 s.
+/// How long to wait for running calls of closed connections. A `setParam` of 60,000 keys takes some 10 s.
 const SETTLE_LIMIT: Duration = Duration::from_secs(60);
-/// How often it is looked whether they have ended: nothing tells.
+/// How often to check whether they have ended: there is no event for it.
 const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
-/// A master that could not be examined.
+/// Why a master could not be examined.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum ExamineError {
-    /// It does not answer.
     #[error("no answer within {limit:?}")]
     Silent { limit: Duration },
-    /// A call of ours failed, or what answers is no master.
+    /// A call of ours failed, or the server is no master.
     #[error(transparent)]
     Look(#[from] InspectError),
 }
@@ -53,7 +51,7 @@ impl From<CallError> for ExamineError {
 }
 
 impl ExamineError {
-    /// What it means for the lifecycle.
+    /// The lifecycle's input for this error.
     pub(crate) fn as_input(&self) -> Input {
         match self {
             Self::Silent { .. } => Input::Unreachable,
@@ -65,7 +63,7 @@ impl ExamineError {
     }
 }
 
-/// What an examination came to.
+/// The result of an examination.
 #[derive(Debug)]
 pub(crate) struct Examination {
     /// How the master came to hold the state.
@@ -75,34 +73,33 @@ pub(crate) struct Examination {
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
-    /// Where it differs nevertheless.
+    /// Differences that remain.
     pub mismatches: Vec<String>,
-    /// How long the look took.
+    /// How long reading the master took.
     pub look: Duration,
     /// How long the injection took.
     pub injection: Duration,
 }
 
-/// How an examination is to go.
+/// The parameters of an examination.
 #[derive(Debug)]
 pub(crate) struct Manner {
-    /// What is known of the master.
     pub known: Known,
-    /// The injection into an empty master, made ready.
+    /// The injection into an empty master, prepared ahead.
     pub prepared: Option<JoinHandle<Prepared>>,
 }
 
-/// An injection, made ready.
+/// An injection that was prepared ahead.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// Of the mirror; none if it was made for this very moment.
+    /// The mirror's version and the next token, if prepared ahead; none if planned just now.
     basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether a master holds exactly the mirror's state after it.
+    /// Whether it brings the mirror's state completely.
     complete: bool,
 }
 
-/// Makes the injection into an empty master ready, beside everything else.
+/// Prepares the injection into an empty master, in a thread of its own.
 pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
     tokio::task::spawn_blocking(move || {
         let (version, target, token) = ledger.next();
@@ -118,36 +115,32 @@ pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
 /// What is known of a master before it is examined.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Known {
-    /// Nothing.
     Nothing,
     /// If it bears the token, this process has served it before.
     ServedIfPresent,
-    /// If it bears the token, it has been injected, and nobody has seen it answer.
+    /// If it bears the token, it has been injected but never confirmed.
     InjectedIfPresent,
-    /// This process has just started it, as the successor of one that it served, on a loopback port
-    /// that was free: it is empty. That saves a look, and reading back would show if it were not.
+    /// This process has just started it on a free loopback port, as the successor of one that it served. So it
+    /// is empty and not read before the injection; reading back would show if it were not.
     New { pid: i32 },
 }
 
-/// What is to be brought to a master, and how.
+/// The state to bring to a master, and what it holds now.
 struct Target {
     state: Master,
     found: Master,
-    /// The token that it bears, if everything that it holds is to be replaced.
+    /// Its token, if everything that it holds is to be replaced.
     replaced: Option<Token>,
 }
 
 /// Examines masters, and opens the gate to one that holds the mirror's state.
 #[derive(Clone)]
 pub(crate) struct Examiner {
-    /// Whose state a master is brought to.
     pub ledger: Arc<Ledger>,
     pub upstream: Arc<Upstream>,
-    /// Tells everybody whether calls pass.
     pub gate: Tx,
-    /// Who starts masters.
     pub supervision: Supervision,
-    /// How a hung master is told from a slow one.
+    /// How a hung master is distinguished from a slow one.
     pub probing: Probing,
     /// How long a probe may take.
     pub probe_timeout: Duration,
@@ -155,8 +148,8 @@ pub(crate) struct Examiner {
 }
 
 impl Examiner {
-    /// What is known of the master that is there now. `new`: the process id of one that has just been started,
-    /// and that nobody has spoken to.
+    /// What is known of the present master. `new`: the process id of one that has just been started and has
+    /// not been called yet.
     pub(super) fn known(&self, new: Option<i32>) -> Known {
         match (self.ledger.has_served_present(), new) {
             (None, _) => Known::Nothing,
@@ -211,8 +204,8 @@ impl Examiner {
         Ok(examination)
     }
 
-    /// Returns when the master can no longer be running a call of a connection that has been closed: what
-    /// it holds counts only then.
+    /// Returns when the master cannot be running a call of a closed connection any more. Its state is
+    /// reliable only then.
     async fn settle(&self, connection: &Connection) -> Result<(), ExamineError> {
         let settled = async {
             self.upstream.no_writers().await;
@@ -224,7 +217,7 @@ impl Examiner {
             return Ok(());
         }
         match self.supervision {
-            // Replaced, like one that hangs.
+            // Replaced, like a master that hangs.
             Supervision::Ours => Err(ExamineError::Silent {
                 limit: SETTLE_LIMIT,
             }),
@@ -256,7 +249,8 @@ impl Examiner {
         let found = match fresh {
             true => Master::default(),
             false => {
-                // What cannot be read back is taken from the mirror, of a master that was given it.
+                // What cannot be read back is taken from the mirror, if this master was given the mirror's
+                // state.
                 let previous = match bears {
                     Bears::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
@@ -266,7 +260,7 @@ impl Examiner {
             }
         };
         examination.look = start.elapsed();
-        // From here to the open gate the mirror must not change: the master is compared with it.
+        // From here until the gate opens the mirror must not change: the master is compared with it.
         self.gate.set(State::Injecting);
         let Basis {
             mirror,
@@ -274,7 +268,7 @@ impl Examiner {
             pending,
         } = self.ledger.begin_injection();
         let before = self.ledger.token();
-        // Nothing of ours to bring: a running system is taken over.
+        // An empty mirror takes over a running system.
         let takes_over = !found.is_empty() && mirror.is_empty();
         let (state, replaced) = match bears {
             Bears::Nothing => {
@@ -287,7 +281,7 @@ impl Examiner {
                 };
                 (mirror.clone(), None)
             }
-            // It has been succeeded since: whatever it holds is older than the mirror.
+            // It was succeeded by another incarnation: the mirror is newer than anything it holds.
             Bears::Earlier => {
                 examination.outcome = Outcome::Injected;
                 (mirror.clone(), Some(before))
@@ -300,7 +294,7 @@ impl Examiner {
                 };
                 examination.outcome = outcome;
                 let state = replay::reconcile(&mirror, &found, &pending, authority);
-                // No look shows who subscribes parameters.
+                // Reading a master does not show its parameter subscribers.
                 let hidden = |call: &Request| {
                     let method = call.method();
                     matches!(method, Method::SubscribeParam | Method::UnsubscribeParam)
@@ -327,7 +321,7 @@ impl Examiner {
             .await
     }
 
-    /// Brings the master to `target`, reads it back and leaves `token`.
+    /// Brings the master to `target`, reads it back and leaves `token` on it.
     async fn bring(
         &self,
         connection: &mut Connection,
@@ -358,8 +352,8 @@ impl Examiner {
             let reply = connection.predicted(plan.request().clone(), plan.answer());
             let raw = self.while_alive(reply).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
-            // The reply is long, and everybody waits: it is decoded only if it differs from the
-            // predicted one at all.
+            // The reply is long and calls are waiting: it is decoded only if it differs from the predicted
+            // one.
             let verdict = match raw.body == plan.answer() {
                 true => Ok(()),
                 false => plan.verify(&raw.decode()?),
@@ -372,7 +366,7 @@ impl Examiner {
                 self.ledger.delivered();
                 tracing::debug!(skipped = plan.skipped().len(), "injected");
                 self.stats.injections.count();
-                // Thousands of small pieces, freed beside traffic.
+                // Thousands of small allocations: freed in another thread.
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
@@ -382,7 +376,7 @@ impl Examiner {
                 mismatches = ?examination.mismatches,
                 "the master differs from what was injected"
             );
-            // The truth of the master wins over what we expected of it; the rest is tried again.
+            // What the master holds wins over what was expected; the rest is tried again.
             let first = self.first_look(connection).await?;
             let found = inspect::second(first, connection, plan.expected());
             let found = self.while_alive(found).await?;
@@ -404,7 +398,7 @@ impl Examiner {
             .await
     }
 
-    /// Waits for what may take long, as long as the master shows signs of life.
+    /// Waits for slow `work` as long as the master answers probes.
     async fn while_alive<T, E: Into<ExamineError>>(
         &self,
         work: impl Future<Output = Result<T, E>>,
@@ -416,13 +410,13 @@ impl Examiner {
     }
 }
 
-/// As [`sockets::may_run_a_call`]. Calls go on meanwhile: with 15,000 sockets that takes 100 ms.
+/// As [`sockets::may_run_a_call`], off the runtime's threads: with 15,000 sockets it takes 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
 }
 
-/// Says what the master has that the mirror did not know, or no longer.
+/// Logs where the master differed from the mirror.
 fn say_difference(difference: &[String]) {
     if !difference.is_empty() {
         tracing::warn!(

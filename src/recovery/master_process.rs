@@ -1,4 +1,4 @@
-//! The supervised rosmaster: a child of ours, or one that an earlier rosrescue left to us.
+//! The supervised rosmaster: our child, or one that an earlier rosrescue left running.
 
 use tokio::sync::mpsc;
 
@@ -12,22 +12,21 @@ use crate::{
 /// A child's process id, and how it ended.
 type End = (u32, String);
 
-/// The master that we start, and end.
+/// The master that rosrescue starts and ends.
 #[derive(Debug)]
 pub(crate) struct MasterProcess {
     rosmaster: Rosmaster,
-    /// Port of the last master; tried first, so that whoever looks finds it where it was.
+    /// Port of the last master. Tried first, so that the address stays the same.
     port: Option<u16>,
-    /// Our child, or what was left to us, while it has not been reported gone.
+    /// Our child, or the master that was left running, until its end is reported.
     current: Option<u32>,
-    /// Our child, while nobody has spoken to it.
+    /// Our child, until it is called for the first time.
     new: Option<i32>,
-    /// Ends of processes.
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`; the last one was at `port`, and may be there still.
+    /// Starts masters with `rosmaster`. The last one was at `port`, and may still run.
     pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
         let left = rosmaster.left_behind(port);
         let this = Self {
@@ -47,21 +46,21 @@ impl MasterProcess {
         this
     }
 
-    /// Whether a master of an earlier rosrescue is there.
+    /// Whether a master of an earlier rosrescue is running.
     pub(crate) fn is_left(&self) -> bool {
         self.current.is_some()
     }
 
-    /// Tells of the end of `pid`, which `end` waits for.
+    /// Reports the end of `pid`, for which `end` waits.
     fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
         let ends = self.ends.0.clone();
         tokio::spawn(async move {
-            // The receiver is gone only when nobody cares any more.
+            // The receiver is gone only at shutdown.
             let _ = ends.send((pid, end.await)).await;
         });
     }
 
-    /// Starts a master, and tells where it is.
+    /// Starts a master and returns its address.
     pub(crate) fn spawn(
         &mut self,
         ledger: &Ledger,
@@ -75,7 +74,7 @@ impl MasterProcess {
         let uri = address.to_string();
         upstream.relocate(address);
         if ledger.session().master_uri.as_ref() != Some(&uri) {
-            // Before it runs: a rosrescue that dies now leaves a master that the next one can find.
+            // Recorded before it runs: if rosrescue dies now, the next one can find the master.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
         let mut child = self.rosmaster.spawn(port)?;
@@ -93,7 +92,7 @@ impl MasterProcess {
         Ok(())
     }
 
-    /// The process id of a master that was started and not asked for before.
+    /// The process id of a master that was started since the last call.
     pub(crate) fn take_new(&mut self) -> Option<i32> {
         self.new.take()
     }
@@ -106,35 +105,35 @@ impl MasterProcess {
         self.new = None;
     }
 
-    /// Returns when the master has ended: how. Cancel safe.
+    /// Returns how the master ended, when it has ended. Cancel safe.
     async fn gone(&mut self) -> String {
         loop {
             match self.ends.1.recv().await {
                 Some((pid, how)) if Some(pid) == self.current => return how,
                 Some(_) => {}
-                // We hold a sender.
+                // Never: we hold a sender.
                 None => std::future::pending().await,
             }
         }
     }
 
     pub(crate) fn kill(&self) {
-        // Until its end is told nobody else can have its process id; of one that was left to us that
-        // holds but for the moment between the two.
+        // A child's process id cannot be reused before its end is reported. For a master that was left
+        // running this holds except for a moment between its end and the report.
         if let Some(pid) = self.current {
             tracing::warn!(pid, "killing the master");
             process::signal_process(pid, rustix::process::Signal::KILL);
         }
     }
 
-    /// Ends the master in order.
+    /// Stops the master in order.
     pub(crate) async fn stop(mut self) {
         if let Some(pid) = self.current {
             process::stop(pid, self.gone()).await;
         }
     }
 
-    /// The end of what the last master wrote.
+    /// The last output of the last master.
     pub(crate) fn last_words(&self) -> String {
         self.rosmaster.last_words()
     }

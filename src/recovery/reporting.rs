@@ -12,10 +12,10 @@ use crate::{
     status::report::{Outcome, Phases, Report, ms},
 };
 
-/// A message about a state that lasts is repeated after this time.
+/// A message about a lasting state is repeated after this time.
 const REPEAT: Duration = Duration::from_secs(10);
 
-/// The time since which calls have not passed.
+/// The time during which calls have not passed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Outage {
     pub cause: &'static str,
@@ -70,10 +70,10 @@ impl Outage {
 }
 
 impl Driver {
-    /// Reports what an examination came to; health check and reconciliation add to the report when they end.
+    /// Reports an examination. Health check and reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.lifecycle.begins() && examination.outcome == Outcome::Injected {
-            // Nothing but what the session begins with.
+            // It holds only the session's initial state.
             examination.outcome = Outcome::Begun;
         }
         let Outage { cause, since, .. } = self.outage;
@@ -81,8 +81,8 @@ impl Driver {
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
-            // Such as after each idle connection that a master with `-t` closes; or it is being
-            // stopped, and its threads end before it does.
+            // Usual: a master with `-t` closes each idle connection, and the threads of a master that is
+            // being stopped end before it does.
             tracing::debug!("the same master goes on");
             return;
         }
@@ -93,7 +93,7 @@ impl Driver {
             facts.last_recovery = Some(report);
         });
         if !self.lifecycle.has_served() {
-            // What happened just before we died ourselves, nobody knows any more.
+            // After a restart of rosrescue it is unknown what changed just before.
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
@@ -115,7 +115,7 @@ impl Driver {
     }
 
     pub(super) fn log_waiting(&mut self, what: &str) {
-        // A child that is about to listen needs no message.
+        // No message for a child that is about to listen.
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
@@ -123,7 +123,7 @@ impl Driver {
         }
     }
 
-    /// Warns, at most once in [`REPEAT`] for the same text.
+    /// Warns. The same text is logged at most once in [`REPEAT`].
     pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
         let again = self

@@ -1,4 +1,4 @@
-//! Whether a master that is busy with an injection still lives.
+//! Whether a master that is busy with an injection is still alive.
 
 use std::time::Duration;
 
@@ -6,9 +6,9 @@ use super::examine::Examiner;
 use crate::master;
 
 impl Examiner {
-    /// Asks the master for signs of life, over connections of their own, and returns when it has given
-    /// none for as many probes in a row as mean that it hangs: for how long. rosmaster answers
-    /// each connection in a thread of its own, so that one which works answers others meanwhile.
+    /// Probes the master over separate connections. Returns how long it has been silent, once it has missed
+    /// as many probes in a row as mean that it hangs. rosmaster runs each connection in a thread of its own,
+    /// so a working one answers.
     pub(super) async fn silence(&self) -> Duration {
         let (probing, patience) = (self.probing, self.probe_timeout);
         let sign_of_life = master::get_pid();
@@ -17,7 +17,7 @@ impl Examiner {
             if missed == 0 {
                 tokio::time::sleep(probing.interval).await;
             }
-            // A master that refuses or answers nonsense does not hang: the injection itself will fail.
+            // A master that refuses or answers nonsense does not hang; the injection itself will fail.
             let probe = async {
                 if let Ok(mut connection) = self.upstream.connect().await {
                     let _ = connection.call(&sign_of_life).await;

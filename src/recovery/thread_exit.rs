@@ -1,8 +1,8 @@
 //! The earliest sign that a process is being ended: the end of one of its threads.
 //!
-//! A signal that ends a process ends each of its threads on its own, and only the last one of them
-//! gives back the memory and then closes the descriptors, one by one. A master with 80 nodes has some
-//! 100 of each: its connections tell of its death after 4 to 12 ms, most of its threads after 1 to 4.
+//! A signal that ends a process ends each thread separately. Only the last thread frees the memory and then
+//! closes the descriptors, one by one. A master with 80 nodes has some 100 threads and some 100 descriptors:
+//! its connections end 4 to 12 ms after its death, most of its threads after 1 to 4 ms.
 
 use std::{fs, future::poll_fn, io, task::Poll};
 
@@ -11,21 +11,21 @@ use tokio::net::unix::pipe::Receiver;
 
 use crate::process::pidfd;
 
-/// So many threads are watched: one of them may be the last. A rosmaster with `-w 1` has no more that
-/// live as long as it does, one that calls nodes and one that serves.
+/// Threads to watch: more than one, because one may be the last to end. A rosmaster with `-w 1` has only two
+/// that live as long as it does: one calls nodes, one serves.
 const WATCHED: usize = 2;
-/// The descriptor is to tell of the end of a thread, not of a process. Linux 6.9 or later.
+/// Makes the descriptor report the end of a thread instead of a process. Linux 6.9 or later.
 const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits());
 
-/// Resolves when one of the oldest threads of the process `pid` has ended, other than the first:
-/// Linux tells of that one's end only with that of the whole process. In rosmaster the oldest ones
-/// live as long as the master does.
+/// Resolves when one of the oldest threads of the process `pid` has ended, except for the first: Linux
+/// reports the end of that one only with the end of the process. In rosmaster the oldest threads live as long
+/// as the master.
 ///
 /// # Errors
 ///
-/// What the system says: the process is gone, or the kernel cannot watch threads.
+/// The system's error: the process is gone, or the kernel cannot watch threads.
 pub(super) fn of(pid: i32) -> io::Result<impl Future<Output = ()> + Send + use<>> {
-    // In the order in which they were started.
+    // Listed in the order in which they were started.
     let threads = fs::read_dir(format!("/proc/{pid}/task"))?;
     let others = threads.skip(1).take(WATCHED).map(|entry| {
         let name = entry?.file_name();
