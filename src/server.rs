@@ -1,4 +1,4 @@
-//! What clients talk to: listener, admission, calls and pages.
+//! The side that clients talk to: listener, admission, calls and pages.
 
 pub(crate) mod admission;
 pub(crate) mod body;
@@ -18,16 +18,16 @@ use tokio::sync::{Notify, Semaphore};
 use self::{calls::Calls, clients::Clients, idle::Idle, pages::Pages};
 use crate::status::stats::Stats;
 
-/// What a request meets, whatever it asks for.
+/// What every request needs.
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
-    /// Tells this process from every other; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
+    /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
-    /// Notified when a request of our own came back to us: the master's address is our own.
+    /// Notified when a request of our own arrives here: the master's address is our own.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,
-    /// Those of them without a request.
+    /// Connections without a request.
     pub idle: Idle,
     /// Largest body, in bytes.
     pub max_body: usize,
@@ -35,6 +35,5 @@ pub struct Server {
     pub bodies: Semaphore,
     pub stats: &'static Stats,
     pub calls: Calls,
-    /// Answers people and monitors.
     pub pages: Pages,
 }

@@ -356,7 +356,7 @@ async fn reconcile(
     call: Request,
     outcome: &mut CheckResult,
 ) {
-    // In a multicall it may not displace another node.
+    // A multicall is never batched: an earlier call of its batch could make it displace a node.
     let kind = call.kind();
     let alone = Request::multicall([call]);
     let reply = nodes.write_queue.call_if(alone, condition.clone()).await;

@@ -1,7 +1,7 @@
 //! Checks on a request's head before it is admitted, without IO.
 //!
-//! ROS 1 has no authentication. What can be kept out without any ROS client noticing is a web page
-//! that makes a person's browser call the master, and a `shutdown` from another computer.
+//! ROS 1 has no authentication. Two things can be refused without any ROS client noticing: a call that a web
+//! page makes through a person's browser, and a `shutdown` from another computer.
 
 use std::net::IpAddr;
 
@@ -12,12 +12,12 @@ use hyper::{
 
 use crate::master::{MASTER, Request};
 
-/// A request that is turned away.
+/// A refused request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Refusal {
     /// The HTTP status to answer.
     pub status: StatusCode,
-    /// Why, for the person who reads it.
+    /// Why, for people.
     pub reason: String,
 }
 
@@ -30,8 +30,8 @@ const BROWSER_TYPES: [&str; 3] = [
 
 /// Whether a POST with these headers may call the master. `names` are those of this computer.
 ///
-/// A browser says with every POST of a page where the page is from (`null` if it keeps that to
-/// itself); no ROS client does. It may lack a content type, as that of a typed array does.
+/// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client does. The
+/// content type may be missing, as in a browser's POST of a typed array.
 pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     for origin in headers.get_all(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
@@ -67,11 +67,11 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     Ok(())
 }
 
-/// Whether `Host` is an address or a name of this computer: a page whose own name was pointed at
-/// us (DNS rebinding) names itself there.
+/// Whether `Host` is an address or a name of this computer. After DNS rebinding, a page whose own name was
+/// pointed at this computer sends that name.
 ///
-/// The domains that this computer is in (`robot.local`, `robot.example.com`) are not known here, so
-/// any may stand behind its host name: the status page changes nothing.
+/// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain may follow
+/// its host name. That is safe: the status page changes nothing.
 pub(crate) fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
@@ -114,8 +114,8 @@ pub(crate) fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
 }
 
-/// Whether a `shutdown` is what a master sends to a node when another one takes its name. Here it
-/// arrives if somebody registered our address as a node's, from whatever computer.
+/// Whether a `shutdown` is one that a master sends to a node whose name was taken. It arrives here if a
+/// client, on any computer, registered our address as a node's.
 pub(crate) fn is_for_a_node(call: &Request) -> bool {
     call.caller() == Some(MASTER)
 }

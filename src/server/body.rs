@@ -12,16 +12,16 @@ use tokio::{
 
 use crate::xmlrpc::Value;
 
-/// Larger bodies, in bytes, need room in memory and are decoded outside the runtime's threads: so much
+/// Larger bodies, in bytes, reserve memory and are decoded outside the runtime's threads: decoding this much
 /// takes some 0.3 ms.
 pub(crate) const SMALL: usize = 64 << 10;
-/// Every body is given this time, and a second more for each [`RATE`] bytes that have arrived. No pause
-/// in it may be longer.
+/// Time for every body, plus a second for each [`RATE`] bytes that have arrived. Also the longest pause in
+/// it.
 const TIME: Duration = Duration::from_secs(10);
-/// The slowest link that a body is taken from, in bytes a second.
+/// The slowest accepted link, in bytes a second.
 const RATE: u64 = 64 << 10;
-/// Deadlock breaker: its holder may exceed the budget, so that one body can always be read to its end
-/// where several have a part of the room each.
+/// Deadlock breaker: its holder may exceed the budget. So one body can always be read to its end when several
+/// hold a part of the budget each.
 static LAST: Semaphore = Semaphore::const_new(1);
 
 /// Why there is no body.
@@ -29,16 +29,16 @@ static LAST: Semaphore = Semaphore::const_new(1);
 pub(crate) enum BodyError {
     /// It is larger than this limit, in bytes.
     TooLarge { limit: usize },
-    /// It broke off, or is no HTTP.
+    /// It broke off, or is not HTTP.
     Broken,
     /// Its bytes came too slowly.
     TooSlow,
-    /// Others took all the room for too long.
+    /// Other bodies held the memory for too long.
     NoRoom,
 }
 
-/// Room in memory for one body; given back on drop. What is announced costs nothing: a body takes
-/// twice what has arrived of it.
+/// Memory reserved for one body; released on drop. A body reserves twice what has arrived of it; an announced
+/// length reserves nothing.
 #[derive(Debug)]
 pub(crate) struct Room<'a> {
     /// In KiB.
@@ -48,7 +48,7 @@ pub(crate) struct Room<'a> {
 }
 
 impl<'a> Room<'a> {
-    /// No room yet, of `pool`'s, which counts KiB.
+    /// An empty reservation from `pool`, which counts KiB.
     pub(crate) fn of(pool: &'a Semaphore) -> Self {
         Self {
             pool,
@@ -57,7 +57,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// Waits until there is room for `bytes` in all.
+    /// Waits until `bytes` in all are reserved.
     async fn grow(&mut self, bytes: usize) {
         let held = self.held.as_ref().map_or(0, SemaphorePermit::num_permits);
         let missing = bytes.div_ceil(1 << 10).saturating_sub(held);
@@ -65,7 +65,7 @@ impl<'a> Room<'a> {
             return;
         }
         let missing = u32::try_from(missing).unwrap_or(u32::MAX);
-        // Neither is ever closed.
+        // Never closed.
         tokio::select! {
             biased;
             more = self.pool.acquire_many(missing) => match (&mut self.held, more) {
@@ -76,7 +76,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// As [`grow`](Self::grow), for as long as a body of `longest` bytes may take.
+    /// As [`grow`](Self::grow), within the time that a body of `longest` bytes may take.
     async fn grow_in_time(&mut self, bytes: usize, longest: usize) -> Result<(), BodyError> {
         let grown = timeout(time_for(longest), self.grow(bytes)).await;
         grown.map_err(|_| BodyError::NoRoom)
@@ -88,7 +88,7 @@ fn time_for(bytes: usize) -> Duration {
     TIME + Duration::from_secs(bytes as u64 / RATE)
 }
 
-/// Reads a body of at most `limit` bytes, and takes `room` for it as it arrives.
+/// Reads a body of at most `limit` bytes, and reserves memory in `room` as it arrives.
 pub(crate) async fn read(
     mut body: Incoming,
     limit: usize,
@@ -122,7 +122,7 @@ pub(crate) async fn read(
             let size = (2 * length).min(most);
             let waits = Instant::now();
             room.grow_in_time(size, most).await?;
-            // The client is not to blame for that time.
+            // Time that the client did not cause.
             start += waits.elapsed();
             whole.reserve_exact(size.saturating_sub(whole.len()));
         }
@@ -130,8 +130,7 @@ pub(crate) async fn read(
     }
 }
 
-/// Takes room for what a large body says when it is taken apart: of short values that is many times
-/// their text.
+/// Reserves memory for the decoded values of a large body: short values take many times their text.
 pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
     const OPEN: &[u8] = b"<value";
     let searched = text.clone();
@@ -142,12 +141,12 @@ pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result
             .count())
     };
     let values = in_a_thread(count).await.unwrap_or_default();
-    // A list that grows has room for twice what is in it.
+    // A growing list reserves up to twice its content.
     let size = 2 * (text.len() + values * size_of::<Value>());
     room.grow_in_time(size, text.len()).await
 }
 
-/// Does `work` beside the runtime's threads.
+/// Runs `work` outside the runtime's threads.
 async fn in_a_thread<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Option<T> {

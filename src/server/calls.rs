@@ -26,38 +26,36 @@ use crate::{
     },
 };
 
-/// The connection is closed without an answer. A node asks again after that, whereas an error that
-/// we make up would cost it its registration, or its life.
+/// The connection is closed without an answer. A node retries after that. An error made up by rosrescue would
+/// cost it its registration, or end the node.
 #[derive(Debug, Error)]
 #[error("closed without an answer: {0}")]
 pub struct Closed(pub(super) &'static str);
 
-/// A master that takes longer is answered for by the mirror, where that is exact. A rosmaster answers
-/// in less than a millisecond, and behind a call that keeps its interpreter busy in some ten.
+/// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
+/// millisecond, and within some ten behind a call that keeps its interpreter busy.
 const PATIENCE: Duration = Duration::from_millis(100);
 /// Why a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "so many answers at once are left to the master";
 
 pub struct Calls {
-    /// Whether they pass to the master.
+    /// Whether calls pass to the master.
     pub gate: gate::Rx,
-    /// The mirror's answers.
     pub ledger: Arc<Ledger>,
-    /// The way to the master for reads.
+    /// Connections for reads.
     pub pool: Arc<Pool>,
-    /// The way to the master for writes.
     pub write_queue: WriteQueue,
-    /// Notified when the master has not answered a call for longer than it should take.
+    /// Notified when the master takes too long to answer a call.
     pub slow: Arc<Notify>,
     pub stats: &'static Stats,
-    /// Our own address, which stands in replies for the master's.
+    /// Our own address. Replaces the master's in replies.
     pub uri: String,
-    /// How long a call waits that only a master can answer.
+    /// How long a call waits if only a master can answer it.
     pub hold: Duration,
 }
 
 impl Calls {
-    /// Answers a call of `peer`; none if its body could not be decoded.
+    /// Answers a call of `peer`. `call` is none if its body could not be decoded.
     pub async fn answer(
         &self,
         peer: SocketAddr,
@@ -92,7 +90,7 @@ impl Calls {
         }
     }
 
-    /// Forwards a read. While the master is away, fails or takes too long the mirror answers.
+    /// Forwards a read. The mirror answers while the master is away, fails or takes too long.
     async fn read(
         &self,
         head: Head,
@@ -126,7 +124,7 @@ impl Calls {
                         Err(_) => {
                             self.slow.notify_one();
                             if let Some(reply) = from_mirror() {
-                                // Its end tells that the master answers again.
+                                // When this read ends, the master answers again.
                                 let pool = self.pool.clone();
                                 tokio::spawn(async move {
                                     let _stalled = pool.stalled();
@@ -162,8 +160,8 @@ impl Calls {
         }
     }
 
-    /// Queues a write. While the master is away the mirror answers it from there; during an injection and
-    /// behind a master that takes too long, only if it changes nothing.
+    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection,
+    /// or while the master takes too long, it does so only if the write changes nothing.
     async fn write(
         &self,
         head: Head,
@@ -189,7 +187,7 @@ impl Calls {
             let answerable = call.is_some_and(Request::is_answerable);
             loop {
                 gate.shut_for(self.hold).await;
-                // An injection ends by itself, and the mirror answers if it fails.
+                // An injection ends by itself; if it fails, the mirror answers.
                 if !answerable || gate.state() != State::Injecting {
                     return;
                 }
@@ -210,7 +208,7 @@ impl Calls {
                 }
                 () = &mut patience, if patient => {
                     if !self.gate.is_open() {
-                        // It may open to a master that hangs.
+                        // The gate may open to a master that hangs.
                         patience.as_mut().reset(tokio::time::Instant::now() + PATIENCE);
                         continue;
                     }
@@ -224,8 +222,8 @@ impl Calls {
         }
     }
 
-    /// Until when the master may answer before the mirror does. One that keeps others waiting gets no fresh
-    /// [`PATIENCE`].
+    /// When the mirror answers instead of the master. If the master has kept an earlier call waiting, this
+    /// call gets no [`PATIENCE`] of its own.
     fn patience(&self) -> tokio::time::Instant {
         let now = tokio::time::Instant::now();
         if self.pool.is_stalled() {
@@ -238,7 +236,7 @@ impl Calls {
     async fn answer_idle(&self, call: Option<&Request>) -> Option<HttpReply> {
         let call = call.filter(|call| call.is_answerable())?;
         let (reply, seq) = self.ledger.answer_idle(Instant::now(), call)?;
-        // What made it idle may not be on the disk yet.
+        // The write that made this one redundant may not be on the disk yet.
         if let Some(seq) = self.ledger.to_await(seq) {
             self.ledger.durable(seq).await;
         }

@@ -1,4 +1,4 @@
-//! Who is connected: a table for the status page.
+//! Connected clients: a table for the status page.
 
 use std::net::SocketAddr;
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 /// Clients listed on the status page; there may be thousands.
 const LISTED: usize = 1000;
-/// What is kept of a caller id, in characters: a client may send any, and be idle for hours.
+/// Kept length of a caller id, in characters: a client may send any, and be idle for hours.
 const CALLER_ID: usize = 200;
 
 /// The connections of clients.
@@ -24,14 +24,14 @@ struct Seen {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Client {
     pub peer: String,
-    /// The caller id of its last call, if it is long its beginning.
+    /// The caller id of its last call, cut if it is long.
     pub caller_id: String,
-    /// Calls made on it.
+    /// Calls on this connection.
     pub calls: u64,
 }
 
 impl Clients {
-    /// A connection from `peer`; it is listed until the result is dropped.
+    /// Lists a connection from `peer` until the result is dropped.
     pub fn enter(&self, peer: SocketAddr) -> Present<'_> {
         self.0.insert(peer, Seen::default());
         Present {
@@ -51,7 +51,6 @@ impl Clients {
         }
     }
 
-    /// Number of connections.
     pub fn count(&self) -> usize {
         self.0.len()
     }

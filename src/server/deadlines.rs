@@ -1,8 +1,8 @@
-//! A connection that ends when a peer sends a request's head too slowly, or takes nothing of an answer.
+//! Ends a connection whose peer sends a request's head too slowly, or does not read its answer.
 //!
-//! hyper's own limit on the time for a head also counts the idle time before it, and would close
-//! the keep-alive connections that nodes hold for hours. Here the time begins with the head's first
-//! byte. For writing hyper has no limit.
+//! hyper's own limit on the time for a head includes the idle time before it, and would close the keep-alive
+//! connections that nodes hold for hours. Here the time starts with the head's first byte. hyper has no limit
+//! for writing.
 
 use std::{
     io,
@@ -25,7 +25,7 @@ use super::idle::{Idle, Idling};
 
 /// Time in which a request's head must arrive, from its first byte.
 const HEAD_TIME: Duration = Duration::from_secs(10);
-/// Time in which a peer must take something of an answer.
+/// Time in which a peer must read a part of an answer.
 const WRITE_TIME: Duration = Duration::from_secs(60);
 
 /// Where a connection stands between requests.
@@ -45,7 +45,7 @@ impl Deadlines {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
-    /// There is an answer. Once it has been sent, the next byte begins a head.
+    /// The answer is ready. After it has been sent, the next byte starts a head.
     pub(crate) fn replying(&self) {
         self.place.store(REPLYING, Ordering::Relaxed);
     }
@@ -60,22 +60,22 @@ impl Deadlines {
     }
 }
 
-/// A stream that keeps `deadlines`, and is one of the idle ones between requests.
+/// A stream that enforces `deadlines` and counts as idle between requests.
 #[derive(Debug)]
 pub(crate) struct Timed<'a, S> {
     stream: S,
     deadlines: Deadlines,
     deadline: Pin<Box<Sleep>>,
-    /// The peer takes nothing.
+    /// The peer does not read.
     stuck: bool,
     idle: &'a Idle,
-    /// Told when it is to end because others are idle too.
+    /// Notified when it must close because too many connections are idle.
     close: Arc<Notify>,
     idling: Option<Idling<'a>>,
 }
 
 impl<'a, S> Timed<'a, S> {
-    /// `stream` before its first request. `close` is told when `idle` has too many.
+    /// `stream` before its first request. `close` is notified when `idle` has too many.
     pub(crate) fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
@@ -88,7 +88,7 @@ impl<'a, S> Timed<'a, S> {
         }
     }
 
-    /// Ends a write that makes no progress.
+    /// Fails a write that makes no progress.
     fn written(
         &mut self,
         cx: &mut Context<'_>,
@@ -145,7 +145,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Timed<'_, S> {
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         let this = &mut *self;
         let polled = Pin::new(&mut this.stream).poll_flush(cx);
-        // hyper flushes when it has written all of an answer.
+        // hyper flushes once the whole answer is written.
         if polled.is_ready() && this.deadlines.is(REPLYING) {
             this.deadlines.place.store(IDLE, Ordering::Relaxed);
             this.idling = Some(this.idle.enter(&this.close));

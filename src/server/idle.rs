@@ -1,8 +1,8 @@
-//! Connections without a request, in the order in which they fell idle.
+//! Connections without a request, ordered by the start of their idle time.
 //!
-//! Nodes keep such connections for hours, so there is no time after which one is closed. But when
-//! there are too many of them, the one that has been idle for longest gives way: its client connects
-//! again when it has something to say, as it must with a rosmaster that closes idle connections.
+//! Nodes keep such connections for hours, so there is no idle timeout. When there are too many, the one that
+//! has been idle for longest is closed. Its client reconnects when needed, as it must with a rosmaster that
+//! closes idle connections.
 
 use std::{
     collections::BTreeMap,
@@ -11,10 +11,9 @@ use std::{
 
 use tokio::sync::Notify;
 
-/// So many connections may be idle, however many there may be in all. Each takes some 16 KB, after a large body 40.
+/// Most idle connections, whatever the limit on all. Each takes some 16 KB, after a large body 40.
 const MOST: usize = 2000;
 
-/// The idle connections.
 #[derive(Debug)]
 pub struct Idle {
     most: usize,
@@ -24,13 +23,12 @@ pub struct Idle {
 #[derive(Debug, Default)]
 struct Queue {
     next: u64,
-    /// How to tell them to close; the first has been idle for longest.
+    /// Closes them when notified; the first has been idle for longest.
     waiting: BTreeMap<u64, Arc<Notify>>,
 }
 
 impl Idle {
-    /// Room for idle ones among `connections`, two or more: half of them, so that they never keep a new
-    /// one out.
+    /// Allows half of `connections` (two or more) to be idle, so that idle ones never keep a new one out.
     pub fn among(connections: usize) -> Self {
         Self {
             most: (connections / 2).min(MOST),
@@ -38,8 +36,8 @@ impl Idle {
         }
     }
 
-    /// A connection is idle until the result is dropped. If it is to be closed, `close` is notified; should
-    /// it have a request by then, that goes first, and it counts as idle again afterwards.
+    /// Counts a connection as idle until the result is dropped. `close` is notified if it must close. If it
+    /// has a request by then, that is served first, and the connection counts as idle again afterwards.
     pub fn enter(&self, close: &Arc<Notify>) -> Idling<'_> {
         let mut queue = self.queue();
         let number = queue.next;
@@ -59,7 +57,7 @@ impl Idle {
     }
 }
 
-/// A connection is idle while this is there.
+/// Counts a connection as idle until it is dropped.
 #[derive(Debug)]
 pub struct Idling<'a> {
     idle: &'a Idle,

@@ -1,4 +1,4 @@
-//! Sockets that nodes connect to, and the connections on them.
+//! Listening sockets and their connections.
 
 use std::{
     io,
@@ -24,22 +24,21 @@ use super::{
     service,
 };
 
-/// Connections that the kernel holds for us while we are busy, or not there for a moment.
+/// Connections that the kernel holds while rosrescue is busy, or briefly away.
 const BACKLOG: i32 = 1024;
-/// What a connection buffers of what it reads, in bytes; hyper keeps so much of it in idle times. A
-/// head must fit into it.
+/// Read buffer of a connection, in bytes. hyper keeps it while the connection is idle. A head must fit into
+/// it.
 const BUFFER: usize = 16 << 10;
 /// Pause after a failed accept, such as one without a free file descriptor.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// After this time without a sign of life a peer is asked for one, so that connections of computers
-/// that vanished do not pile up.
+/// After this idle time the kernel probes the peer, so that connections of vanished computers do not pile up.
 const KEEPALIVE: Duration = Duration::from_secs(60);
 
-/// An address that cannot be served.
+/// Why an address cannot be served.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ListenError {
-    /// Somebody else has the port.
+    /// Another process has the port.
     #[error(
         "port {} is in use at {}: another master or rosrescue runs there; stop it, or choose \
          another port with {option}",
@@ -47,23 +46,21 @@ pub enum ListenError {
     )]
     InUse {
         address: SocketAddr,
-        /// The option that chooses it.
+        /// The option that chooses the port.
         option: &'static str,
     },
     /// Any other reason.
     #[error("cannot listen at {address}: {source}; choose another one with {option}")]
     Other {
         address: SocketAddr,
-        /// The option that chooses what is wrong with it.
+        /// The option that chooses the faulty part of the address.
         option: &'static str,
-        /// What the system said.
         source: io::Error,
     },
 }
 
-/// Listens at all of `addresses`, without blocking. All but the first are left out if the computer lacks their address
-/// family. With port 0 they share one free port. `option`, which
-/// chooses the port, is named in errors.
+/// Listens at all of `addresses`, without blocking. All but the first are left out if the computer lacks
+/// their address family. With port 0 they share one free port. Errors name `option`, which chooses the port.
 pub fn bind(
     addresses: &[SocketAddr],
     option: &'static str,
@@ -84,7 +81,7 @@ pub fn bind(
                 tracing::debug!(%address, %error, "not served");
             }
             Err(source) => {
-                // Some ports are for root only; all else is about the address.
+                // Some ports are for root only; other errors concern the address.
                 let option = match source.kind() {
                     io::ErrorKind::PermissionDenied => option,
                     _ => "--listen",
@@ -116,7 +113,7 @@ fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
     Ok(socket.into())
 }
 
-/// Serves `listener` until `stop`; connections that are under way may end in order.
+/// Serves `listener` until `stop`; requests under way may finish.
 pub async fn run(
     listener: TcpListener,
     server: Arc<Server>,
@@ -126,7 +123,7 @@ pub async fn run(
 ) {
     let mut failed = false;
     loop {
-        // The permit comes second: a listener that nobody connects to needs none.
+        // The permit comes second, so that an unused listener takes none.
         let accepted = async {
             let accepted = listener.accept().await?;
             // Never closed.
@@ -170,7 +167,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let close = Arc::new(Notify::new());
     let timed = Timed::new(stream, deadlines.clone(), &here.idle, close.clone());
     let service = |request| {
-        // On the heap: idle connections do not keep space for it.
+        // On the heap, so that idle connections hold no memory for it.
         Box::pin(service::serve(
             server.clone(),
             peer,
@@ -186,7 +183,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let mut connection = std::pin::pin!(connection);
     let ended = loop {
         tokio::select! {
-            // A request that has come goes first.
+            // A request that has arrived goes first.
             biased;
             ended = &mut connection => break ended,
             () = close.notified() => {
@@ -206,15 +203,15 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     }
 }
 
-/// This computer's address on the network, if it has one: that of the route to the outside. No
-/// packet is sent for it.
+/// This computer's address on the network, if it has one: the one that its route to the outside uses. No
+/// packet is sent.
 pub fn local_address() -> Option<IpAddr> {
     let routed = |from: SocketAddr, to: SocketAddr| {
         let socket = net::UdpSocket::bind(from).ok()?;
         socket.connect(to).ok()?;
         Some(socket.local_addr().ok()?.ip())
     };
-    // Addresses that are set apart for documentation: they are routed as any other.
+    // Addresses reserved for documentation: routed like any other.
     let v4 = routed(([0, 0, 0, 0], 0).into(), ([192, 0, 2, 1], 9).into());
     let documentation = Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 1);
     v4.or_else(|| routed((Ipv6Addr::UNSPECIFIED, 0).into(), (documentation, 9).into()))

@@ -27,19 +27,14 @@ use crate::{
     upstream::Upstream,
 };
 
-/// Where the pages' content comes from.
 pub struct Pages {
     /// What nodes use as `ROS_MASTER_URI`.
     pub uri: String,
     pub checkpoint: String,
-    /// The master's address.
     pub upstream: Arc<Upstream>,
-    /// Whether calls pass.
     pub gate: gate::Rx,
-    /// The mirror, and whether it is recorded.
     pub ledger: Arc<Ledger>,
     pub nodes: Arc<Nodes>,
-    /// Deaths and recoveries.
     pub board: Arc<Board>,
     pub clients: Arc<Clients>,
     pub stats: &'static Stats,
@@ -107,41 +102,38 @@ impl Pages {
 /// The status at one moment.
 #[derive(Clone, Debug, Serialize)]
 struct Status {
-    /// Version of rosrescue.
     version: &'static str,
     /// What nodes use as `ROS_MASTER_URI`.
     uri: String,
-    /// The real master.
     master: String,
-    /// Whether calls pass to it.
+    /// Whether calls pass to the master.
     open: bool,
-    /// Whether calls are answered, by it or by the mirror.
+    /// Whether calls are answered, by the master or the mirror.
     ready: bool,
-    /// Since when the mirror stands in for it: seconds since 1970 by the wall clock.
+    /// Since when the mirror stands in: seconds since 1970, by the wall clock.
     standing_in_since: Option<f64>,
     /// Writes that the mirror has answered and the master has not run yet.
     pending_writes: usize,
-    /// Whether it dies again and again.
+    /// Whether the master keeps dying.
     crash_loop: bool,
     /// Masters that have died since the start.
     deaths: u64,
-    /// The checkpoint file.
     checkpoint: String,
-    /// Why the state is not recorded; none if all is well.
+    /// Why the state is not recorded; none if it is.
     unprotected: Option<String>,
-    /// Whether another process keeps the port, and starts rosrescue again, when it dies.
+    /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
     guarded: bool,
     guarded_by: String,
-    /// What the mirror holds.
+    /// Contents of the mirror.
     state: Counts,
-    /// Nodes that do not answer now and are not known to be dead.
+    /// Nodes that do not answer and are not known to be dead.
     unreachable: Vec<String>,
     /// Masters examined since the start.
     recoveries: u64,
     last_recovery: Option<Report>,
-    /// Connections of clients, at most a thousand of them.
+    /// Connections of clients, at most a thousand.
     clients: Vec<Client>,
-    /// What was counted since the start.
+    /// Counters since the start.
     counters: serde_json::Map<String, serde_json::Value>,
 }
 

@@ -17,7 +17,7 @@ use crate::{
 /// What hyper sends.
 pub(crate) type HttpReply = Response<Full<Bytes>>;
 
-/// A master's reply out of a batch, or the mirror's, with our address for the master's own.
+/// The mirror's reply, or the master's from a batch, with our address in place of the master's.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
     match call.filter(|call| batch::asks_uri(call)) {
         Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),
@@ -25,7 +25,7 @@ pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpRepl
     }
 }
 
-/// A master's reply, with our address for its own.
+/// A master's reply, with our address in place of its own.
 pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> HttpReply {
     if let Some(call) = call.filter(|call| batch::asks_uri(call))
         && let Ok(reply @ Reply::Value(_)) = xmlrpc::decode_reply(&raw.body)
@@ -61,7 +61,7 @@ pub(super) fn no_shutdown(why: &str) -> HttpReply {
     xml(&Reply::Value(reply.to_vec().into()))
 }
 
-/// A reply that is no XML-RPC.
+/// A reply that is not XML-RPC.
 pub(super) fn page(status: StatusCode, kind: &'static str, text: String) -> HttpReply {
     let mut http = Response::new(Full::new(Bytes::from(text)));
     *http.status_mut() = status;

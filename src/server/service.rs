@@ -19,8 +19,8 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Said to another computer of a body that rosrescue cannot decode. The master may know how to, and
-/// it may be a `shutdown`.
+/// Sent to another computer whose body rosrescue cannot decode. The master may be able to, and the call may
+/// be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
                          computer only; send XML-RPC in UTF-8, without a document type";
 
@@ -89,7 +89,7 @@ async fn post(
     let read = async {
         let limit = server.max_body;
         let body = body::read(request.into_body(), limit, &mut room).await?;
-        // What is packed is the master's to unpack: no ROS client packs.
+        // A packed body is left to the master: no ROS client packs.
         let call = match &head.encoding {
             None => decode(body.clone(), &mut room).await?,
             Some(_) => None,
@@ -134,7 +134,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// What a body says, if it says it in a way that we know.
+/// Decodes a body; none if it cannot be decoded.
 async fn decode(body: Bytes, room: &mut Room<'_>) -> Result<Option<master::Request>, BodyError> {
     if body.len() <= body::SMALL {
         return Ok(master::Request::decode(&body).ok());
