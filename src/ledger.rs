@@ -1,7 +1,7 @@
 //! Mirror and journal under one lock: a write is recorded and applied in one step.
 //!
-//! The lock also orders both against the moment at which a new incarnation takes over: a reply of
-//! the old master that arrives after its state was taken for the injection is not acknowledged.
+//! The lock also orders both against the takeover by a new incarnation: a reply of the old master that
+//! arrives after the injection's state was taken is not acknowledged.
 
 pub(crate) mod activity;
 pub(crate) mod checkpointer;
@@ -32,19 +32,19 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Most pending writes beside which unregistrations that take nothing away are kept.
+/// Most pending writes beside which unregistrations without effect on the mirror are kept.
 const IDLE_PENDING: usize = 1000;
 
-/// Memory that the answers to the reads in one multicall may take, in bytes. A few short reads of a large
-/// state ask for any amount of it, and wait for the master instead.
+/// Memory for the answers to the reads of one multicall, in bytes. A few short reads of a large state could
+/// ask for any amount; larger ones wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
-/// The master that answered has been succeeded by another one, or what it showed by what the mirror has
-/// taken since: it does not count, and must be asked again.
+/// The answer does not count, and the master must be asked again: another incarnation has taken over, or the
+/// mirror has changed since.
 #[derive(Debug)]
 pub struct Superseded;
 
-/// What became of calls that the master answered.
+/// The result of recording answered calls.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Recorded {
     /// The journal's last record of them; none if nothing had to be recorded.
@@ -53,7 +53,7 @@ pub struct Recorded {
     pub doubtful: bool,
 }
 
-/// What an injection starts from.
+/// The state that an injection starts from.
 #[derive(Debug)]
 pub struct Basis {
     pub mirror: Master,
@@ -62,7 +62,7 @@ pub struct Basis {
     pub pending: Vec<Request>,
 }
 
-/// The mirror, the journal and what belongs to them.
+/// The mirror, the journal and their bookkeeping.
 pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
@@ -72,27 +72,27 @@ pub struct Ledger {
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
-    /// Wakes those who notify nodes.
+    /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
 }
 
 struct Inner {
     mirror: Master,
-    /// What getPid and getUri answer; no part of the state.
+    /// The answers to getPid and getUri; not a part of the state.
     identity: (i32, String),
     session: Session,
-    /// None if no checkpoint could be opened: unprotected.
+    /// None if no checkpoint could be opened: the state is unprotected.
     store: Option<Store>,
-    /// Changes with every change of the mirror.
+    /// Changes whenever the mirror changes.
     version: u64,
     whole: Whole,
     pending: PendingWrites,
     activity: Activity,
     diverged: HashSet<Method>,
-    /// A master is being brought to the mirror's state, which must not change meanwhile.
+    /// An injection is under way: the mirror must not change.
     injecting: bool,
     doubted: bool,
-    /// The present incarnation may still run a batch that nobody waits for any more.
+    /// The present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
     /// The incarnation that was served last.
     served: Option<u64>,
@@ -100,7 +100,7 @@ struct Inner {
 
 impl Ledger {
     /// A ledger of `mirror`, recorded in `store`. `pending`: writes that the incarnation of `session` may not
-    /// have run. `sync`: when a record has to be on the disk.
+    /// have run. `sync`: when a record must be on the disk.
     pub fn new(
         mirror: Master,
         session: Session,
@@ -137,7 +137,7 @@ impl Ledger {
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
-        // No code under the lock can panic half-way through a change that matters.
+        // No code under the lock can panic in the middle of a change.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -145,19 +145,19 @@ impl Ledger {
         look(&self.lock().mirror)
     }
 
-    /// What the master would answer to a read; none if it is a multicall that asks for too much.
+    /// The master's predicted answer to a read; none if it is a multicall that asks for too much.
     pub fn answer(&self, read: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let fits = mirror.fits(read, ANSWER_MOST);
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
-    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it does. Nodes
-    /// that a master would notify of it are notified. With the reply comes the journal's last record:
-    /// what has changed nothing may be as new as that.
+    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
+    /// Nodes are notified as by a master. Returns the journal's last record too: the earlier write that made
+    /// this one redundant may be as new as that.
     pub fn answer_idle(&self, now: Instant, write: &Request) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
-        // An unregistration of what is not here may be of what is on its way to the master.
+        // An unregistration may concern a registration that is still on its way to the master.
         let idle = !write.calls().into_iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
@@ -167,12 +167,12 @@ impl Ledger {
         })
     }
 
-    /// Tells the mirror what getPid and getUri answer.
+    /// Sets the answers to getPid and getUri.
     pub fn set_identity(&self, pid: i32, uri: String) {
         self.lock().set_identity((pid, uri));
     }
 
-    /// Tells the mirror what getPid answers from now on.
+    /// Sets the answer to getPid.
     pub fn set_master_pid(&self, pid: i32) {
         let mut inner = self.lock();
         let (_, uri) = inner.identity.clone();
@@ -188,7 +188,7 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// The number of the present incarnation: replies must come from it.
+    /// The number of the present incarnation.
     pub fn incarnation(&self) -> u64 {
         self.lock().session.incarnation
     }
@@ -198,7 +198,8 @@ impl Ledger {
         self.lock().token()
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in its order.
+    /// Records and applies calls that the master of `incarnation` has answered, in the order in which it ran
+    /// them.
     pub fn record(
         &self,
         now: Instant,
@@ -227,7 +228,7 @@ impl Ledger {
                 inner.report_divergence(&answered, &outcome);
                 recorded.doubtful = true;
                 if !answered.executed {
-                    // What the master refused is in no journal.
+                    // A refused call is in no journal.
                     inner.changed_unrecorded();
                 }
             }
@@ -244,25 +245,24 @@ impl Ledger {
         Ok(recorded)
     }
 
-    /// What the master would answer to this call.
+    /// The master's predicted answer to this call.
     pub fn predict(&self, call: &Request) -> Reply {
         let mut model = self.with_mirror(Clone::clone);
         model.apply_telling(call, &mut ())
     }
 
-    /// Records and applies a call of our own before there is any master.
+    /// Records and applies a call of our own before there is a master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
         inner.append(&[Entry::call(call.clone().into())]);
     }
 
-    /// Answers a call of the Master API as the master would while it is away: records what it changes as
-    /// pending, applies it, and has nodes notified. With the reply comes the journal's last record, of it
-    /// or, if it changes nothing, of what made it so.
+    /// Answers a call of the Master API as an absent master would: records its changes as pending, applies
+    /// them, and has nodes notified. Returns the journal's last record too: that of the call or, if it
+    /// changes nothing, of what made it redundant.
     ///
-    /// None while a master is being brought to the mirror's state, or if the call reads too much besides:
-    /// it has to wait.
+    /// None during an injection, or if the call also reads too much: it has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
@@ -271,7 +271,7 @@ impl Ledger {
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // Only its answer could not be written. What is refused once is refused again.
+            // The writes were applied; only the answer could not be encoded. A refused one is refused again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()
@@ -283,15 +283,15 @@ impl Ledger {
             }
         };
         if !changes {
-            // The master may know what the mirror does not: a registration that it ran for a rosrescue
-            // that died before the reply.
+            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
+            // before the reply.
             let room = inner.pending.calls().len() < IDLE_PENDING;
             writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
         }
         if writes.is_empty() {
             return Some((reply, inner.last_seq()));
         }
-        // A look that shows what it takes away would bring it back.
+        // Makes an inspection under way outdated: it could bring back what this call takes away.
         inner.version += u64::from(!changes);
         self.stats.recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| Entry::Call {
@@ -305,23 +305,23 @@ impl Ledger {
         Some((reply, seq))
     }
 
-    /// How many writes the present incarnation may not have run.
+    /// Number of writes that the present incarnation may not have run.
     pub fn pending(&self) -> usize {
         self.lock().pending.calls().len()
     }
 
-    /// What the present incarnation may hold beside what can be read of it.
+    /// Everything that the present incarnation may hold, beyond what can be read from it.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         replay::may_hold(&inner.mirror, inner.pending.calls())
     }
 
-    /// The present master may not be what the mirror is: it is to be read again.
+    /// The present master may differ from the mirror and must be read again.
     pub fn doubt(&self) {
         self.lock().doubted = true;
     }
 
-    /// Whether there was such a doubt, once.
+    /// Whether there was such a doubt. Clears it.
     pub fn take_doubt(&self) -> bool {
         std::mem::take(&mut self.lock().doubted)
     }
@@ -331,15 +331,16 @@ impl Ledger {
         self.lock().version
     }
 
-    /// The master holds `state`: so does the mirror from now on. Answers in what it differed before,
-    /// in a few sentences without values.
+    /// Sets the mirror to `state`, which the master holds. Returns the differences, in a few sentences
+    /// without values.
     pub fn adopt(&self, state: Master) -> Vec<String> {
         let difference = self.lock().adopt(state);
         self.work.notify_one();
         difference
     }
 
-    /// As [`Self::adopt`], of what the master of `incarnation` held when the mirror was at `version`.
+    /// As [`Self::adopt`], if `state` was read from the master of `incarnation` when the mirror was at
+    /// `version`.
     pub fn adopt_if(
         &self,
         incarnation: u64,
@@ -356,7 +357,7 @@ impl Ledger {
         Ok(difference)
     }
 
-    /// Works with the mirror and what calls did to it of late.
+    /// Runs `work` on the mirror and the recent activity.
     pub fn with_activity<T>(&self, work: impl FnOnce(&Master, &mut Activity) -> T) -> T {
         let mut inner = self.lock();
         let Inner {
@@ -366,13 +367,13 @@ impl Ledger {
     }
 }
 
-/// Whether a call, if it is no multicall, takes something away that its caller registered.
+/// Whether a call, other than a multicall, is an unregistration.
 fn is_unregistration(call: &Request) -> bool {
     *call.method() != Method::Multicall && call.kind() == Kind::Unregister
 }
 
 impl Inner {
-    /// Applies `call`. `standing_in`: whether it changes anything, if no master notifies nodes of it.
+    /// Applies `call`. `standing_in`: whether it changes anything; none if a master notifies nodes of it.
     fn apply(
         &mut self,
         now: Instant,
@@ -410,8 +411,7 @@ impl Inner {
 
     fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
-            // Should the present incarnation come back, it is brought to the mirror's state as one that
-            // was succeeded.
+            // If the present incarnation comes back, the mirror's state replaces everything it holds.
             self.next_incarnation();
         }
     }
@@ -435,7 +435,7 @@ impl Inner {
         Token::new(&self.session.mark, self.session.incarnation)
     }
 
-    /// The mirror has changed otherwise than by journaled calls: a whole checkpoint is due.
+    /// The mirror has changed without a journaled call: a whole checkpoint is due.
     fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
     }
@@ -450,7 +450,7 @@ impl Inner {
         self.store.as_ref().map(Store::seq)
     }
 
-    /// Appends to the journal; a failure is the store's to remember, and no call's to suffer.
+    /// Appends to the journal. A failure is kept by the store and does not fail the call.
     fn append(&mut self, entries: &[Entry]) -> Option<u64> {
         let store = self.store.as_mut()?;
         if entries.is_empty() {

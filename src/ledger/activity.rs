@@ -1,4 +1,4 @@
-//! What calls did of late: what nodes may not have heard of, and who registered when.
+//! Recent effects of calls: notifications that nodes may have missed, and when nodes registered.
 
 use std::{
     collections::HashMap,
@@ -13,26 +13,25 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// How long before an outage a change may lie whose notices the dead master still owed. Its three
-/// notifier threads can be held up by nodes that cannot be reached.
+/// How long before an outage a change may lie whose notifications the dead master may not have sent.
+/// Unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
-/// Topics, and parameters of one node, remembered for that; and changes to tell at the same time.
+/// Most remembered topics, and parameters of one node; also most changes in the outbox.
 const NOTICES: usize = 4096;
-/// So many nodes may be remembered that are not registered any more.
+/// Nodes to remember although they are no longer registered.
 const NODES: usize = 1024;
 
-/// Something that a node is notified of.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Notification {
-    /// What a master would have sent at that moment.
+    /// A call that a master would have sent at that moment.
     Call(Arc<Call>),
-    /// The full list of a topic's publishers, as it is when it is sent.
+    /// All publishers of a topic at the time of sending.
     Topic(String),
-    /// The value of a parameter, as it is when it is sent. The key ends in a slash.
+    /// The value of a parameter at the time of sending. The key ends in a slash.
     Param(Arc<str>),
 }
 
-/// Something that has changed, which a master may tell late.
+/// A change whose notification a master may send late.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Change {
     /// The publishers of a topic.
@@ -41,7 +40,7 @@ pub enum Change {
     Param(String, Arc<str>),
 }
 
-/// A node whose name another one has taken at another address: it is to shut down.
+/// A node that is to shut down: another one has taken its name at another address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Displaced {
     pub node: String,
@@ -52,10 +51,10 @@ pub struct Displaced {
     pub topics: Vec<String>,
 }
 
-/// What a master that died may not have told.
+/// Notifications that a dead master may not have sent.
 #[derive(Debug, Default)]
 pub struct Owed {
-    /// Topics, to all their subscribers.
+    /// Topics, for all their subscribers.
     pub topics: Vec<String>,
     /// Parameters, each as the address of a subscriber and a key.
     pub params: Vec<(String, Arc<str>)>,
@@ -63,24 +62,24 @@ pub struct Owed {
     pub displaced: Vec<Displaced>,
 }
 
-/// What nodes are to be notified of, since the last time.
+/// New notifications since the last time.
 #[derive(Debug, Default)]
 pub struct Outbox {
     /// By address, in order.
     pub calls: Vec<(String, Arc<Call>)>,
     /// Nodes that are to shut down.
     pub displaced: Vec<Displaced>,
-    /// Changes that a master tells, and may tell late.
+    /// Changes that the master sends too, but maybe late.
     pub changes: IndexSet<Change>,
 }
 
-/// When a node's registrations last changed, as numbers that grow with every call: equal numbers
-/// mean that nothing came between.
+/// When a node's registrations last changed. The numbers grow with every call: equal numbers mean no change
+/// in between.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LastCalls {
-    /// It registered something.
+    /// The last call that registered something.
     pub registered: u64,
-    /// Something of it was unregistered.
+    /// The last call that unregistered something.
     pub unregistered: u64,
 }
 
@@ -92,15 +91,14 @@ struct Pid {
     pid: i32,
 }
 
-/// A change that nodes are to be notified of.
 #[derive(Clone, Copy, Debug)]
 struct Noted {
     at: Instant,
-    /// We have notified them, and not only a master that may have died before it could.
+    /// rosrescue has notified the nodes itself, not only a master that may have died before it could.
     told: bool,
 }
 
-/// What calls did of late. Bounded.
+/// Recent effects of calls. Bounded.
 #[derive(Debug, Default)]
 pub struct Activity {
     count: u64,
@@ -108,31 +106,31 @@ pub struct Activity {
     /// By address and key.
     params: IndexMap<(String, Arc<str>), Noted>,
     last_calls: HashMap<String, LastCalls>,
-    /// Nodes that are no more are forgotten when `last_calls` is longer than this.
+    /// Nodes that are no longer registered are forgotten when `last_calls` is longer than this.
     prune_at: usize,
     pids: HashMap<String, Pid>,
-    /// Nodes that registered and have not been asked for their process id since, and when.
+    /// When nodes registered that have not been asked for their process id since.
     unidentified: IndexMap<String, Instant>,
-    /// Nodes that a master was to shut down, and when.
+    /// Nodes that a master had to shut down, and when.
     displaced: Vec<(Instant, Displaced)>,
-    /// Whether changes that a master tells are collected.
+    /// Whether changes that a master sends are collected.
     notifying: bool,
     outbox: Outbox,
 }
 
-/// Whom a call is told to.
+/// Who is to be notified of a call.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
     /// By address and key.
     params: IndexSet<(String, Arc<str>)>,
-    /// The calls themselves, if no master makes them.
+    /// The notifications themselves, if no master sends them.
     calls: Option<Vec<(String, Arc<Call>)>>,
     pub(super) displaced: Vec<Displaced>,
 }
 
 impl Noticed {
-    /// `standing_in`: no master notifies anybody.
+    /// `standing_in`: no master sends notifications.
     pub(super) fn new(standing_in: bool) -> Self {
         Self {
             calls: standing_in.then(Vec::new),
@@ -163,8 +161,8 @@ impl NoticeSink for Noticed {
 }
 
 impl Activity {
-    /// A call has been applied, with these notices. `registered` says of a node whether the mirror
-    /// knows it. Answers whether there is something new in the outbox.
+    /// Notes an applied call and its notifications. `registered`: whether the mirror knows a node. Returns
+    /// whether the outbox has something new.
     pub(super) fn applied(
         &mut self,
         now: Instant,
@@ -217,7 +215,7 @@ impl Activity {
         changed
     }
 
-    /// The nodes that `call` takes the names of, as they are before it is applied.
+    /// The present holders of the names that `call` would take.
     pub(super) fn displaced_by(&self, mirror: &Master, call: &Request) -> Vec<Displaced> {
         let found = call.calls().into_iter().filter_map(|call| {
             let (node, api) = mirror.displaced_by(call)?;
@@ -267,8 +265,8 @@ impl Activity {
         self.last_calls.get(node).copied().unwrap_or_default()
     }
 
-    /// Changes so shortly before `now`, or since, that a master which died then may not have told
-    /// them, and we have not. From now on they count as told.
+    /// Recent changes before `now`, and all later ones, of which rosrescue has not notified nodes and a
+    /// master that died then may not have. They count as sent from now on.
     pub fn take_owed(&mut self, now: Instant) -> Owed {
         fn take<K: Clone>(noted: &mut IndexMap<K, Noted>, now: Instant) -> Vec<K> {
             let untold = noted.iter_mut().filter(|(_, noted)| !noted.told);
@@ -289,8 +287,7 @@ impl Activity {
         }
     }
 
-    /// All that changed so shortly before `now`, or since, is to be told once more: a master that goes
-    /// on may tell what it knew before.
+    /// Marks recent changes as not sent: a master that continues may send outdated notifications.
     pub fn tell_again(&mut self) {
         let params = self.params.values_mut();
         for noted in self.topics.values_mut().chain(params) {
@@ -298,7 +295,7 @@ impl Activity {
         }
     }
 
-    /// Collects what a master tells from now on, or no longer. Answers whether that changes anything.
+    /// Starts or stops collecting changes that a master sends. Returns whether that is a change.
     pub fn set_notifying(&mut self, notifying: bool) -> bool {
         if !notifying {
             self.outbox.changes.clear();
@@ -306,12 +303,11 @@ impl Activity {
         std::mem::replace(&mut self.notifying, notifying) != notifying
     }
 
-    /// What nodes are to be notified of.
     pub fn take_outbox(&mut self) -> Outbox {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Takes everything that a node may be told for changed just now.
+    /// Treats everything that nodes subscribe as changed now.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,
@@ -324,7 +320,7 @@ impl Activity {
         self.params.extend(params.map(|param| (param, noted)));
     }
 
-    /// What the master may not have told by `now` is collected once more.
+    /// Collects once more what the master may not have sent by `now`.
     pub fn repeat_changes(&mut self, now: Instant) {
         let recent = |noted: &Noted| is_recent(noted.at, now);
         let topics = self.topics.iter().filter(|(_, noted)| recent(noted));
@@ -334,8 +330,8 @@ impl Activity {
         self.outbox.changes.extend(topics.chain(params));
     }
 
-    /// `pid` is behind `api`, at which `node` is registered, and was asked for after the call that
-    /// `registered` numbers.
+    /// Notes that `pid` is behind `api`, where `node` is registered. `registered`: the node's last
+    /// registration when it was asked.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
         if self.last_calls(node).registered == registered {
             self.unidentified.shift_remove(node);
@@ -349,20 +345,20 @@ impl Activity {
         }
     }
 
-    /// The process id that was last behind `api`, at which `node` is registered, and whether the node
-    /// has registered something since: a process that takes an old port under the same name does.
+    /// The process id last seen behind `api`, where `node` is registered, and whether the node has registered
+    /// something since: a different process that takes an old port under the same name does.
     pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
         let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
         Some((pid.pid, pid.registered != self.last_calls(node).registered))
     }
 
-    /// When the node registered that nobody has asked for its process id for longest.
+    /// The earliest registration of a node that has not been asked for its process id.
     pub fn next_unidentified(&self) -> Option<Instant> {
         self.unidentified.values().min().copied()
     }
 
-    /// Nodes that last registered something at `before` or earlier, and have not been asked for
-    /// their process id since. Each is named once.
+    /// Nodes whose last registration was at `before` or earlier, and which have not been asked for their
+    /// process id since. Each is returned once.
     pub fn take_unidentified(&mut self, before: Instant) -> Vec<String> {
         let ripe = |_: &String, at: &mut Instant| *at <= before;
         let mut taken = Vec::new();

@@ -1,7 +1,6 @@
-//! Keeps the checkpoint: forces the journal to the disk, checks that the file is still the one at its
-//! path and as it was left, writes new generations, and re-arms after the disk has failed or somebody has
-//! moved or changed the file. Beside traffic; a call waits for it with `--sync always`, and where what it
-//! did is in no journal.
+//! Keeps the checkpoint: syncs the journal, checks that the file is still unchanged at its path, writes new
+//! generations, and re-arms after a disk failure or after another process moved or changed the file. Runs
+//! beside traffic. A call waits for it with `--sync always`, and if its effect is in no journal.
 
 use std::{
     path::PathBuf,
@@ -21,13 +20,13 @@ use crate::{
 const LOOK: Duration = Duration::from_millis(500);
 /// Time between attempts to protect an unprotected store again.
 const AGAIN: Duration = Duration::from_secs(1);
-/// The journal is compacted when nothing was recorded for this time,
+/// The journal is compacted after this time without a record,
 const QUIET: Duration = Duration::from_secs(2);
 /// but not more often than this: a memory card wears out.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// Keeps the checkpoint of `ledger` at `path` until `stop`, and forces it to the disk every `sync_interval`,
-/// unless the ledger's policy has it otherwise.
+/// Keeps the checkpoint of `ledger` at `path` until `stop`. Syncs it every `sync_interval`, unless the
+/// ledger's policy differs.
 pub(crate) async fn run(
     ledger: Arc<Ledger>,
     path: PathBuf,
@@ -67,17 +66,17 @@ struct Checkpointer {
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
-    /// The journal's last record at the last round.
+    /// The journal's last record in the last round.
     seq: u64,
     recorded_at: Instant,
     compacted_at: Option<Instant>,
     failed_at: Option<Instant>,
-    /// The failure that was said last.
+    /// The failure that was logged last.
     said: Option<String>,
 }
 
 impl Checkpointer {
-    /// Until the next sync, however long that is: the file is looked at all the same.
+    /// Until the next sync. In between, however long that is, the file is still checked.
     async fn pause(&mut self) {
         let end = Instant::now() + self.sync_interval;
         loop {
@@ -95,7 +94,7 @@ impl Checkpointer {
             self.open_again().await;
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
-        // Also of what the next lines repair at once.
+        // Before the repair below: a failure is logged even if it is repaired at once.
         self.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
@@ -103,7 +102,7 @@ impl Checkpointer {
         self.say_protection();
     }
 
-    /// Checks the file and, if it `syncs`, brings it to the disk.
+    /// Checks the file and, with `syncs`, syncs it.
     async fn sync(&self, syncs: bool) {
         let ledger = &self.ledger;
         let jobs = ledger.with_store(|store, _| {
@@ -113,7 +112,7 @@ impl Checkpointer {
         let (check, sync) = jobs.unwrap_or_default();
         let work = move || (check.map(CheckJob::run), sync.map(SyncJob::run));
         if let Ok((checked, synced)) = tokio::task::spawn_blocking(work).await {
-            // A failure is the store's to remember and `say_protection`'s to tell.
+            // The store keeps a failure; `say_protection` logs it.
             ledger.with_store(|store, _| {
                 let _ = checked.map(|done| store.checked(done));
                 let _ = synced.map(|done| store.synced(done));
@@ -126,8 +125,8 @@ impl Checkpointer {
             None => store.synced_seq(),
             Some(_) => store.seq(),
         });
-        // Without a store nothing has a number that anybody could wait for; one that is opened later
-        // counts from where its file ends.
+        // Without a store there are no records to wait for; a store opened later counts from the end of its
+        // file.
         if let Some(durable) = durable {
             ledger.set_durable(durable);
         }
@@ -155,7 +154,7 @@ impl Checkpointer {
             .compacted_at
             .is_none_or(|at| now.duration_since(at) >= BETWEEN);
         let quiet = now.duration_since(self.recorded_at) >= QUIET;
-        // A whole snapshot on a disk that is full is not to be written at every turn.
+        // On a full disk, do not write a whole snapshot in every round.
         let failed = self
             .failed_at
             .is_some_and(|at| now.duration_since(at) < AGAIN);
@@ -190,8 +189,8 @@ impl Checkpointer {
         }
     }
 
-    /// The checkpoint could not be opened at the start: perhaps now. Nothing of it is read, what the
-    /// memory holds is newer; but it is kept, since nobody has seen what it holds.
+    /// Tries to open a checkpoint that could not be opened at the start. Its contents are not restored,
+    /// memory is newer; but they are unknown, so the file is kept.
     async fn open_again(&self) {
         let path = self.path.clone();
         let opened = tokio::task::spawn_blocking(move || Store::open_over(&path)).await;
@@ -200,7 +199,7 @@ impl Checkpointer {
         }
     }
 
-    /// Says, once, that the state is no longer recorded, and that it is again.
+    /// Logs once that the state is no longer recorded, and once that it is again.
     fn say_protection(&mut self) {
         let path = self.path.display();
         let kept = self.ledger.with_store(|store, _| store.take_kept());

@@ -1,4 +1,4 @@
-//! What the checkpointer does with mirror and journal, and how others wait for it.
+//! The ledger's side of the checkpointer, and how calls wait for it.
 
 use super::{Inner, Ledger};
 use crate::checkpoint::{
@@ -7,7 +7,7 @@ use crate::checkpoint::{
 };
 use crate::cli::SyncPolicy;
 
-/// How far whole checkpoints have come, in versions of the mirror.
+/// Progress of whole checkpoints, in versions of the mirror.
 #[derive(Debug, Default)]
 pub(super) struct Whole {
     /// After the last change that is in no journal.
@@ -27,8 +27,8 @@ impl Whole {
 }
 
 impl Ledger {
-    /// The record that has to be on the disk before a call whose last record is `seq` is answered; none if
-    /// the policy wants none.
+    /// The record that must be on the disk before a call whose last record is `seq` is answered; none if the
+    /// policy requires none.
     pub fn to_await(&self, seq: Option<u64>) -> Option<u64> {
         seq.filter(|_| self.sync == SyncPolicy::Always)
     }
@@ -36,17 +36,17 @@ impl Ledger {
     /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
     pub async fn durable(&self, seq: u64) {
         let mut durable = self.durable.subscribe();
-        // The sender lives as long as we do.
+        // We own the sender.
         let _ = durable.wait_for(|reached| *reached >= seq).await;
     }
 
-    /// The journal up to `seq` is as safe as it will get.
+    /// The journal up to `seq` is on the disk, or the disk has failed.
     pub fn set_durable(&self, seq: u64) {
         raise(&self.durable, seq);
     }
 
-    /// What to wait for by [`Self::attempted`] until the mirror is in the file as it is now. None: it is,
-    /// or nobody knows when it can be.
+    /// The version to wait for with [`Self::attempted`] until the file holds the mirror as it is now. None if
+    /// it does, or if the file cannot be written.
     pub fn unwritten(&self) -> Option<u64> {
         let inner = self.lock();
         let store = inner.store.as_ref();
@@ -55,15 +55,15 @@ impl Ledger {
         (works && whole.failure.is_none() && whole.is_due()).then_some(whole.unrecorded)
     }
 
-    /// Returns when a whole checkpoint of this version of the mirror, or a later one, has been written,
-    /// or could not be.
+    /// Returns when a whole checkpoint of this or a later version of the mirror has been written, or has
+    /// failed.
     pub async fn attempted(&self, version: u64) {
         let mut attempted = self.attempted.subscribe();
-        // The sender lives as long as we do.
+        // We own the sender.
         let _ = attempted.wait_for(|reached| *reached >= version).await;
     }
 
-    /// What became of the whole checkpoint that was taken last.
+    /// Notes the result of the whole checkpoint that was taken last.
     pub fn set_attempted(&self, result: Result<(), &StoreError>) {
         let mut inner = self.lock();
         let whole = &mut inner.whole;
@@ -76,8 +76,8 @@ impl Ledger {
         raise(&self.attempted, taken);
     }
 
-    /// Works on the store, if there is one, with the means to take the checkpoint that belongs to
-    /// this very moment.
+    /// Runs `work` on the store, if there is one, and on a function that takes a checkpoint of the same
+    /// moment.
     pub fn with_store<T>(
         &self,
         work: impl FnOnce(&mut Store, &mut dyn FnMut() -> Checkpoint) -> T,
@@ -96,28 +96,28 @@ impl Ledger {
         Some(result)
     }
 
-    /// There is a store now, which holds nothing yet.
+    /// Sets a new store, which holds nothing yet.
     pub fn set_store(&self, store: Store) {
         self.lock().store = Some(store);
     }
 
-    /// What a checkpoint written now holds.
+    /// The checkpoint to write now.
     pub fn checkpoint(&self) -> Checkpoint {
         self.lock().checkpoint()
     }
 
-    /// Whether the mirror changed otherwise than by journaled calls since the last checkpoint.
+    /// Whether the mirror has changed without a journaled call since the last checkpoint.
     pub fn checkpoint_due(&self) -> bool {
         self.lock().whole.is_due()
     }
 
-    /// Why the state is not recorded; none if all is well.
+    /// Why the state is not recorded; none if it is.
     pub fn unprotected(&self) -> Option<String> {
         let inner = self.lock();
         let Some(store) = &inner.store else {
             return Some("the checkpoint could not be opened".to_owned());
         };
-        // The journal alone does not hold everything then.
+        // Then the journal alone is not enough.
         let failure = inner.whole.failure.as_deref();
         let failure = failure.filter(|_| inner.whole.is_due());
         store.unprotected().or(failure).map(str::to_owned)

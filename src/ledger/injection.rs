@@ -1,11 +1,10 @@
-//! From a master that is back to the open gate.
+//! Steps from an examined master to an open gate.
 
 use super::{Basis, Ledger};
 use crate::{master::Master, replay::Token};
 
 impl Ledger {
-    /// The mirror must not change from now on, until [`Self::end_injection`]. What a master that is about to
-    /// be brought to its state is planned from.
+    /// Freezes the mirror until [`Self::end_injection`]. Returns what the injection is planned from.
     pub fn begin_injection(&self) -> Basis {
         let mut inner = self.lock();
         inner.injecting = true;
@@ -16,24 +15,23 @@ impl Ledger {
         }
     }
 
-    /// The mirror's version and state, and the token that the next incarnation will get.
+    /// The mirror's version and state, and the next incarnation's token.
     pub fn next(&self) -> (u64, Master, Token) {
         let inner = self.lock();
         let token = Token::new(&inner.session.mark, inner.session.incarnation + 1);
         (inner.version, inner.mirror.clone(), token)
     }
 
-    /// The next incarnation takes over, to be brought to the mirror's state: replies of the one before no
-    /// longer count. The new one's token.
+    /// Starts the next incarnation: replies of the previous one no longer count. Returns the new token.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.next_incarnation();
-        // The new one is brought to the mirror's state, or the mirror to its.
+        // Either side is brought to the other's state, so there is no doubt.
         (inner.doubted, inner.abandoned) = (false, false);
         inner.token()
     }
 
-    /// The present incarnation holds what the mirror holds.
+    /// The present incarnation holds the mirror's state: no write is pending.
     pub fn delivered(&self) {
         let mut inner = self.lock();
         if !inner.pending.calls().is_empty() {
@@ -44,7 +42,7 @@ impl Ledger {
         }
     }
 
-    /// The present incarnation is served from now on: its number. The mirror may change again.
+    /// The present incarnation is served from now on: the mirror may change again. Returns its number.
     pub fn serve(&self) -> u64 {
         let mut inner = self.lock();
         inner.injecting = false;
@@ -64,18 +62,18 @@ impl Ledger {
         self.lock().injecting = false;
     }
 
-    /// A batch was in flight when the connection to the present incarnation ended: it may still be run.
+    /// The connection to the present incarnation ended with a batch in flight: it may still be run.
     pub fn abandon_batch(&self) {
         self.lock().abandoned = true;
     }
 
-    /// The present incarnation runs no call that it was sent before.
+    /// The present incarnation cannot be running an earlier call any more.
     pub fn settled(&self) {
         self.lock().abandoned = false;
     }
 
-    /// Whether the present incarnation can go on as it is: it owes no write, and runs none that nobody
-    /// waits for. The mirror must not change then, until [`Self::end_injection`].
+    /// Whether the present incarnation can go on unchanged: no write is pending, and it runs no abandoned
+    /// batch. If so, the mirror is frozen until [`Self::end_injection`].
     pub fn resume(&self) -> bool {
         let mut inner = self.lock();
         let whole = inner.pending.calls().is_empty() && !inner.abandoned;

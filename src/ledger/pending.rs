@@ -2,12 +2,12 @@
 
 use crate::{master::Request, xmlrpc::Value};
 
-/// Most of them that are kept,
+/// Most pending writes,
 const COUNT_MAX: usize = 10_000;
-/// and most bytes of memory, about.
+/// and their most memory in bytes, about.
 const BYTES_MAX: usize = 16 << 20;
 
-/// They are too many to tell what of a master's state is newer than the mirror's.
+/// Too many pending writes to decide what in a master's state is newer than the mirror.
 #[derive(Debug)]
 pub(super) struct TooMany;
 
@@ -23,7 +23,7 @@ impl PendingWrites {
     ///
     /// # Errors
     ///
-    /// If they are too many: all are dropped then.
+    /// If they are too many: all are dropped.
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,

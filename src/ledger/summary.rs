@@ -1,4 +1,4 @@
-//! Replies in the log.
+//! Replies as logged.
 
 use super::Inner;
 use crate::{
@@ -10,7 +10,7 @@ use crate::{
 /// Limit on a reply in a log line, in bytes.
 const LOGGED_REPLY: usize = 300;
 
-/// A reply for the log. Values of parameters are nobody's business there.
+/// A reply for the log, without values of parameters.
 fn summary(method: &Method, reply: &Reply) -> String {
     let text = match reply {
         Reply::Value(Value::Array(answer)) if *method == Method::SubscribeParam => {
