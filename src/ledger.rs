@@ -310,7 +310,7 @@ impl Ledger {
         self.lock().pending.calls().len()
     }
 
-    /// Everything that the present incarnation may hold, beyond what can be read from it.
+    /// Parameter subscriptions that the present incarnation may hold; they cannot be read from it.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         replay::may_hold(&inner.mirror, inner.pending.calls())

@@ -1,6 +1,6 @@
-//! The write queue: writes go to the master one batch at a time, so that the journal's order is the
-//! order in which the master ran them. Those that queue up meanwhile go together. While the master is
-//! away the mirror answers them, in the same order.
+//! The write queue: writes go to the master one batch at a time, so the journal's order is the order in which
+//! the master ran them. Writes that arrive meanwhile form the next batch. While the master is away the mirror
+//! answers them, in the same order.
 
 pub(crate) mod batch;
 mod outdated;
@@ -25,7 +25,7 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Calls between the clients and the queue. The worker never lets them wait.
+/// Calls between the clients and the queue. The worker always empties it at once.
 const CHANNEL: usize = 64;
 
 /// The way into the queue.
@@ -37,23 +37,22 @@ pub struct WriteQueue {
 }
 
 impl WriteQueue {
-    /// Puts a call in the queue.
     pub(crate) async fn submit(&self, item: Item) {
-        // The worker is gone only when rosrescue stops; the answer's sender is dropped then.
+        // The worker ends only when rosrescue stops. The answer's sender is dropped then.
         let _ = self.items.send(item).await;
     }
 
-    /// When the batch was sent that the master has not answered yet, if there is one.
+    /// When the unanswered batch was sent, if there is one.
     pub(crate) fn unanswered_since(&self) -> Option<Instant> {
         *self.sent.borrow()
     }
 
-    /// Makes a call of rosrescue's own, recorded as any other. None if nobody answers.
+    /// Makes a call of rosrescue's own, recorded like any other. None if there is no answer.
     pub async fn call(&self, call: Request) -> Option<Reply> {
         self.call_own(call, None).await
     }
 
-    /// As [`Self::call`]; the call is dropped, too, if `condition` no longer holds when it is its turn.
+    /// As [`Self::call`], but drops the call if `condition` no longer holds when it is due.
     pub async fn call_if(&self, call: Request, condition: Condition) -> Option<Reply> {
         self.call_own(call, Some(condition)).await
     }
@@ -74,15 +73,15 @@ impl WriteQueue {
         }
     }
 
-    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until
-    /// the gate has changed. Called by the gate's only writer.
+    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until the
+    /// gate has changed. Called by the gate's only writer.
     pub async fn lost(&self) {
         self.lost.notified().await;
     }
 }
 
-/// Makes a write queue; the second part is to be run. `resync_interval`: how often the master is compared
-/// with the mirror, if it is to be.
+/// Makes a write queue and the worker to run. `resync_interval`: how often the master is compared with the
+/// mirror, if at all.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
@@ -106,7 +105,7 @@ pub(crate) fn write_queue(
     (WriteQueue { items, lost, sent }, worker)
 }
 
-/// What a batch travels with.
+/// What a round trip needs.
 #[derive(Clone)]
 struct Link {
     ledger: Arc<Ledger>,

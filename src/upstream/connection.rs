@@ -1,4 +1,4 @@
-//! One connection to the master: requests, replies, and its end.
+//! One connection to the master.
 
 use std::{io, net::SocketAddr};
 
@@ -19,7 +19,7 @@ use crate::{
     xmlrpc::{self, Call, Reply},
 };
 
-/// One keep-alive connection to the master, for one call at a time.
+/// A keep-alive connection to the master, for one call at a time.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
@@ -32,8 +32,8 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// A connection to the server at `address` over `stream`. Replies of more than `max_reply` bytes
-    /// are not taken.
+    /// A connection to the server at `address` over `stream`. Larger replies than `max_reply` bytes are
+    /// refused.
     pub async fn over(
         stream: TcpStream,
         address: &MasterUri,
@@ -59,7 +59,7 @@ impl Connection {
             .map_err(io::Error::other)?;
         let (end, ended) = watch::channel(());
         tokio::spawn(async move {
-            // Its error, if any, is also that of the call under way.
+            // The call under way gets its error, if any.
             let _ = driver.await;
             drop((end, writer));
         });
@@ -80,32 +80,31 @@ impl Connection {
         self.sender.is_closed()
     }
 
-    /// Whether the other end is on this computer, or seems to be: a tunnel's is here too.
+    /// Whether the other end is on this computer, or seems to be: a tunnel's end is here too.
     pub fn is_local(&self) -> bool {
         self.local
     }
 
-    /// The other end.
+    /// The other end's address.
     pub fn peer(&self) -> SocketAddr {
         self.peer
     }
 
-    /// Returns when the connection has ended.
     pub fn ended(&self) -> impl Future<Output = ()> + Send + 'static {
         let mut ended = self.ended.clone();
         async move {
-            // Nothing is ever sent: it ends in the error that the sender is gone.
+            // Nothing is ever sent: it ends when the sender is dropped.
             while ended.changed().await.is_ok() {}
         }
     }
 
-    /// Sends `body` as it is; the reply comes back as it is.
+    /// Sends `body` unchanged and returns the reply unchanged.
     pub async fn forward(&mut self, head: &Head, body: Bytes) -> Result<RawReply, CallError> {
         self.exchange(head, body, None).await
     }
 
-    /// Sends a body of our own. As far as the reply is what was `predicted` it is only compared, and
-    /// takes no memory.
+    /// Sends a body of our own. The part of the reply that equals `predicted` is only compared and takes no
+    /// memory.
     pub async fn predicted(
         &mut self,
         body: Bytes,
@@ -121,12 +120,12 @@ impl Connection {
         body: Bytes,
         predicted: Option<&Bytes>,
     ) -> Result<RawReply, CallError> {
-        // rosmaster gzips replies when it may, in Python: it may not.
+        // No Accept-Encoding: rosmaster would gzip replies, in Python.
         let mut request = Request::post(head.path.as_str())
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
-            // Of an empty body too: without it rosmaster answers with a status 500 and no body.
+            // Also for an empty body: without it rosmaster answers with a status 500 and no body.
             .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {
@@ -157,14 +156,13 @@ impl Connection {
         })
     }
 
-    /// Makes a call of our own.
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
         let body = Bytes::from(xmlrpc::encode_call(call));
         self.forward(&Head::default(), body).await?.decode()
     }
 }
 
-/// The whole of `body`. As far as it is what was `predicted`, that stands for it.
+/// Reads all of `body`. The part that equals `predicted` is not stored twice.
 async fn collect<B: Body<Data = Bytes> + Unpin>(
     mut body: B,
     predicted: &Bytes,

@@ -1,4 +1,4 @@
-//! Looks at a master over a connection.
+//! Reads a master's state over a connection.
 
 use thiserror::Error;
 
@@ -8,19 +8,18 @@ use crate::{
     replay::{Inspection, NotAMaster, Token},
 };
 
-/// A look that showed nothing.
+/// Why a master's state could not be read.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum InspectError {
-    /// The connection failed.
     #[error(transparent)]
     Call(#[from] CallError),
-    /// What answers is no master.
+    /// The server is no master.
     #[error(transparent)]
     NotAMaster(#[from] NotAMaster),
 }
 
-/// The first look; without the parameters if the master cannot return one of them.
+/// The first request; without the parameters if the master cannot return one of them.
 pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
@@ -32,7 +31,7 @@ pub(crate) async fn first(
         )) => look(connection, Inspection::call_without_params(token)).await,
         Err(error) if is_broken_document(&error) => {
             let rest = look(connection, Inspection::call_without_params(token)).await;
-            // A server that speaks no XML-RPC may have closed the connection.
+            // A server that does not speak XML-RPC may have closed the connection.
             rest.map_err(|_| error)
         }
         whole => whole,
@@ -43,12 +42,12 @@ async fn look(connection: &mut Connection, call: Request) -> Result<Inspection, 
     Ok(Inspection::decode(&connection.call(&call.into()).await?)?)
 }
 
-/// Whether a parameter may have broken the document: a master does not escape a date's text.
+/// Whether a parameter may have broken the document: a master does not escape the text of a date.
 fn is_broken_document(error: &InspectError) -> bool {
     matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
 
-/// The second look, and with it the state that the master holds.
+/// The second request. Returns the state that the master holds.
 pub(crate) async fn second(
     first: Inspection,
     connection: &mut Connection,

@@ -1,4 +1,4 @@
-//! The bounded set of connections on which reads travel to the master.
+//! A bounded pool of connections for reads.
 
 use std::sync::{
     Arc, Mutex, PoisonError,
@@ -16,29 +16,25 @@ use crate::{
     ledger::Ledger,
 };
 
-/// A read that got no reply from the master.
+/// Why a read got no reply from the master.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReadError {
-    /// No connection.
     #[error(transparent)]
     Connect(#[from] VerifyError),
-    /// No reply.
     #[error(transparent)]
     Call(#[from] CallError),
-    /// The gate shut meanwhile.
+    /// The gate was shut meanwhile.
     #[error("the gate was shut")]
     Shut,
 }
 
-/// A connection to the incarnation that is being served could not be made.
+/// Why there is no connection to the served incarnation.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum VerifyError {
-    /// No connection at all.
     #[error(transparent)]
     Connect(#[from] ConnectError),
-    /// It did not answer.
     #[error(transparent)]
     Call(#[from] CallError),
     /// It is another incarnation, which does not hold the state yet.
@@ -46,9 +42,8 @@ pub enum VerifyError {
     OtherIncarnation,
 }
 
-/// Connects and makes sure that the incarnation behind the connection is the one that was brought
-/// to the mirror's state. Nothing else may be said on a new connection first: the master may have
-/// died and come back between two looks.
+/// Connects and verifies that the incarnation is the one that holds the mirror's state. Must be the first
+/// call on a new connection: the master may have restarted unnoticed.
 pub(crate) async fn connect_verified(
     upstream: &Upstream,
     token: &Token,
@@ -56,7 +51,7 @@ pub(crate) async fn connect_verified(
     verified(upstream.connect().await?, token).await
 }
 
-/// `connection`, if it reaches the incarnation that bears `token`.
+/// Returns `connection` if its incarnation bears `token`.
 pub(crate) async fn verified(
     mut connection: Connection,
     token: &Token,
@@ -67,15 +62,15 @@ pub(crate) async fn verified(
     }
 }
 
-/// Connections for reads: few, because a Python master serves many badly.
+/// Connections for reads. Few: a Python master is slow with many.
 pub struct Pool {
     upstream: Arc<Upstream>,
     ledger: Arc<Ledger>,
     gate: gate::Rx,
     permits: Semaphore,
-    /// Idle connections, with the incarnation that they reach.
+    /// Idle connections, each with its incarnation.
     idle: Mutex<Vec<(u64, Connection)>>,
-    /// Reads that have waited for too long.
+    /// Number of reads that have waited too long.
     stalled: AtomicUsize,
 }
 
@@ -101,12 +96,12 @@ impl Pool {
         }
     }
 
-    /// Whether the master has not answered a read for longer than it should take.
+    /// Whether a read has waited for the master too long.
     pub fn is_stalled(&self) -> bool {
         self.stalled.load(Ordering::Relaxed) > 0
     }
 
-    /// The master has not answered a read for longer than it should take, until the result is dropped.
+    /// Notes that a read has waited for the master too long, until the result is dropped.
     pub fn stalled(&self) -> Stalled<'_> {
         self.stalled.fetch_add(1, Ordering::Relaxed);
         Stalled(self)
@@ -125,8 +120,8 @@ impl Pool {
         }
     }
 
-    /// Sends a read to the master of `incarnation`. A read may be sent twice: once more when an idle
-    /// connection turns out to have been closed.
+    /// Sends a read to the master of `incarnation`. A read is sent once more if an idle connection turns out
+    /// to be closed.
     pub async fn forward(
         &self,
         incarnation: u64,

@@ -1,16 +1,15 @@
-//! Whether a call of an earlier connection may still be running in the master, as the kernel's table
-//! of TCP sockets tells.
+//! Whether the master may still be running a call of an earlier connection, according to the kernel's table
+//! of TCP sockets.
 //!
-//! A rosmaster runs each connection in a thread of its own, and closes its end only when it has run
-//! what has come. So as long as it may run a call of a connection that we have closed, or that was
-//! closed by the end of an earlier rosrescue,
+//! A rosmaster runs each connection in a thread of its own, and closes its end only after running what has
+//! arrived. So while it may run a call of a connection that rosrescue has closed, or that the end of an
+//! earlier rosrescue closed,
 //!
-//! * its end of the connection, on this computer, is in the state CLOSE_WAIT, if it has been accepted
-//!   yet or not,
-//! * ours, which belongs to no process any more, is in FIN_WAIT1 or FIN_WAIT2.
+//! * its end of the connection, on this computer, is in the state CLOSE_WAIT, whether accepted or not,
+//! * our end, which belongs to no process any more, is in FIN_WAIT1 or FIN_WAIT2.
 //!
-//! Linux forgets ours a minute after the other side has acknowledged the end, so that a master on
-//! another computer is given no more than that; see `docs/decisions/0003-no-call-in-flight.md`.
+//! Linux forgets our end a minute after the other side has acknowledged the close. So a master on another
+//! computer gets no more time than that; see `docs/decisions/0003-no-call-in-flight.md`.
 
 use std::{
     fs,
@@ -23,11 +22,10 @@ const FIN_WAIT2: u8 = 0x05;
 const CLOSE_WAIT: u8 = 0x08;
 const CLOSING: u8 = 0x0b;
 
-/// Whether the master at `master` may still be running a call of a connection that has been closed on
-/// this side.
+/// Whether the master at `master` may still be running a call of a connection that was closed on this side.
 pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
     ["tcp", "tcp6"].into_iter().any(|table| {
-        // Where there is no such table nobody knows: the same as if nothing ran.
+        // Without the table nothing is known: treated as if nothing ran.
         let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
         is_in_table(&table, master)
     })
@@ -41,7 +39,7 @@ fn is_in_table(table: &str, master: SocketAddr) -> bool {
         let state = u8::from_str_radix(columns.next()?, 16).ok()?;
         Some((local, remote, state))
     });
-    // Most are in none of these states.
+    // Most sockets are in none of these states.
     sockets.any(|(local, remote, state)| match state {
         CLOSE_WAIT => address(local) == Some(master),
         FIN_WAIT1 | FIN_WAIT2 | CLOSING => address(remote) == Some(master),
@@ -49,7 +47,7 @@ fn is_in_table(table: &str, master: SocketAddr) -> bool {
     })
 }
 
-/// An address as the table has it: words of 32 bits in the computer's own order, and the port.
+/// An address as in the table: 32-bit words in this computer's byte order, and the port.
 fn address(text: &str) -> Option<SocketAddr> {
     let (ip, port) = text.split_once(':')?;
     let words: Vec<_> = (0..ip.len() / 8)

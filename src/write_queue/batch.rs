@@ -1,4 +1,4 @@
-//! Writes in the queue, how they are packed into one request, and what comes back.
+//! Queued writes, how a batch becomes one request, and how its reply is unpacked.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -14,47 +14,43 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Most calls in a batch. A compact multicall costs the master some 40 us a call, so that nobody
-/// waits for more than a few milliseconds.
+/// Most calls in a batch. A compact multicall costs the master some 40 us a call, so a call waits for a few
+/// milliseconds at most.
 const CALLS_MAX: usize = 100;
 /// Most bytes of bodies in a batch.
 const BYTES_MAX: usize = 1 << 20;
 
-/// The answer to a call in the queue.
 #[derive(Debug)]
 pub(crate) enum Answer {
     /// The master's reply as it came.
     Raw(RawReply),
-    /// A reply that we write out: the mirror's, or one out of a batch.
+    /// A reply to encode: the mirror's, or one from a batch.
     Made(Reply),
-    /// No answer: close the connection, so that the client asks again.
+    /// No answer: closes the connection, so that the client retries.
     Close,
 }
 
-/// A call in the queue.
 #[derive(Debug)]
 pub(crate) struct Item {
     /// The client's bytes; none for a call of our own.
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
-    /// Where the answer goes.
     pub answer: oneshot::Sender<Answer>,
-    /// Of a call of our own: what it stands on.
+    /// For a call of our own: when it is still right.
     pub condition: Option<Condition>,
 }
 
-/// A node and its last last_calls, as they were when it was found out that something is to be registered or
-/// unregistered for it. A node that does the contrary itself meanwhile knows better.
+/// A node and its last calls at the time of the decision to register or unregister something for it. The
+/// condition fails if the node does the opposite itself meanwhile.
 #[derive(Clone, Debug)]
 pub struct Condition {
     pub node: String,
-    /// Its last last_calls then.
     pub last_calls: LastCalls,
 }
 
 impl Condition {
-    /// Whether it still holds for a call of this kind, now that these are the node's last last_calls.
+    /// Whether it holds for a call of this kind, given the node's last calls `now`.
     pub fn holds(&self, kind: Kind, now: LastCalls) -> bool {
         match kind {
             Kind::Unregister => self.last_calls.registered == now.registered,
@@ -64,7 +60,7 @@ impl Condition {
 }
 
 impl Item {
-    /// The method and the caller id, for messages.
+    /// Method and caller id, for messages.
     pub(crate) fn describe(&self) -> String {
         let Some(call) = &self.call else {
             return "a request that rosrescue cannot decode".to_owned();
@@ -73,8 +69,8 @@ impl Item {
         format!("{:.100} of {caller_id:.200}", call.method().name())
     }
 
-    /// Whether it may share a batch with others. Only calls whose reply holds no parameter value: a
-    /// value that the master cannot return would spoil the replies of all.
+    /// Whether it may share a batch. Only if its reply holds no parameter value: a value that the master
+    /// cannot return would spoil the whole reply.
     fn may_share(&self) -> bool {
         let shareable = |call: &Arc<Request>| {
             let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
@@ -92,7 +88,7 @@ impl Item {
     }
 }
 
-/// Takes the next batch from the front of `queue`: one call, or several that may share.
+/// Takes the next batch from the front of `queue`: one call, or several that may share a batch.
 pub(crate) fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
     let mut items: Vec<_> = queue.pop_front().into_iter().collect();
     let mut bytes = items.first().map_or(0, Item::weight);
@@ -108,7 +104,7 @@ pub(crate) fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
     items
 }
 
-/// What goes out for `items`: the client's own bytes if it is one call.
+/// The request for `items`: the client's own bytes if it is a single call.
 pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     if let [
         Item {
@@ -132,7 +128,7 @@ pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     (Head::default(), Bytes::from(body))
 }
 
-/// The replies to `count` calls that travelled together; none if the master did not answer each.
+/// The replies to the `count` calls of a batch; none if the master did not answer each.
 pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     let Reply::Value(Value::Array(results)) = reply else {
         return None;
@@ -141,14 +137,13 @@ pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     (replies.len() == count).then_some(replies)
 }
 
-/// Whether the master writes its own address into the reply: `getUri`, alone or in a multicall.
+/// Whether the reply holds the master's address: `getUri`, alone or in a multicall.
 pub(crate) fn asks_uri(call: &Request) -> bool {
     let mut calls = call.calls().into_iter();
     calls.any(|call| *call.method() == Method::GetUri)
 }
 
-/// Puts our own address where the master wrote its own: into replies to `getUri`, alone or in a
-/// multicall.
+/// Replaces the master's address with our own in replies to `getUri`, alone or in a multicall.
 pub(crate) fn with_uri(call: &Request, mut reply: Reply, uri: &str) -> Reply {
     if let Reply::Value(value) = &mut reply {
         write_uri(call, value, uri);

@@ -1,4 +1,4 @@
-//! Calls of our own that are no longer right, because of what others did.
+//! Calls of our own that other calls have made wrong.
 
 use super::batch::Item;
 use crate::{
@@ -6,8 +6,8 @@ use crate::{
     master::Master,
 };
 
-/// Whether a call of our own was right when it was made and is no longer: the node has come back at
-/// another address, and would be shut down for it, or has done the contrary itself.
+/// Whether a call of our own is no longer right: the node has come back at another address and would be shut
+/// down, or has done the opposite itself.
 pub(super) fn is_outdated(ledger: &Ledger, item: &Item) -> bool {
     let Some(call) = item.call.as_deref().filter(|_| item.raw.is_none()) else {
         return false;

@@ -1,4 +1,4 @@
-//! One request of the write queue to the master and its reply.
+//! One request of the write queue to the master, and its reply.
 
 use bytes::Bytes;
 use thiserror::Error;
@@ -13,30 +13,28 @@ use crate::{
     },
 };
 
-/// What a round trip ends in.
+/// The result of a round trip.
 pub(super) struct Done {
-    /// The connection, if it can be used again, and the incarnation that it reaches.
+    /// The connection, if it is reusable, and its incarnation.
     pub(super) connection: Option<(u64, Connection)>,
     pub(super) result: Result<Received, RoundTripError>,
 }
 
-/// What it was made for.
 pub(super) enum Received {
     Reply(RawReply),
-    /// What the master holds.
+    /// The master's state.
     Held(Box<Master>),
 }
 
 /// Why a round trip failed.
 #[derive(Debug, Error)]
 pub(super) enum RoundTripError {
-    /// There was no connection to the right incarnation.
+    /// There is no connection to the right incarnation.
     #[error(transparent)]
     Connect(#[from] VerifyError),
-    /// The calls got no reply.
     #[error(transparent)]
     Call(#[from] CallError),
-    /// The look at the master failed.
+    /// Reading the master's state failed.
     #[error(transparent)]
     Look(#[from] InspectError),
 }
@@ -48,8 +46,8 @@ impl RoundTripError {
     }
 }
 
-/// Sends `request`, or without one looks at what the master holds. The future owns what it needs, so
-/// that dropping it ends the connection.
+/// Sends `request`; without one, reads the master's state. The future owns what it needs, so that dropping it
+/// ends the connection.
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,
@@ -96,7 +94,7 @@ async fn connect(link: &Link) -> Result<Connection, VerifyError> {
     verified(connection, &link.ledger.token()).await
 }
 
-/// What the master behind `connection` holds.
+/// The state of the master behind `connection`.
 async fn held(link: &Link, connection: &mut Connection) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
     let first = inspect::first(connection, &link.ledger.token()).await?;

@@ -25,25 +25,24 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Pause before a batch that was not sent is tried again while the gate stays open.
+/// Pause before an unsent batch is tried again while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// Pause before a master that could not be looked at is looked at again.
+/// Pause before reading the master's state again after a failure.
 const LOOK_PAUSE: Duration = Duration::from_secs(1);
-/// How long a batch may go on when the gate has shut, before the mirror answers it: a master that is
-/// killed closes its connections within milliseconds, and one that only closed an idle one answers.
+/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master
+/// closes its connections within milliseconds; one that only closed an idle connection answers.
 const GRACE: Duration = Duration::from_millis(5);
 
-/// A batch on its way to the master, or a look if it has no items.
+/// A batch on its way to the master. Without items: the master's state is being read.
 struct InFlight {
     incarnation: u64,
-    /// Of the mirror, when it was sent.
+    /// The mirror's version when it was sent.
     version: u64,
     items: Vec<Item>,
     sent: tokio::time::Instant,
     done: Pin<Box<dyn Future<Output = Done> + Send>>,
 }
 
-/// Drains the write queue.
 pub(crate) struct Worker {
     link: Link,
     gate: gate::Rx,
@@ -53,20 +52,20 @@ pub(crate) struct Worker {
     queue: VecDeque<Item>,
     connection: Option<(u64, Connection)>,
     in_flight: Option<InFlight>,
-    /// Until when the batch in flight may go on behind a shut gate.
+    /// How long the batch in flight may continue behind a shut gate.
     grace: Option<tokio::time::Instant>,
     /// A batch was lost, and the gate has not changed since.
     lost: bool,
     tell_lost: Arc<Notify>,
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
-    /// The one that was open last.
+    /// The incarnation for which the gate was open last.
     incarnation: u64,
     resync_due: bool,
-    /// When a resync is due that could not be made before.
+    /// When to retry a resync that failed.
     resync_at: Option<tokio::time::Instant>,
     retry_at: Option<tokio::time::Instant>,
-    /// Calls that we do not understand, answered with success: the answers wait until the mirror
-    /// has been made anew, and knows what the calls did.
+    /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
+    /// read from the master again and holds their effects.
     opaque: Opaque,
 }
 
@@ -74,7 +73,6 @@ pub(crate) struct Worker {
 struct Opaque {
     incarnation: u64,
     answers: Vec<(Item, Answer)>,
-    /// The journal's last record of them.
     seq: Option<u64>,
 }
 
@@ -122,7 +120,7 @@ impl Worker {
                 },
                 () = gate.changed() => changed = true,
                 done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
-                    // A look that takes longer than the interval must leave time for calls.
+                    // A read that takes longer than the interval must leave time for calls.
                     if matches!(done.result, Ok(Received::Held(_))) && let Some(resync) = &mut resync {
                         resync.reset();
                     }
@@ -141,9 +139,9 @@ impl Worker {
             while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
             }
-            // Answered already, or sent away.
+            // Drops calls that are answered, or whose client has gone.
             self.queue.retain(|item| !item.answer.is_closed());
-            // Whatever woke us: nobody is told of a change once it has been looked at.
+            // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = gate.look_changed();
             if changed || unseen {
                 (self.retry_at, self.lost) = (None, false);
@@ -165,7 +163,7 @@ impl Worker {
             .in_flight
             .take_if(|batch| batch.incarnation != incarnation)
         {
-            // Its master has been succeeded, and the new one never saw these calls.
+            // The new master never got these calls.
             self.take_back(batch.items);
         }
         if self.opaque.incarnation != incarnation {
@@ -173,7 +171,7 @@ impl Worker {
             self.take_back(opaque.into_iter().map(|(item, _)| item).collect());
         }
         if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
-            // What was doubted is gone.
+            // The doubt concerned the previous master.
             self.resync_due = false;
         }
         self.resync_due |= self.link.ledger.take_doubt();
@@ -232,7 +230,7 @@ impl Worker {
 
     fn resync(&mut self, incarnation: u64, version: u64, state: Master) {
         let Ok(difference) = self.link.ledger.adopt_if(incarnation, version, state) else {
-            // The gate was shut meanwhile, and the mirror has taken what this look does not show.
+            // The gate was shut meanwhile, or the mirror has changed since.
             self.resync_due = true;
             return;
         };
@@ -260,7 +258,7 @@ impl Worker {
                 _ => self.resync_at = Some(now + LOOK_PAUSE),
             }
             if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
-                // It lives and shows nothing: a client need not wait for that.
+                // The master lives but cannot be read: clients need not wait for that.
                 self.answer_opaque();
             }
             return;
@@ -268,7 +266,7 @@ impl Worker {
         self.take_back(items);
         if error.may_have_run() {
             self.link.ledger.abandon_batch();
-            // Whether it has run shows only when the master is seen again. Until then the mirror answers.
+            // Whether it ran is known only when the master is back. Until then the mirror answers.
             self.lost = true;
             self.tell_lost.notify_one();
         } else {
@@ -282,7 +280,7 @@ impl Worker {
         }
     }
 
-    /// Records what the master answered, and only then answers the clients.
+    /// Records what the master answered, then answers the clients.
     fn deliver(&mut self, incarnation: u64, items: Vec<Item>, raw: RawReply) {
         let reply = xmlrpc::decode_reply(&raw.body)
             .ok()
@@ -293,8 +291,8 @@ impl Worker {
                 opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
                 vec![reply]
             }
-            // What we cannot read may have changed anything, and only a look shows what. A subscription
-            // of parameters no look shows: it is recorded as if it had gone as predicted.
+            // A call that cannot be decoded may change anything: the master's state must be read. That does
+            // not show parameter subscriptions: they are recorded as if they went as predicted.
             ([item], None) if raw.status.is_success() => {
                 opaque = true;
                 let call = item.call.as_deref().filter(|call| subscribes_params(call));
@@ -323,7 +321,7 @@ impl Worker {
         };
         self.resync_due |= recorded.doubtful || opaque;
         if opaque {
-            // Others may be held already: after a look that failed calls are sent before the next one.
+            // Answers may be waiting already: after a failed read, calls are sent before the next one.
             self.opaque.incarnation = incarnation;
             self.opaque.seq = self.opaque.seq.max(recorded.seq);
             let answers = items
@@ -345,7 +343,7 @@ impl Worker {
         self.answer(recorded.seq, None, answers);
     }
 
-    /// A batch was answered as a whole by something else than its results.
+    /// A batch got one answer as a whole instead of its results.
     fn undeliverable(&mut self, items: Vec<Item>) {
         tracing::warn!(
             calls = items.len(),
@@ -357,8 +355,8 @@ impl Worker {
         }
     }
 
-    /// Answers from the mirror what is in the queue, and before it what was in flight. What only a master
-    /// can answer waits.
+    /// Answers the batch in flight, then the queue, from the mirror. Calls that only a master can answer
+    /// wait.
     fn stand_in(&mut self) {
         let now = tokio::time::Instant::now();
         if self.in_flight.is_some() && now < *self.grace.get_or_insert(now + GRACE) {
@@ -368,7 +366,7 @@ impl Worker {
         if self.in_flight.is_some() {
             self.link.ledger.abandon_batch();
         }
-        // Its end is what a master that comes back waits for: no call of it is running any more.
+        // A master that comes back waits for this end: then it runs no call of this connection any more.
         self.connection = None;
         if let Some(batch) = self
             .in_flight
@@ -400,8 +398,8 @@ impl Worker {
         self.answer(last, None, answers);
     }
 
-    /// Sends answers when what they tell of is safe: the journal up to `seq` is on the disk, if `--sync` wants
-    /// that, and the mirror of this version in a whole checkpoint.
+    /// Sends answers once their effects are safe: the journal up to `seq` is on the disk, if `--sync`
+    /// requires it, and this `version` of the mirror is in a whole checkpoint.
     fn answer(&self, seq: Option<u64>, version: Option<u64>, answers: Vec<(Item, Answer)>) {
         let seq = self.link.ledger.to_await(seq);
         let send = move || {
@@ -425,7 +423,7 @@ impl Worker {
     }
 }
 
-/// Whether `call`, or an entry of it, subscribes a parameter. Its reply holds the parameter's value.
+/// Whether `call`, or an entry of it, subscribes a parameter. The reply holds the parameter's value.
 fn subscribes_params(call: &Request) -> bool {
     let mut calls = call.calls().into_iter();
     calls.any(|call| *call.method() == Method::SubscribeParam)
