@@ -1,4 +1,4 @@
-//! The checkpoint: the file's format, the store on the disk, and whether its session goes on.
+//! The checkpoint: its file format, its store on disk, and whether its session continues.
 
 pub mod format;
 pub mod session;

@@ -1,13 +1,12 @@
-//! The checkpoint's text: what a file holds, to and from bytes. Pure; the file itself is
-//! [`store`](crate::checkpoint::store)'s.
+//! The checkpoint's text, to and from bytes. Pure; [`store`](crate::checkpoint::store) handles the file.
 //!
-//! A checkpoint is one YAML document: a first line (a comment) that frames and guards the snapshot,
-//! the snapshot in block style, and a last key `journal:` under which every appended line is one
-//! [`Record`] in flow style. `docs/checkpoint.md` describes the format for people.
+//! A checkpoint is one YAML document: a first line (a comment) with lengths and check sums, the snapshot in
+//! block style, and a last key `journal:` under which every appended line is one [`Record`] in flow style.
+//! `docs/checkpoint.md` describes the format for people.
 //!
-//! * `emit`: values to YAML that YAML 1.1 and 1.2 readers take alike.
-//! * `yaml`: YAML to values, on the events of serde-saphyr's parser.
-//! * `frame`: the first line, the records' check sums, and what of a damaged file is whole.
+//! * `emit`: values to YAML that YAML 1.1 and 1.2 readers read alike.
+//! * `yaml`: YAML to values, from the events of serde-saphyr's parser.
+//! * `frame`: the first line, check sums, and the whole parts of a damaged file.
 //! * `document`: which value stands under which key.
 
 mod document;
@@ -27,40 +26,40 @@ use crate::xmlrpc::Call;
 pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub(crate) use frame::{Framed, push_body, scan, seal};
 
-/// Levels of nesting that can be written and read back: those of the deepest value of a call
-/// (`xmlrpc` takes 512) below a parameter path of half as many names. rosmaster itself cannot return
-/// a value deeper than 492 levels.
+/// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512)
+/// below a parameter path of half as many names. rosmaster itself cannot return a value deeper than 492
+/// levels.
 pub const DEPTH_MAX: usize = 768;
 
-/// What a restart needs to know to tell whether the robot's run goes on.
+/// What a restart needs to decide whether the session continues.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Session {
-    /// Names the run; the `run_id` of roslaunch.
+    /// Identifies the session; the `run_id` of roslaunch.
     pub id: String,
     /// The kernel's boot id when the session began.
     pub boot_id: String,
     /// Whether the session ended by an orderly stop.
     pub closed: bool,
-    /// The caller id that marks the incarnation of the master.
+    /// The caller id that marks the master's incarnation.
     pub mark: String,
-    /// Where the master was, if there was one yet.
+    /// The master's address, if there was one yet.
     pub master_uri: Option<String>,
     /// Wall clock time of the start as text, for people only.
     pub started: String,
-    /// Number of the master's incarnation, which its token bears.
+    /// Number of the master's incarnation, as in its token.
     pub incarnation: u64,
-    /// All pending writes up to this record have reached the master. A snapshot's pending writes
-    /// count as of the snapshot's last record.
+    /// All pending writes up to this record have reached the master. A snapshot's pending writes have the
+    /// number of its last record.
     pub delivered: u64,
 }
 
-/// What one record says.
+/// The content of a record.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Entry {
     /// A write that was answered with success.
     Call {
         call: Call,
-        /// Whether the mirror answered it and no master had run it yet.
+        /// Whether the mirror answered it before a master had run it.
         pending: bool,
     },
     /// Replaces the session.
@@ -78,33 +77,32 @@ impl Entry {
 /// One line of the journal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// Its number: one more than that of the record before, over all generations of the file.
+    /// One more than the previous record's, across all generations of the file.
     pub seq: u64,
     pub entry: Entry,
 }
 
-/// A whole state, and where in the journal it stands.
+/// A whole state and its place in the journal.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
     /// Number of the last record whose effect `snapshot` contains; 0 if there was none.
     pub seq: u64,
     pub session: Session,
-    /// The master's state.
     pub snapshot: Snapshot,
-    /// Those of the writes in `snapshot` that no master has run yet, in order.
+    /// The writes in `snapshot` that no master has run yet, in order.
     pub pending: Vec<Call>,
 }
 
 /// A checkpoint's text, and the stamp that its records must carry.
 #[derive(Debug)]
 pub struct Encoded {
-    /// The whole file before its first record.
+    /// The whole file up to its first record.
     pub bytes: Vec<u8>,
     /// Ties records to these bytes.
     pub stamp: Stamp,
 }
 
-/// Why something cannot be written.
+/// Why something cannot be encoded.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum EncodeError {
@@ -116,17 +114,17 @@ pub enum EncodeError {
     },
 }
 
-/// Why a file is not for us to read.
+/// Why a file is not read.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum DecodeError {
-    /// Neither the first line nor anything else in it is ours.
+    /// Nothing in it belongs to a checkpoint.
     #[error("not a rosrescue checkpoint")]
     NotACheckpoint,
-    /// An intact file of a later rosrescue.
+    /// An intact file of a newer rosrescue.
     #[error("written in checkpoint format {version}; this rosrescue knows up to {known}", known = FORMAT_VERSION)]
     NewerVersion {
-        /// The format that its first line names.
+        /// The format in its first line.
         version: u32,
     },
 }
@@ -135,7 +133,7 @@ pub enum DecodeError {
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SnapshotError {
-    /// The first line is not as it was written.
+    /// The first line is damaged.
     #[error("the first line is damaged")]
     Header,
     /// The file ends inside the snapshot.
@@ -145,46 +143,43 @@ pub enum SnapshotError {
         expected: u64,
         found: u64,
     },
-    /// Some byte differs.
+    /// The content differs from what was written.
     #[error("the snapshot's check sum is {found:08x}, not {expected:08x}")]
     Checksum {
-        /// According to the first line.
         expected: u32,
         found: u32,
     },
-    /// The bytes are those that were written, and yet do not make a snapshot.
+    /// The bytes are as written, but are not a valid snapshot.
     #[error("the snapshot is whole and does not make sense: {why}")]
     Content {
-        /// What is wrong.
         why: String,
     },
 }
 
-/// A place in a file that is not as it was written.
+/// A damaged place in a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Damage {
-    /// Where, in bytes from the start of the file.
+    /// In bytes from the start of the file.
     pub offset: usize,
-    /// What is wrong there.
     pub why: String,
 }
 
-/// All that could be read of a file.
+/// The readable parts of a file.
 #[derive(Debug)]
 pub struct Decoded {
-    /// Counts the rewritings of the file; 0 if the first line is damaged.
+    /// The file's generation; 0 if the first line is damaged.
     pub generation: u64,
     /// The snapshot, if it is whole.
     pub checkpoint: Result<Checkpoint, SnapshotError>,
     /// The whole records in order.
     pub records: Vec<Record>,
-    /// The bytes at the end of an append that was cut short, if it was.
+    /// The bytes of a torn append at the end, if any.
     pub torn: Option<Range<usize>>,
-    /// Everything else that is wrong.
+    /// All other damage.
     pub damaged: Vec<Damage>,
 }
 
-/// The bytes of a fresh file that holds `checkpoint` and no record yet.
+/// The bytes of a new file that holds `checkpoint` and no record yet.
 ///
 /// ```
 /// use rosrescue::checkpoint::format::{self, Checkpoint, Entry, Record, Session};
@@ -208,7 +203,7 @@ pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Enc
     Ok(frame::frame_snapshot(&body, checkpoint.seq, generation))
 }
 
-/// The line of `record` in the file whose stamp is `stamp`, its line feed included.
+/// The line of `record` for a file with this `stamp`, with its line feed.
 ///
 /// # Errors
 ///

@@ -1,6 +1,6 @@
-//! Whether a checkpoint's session goes on, or the robot was switched on anew.
+//! Whether a checkpoint's session continues, or the robot was switched on anew.
 //!
-//! A robot that is switched on in the morning must not wake up with yesterday's parameters.
+//! A robot that is switched on in the morning must not start with yesterday's parameters.
 
 use crate::{
     checkpoint::format::{Checkpoint, Entry, Record, Session},
@@ -10,7 +10,7 @@ use crate::{
 /// When a checkpoint is restored at start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Restore {
-    /// If the session goes on: same boot and no orderly stop, or a registered node still lives.
+    /// If the session continues: same boot and no orderly stop, or a registered node still lives.
     Auto,
     /// Always.
     Always,
@@ -21,24 +21,23 @@ pub enum Restore {
 /// What is known about a recorded session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Evidence {
-    /// The computer has not been booted since.
+    /// The computer has not rebooted since.
     pub same_boot: bool,
     /// rosrescue was stopped in order.
     pub closed: bool,
-    /// A node that was registered answers; one on another computer, unless it is the same boot.
+    /// A registered node answers. After a reboot only nodes on other computers count.
     pub node_alive: bool,
 }
 
-/// Why a checkpoint is restored or not, in words.
+/// Whether a checkpoint is restored, and the reason in words.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
-    /// Restore it.
     Restore(&'static str),
-    /// Begin a new session.
+    /// Start a new session.
     Fresh(&'static str),
 }
 
-/// Whether the decision hangs on [`Evidence::node_alive`], which takes time to find out.
+/// Whether the decision depends on [`Evidence::node_alive`], which takes time to find out.
 pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
     let with = |node_alive| {
         decide(
@@ -52,7 +51,6 @@ pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
     with(true) != with(false)
 }
 
-/// Decides.
 pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     let Evidence {
         same_boot,
@@ -73,21 +71,20 @@ pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     }
 }
 
-/// What a checkpoint and the records after it make.
+/// The state rebuilt from a checkpoint and its records.
 #[derive(Debug, Default)]
 pub struct Rebuilt {
     pub mirror: Master,
     pub session: Option<Session>,
-    /// The writes that have not reached the master yet, in order.
+    /// Writes that have not reached the master yet, in order.
     pub pending: Vec<Request>,
-    /// Why the snapshot was left out: it is no state of a master.
+    /// Why the snapshot was left out: it is not the state of a master.
     pub trouble: Option<String>,
 }
 
-/// Applies the records to the checkpoint.
 pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
     let mut rebuilt = Rebuilt::default();
-    // Each with the number of its record; those of the snapshot with the snapshot's.
+    // With the number of each write's record, or of the snapshot.
     let mut pending: Vec<(u64, Request)> = Vec::new();
     if let Some(checkpoint) = checkpoint {
         let writes = checkpoint.pending.into_iter();

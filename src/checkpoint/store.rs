@@ -1,16 +1,15 @@
 //! The checkpoint on disk.
 //!
-//! A [`Store`] owns one file and its companions: it takes the lock, says what it finds
-//! ([`Loaded`]), appends records, and replaces the file by a new generation when the journal has
-//! outgrown the snapshot or the disk has failed. It is synchronous and never decides when to do so.
-//! What may take long ([`SyncJob`], [`CompactionJob`]) is handed out to run on a blocking thread
-//! while records go on being appended. `docs/checkpoint.md` has the commit procedure and what is
-//! assumed about the disk.
+//! A [`Store`] owns one file and its companions: it takes the lock, loads the file ([`Loaded`]), appends
+//! records, and replaces the file by a new generation when the journal is too large or the disk has failed.
+//! It is synchronous and never decides when to do so. Slow work ([`SyncJob`], [`CompactionJob`]) is returned
+//! as a job for a blocking thread; meanwhile records can be appended. `docs/checkpoint.md` has the commit
+//! procedure and the assumptions about the disk.
 //!
-//! A failed write or sync *latches*: the file is never written again, because what a failed
-//! `fsync` has dropped is reported once and then forgotten. The store is then
-//! [unprotected](Store::unprotected) until [`Store::rearm`] has written a new file. What somebody else does
-//! to the file, its folder or its lock makes no write fail; a [`CheckJob`] finds it, and it latches too.
+//! A failed write or sync *latches*: the file is never written again, because the data that a failed `fsync`
+//! has dropped is reported only once. The store is then [unprotected](Store::unprotected) until
+//! [`Store::rearm`] has written a new file. A change by another process to the file, its folder or its lock
+//! makes no write fail; a [`CheckJob`] finds it, and it latches too.
 
 mod aside;
 mod error;
@@ -40,16 +39,16 @@ use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{Change, CheckJob, Checked};
 
-/// The kinds of names under which is kept what was damaged,
+/// Kinds of names for files that are kept: damaged ones,
 const BROKEN: &str = "broken";
-/// and what could not be read.
+/// and unreadable ones.
 const UNREADABLE: &str = "unreadable";
 
-/// The file that we know to be at the path.
+/// The file that is known to be at the path.
 #[derive(Clone, Copy, Debug)]
 struct Present {
     id: FileId,
-    /// Whether it is whole enough to be kept as the previous generation.
+    /// Whether it can become the previous generation.
     usable: bool,
 }
 
@@ -57,21 +56,21 @@ struct Present {
 pub struct Store<S: Storage = Disk> {
     storage: S,
     names: Names,
-    /// The file that records go to.
+    /// The file that receives the records.
     active: Option<Active<S>>,
-    /// Why nothing is recorded. `None` only with `active`.
+    /// Why nothing is recorded. `None` only if `active` is set.
     unprotected: Option<String>,
     pending: Option<Pending>,
     /// Number of the last record, recorded or not: a number is never used twice.
     seq: u64,
     synced_seq: u64,
-    /// The highest generation begun.
+    /// The highest generation that was begun.
     generation: u64,
-    /// What else is at the path is kept before it is replaced.
+    /// The known file. Any other file at the path is kept before it is replaced,
     present: Option<Present>,
-    /// What it is called then,
+    /// under this kind of name;
     aside_kind: &'static str,
-    /// and where the last one went.
+    /// this is where the last one went.
     kept: Option<PathBuf>,
     compact_above: u64,
     file_bytes_max: u64,
@@ -80,12 +79,12 @@ pub struct Store<S: Storage = Disk> {
     lock_id: FileId,
 }
 
-/// Reads the checkpoint at `path` and changes nothing: no lock, no folder, no copies. For a disk on
-/// which [`Store::open`] fails because it cannot be written.
+/// Reads the checkpoint at `path` and changes nothing: no lock, no folder, no copies. For a disk on which
+/// [`Store::open`] fails because it is read-only.
 ///
 /// # Errors
 ///
-/// If the file cannot be read, is not ours or is too new.
+/// If the file cannot be read, is not a checkpoint or is too new.
 pub fn read(path: &Path) -> Result<Option<Loaded>, OpenError> {
     let names = Names {
         path: path.to_owned(),
@@ -103,8 +102,7 @@ impl Store<Disk> {
         Self::open_on(Disk, path)
     }
 
-    /// Opens the checkpoint at `path` for a state that does not come from there; see
-    /// [`Store::open_over_on`].
+    /// Opens the checkpoint at `path` for a state from elsewhere; see [`Store::open_over_on`].
     ///
     /// # Errors
     ///
@@ -124,20 +122,20 @@ fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) 
 }
 
 impl<S: Storage> Store<S> {
-    /// Takes the lock of the checkpoint at `path` and reads what is there; makes its folder if need
-    /// be. A damaged file is kept under another name as well, and so is the end of an append that
-    /// was cut short. What cannot be read is kept when something takes its place. Nothing can be
-    /// recorded before [`begin`](Self::begin).
+    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. A damaged file
+    /// is also copied to another name, and so is a torn append. An unreadable file is kept when it is
+    /// replaced. Nothing can be recorded before [`begin`](Self::begin).
     ///
     /// # Errors
     ///
-    /// If the folder or the file cannot be used, another rosrescue has it, or the file is not ours
-    /// or too new. The file is untouched then.
+    /// If the folder or the file cannot be used, another rosrescue has it, or the file is not a checkpoint or
+    /// too new. The file is then untouched.
     pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
         let Some(found) = load::load(storage, names)? else {
-            // Somebody removed the file to start afresh; its fallback must not come back later.
+            // The operator removed the file to start afresh; the previous generation must not be restored
+            // later.
             names
                 .remove_unfinished(storage)
                 .and_then(|()| set_aside_previous(storage, names, "old"))
@@ -149,7 +147,7 @@ impl<S: Storage> Store<S> {
         if store.present.is_none() {
             store.aside_kind = UNREADABLE;
         }
-        // A disk that refuses these may still be read, and what was read is worth more.
+        // Best effort: a read-only disk can still be read.
         let _ = names.remove_unfinished(storage);
         let kept = match store.present {
             Some(_) => keep_aside(storage, names, &mut loaded, found.torn),
@@ -162,21 +160,19 @@ impl<S: Storage> Store<S> {
             loaded.damage.push(format!(
                 "what is damaged of `{path}` could not be kept: {error}"
             ));
-            // Kept when something takes its place, then.
+            // Kept when it is replaced, then.
             store.present = store.present.filter(|present| present.usable);
         }
         store.set_counts(found.seq, found.generation);
         Ok((store, Some(loaded)))
     }
 
-    /// Takes the lock of the checkpoint at `path` for a state that does not come from there: whatever
-    /// is there now, and its previous generation, is kept under another name before something takes
-    /// its place.
+    /// Takes the lock of the checkpoint at `path` for a state from elsewhere. The present file and its
+    /// previous generation are kept under other names before they are replaced.
     ///
     /// # Errors
     ///
-    /// As [`open_on`](Self::open_on): what is no checkpoint, and might be a folder of somebody's, is not
-    /// renamed either.
+    /// As [`open_on`](Self::open_on). Other files and folders are not renamed.
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
@@ -190,7 +186,7 @@ impl<S: Storage> Store<S> {
         Ok(store)
     }
 
-    /// A store that knows nothing of what is at `path`, which is locked.
+    /// Locks `path`, without reading what is there.
     fn lock_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let path = storage
             .locate(path)
@@ -231,7 +227,7 @@ impl<S: Storage> Store<S> {
         (self.seq, self.synced_seq, self.generation) = (seq, seq, generation);
     }
 
-    /// Where the file is, links resolved.
+    /// The file's path, links resolved.
     pub fn path(&self) -> &Path {
         &self.names.path
     }
@@ -241,12 +237,12 @@ impl<S: Storage> Store<S> {
         self.seq
     }
 
-    /// Number of the last record that is known to survive a loss of power.
+    /// Number of the last record known to survive a loss of power.
     pub fn synced_seq(&self) -> u64 {
         self.synced_seq
     }
 
-    /// How often the file has been written anew.
+    /// Number of times the file has been rewritten.
     pub fn generation(&self) -> u64 {
         self.generation
     }
@@ -258,14 +254,14 @@ impl<S: Storage> Store<S> {
             .map_or(0, |active| active.journal_bytes)
     }
 
-    /// Size of what precedes the journal in bytes.
+    /// Size of the part before the journal, in bytes.
     pub fn snapshot_bytes(&self) -> u64 {
         self.active
             .as_ref()
             .map_or(0, |active| active.snapshot_bytes)
     }
 
-    /// Why nothing is recorded; `None` if all is well.
+    /// Why nothing is recorded; `None` if records are written.
     pub fn unprotected(&self) -> Option<&str> {
         self.unprotected.as_deref()
     }

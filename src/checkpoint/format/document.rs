@@ -1,4 +1,4 @@
-//! Which value stands under which key of the document.
+//! The document: which value stands under which key.
 
 use indexmap::IndexMap;
 
@@ -80,7 +80,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
     Ok(std::mem::take(out))
 }
 
-/// A key whose entries have lines of their own.
+/// A key whose entries take lines of their own.
 fn section<T>(
     out: &mut Vec<u8>,
     title: &str,
@@ -88,14 +88,14 @@ fn section<T>(
     mut write: impl FnMut(&mut Vec<u8>, &T),
 ) {
     section_of_lines(out, title, entries, |out, entry| {
-        // Instead of the blank after the key.
+        // Removes the blank after the key.
         out.pop();
         out.push(b'\n');
         write(out, entry);
     });
 }
 
-/// A key whose entries have one line each; `write` ends the line.
+/// A key whose entries take one line each; `write` ends the line.
 fn section_of_lines<T>(
     out: &mut Vec<u8>,
     title: &str,
@@ -122,7 +122,7 @@ fn text_line(out: &mut Vec<u8>, key: &str, text: &str) {
 }
 
 fn names(out: &mut Vec<u8>, ids: &[String]) {
-    // Texts nest nothing, so this cannot fail.
+    // Cannot fail: texts do not nest.
     let _ = flow_list(out, ids, |out, id| {
         quoted(out, id);
         Ok(())
@@ -156,7 +156,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("incarnation", session.incarnation),
         ("delivered", session.delivered),
     ];
-    // A count that is missing is read as 0.
+    // A missing count is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
     members.extend(counts.map(|(name, count)| (name, integer(count))));
     members
@@ -195,7 +195,7 @@ pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result
     Ok(())
 }
 
-/// The way back of [`write_snapshot`].
+/// Reverses [`write_snapshot`].
 pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
     let Value::Struct(mut document) = yaml::read(yaml)? else {
         return Err("it is no mapping".to_owned());
@@ -244,7 +244,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
     })
 }
 
-/// The way back of [`write_record`], whose number the caller has read already.
+/// Reverses [`write_record`]; the caller has read the number.
 pub(super) fn read_record(line: &str) -> Result<Entry, String> {
     let entries = match yaml::read(line)? {
         Value::Array(entries) => entries,
@@ -297,7 +297,7 @@ fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
-    // Moved out, not cloned; the order of what stays behind does not matter.
+    // Moved, not cloned; the order of the rest does not matter.
     document
         .swap_remove(key)
         .and_then(structure)

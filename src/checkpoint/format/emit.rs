@@ -1,17 +1,16 @@
-//! Values to YAML.
+//! Encodes values as YAML.
 //!
-//! One emitter for both styles. Every string and key is double-quoted on one line, numbers take the
-//! form that YAML 1.1 and 1.2 resolve alike, and what YAML has no type for goes into `!!pairs`,
-//! which no XML-RPC value can collide with. serde-saphyr's writer is not used because it has no
-//! integers beyond 128 bits, spreads texts over several lines, and takes four times as long for a
-//! record (1.1 us against 0.25 us).
+//! One emitter for both styles. Every string and key is double-quoted on one line. Numbers take a form that
+//! YAML 1.1 and 1.2 resolve alike. Types that YAML lacks go into `!!pairs`, which no XML-RPC value uses.
+//! serde-saphyr's writer is not used: it has no integers beyond 128 bits, spreads texts over several lines,
+//! and takes four times as long for a record (1.1 us against 0.25 us).
 
 use std::io::Write;
 
 use super::{DEPTH_MAX, EncodeError};
 use crate::xmlrpc::{Struct, Value};
 
-/// Structs deeper than this are written in one line: indentation would outgrow what it shows.
+/// Deeper structs are written in one line: indentation would take more space than content.
 const BLOCK_LEVELS_MAX: usize = 32;
 /// YAML 1.1 and 1.2 look for the `:` of an implicit key within 1,024 characters only.
 const KEY_BYTES_MAX: usize = 1_000;
@@ -19,7 +18,7 @@ const KEY_BYTES_MAX: usize = 1_000;
 const INT_DIGITS_MAX: usize = 4_000;
 /// Kinds of `!!pairs`.
 pub(super) const DATE_TIME: &str = "dateTime.iso8601";
-/// See [`DATE_TIME`].
+/// Another kind; see [`DATE_TIME`].
 pub(super) const BIG_INT: &str = "int";
 
 /// Writes `members` in block style, one line each, indented by `indent` columns.
@@ -145,7 +144,7 @@ pub(super) fn flow_list<T>(
     Ok(())
 }
 
-/// Writes what YAML has no type for.
+/// Writes a type that YAML lacks.
 fn pair(out: &mut Vec<u8>, kind: &str, text: &str) {
     out.extend_from_slice(b"!!pairs [{");
     quoted(out, kind);
@@ -160,7 +159,7 @@ pub(super) fn decimal(out: &mut Vec<u8>, number: impl std::fmt::Display) {
     let _ = write!(out, "{number}");
 }
 
-/// Whether `digits` reads back as the same [`Value::BigInt`] when it stands there as it is.
+/// Whether plain `digits` read back as the same [`Value::BigInt`].
 fn is_plain_big_int(digits: &str) -> bool {
     let magnitude = digits.strip_prefix('-').unwrap_or(digits);
     (10..=INT_DIGITS_MAX).contains(&magnitude.len())
@@ -169,8 +168,8 @@ fn is_plain_big_int(digits: &str) -> bool {
         && digits.parse::<i32>().is_err()
 }
 
-/// YAML 1.1 wants a point in every float and a sign in every exponent. The digits are the fewest
-/// that read back as the same bits; every NaN is `.nan`, as it is one `nan` on the wire.
+/// YAML 1.1 requires a point in every float and a sign in every exponent. Writes the fewest digits that read
+/// back as the same bits; every NaN is `.nan`, as it is one `nan` on the wire.
 fn double(out: &mut Vec<u8>, number: f64) {
     if number.is_nan() {
         return out.extend_from_slice(b".nan");
@@ -192,7 +191,7 @@ fn double(out: &mut Vec<u8>, number: f64) {
     }
 }
 
-/// `20240131T12:00:00`, which is what Python writes, as YAML writes the same moment.
+/// `20240131T12:00:00`, as Python writes it, converted to a YAML timestamp.
 fn timestamp(text: &str) -> Option<String> {
     let number = |range: std::ops::Range<usize>| {
         let digits = text.get(range)?;
@@ -216,13 +215,13 @@ fn timestamp(text: &str) -> Option<String> {
     (real && date_time(&spelled).as_deref() == Some(text)).then_some(spelled)
 }
 
-/// The way back of [`timestamp`].
+/// Reverses [`timestamp`].
 pub(super) fn date_time(stamp: &str) -> Option<String> {
     let (date, time) = stamp.split_once('T')?;
     Some(format!("{}T{time}", date.replace('-', "")))
 }
 
-/// Writes `text` between double quotes on one line, exact for every reader.
+/// Writes `text` double-quoted on one line, exact for every reader.
 pub(super) fn quoted(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
     let plain = text
@@ -251,13 +250,13 @@ pub(super) fn quoted(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
 }
 
-/// A byte that stands for itself in a double-quoted scalar.
+/// A byte that needs no escape in a double-quoted scalar.
 fn is_plain(byte: u8) -> bool {
     matches!(byte, b' '..=b'~') && byte != b'"' && byte != b'\\'
 }
 
-/// Whether a character beyond ASCII is written as it is: not if PyYAML refuses it, if YAML 1.1
-/// breaks lines at it, or if a person could not see it.
+/// Whether a character beyond ASCII is written unescaped: not if PyYAML refuses it, if YAML 1.1 breaks lines
+/// at it, or if it is invisible.
 fn is_shown(character: char) -> bool {
     !matches!(character,
         '\u{0}'..='\u{a0}' | '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}'

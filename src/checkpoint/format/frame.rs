@@ -1,4 +1,4 @@
-//! What guards the bytes, and what of a damaged file is whole.
+//! Check sums, and finding the whole parts of a damaged file.
 //!
 //! ```text
 //! # rosrescue checkpoint v1 generation=G seq=S snapshot=LENGTH crc32c=C header=H
@@ -28,20 +28,20 @@ const HEADER_BYTES_MAX: usize = 256;
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Generations and records are counted on from what a file says, and no count gets beyond this: a
-/// higher number was never written, and adding to it could overflow.
+/// Counting continues from a file's numbers of generations and records. No count exceeds this: a higher
+/// number was never written, and adding to it could overflow.
 const COUNT_MAX: u64 = u64::MAX / 2;
 
-/// Ties the records of a file to its snapshot.
+/// Ties a file's records to its snapshot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp(u32);
 
-/// Puts the first line before a snapshot.
+/// Puts the first line in front of a snapshot.
 pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
     let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
-    // Writing to a vector cannot fail.
+    // Cannot fail: it writes to a vector.
     let _ = write!(
         bytes,
         "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
@@ -84,7 +84,7 @@ fn push_hex(out: &mut Vec<u8>, number: u32) {
     );
 }
 
-/// Eight lower-case digits, and nothing else that a number could be written with.
+/// Eight lower-case digits and nothing else.
 fn hex(digits: &[u8]) -> Option<u32> {
     let digits = <[u8; 8]>::try_from(digits).ok()?;
     digits.iter().try_fold(0, |number: u32, digit| {
@@ -102,7 +102,7 @@ pub(super) fn count(digits: &str) -> Option<u64> {
     digits.parse().ok().filter(|count| *count <= COUNT_MAX)
 }
 
-/// What the first line says.
+/// The first line's content.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Header {
     pub(crate) generation: u64,
@@ -116,7 +116,7 @@ pub(crate) struct Header {
     length: usize,
 }
 
-/// A line whose check holds.
+/// A line with a valid check.
 #[derive(Debug)]
 pub(crate) struct Line<'a> {
     pub(crate) seq: u64,
@@ -124,7 +124,7 @@ pub(crate) struct Line<'a> {
     body: &'a [u8],
 }
 
-/// A file taken apart, its YAML not read yet.
+/// A file split into its parts, its YAML not read yet.
 #[derive(Debug)]
 pub(crate) struct Framed<'a> {
     pub(crate) header: Option<Header>,
@@ -132,15 +132,15 @@ pub(crate) struct Framed<'a> {
     pub(crate) lines: Vec<Line<'a>>,
     pub(crate) torn: Option<Range<usize>>,
     pub(crate) damaged: Vec<Damage>,
-    /// Whether damage follows the last whole line, so that nobody knows what is missing.
+    /// Whether damage follows the last whole line, so that it is unknown what is missing.
     pub(crate) end_lost: bool,
 }
 
-/// Reads a file as far as it is whole.
+/// Reads the whole parts of a file.
 ///
 /// # Errors
 ///
-/// If it is not ours to read.
+/// If it is not a checkpoint of this format.
 pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
     let framed = scan(bytes)?;
     let checkpoint = framed.checkpoint();
@@ -155,11 +155,11 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
     })
 }
 
-/// Takes a file apart and checks every sum.
+/// Splits a file and verifies every check sum.
 ///
 /// # Errors
 ///
-/// If it is not ours to read.
+/// If it is not a checkpoint of this format.
 pub(crate) fn scan(bytes: &[u8]) -> Result<Framed<'_>, DecodeError> {
     let header = read_header(bytes)?;
     let mut framed = Framed {
@@ -191,7 +191,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     if hex(digits) != Some(stamp) {
         return Ok(None);
     }
-    // From here on the line is as it was written.
+    // The line is verified from here on.
     let Some((version, fields)) = std::str::from_utf8(checked)
         .ok()
         .and_then(|line| line.strip_prefix(MAGIC)?.split_once(' '))
@@ -221,9 +221,9 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     Ok(header)
 }
 
-/// Whether a file without a whole first line and without a whole record is a damaged one of ours
-/// and not somebody else's: empty or beginning with zeros, as a crash of the machine leaves files
-/// behind, or with most of the first line's start or of the document's frame still there.
+/// Whether a file without a whole first line and without a whole record is a damaged checkpoint and not another
+/// program's file: it is empty or begins with zeros, as after a crash of the machine, or most of the first
+/// line's start or of the document's frame remains.
 fn resembles(bytes: &[u8]) -> bool {
     let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
     let differing = bytes
@@ -237,7 +237,7 @@ fn resembles(bytes: &[u8]) -> bool {
 }
 
 impl<'a> Framed<'a> {
-    /// A file in which nothing is whole.
+    /// A file without whole parts.
     pub(crate) fn unreadable(bytes: &'a [u8]) -> Self {
         let (lines, damaged) = (Vec::new(), Vec::new());
         Self {
@@ -250,7 +250,7 @@ impl<'a> Framed<'a> {
         }
     }
 
-    /// The snapshot, read and checked.
+    /// The verified snapshot.
     pub(crate) fn checkpoint(&self) -> Result<Checkpoint, SnapshotError> {
         let header = self.header.ok_or(SnapshotError::Header)?;
         let behind = self.bytes.get(header.length..).unwrap_or_default();
@@ -274,8 +274,8 @@ impl<'a> Framed<'a> {
             .map_err(|why| SnapshotError::Content { why })
     }
 
-    /// The records above number `after`. A line whose check holds and whose text does not make
-    /// sense is added to `damaged`.
+    /// The records with numbers above `after`. A line with a valid check but invalid content is added to
+    /// `damaged`.
     pub(crate) fn records(&self, after: u64, damaged: &mut Vec<Damage>) -> Vec<Record> {
         let lines = self.lines.iter().filter(|line| line.seq > after);
         lines
@@ -301,9 +301,8 @@ impl<'a> Framed<'a> {
             .collect()
     }
 
-    /// Finds the whole lines of the journal and says what is wrong with the others. With the first
-    /// line gone nobody knows where the journal starts, but no line of a snapshot looks like a
-    /// record.
+    /// Finds the journal's whole lines and describes the damage to the others. If the first line is lost, the
+    /// journal's start is unknown, but no line of a snapshot looks like a record.
     fn scan_lines(&mut self) {
         let start = match self.header {
             Some(header) => usize::try_from(header.snapshot)
@@ -312,13 +311,13 @@ impl<'a> Framed<'a> {
         };
         let mut stamp = self.header.map(|header| header.stamp);
         let mut offset = start;
-        // Where the bytes that follow the last whole line start, and what they look like.
+        // Start of the bytes after the last whole line, and whether they look like a torn append.
         let mut tail: Option<(usize, bool)> = None;
         let mut tail_damage: Vec<Damage> = Vec::new();
         let mut rest = self.bytes.get(start..).unwrap_or_default();
         while !rest.is_empty() {
             let at = offset;
-            // Reading from memory does not fail, and this finds the line's end the fastest.
+            // Cannot fail: it reads from memory. This is the fastest way to find the line's end.
             let line_length = (&mut &*rest).skip_until(b'\n').unwrap_or(rest.len());
             let (line, behind) = rest.split_at(line_length);
             (rest, offset) = (behind, offset + line_length);
@@ -370,7 +369,7 @@ impl<'a> Framed<'a> {
     }
 }
 
-/// The number, stamp and body of a line whose check holds.
+/// The number, stamp and body of a line with a valid check.
 fn open_line(line: &[u8]) -> Option<(u64, Stamp, &[u8])> {
     let (checked, digits) = line.split_last_chunk::<8>()?;
     let checked = checked.strip_suffix(b" ")?;

@@ -1,9 +1,8 @@
-//! YAML to values.
+//! Decodes YAML to values.
 //!
-//! This reads the events of serde-saphyr's parser rather than going through serde: its data model
-//! has neither the style of a scalar, nor tags, nor integers beyond 64 bits, and those are what
-//! tells the values apart. It takes what `emit` writes and nothing else: no anchors, no aliases,
-//! no other tags, so no text makes it build more than its own length. Nothing recurses.
+//! Reads the events of serde-saphyr's parser and does not use serde: serde's data model lacks scalar styles,
+//! tags, and integers beyond 64 bits, which distinguish the values. It accepts only what `emit` writes: no
+//! anchors, no aliases, no other tags. So no text can build more than its own length. Nothing recurses.
 
 use std::borrow::Cow;
 
@@ -28,7 +27,7 @@ enum Open {
 }
 
 pub(super) fn read(text: &str) -> Result<Value, String> {
-    // A document adds a few levels of its own around the deepest value.
+    // The document itself adds a few levels around the deepest value.
     let nesting = DEPTH_MAX + 8;
     let options = granit_parser::options! {
         emit_comments: false,
@@ -125,7 +124,8 @@ fn scalar(text: Cow<'_, str>, style: ScalarStyle, tag: Option<&Tag>) -> Option<V
 
 fn plain(text: &str) -> Option<Value> {
     Some(match text {
-        // The parser says `~` where nothing follows a key: the journal, whose lines are read apart.
+        // The parser reports `~` where nothing follows a key. That is the journal, whose lines are read
+        // separately.
         "null" | "~" => Value::Nil,
         "true" => Value::Bool(true),
         "false" => Value::Bool(false),
@@ -141,7 +141,7 @@ fn plain(text: &str) -> Option<Value> {
             } else if first.is_ascii_digit() && magnitude.contains('.') {
                 Value::Double(text.parse().ok()?)
             } else if first.is_ascii_lowercase() && text == magnitude {
-                // The document's own keys are the only plain words.
+                // Only the document's own keys are plain words.
                 Value::String(text.to_owned())
             } else {
                 return None;

@@ -1,5 +1,4 @@
-//! Keeping files under other names: what was damaged, what was found at the path, and sessions that have
-//! ended.
+//! Keeps files under other names: damaged ones, those found at the path, and ended sessions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,13 +8,13 @@ use super::storage::FileId;
 use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
-    /// Gives the present file another name, `PATH.REASON-NUMBER`, and its previous generation too,
-    /// so that neither has a part in what comes next. Nothing can be recorded before the next
-    /// [`begin`](Self::begin). Returns the file's new path, if there was a file.
+    /// Renames the present file to `PATH.REASON-NUMBER`, and its previous generation too, so that neither
+    /// affects the next one. Nothing can be recorded before the next [`begin`](Self::begin). Returns the
+    /// file's new path, if there was a file.
     ///
     /// # Errors
     ///
-    /// If they cannot be renamed: they may still be where they were.
+    /// If they cannot be renamed: they may still be at their old names.
     pub fn set_aside(&mut self, reason: &str) -> Result<Option<PathBuf>, StoreError> {
         self.active = None;
         self.overtake();
@@ -32,7 +31,7 @@ impl<S: Storage> Store<S> {
             })
             .collect();
         let path = &self.names.path;
-        // The previous generation first: left behind alone it could come back.
+        // The previous generation first: if it stayed alone it could be restored.
         let moved = set_aside_previous(&self.storage, &self.names, &kind).and_then(|()| {
             let aside = self.names.aside(&self.storage, &kind)?;
             let moved = rename_if_there(&self.storage, path, &aside)?;
@@ -44,8 +43,8 @@ impl<S: Storage> Store<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Puts the file at `fresh` at the path. What is there is kept under another name, unless it is
-    /// known: kept already as the `previous` generation, or ours and of no use.
+    /// Moves the file at `fresh` to the path. A file that is there is kept under another name, unless it is
+    /// known: it is already kept as the `previous` generation, or is ours and useless.
     pub(super) fn take_path(&mut self, fresh: &Path, previous: Option<FileId>) -> io::Result<()> {
         let (storage, path) = (&self.storage, &self.names.path);
         let there = storage.id_at(path)?;
@@ -62,7 +61,7 @@ impl<S: Storage> Store<S> {
     }
 }
 
-/// Keeps what is damaged, and says under which name.
+/// Keeps a damaged file, and notes under which name.
 pub(super) fn keep_aside(
     storage: &impl Storage,
     names: &Names,

@@ -1,4 +1,4 @@
-//! What can go wrong with the file.
+//! Errors of the store.
 
 use std::io;
 use std::path::PathBuf;
@@ -8,11 +8,10 @@ use thiserror::Error;
 use super::Change;
 use crate::checkpoint::format::EncodeError;
 
-/// Why a checkpoint cannot be opened. Nothing has been changed then.
+/// Why a checkpoint cannot be opened. Nothing has been changed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// Another rosrescue has it.
     #[error(
         "the checkpoint `{}` is in use by another rosrescue{}; stop that one or choose another file with --checkpoint",
         path.display(),
@@ -20,10 +19,10 @@ pub enum OpenError {
     )]
     Locked {
         path: PathBuf,
-        /// The process that holds the lock, if it left its number.
+        /// The process that holds the lock, if known.
         holder: Option<u32>,
     },
-    /// Something else is there.
+    /// The file is something else.
     #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
     NotACheckpoint { path: PathBuf },
     /// A later rosrescue wrote it.
@@ -39,14 +38,14 @@ pub enum OpenError {
     )]
     Io {
         doing: &'static str,
-        /// On which file or folder.
+        /// The file or folder.
         path: PathBuf,
         source: io::Error,
     },
 }
 
 impl OpenError {
-    /// What the operating system said, without what to do about it.
+    /// The operating system's error, without advice.
     pub(super) fn without_advice(&self) -> String {
         match self {
             Self::Io {
@@ -59,7 +58,7 @@ impl OpenError {
     }
 }
 
-/// Why something was not recorded. Calls go on being forwarded.
+/// Why something was not recorded. Calls are still forwarded.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum StoreError {
@@ -73,7 +72,7 @@ pub enum StoreError {
         path: PathBuf,
         source: io::Error,
     },
-    /// Somebody else changed the file.
+    /// Another process changed the file.
     #[error("`{}` was changed by somebody else: {change}", path.display())]
     Changed { path: PathBuf, change: Change },
     /// Another rosrescue took the lock after ours had been removed.
@@ -84,7 +83,7 @@ pub enum StoreError {
     )]
     Taken {
         path: PathBuf,
-        /// The process that holds the lock, if it left its number.
+        /// The process that holds the lock, if known.
         holder: Option<u32>,
     },
     /// The snapshot is older than the journal.
@@ -92,19 +91,19 @@ pub enum StoreError {
         "a snapshot as of record {snapshot} cannot replace a journal that has reached {journal}; take a new one"
     )]
     Stale {
-        /// The record that the snapshot goes up to.
+        /// The last record in the snapshot.
         snapshot: u64,
         /// The journal's last record.
         journal: u64,
     },
-    /// A second one was begun.
+    /// A new generation is already being written.
     #[error("another generation of the checkpoint is being written; finish that one first")]
     Busy,
-    /// A generation that is no longer wanted: a later one was begun, the file was set aside, or too
-    /// much was recorded while it was written.
+    /// The new generation is obsolete: a later one was begun, the file was set aside, or too much was
+    /// recorded meanwhile.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken { path: PathBuf },
-    /// What should be written cannot be.
+    /// The content cannot be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
 }

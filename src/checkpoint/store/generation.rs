@@ -1,4 +1,4 @@
-//! Writing a new generation of the file while calls go on being recorded.
+//! Writes a new generation of the file while calls are still recorded.
 
 use std::io;
 use std::path::Path;
@@ -9,55 +9,54 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use crate::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// A journal that is smaller than this is not worth a new generation.
+/// A smaller journal is not worth a new generation.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
-/// What is recorded while a new generation is written is kept in memory too, up to this size;
-/// beyond it that generation is given up and the present file goes on.
+/// Records made while a new generation is written are also kept in memory, up to this size. Beyond it the new
+/// generation is dropped and the present file stays in use.
 pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
-/// A new generation that is being written.
 pub(super) struct Pending {
     generation: u64,
-    /// Bodies of the records since, each with a line feed.
+    /// Bodies of the records made meanwhile, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// Dangles when the job or its result was dropped instead of being finished.
+    /// Dangles if the job or its result was dropped unfinished.
     ticket: Weak<Ticket>,
 }
 
-/// Whether a generation is still wanted; locked while its job changes names, so that no job that
-/// was superseded touches the files of the one that superseded it.
+/// Whether a generation is still wanted. Locked while its job renames files, so that a superseded job cannot
+/// touch its successor's files.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
 impl Ticket {
     fn lock(&self) -> MutexGuard<'_, bool> {
-        // A truth value is whole whatever became of the thread that wrote it.
+        // A poisoned boolean is still valid.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Writes a new generation; from [`Store::begin_compaction`](super::Store::begin_compaction).
+/// Writes a new generation; see [`Store::begin_compaction`](super::Store::begin_compaction).
 #[must_use = "the journal goes on growing until the job has run and has been finished"]
 pub struct CompactionJob<S: Storage> {
     plan: Plan<S>,
     checkpoint: Checkpoint,
 }
 
-/// Where a new generation goes.
+/// What a job needs to write a new generation.
 struct Plan<S: Storage> {
     storage: S,
     names: Names,
     generation: u64,
     /// The present file, if it becomes the previous generation.
     keep_present: Option<FileId>,
-    /// What comes first then: the generation before may be the only one to have some of the present
-    /// file's records on the medium.
+    /// Runs first if the present file is kept: some of its records may be on the medium only in the older
+    /// generation.
     settle: Option<SyncJob<S>>,
     ticket: Arc<Ticket>,
 }
 
-/// A new generation on disk under a name of its own, or why there is none.
+/// A new generation on disk under a temporary name, or why there is none.
 #[must_use = "give it to `Store::finish_compaction`"]
 pub struct Compacted<S: Storage> {
     generation: u64,
@@ -71,15 +70,15 @@ struct Written<S: Storage> {
     stamp: Stamp,
     snapshot_bytes: u64,
     crc: u32,
-    /// The file that is the previous generation now.
+    /// The new previous generation.
     previous: Option<FileId>,
-    /// Whether the previous generation is the present file itself, so that it has what is appended
-    /// to that until the new one takes its place.
+    /// Whether the previous generation is the present file itself. Then it also gets what is appended until
+    /// the new one replaces it.
     linked: bool,
 }
 
 impl<S: Storage> CompactionJob<S> {
-    /// Encodes, writes and syncs; blocks as long as the disk does.
+    /// Encodes, writes and syncs. Blocks as long as the disk does.
     pub fn run(self) -> Compacted<S> {
         self.plan.run(&self.checkpoint)
     }
@@ -127,8 +126,8 @@ impl<S: Storage> Plan<S> {
                 .map_err(failed("keep", &path))?;
             previous = self.keep_present;
         }
-        // Both names are on the medium before the new generation takes the path: whatever part of
-        // the rest a loss of power undoes, the records are in one of the two.
+        // Both names are on the medium before the new generation takes the path. So whatever a loss of power
+        // undoes later, the records are in one of the two files.
         storage
             .sync_dir(names.folder())
             .map_err(failed("sync the folder of", &path))?;
@@ -143,13 +142,13 @@ impl<S: Storage> Plan<S> {
         })
     }
 
-    /// Whether the present file is to be kept and nobody has moved it away.
+    /// Whether the present file is to be kept and is still at its path.
     fn present_is_there(&self) -> bool {
         let there = self.storage.id_at(&self.names.path).ok().flatten();
         there.is_some() && there == self.keep_present
     }
 
-    /// A file at `path` that holds `bytes`, on the medium.
+    /// Writes `bytes` to a file at `path` and syncs it.
     fn write_at(&self, path: &Path, bytes: &[u8]) -> Result<S::File, StoreError> {
         let storage = &self.storage;
         let file = storage.create(path).map_err(failed("create", path))?;
@@ -159,8 +158,8 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the previous generation, which the present file is about to replace anyway. The present
-    /// file itself never gives way: it is the only copy until there is a new one.
+    /// Removes the previous generation, which is about to be replaced anyway. Never the present file: it is
+    /// the only copy until there is a new one.
     fn make_room(&self) -> bool {
         let wanted = self.ticket.lock();
         *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
@@ -168,13 +167,13 @@ impl<S: Storage> Plan<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// Writes `checkpoint` as a fresh generation and returns when it is on the medium. The present
-    /// file becomes the previous generation.
+    /// Writes `checkpoint` as a new generation and syncs it. The present file becomes the previous
+    /// generation.
     ///
     /// # Errors
     ///
-    /// If it cannot be written: the store is unprotected if it was before, else it goes on with the
-    /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
+    /// If it cannot be written: the store stays unprotected if it was, otherwise it keeps using the present
+    /// file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
     pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         if checkpoint.seq >= self.seq {
             self.overtake();
@@ -187,7 +186,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Whether the journal has outgrown the snapshot, so that a new generation is worth writing.
+    /// Whether the journal is large enough for a new generation.
     pub fn wants_compaction(&self) -> bool {
         !self.is_busy()
             && self.active.as_ref().is_some_and(|active| {
@@ -195,10 +194,9 @@ impl<S: Storage> Store<S> {
             })
     }
 
-    /// Begins a new generation with `checkpoint`, taken as of now: its [`Checkpoint::seq`] is
-    /// [`seq`](Self::seq). Run the job anywhere, go on appending, then give its result to
-    /// [`finish_compaction`](Self::finish_compaction). Also the way to re-arm an unprotected store
-    /// beside traffic.
+    /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] is
+    /// [`seq`](Self::seq). Run the job on any thread, continue to append, then pass its result to
+    /// [`finish_compaction`](Self::finish_compaction). Also re-arms an unprotected store beside traffic.
     ///
     /// # Errors
     ///
@@ -246,13 +244,12 @@ impl<S: Storage> Store<S> {
         })
     }
 
-    /// Whether a new generation is being written.
     fn is_busy(&self) -> bool {
         let ticket = self.pending.as_ref().map(|pending| &pending.ticket);
         ticket.is_some_and(|ticket| ticket.strong_count() > 0)
     }
 
-    /// Takes care that a generation that is being written touches no file but its own from now on.
+    /// Invalidates the generation being written: from now on it touches only its own file.
     pub(super) fn overtake(&mut self) {
         if let Some(ticket) = self
             .pending
@@ -263,13 +260,13 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Adds what was recorded meanwhile to the new generation and puts it in the present file's
-    /// place. Quick: it waits for no disk that can give a file two names.
+    /// Appends the records made meanwhile to the new generation and moves it to the path. Quick: it waits for
+    /// the disk only where the file system has no hard links.
     ///
     /// # Errors
     ///
-    /// If there is no new generation. The present file goes on as it was, and the next compaction
-    /// is wanted when it has doubled.
+    /// If there is no new generation. The present file stays in use, and the next compaction is due when it
+    /// has doubled.
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
@@ -278,7 +275,7 @@ impl<S: Storage> Store<S> {
         let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
         let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
-            // It may not be there at all; if it stays, the next start removes it.
+            // It may not exist. If it stays, the next start removes it.
             let _ = self.storage.remove(&fresh);
             let journal = self
                 .active
@@ -308,7 +305,7 @@ impl<S: Storage> Store<S> {
         append_all(&self.storage, &written.file, &journal)
             .and_then(|()| match written.linked {
                 true => Ok(()),
-                // The one case in which it waits: on file systems such as FAT.
+                // The only wait: on file systems such as FAT.
                 false => self.storage.sync(&written.file),
             })
             .map_err(failed("write", &fresh))?;
@@ -317,7 +314,7 @@ impl<S: Storage> Store<S> {
             .status(&written.file)
             .map_err(failed("check", &fresh))?;
         if let Err(source) = self.take_path(&fresh, written.previous) {
-            // Which file the path names now, nobody knows.
+            // It is unknown which file is at the path now.
             return Err(self.latch(failed("replace", &self.names.path)(source)));
         }
         self.active = Some(Active {
@@ -342,7 +339,7 @@ impl<S: Storage> Store<S> {
         Ok(())
     }
 
-    /// Ends being unprotected: [`begin`](Self::begin) under the name that says why.
+    /// Ends being unprotected. Same as [`begin`](Self::begin).
     ///
     /// # Errors
     ///
@@ -351,7 +348,7 @@ impl<S: Storage> Store<S> {
         self.begin(checkpoint)
     }
 
-    /// Writes a last generation, which `checkpoint` says is closed, and stops recording.
+    /// Writes a last generation, marked as closed in `checkpoint`, and stops recording.
     ///
     /// # Errors
     ///
@@ -376,7 +373,7 @@ impl Pending {
     }
 }
 
-/// Appends all of `bytes`, in as many writes as it takes.
+/// Appends all of `bytes`, in as many writes as needed.
 pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) -> io::Result<()> {
     let mut rest = bytes;
     while !rest.is_empty() {
@@ -388,7 +385,7 @@ pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) 
     Ok(())
 }
 
-/// Says what was done to which file when it failed.
+/// Adds to an error what failed, and on which file.
 pub(super) fn failed(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> StoreError {
     move |source| StoreError::Io {
         doing,

@@ -1,4 +1,4 @@
-//! Appending records to the present file, and bringing them to the medium.
+//! Appends records to the present file and syncs them.
 
 use std::io;
 use std::sync::Arc;
@@ -8,10 +8,10 @@ use super::storage::FileId;
 use super::{Names, Storage, Store, StoreError};
 use crate::checkpoint::format::{self, Entry, Stamp};
 
-/// Room for encoding that is kept between appends.
+/// Most encoding buffer that is kept between appends.
 const BUFFER_BYTES_MAX: usize = 1024 * 1024;
 
-/// The file that records go to.
+/// The file that receives the records.
 pub(super) struct Active<S: Storage> {
     pub(super) file: Arc<S::File>,
     pub(super) stamp: Stamp,
@@ -19,27 +19,27 @@ pub(super) struct Active<S: Storage> {
     pub(super) snapshot_bytes: u64,
     pub(super) journal_bytes: u64,
     pub(super) id: FileId,
-    /// The check sum of all that was written.
+    /// Check sum of everything written.
     pub(super) crc: u32,
-    /// The time of modification that our last write has left.
+    /// Modification time after our last write.
     pub(super) modified: i128,
-    /// Whether somebody else may have written to it, so that the content must be read.
+    /// Whether another process may have written to it, so that its content must be read.
     pub(super) suspect: bool,
-    /// Whether everything appended is on the medium.
+    /// Whether everything appended has been synced.
     pub(super) clean: bool,
-    /// Whether the file's name is.
+    /// Whether the file's name has been synced.
     pub(super) named: bool,
 }
 
 impl<S: Storage> Store<S> {
-    /// Records `entries` with one write. Each gets a number, whether it could be recorded or not;
-    /// the last one's is returned. When this returns they survive the death of every process; a
-    /// [`sync_job`](Self::sync_job) makes them survive a loss of power.
+    /// Records `entries` with one write. Each gets a number, whether it could be recorded or not; returns the
+    /// last one. After that they survive the death of every process; a [`sync_job`](Self::sync_job) makes
+    /// them survive a loss of power.
     ///
     /// # Errors
     ///
-    /// If they were not recorded. Unless the reason is an [`EncodeError`](crate::checkpoint::format::EncodeError),
-    /// the store is unprotected now.
+    /// If they were not recorded. The store is then unprotected, unless the reason is an
+    /// [`EncodeError`](crate::checkpoint::format::EncodeError).
     pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
         let first = self.seq.saturating_add(1);
         self.seq = self.seq.saturating_add(entries.len() as u64);
@@ -71,7 +71,7 @@ impl<S: Storage> Store<S> {
                 });
             }
         };
-        // Nothing is acknowledged that went behind somebody else's bytes, or into a file cut off.
+        // Nothing may be acknowledged that was appended after foreign bytes, or to a truncated file.
         if let Ok(status) = self.storage.status(&active.file)
             && let Err(change) = active.compare(&status)
         {
@@ -80,13 +80,13 @@ impl<S: Storage> Store<S> {
         active.clean &= self.buffer.is_empty();
         let length = active.length() + self.buffer.len() as u64;
         let appended = match length > self.file_bytes_max {
-            // It would never be read again.
+            // A larger file could not be read again.
             true => Err(io::ErrorKind::FileTooLarge.into()),
             false => self.storage.append(&active.file, &self.buffer),
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
-            // The rest would fail too; the next write would only say why.
+            // Not retried: the rest would fail too, only with a clearer error.
             Ok(taken) => Err(io::Error::new(
                 io::ErrorKind::StorageFull,
                 format!("only {taken} of {} bytes were taken", self.buffer.len()),
@@ -110,19 +110,19 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Stops recording, for good as far as the present file is concerned.
+    /// Stops recording to the present file for good.
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());
         if self.active.take().is_some_and(|active| !active.named)
             && let Some(present) = &mut self.present
         {
-            // Nobody knows what of it is on the medium, and the generation before has all of it that was.
+            // It is unknown how much of it is on the medium. The previous generation has everything that was.
             present.usable = false;
         }
         error
     }
 
-    /// The work that brings what was appended to the medium; `None` if there is none.
+    /// The sync that is due; `None` if none is.
     pub fn sync_job(&self) -> Option<SyncJob<S>> {
         let active = self
             .active
@@ -137,11 +137,11 @@ impl<S: Storage> Store<S> {
         })
     }
 
-    /// Takes note of a sync.
+    /// Notes the result of a sync.
     ///
     /// # Errors
     ///
-    /// If it failed: the store is unprotected now.
+    /// If it failed: the store is now unprotected.
     pub fn synced(&mut self, done: Synced) -> Result<(), StoreError> {
         let active = self
             .active
@@ -157,26 +157,25 @@ impl<S: Storage> Store<S> {
                 Ok(())
             }
             (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
-            // Of a file that has been replaced since; what it held is in its successor, which is
-            // not synced yet.
+            // Of a file that has been replaced since. Its successor holds the same records and is not synced
+            // yet.
             (Err(_), None) => Ok(()),
         }
     }
 }
 
-/// Brings everything that was appended so far to the medium; from
-/// [`Store::sync_job`](super::Store::sync_job).
+/// Syncs everything appended so far; see [`Store::sync_job`](super::Store::sync_job).
 #[must_use = "nothing is synced until it has run"]
 pub struct SyncJob<S: Storage> {
     pub(super) storage: S,
     pub(super) file: Arc<S::File>,
-    /// The names, if the folder is to be synced too.
+    /// Present if the folder must be synced too.
     pub(super) names: Option<Names>,
     generation: u64,
     seq: u64,
 }
 
-/// How a sync went.
+/// The result of a sync.
 #[must_use = "give it to `Store::synced`"]
 pub struct Synced {
     generation: u64,
@@ -186,7 +185,7 @@ pub struct Synced {
 }
 
 impl<S: Storage> SyncJob<S> {
-    /// Syncs; blocks as long as the disk does.
+    /// Syncs. Blocks as long as the disk does.
     pub fn run(self) -> Synced {
         let mut result = self.storage.sync(&self.file);
         if let (Ok(()), Some(names)) = (&result, &self.names) {

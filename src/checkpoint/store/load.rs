@@ -1,4 +1,4 @@
-//! What a checkpoint and its previous generation say together.
+//! Loads a checkpoint from its present and previous generations.
 
 use std::io;
 use std::path::Path;
@@ -9,21 +9,21 @@ use crate::checkpoint::format::{
     self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session,
 };
 
-/// No checkpoint is larger; what is, is not read.
+/// Larger files are not read; no checkpoint is larger.
 pub(super) const FILE_BYTES_MAX: u64 = 1 << 30;
 
 /// What was found on disk.
 #[derive(Debug, Default)]
 pub struct Loaded {
-    /// The newest whole snapshot. Without one, `records` is all that is left of the state.
+    /// The newest whole snapshot. Without one, only `records` are left of the state.
     pub checkpoint: Option<Checkpoint>,
     /// The whole records after it, in order.
     pub records: Vec<Record>,
-    /// Whether these make exactly the state that was recorded; if not, something is missing.
+    /// Whether this is exactly the recorded state; if not, something is missing.
     pub exact: bool,
-    /// An append that was cut short, as a crash leaves it: it was never acknowledged.
+    /// An append torn by a crash: it was never acknowledged.
     pub torn: Option<String>,
-    /// What else is wrong, a sentence each; to be said loudly.
+    /// Other damage, a sentence each; to be logged as errors.
     pub damage: Vec<String>,
 }
 
@@ -41,29 +41,28 @@ impl Loaded {
     }
 }
 
-/// [`Loaded`], and what the store needs to go on from there.
+/// [`Loaded`], and what the store needs to continue.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     pub(super) loaded: Loaded,
-    /// Number of the last record known.
+    /// The highest known record number.
     pub(super) seq: u64,
-    /// The highest generation known.
+    /// The highest known generation.
     pub(super) generation: u64,
-    /// Whether the present file can serve as the previous generation of the next.
+    /// Whether the present file can become the next previous generation.
     usable: bool,
-    /// The present file, if it could be read.
+    /// The present file, if it was readable.
     pub(super) present: Option<Present>,
-    /// What is at the previous generation's path and can be no fallback: the kind of name under
-    /// which it is to be kept.
+    /// For a previous generation that is no usable fallback: the kind of name to keep it under.
     pub(super) bad_previous: Option<&'static str>,
-    /// The bytes of an append that was cut short.
+    /// The bytes of a torn append.
     pub(super) torn: Option<Vec<u8>>,
 }
 
 /// Reads the checkpoint of `names`; `None` if there is none.
 pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
     let path = &names.path;
-    // Before it is read: what takes its place later is another file, and is kept.
+    // Taken before reading: a file that replaces it later has another id, and is kept.
     let id = storage.id_at(path).ok().flatten();
     let bytes = match read(storage, path) {
         Ok(None) => return Ok(None),
@@ -98,7 +97,7 @@ pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found
             );
             let nothing = Framed::unreadable(&[]);
             let mut found = join(names, &nothing, Err(why), Some(&previous), &[]);
-            // The next one must not be taken for the one that cannot be read.
+            // The next generation must not have the number of the unreadable one.
             found.generation += 1;
             found
         }
@@ -119,7 +118,7 @@ fn load_present(
             let path = path.clone();
             return Err(OpenError::NewerVersion { path, version });
         }
-        // Beside a previous generation of ours, this was ours too.
+        // Next to a previous generation of ours, this file was ours too.
         (Err(DecodeError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
         (Err(DecodeError::NotACheckpoint), None) => {
             return Err(OpenError::NotACheckpoint { path: path.clone() });
@@ -165,11 +164,11 @@ fn join(
     };
     let base = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.seq);
 
-    // The previous generation may hold records that the present one lost or, after a loss of power
-    // just behind a compaction, has not got yet.
+    // The previous generation may hold records that the present one has lost, or lacks after a loss of power
+    // just after a compaction.
     let mut records = present.records(base, &mut damaged);
     let own = records.len();
-    // A file that somebody put back from a copy is no successor of the previous generation.
+    // A file restored from a copy does not follow the previous generation.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {
         generation(present).is_none_or(|present| generation(previous).is_some_and(|g| g < present))
@@ -177,7 +176,7 @@ fn join(
     if let Some(previous) = older {
         let mut ignored: Vec<Damage> = Vec::new();
         records.extend(previous.records(base, &mut ignored));
-        // Stable: of two equal numbers the present generation's stays.
+        // Stable: of two equal numbers the present generation's is kept.
         records.sort_by_key(|record| record.seq);
         records.dedup_by_key(|record| record.seq);
     }
@@ -185,7 +184,7 @@ fn join(
         format!("`{}` is damaged at byte {offset}: {why}", path.display())
     }));
 
-    // What the present file had reached when it was begun.
+    // The record number at which the present file was begun.
     let begun = present.header.map(|header| header.seq);
     let begun = begun.or_else(|| Some(present.lines.first()?.seq.saturating_sub(1)));
     let mut exact = checkpoint.is_some() && !present.end_lost && begun.is_some();
@@ -204,8 +203,8 @@ fn join(
         expected = begun.saturating_add(1);
     }
     let torn = present.torn.clone();
-    // Above every number that either file bears, whether or not its record could be used: what is
-    // left of a file may lie beside later generations, and must not pass for their records.
+    // Above every number in either file, usable or not: remains of a file may stay next to later generations,
+    // and must not be taken for their records.
     let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
     let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
     Found {
@@ -214,7 +213,7 @@ fn join(
             .and_then(generation)
             .max(generation(present))
             .unwrap_or(0),
-        // Not while the previous generation has what it lacks.
+        // Not while it lacks records that the previous generation has.
         usable: whole && records.len() == own,
         present: None,
         bad_previous: None,

@@ -1,10 +1,9 @@
-//! The lock on this machine's disk, which nobody can take away.
+//! The lock on this machine's disk, which no other process can remove.
 //!
-//! A lock file alone is not enough: it can be deleted, or renamed with its folder, and the next
-//! rosrescue would make a new one. So there are three locks. The lock file serves everybody who
-//! sees the folder, in other containers too. A socket in the abstract namespace, named after the
-//! checkpoint, cannot be removed while we live. And the checkpoint itself is locked, see
-//! [`claim`].
+//! A lock file alone is not enough: it can be deleted, or renamed with its folder, and the next rosrescue
+//! would create a new one. So there are three locks. The lock file works for every process that sees the
+//! folder, in other containers too. A socket in the abstract namespace, named after the checkpoint, cannot be
+//! removed while rosrescue lives. The checkpoint itself is locked too, see [`claim`].
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -20,19 +19,18 @@ use rustix::fs::FlockOperation;
 
 use super::storage::FileId;
 
-/// Locks outlive a process that is killed while it starts another one, until that one has closed what
-/// it inherited. Who starts at that moment is not to be refused.
+/// Locks of a process that is killed while it starts another one last until that one has closed its inherited
+/// descriptors. A rosrescue that starts at that moment must not be refused.
 const LINGER: Duration = Duration::from_millis(500);
 
-/// Held until dropped.
 #[derive(Debug)]
 pub struct DiskLock {
     file: File,
-    /// `None` where the kernel has no such sockets.
+    /// `None` if the kernel lacks such sockets.
     _name: Option<UnixDatagram>,
 }
 
-/// Somebody else has it: the process, if it left its number.
+/// Refused; with the process that holds the lock, if known.
 type Refused = Option<u32>;
 
 impl DiskLock {
@@ -60,7 +58,7 @@ impl DiskLock {
         Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
     }
 
-    /// Makes the lock file anew if it is no longer ours that is at `path`, and its folder, too.
+    /// Makes a new lock file, and its folder if needed, when the one at `path` is no longer ours.
     pub(super) fn renew(&mut self, path: &Path) -> io::Result<Result<(), Refused>> {
         if FileId::at(path)? == Some(self.id()?) {
             return Ok(Ok(()));
@@ -76,14 +74,14 @@ impl DiskLock {
     }
 }
 
-/// Locks a checkpoint's own file for as long as it is open, where the file system can.
+/// Locks a checkpoint's own file while it is open, where the file system can.
 pub(super) fn claim(file: &File) {
     let _ = rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive);
 }
 
 /// Whether another rosrescue has this file open.
 fn is_claimed(checkpoint: &Path) -> bool {
-    // At a pipe, opening would wait.
+    // Opening a pipe would block.
     if !fs::metadata(checkpoint).is_ok_and(|metadata| metadata.is_file()) {
         return false;
     }
@@ -105,7 +103,7 @@ fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
         .open(path)?;
     match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {
-            // For people and for the message of the next one; the lock holds without it.
+            // For people and for error messages; the lock holds without it.
             let _ = file
                 .set_len(0)
                 .and_then(|()| writeln!(file, "{}", std::process::id()));
@@ -123,12 +121,11 @@ fn holder(file: File) -> Option<u32> {
     text.trim().parse().ok()
 }
 
-/// Binds the socket that bears the checkpoint's name. A datagram socket: it has no queue of
-/// connections that somebody could fill.
+/// Binds the socket named after the checkpoint. A datagram socket has no queue of connections that another
+/// process could fill.
 fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     let root = FileId::of(&fs::metadata("/")?);
-    // A path means the same file only within one tree of mounts: containers that share a network
-    // have one each.
+    // Within one tree of mounts a path means one file. Containers that share a network have a tree each.
     let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();
     let folder = checkpoint.parent().unwrap_or_else(|| Path::new("/"));
     let path = fs::canonicalize(folder)?.join(checkpoint.file_name().unwrap_or_default());
@@ -138,8 +135,7 @@ fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
     UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
-/// FNV-1a of 64 bits: a path can be longer than the name of a socket, and every version must come
-/// to the same name.
+/// 64-bit FNV-1a. A path can be longer than a socket's name, and every version must compute the same name.
 fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
         (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)

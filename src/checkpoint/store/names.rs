@@ -1,15 +1,14 @@
-//! The names of the files beside a checkpoint: one place makes them all.
+//! The names of the files next to a checkpoint.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::{Storage, StoreError};
 
-/// Files of one kind that are kept; older ones are removed, so that a robot that is switched on
-/// every morning does not fill its disk.
+/// Files to keep of one kind. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
 
-/// A checkpoint's path and those of its companions, all in one folder.
+/// A checkpoint's path and its companions', all in one folder.
 #[derive(Clone, Debug)]
 pub(super) struct Names {
     pub(super) path: PathBuf,
@@ -43,7 +42,7 @@ impl Names {
         self.path.parent().unwrap_or_else(|| Path::new("/"))
     }
 
-    /// The endings of the names in the folder that start with the checkpoint's and a dot.
+    /// The endings of all names in the folder that start with the checkpoint's name and a dot.
     fn endings(&self, storage: &impl Storage) -> io::Result<Vec<String>> {
         let stem = self.path.file_name().unwrap_or_default().to_string_lossy() + ".";
         let names = storage.list(self.folder())?.into_iter();
@@ -70,20 +69,20 @@ impl Names {
         self.with(&format!(".{kind}-{number}"))
     }
 
-    /// A name for a file of this kind that none has yet. Numbered: the clock may be anywhere.
-    /// Makes room for it.
+    /// A new name for a file of this kind; removes surplus old ones. Numbered, because the clock may be
+    /// wrong.
     pub(super) fn aside(&self, storage: &impl Storage, kind: &str) -> io::Result<PathBuf> {
         let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
         for number in found.iter().take(surplus) {
-            // Whatever it is, it is no reason to keep nothing new.
+            // A failed removal must not prevent the new file.
             let _ = storage.remove(&self.numbered(kind, *number));
         }
         let number = found.last().copied().unwrap_or(0).saturating_add(1);
         Ok(self.numbered(kind, number))
     }
 
-    /// Removes what a crash left unfinished: new generations, and names on their way to another.
+    /// Removes files that a crash left unfinished: new generations, and files being renamed.
     pub(super) fn remove_unfinished(&self, storage: &impl Storage) -> io::Result<()> {
         for generation in self.numbers(storage, "new")? {
             storage.remove(&self.fresh(generation))?;

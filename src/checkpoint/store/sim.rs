@@ -1,4 +1,4 @@
-//! A disk in memory that can die, lose what was not synced, and fail.
+//! A simulated disk that can stop, lose what was not synced, and fail.
 
 mod storage;
 
@@ -12,28 +12,27 @@ use super::FileId;
 /// How an operation fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// The process dies before the operation; of a write this share of the bytes, in eighths, is
-    /// taken.
+    /// The process dies before the operation. A write still takes this many eighths of its bytes.
     Kill(usize),
-    /// The operation and all later ones return this error number; a write takes half of its bytes
-    /// first and says so.
+    /// This operation and all later ones fail with this error number. A write first takes half of its bytes
+    /// and reports that.
     Short(i32),
-    /// The operation and all later ones return this error number.
+    /// This operation and all later ones fail with this error number.
     Errno(i32),
-    /// This operation alone returns this error number.
+    /// Only this operation fails with this error number.
     Once(i32),
 }
 
-/// A file: what is on the medium, and the writes since.
+/// A file: its content on the medium, and the writes since.
 #[derive(Clone, Default)]
 struct Inode {
     durable: Vec<u8>,
     writes: Vec<Vec<u8>>,
-    /// How often it has been written.
+    /// Number of writes.
     modified: i128,
-    /// The medium does not give it back.
+    /// The medium cannot read it.
     unreadable: bool,
-    /// A sync failed: touching the file again is an error, because its dirty pages may be gone.
+    /// A sync failed: using the file again is an error, because its dirty pages may be gone.
     poisoned: bool,
 }
 
@@ -43,7 +42,7 @@ impl Inode {
     }
 }
 
-/// A change of names since the folder was synced.
+/// A rename since the folder was synced.
 #[derive(Clone)]
 enum NameOp {
     Set(PathBuf, usize),
@@ -78,14 +77,14 @@ struct World {
     names: BTreeMap<PathBuf, usize>,
     durable_names: BTreeMap<PathBuf, usize>,
     pending: Vec<NameOp>,
-    /// Operations so far that change something.
+    /// Number of modifying operations so far.
     ops: usize,
     fault: Option<(usize, Fault)>,
     hit: bool,
     dead: bool,
 }
 
-/// The disk; clones are the same disk.
+/// The simulated disk; clones share it.
 #[derive(Clone, Default)]
 pub(super) struct SimFs(Arc<Mutex<World>>);
 
@@ -98,7 +97,7 @@ impl SimFile {
     }
 }
 
-/// What is to be done, and the error to return if it is not.
+/// Whether an operation proceeds, or its error.
 enum Step {
     Go,
     Partly(usize),
@@ -106,7 +105,7 @@ enum Step {
 }
 
 impl World {
-    /// Counts an operation and says whether it happens.
+    /// Counts an operation and returns whether it proceeds.
     fn step(&mut self) -> Step {
         let op = self.ops;
         self.ops += 1;
@@ -139,7 +138,7 @@ impl World {
         }
     }
 
-    /// [`step`](Self::step) of an operation that is never done in part.
+    /// [`step`](Self::step) of an atomic operation.
     fn whole_step(&mut self) -> io::Result<()> {
         match self.step() {
             Step::Go => Ok(()),
@@ -155,7 +154,7 @@ impl World {
             .ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
-    /// A new file that has its name for good.
+    /// A new file with a durable name.
     fn add(&mut self, path: &Path) -> usize {
         let inode = self.inodes.len();
         self.inodes.push(Inode::default());
@@ -171,21 +170,21 @@ impl World {
 }
 
 impl SimFs {
-    /// Lets operation number `at`, counted from now, fail.
+    /// Makes operation number `at`, counted from now, fail.
     pub(super) fn arm(&self, at: usize, fault: Fault) {
         let mut world = self.0.lock().unwrap();
         world.fault = Some((world.ops + at, fault));
         world.hit = false;
     }
 
-    /// Ends all faults; says whether there was one.
+    /// Ends all faults. Returns whether there was one.
     pub(super) fn disarm(&self) -> bool {
         let mut world = self.0.lock().unwrap();
         world.fault = None;
         world.hit
     }
 
-    /// Somebody else puts `bytes` at `path`, as a file of its own or in place.
+    /// Another process writes `bytes` to `path`, as a new file or in place.
     pub(super) fn overwrite(&self, path: &Path, bytes: &[u8], in_place: bool) {
         let mut world = self.0.lock().unwrap();
         let inode = match world.find(path) {
@@ -200,14 +199,14 @@ impl SimFs {
         };
     }
 
-    /// From now on what is at `path` cannot be read.
+    /// Makes the file at `path` unreadable.
     pub(super) fn make_unreadable(&self, path: &Path) {
         let mut world = self.0.lock().unwrap();
         let inode = world.find(path).unwrap();
         world.inodes[inode].unreadable = true;
     }
 
-    /// Somebody else removes what is at `path`.
+    /// Another process removes the file at `path`.
     pub(super) fn take_away(&self, path: &Path) {
         let mut world = self.0.lock().unwrap();
         world.names.remove(path);
@@ -221,7 +220,7 @@ impl SimFs {
         inodes.any(|inode| world.inodes[*inode].content() == bytes)
     }
 
-    /// Operations so far.
+    /// Number of operations so far.
     pub(super) fn ops(&self) -> usize {
         self.0.lock().unwrap().ops
     }
@@ -240,8 +239,8 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// The disk as the next process finds it: all that was written is there, and nothing of it is
-    /// any safer than before.
+    /// The disk for the next process after a kill: all writes are there, but none is more durable than
+    /// before.
     pub(super) fn after_kill(&self) -> Self {
         let mut world = self.0.lock().unwrap().clone();
         (world.fault, world.dead, world.ops) = (None, false, 0);
@@ -252,9 +251,9 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// What may be on the medium after a loss of power: any subset of the changes of names, and of
-    /// every file what was synced and then nothing, or every later write as it was or as zeros, the
-    /// last one whole or cut at an eighth of it. All combinations, or about `limit` of them if there are more.
+    /// Possible disks after a loss of power: any subset of the renames; of every file what was synced and
+    /// then nothing, or every later write as it was or as zeros, the last one whole or cut at an eighth of
+    /// it. All combinations, or about `limit` of them if there are more.
     pub(super) fn after_power_loss(&self, limit: usize) -> Vec<Self> {
         let world = self.0.lock().unwrap().clone();
         let unsynced: Vec<usize> = (0..world.inodes.len())
@@ -262,7 +261,7 @@ impl SimFs {
             .collect();
         let ways = |nth: &usize| (8_usize << world.inodes[*nth].writes.len()) + 1;
         let combinations = unsynced.iter().map(ways).product::<usize>() << world.pending.len();
-        // Odd, so that the choices of names have their turn with every other choice.
+        // Odd, so that every choice of names meets every other choice.
         let stride = (combinations / limit) | 1;
         let mut seen = BTreeSet::new();
         let mut images = Vec::new();

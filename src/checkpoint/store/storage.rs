@@ -1,4 +1,4 @@
-//! What the store asks of a disk, and the real one.
+//! The store's disk operations, and the real disk.
 
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, Read, Write};
@@ -10,10 +10,9 @@ use rustix::io::Errno;
 
 use super::lock::{self, DiskLock};
 
-/// Which file it is, whatever its name.
+/// Identifies a file, whatever its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileId {
-    /// The file system.
     pub device: u64,
     pub inode: u64,
 }
@@ -26,7 +25,7 @@ impl FileId {
         }
     }
 
-    /// Of what `path` names, if anything; a link that leads nowhere is something.
+    /// Of the file at `path`, if any; a broken link counts as a file.
     pub(super) fn at(path: &Path) -> io::Result<Option<Self>> {
         match fs::metadata(path).or_else(|_| fs::symlink_metadata(path)) {
             Ok(metadata) => Ok(Some(Self::of(&metadata))),
@@ -43,64 +42,59 @@ fn is_absence(error: &io::Error) -> bool {
     )
 }
 
-/// What shows whether somebody else has written to a file.
+/// Shows whether another process has written to a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileStatus {
     pub id: FileId,
     pub length: u64,
-    /// When it was written last, in nanoseconds; only ever compared with itself.
+    /// Time of the last write, in nanoseconds; only compared with itself.
     pub modified: i128,
 }
 
-/// The operations that a checkpoint needs. `append` makes one `write(2)`; names are whole paths in
-/// one folder; nothing is durable before `sync` (contents) and `sync_dir` (names).
+/// The disk operations that a checkpoint needs. `append` makes one `write(2)`. Names are whole paths in one
+/// folder. Nothing is durable before `sync` (contents) and `sync_dir` (names).
 pub trait Storage: Clone + Send + Sync + 'static {
-    /// A file open for appending.
     type File: Send + Sync + 'static;
-    /// Holds the lock until dropped.
     type Lock: Send + 'static;
 
-    /// Makes the folder of `path` if need be and says where the file really is.
+    /// Creates the folder of `path` if needed. Returns the file's real path.
     fn locate(&self, path: &Path) -> io::Result<PathBuf>;
-    /// Takes the lock of `checkpoint`, with the lock file `path` in which our process id is left, or
-    /// says who has it.
+    /// Takes the lock of `checkpoint` and writes our process id to the lock file `path`. If it is taken,
+    /// returns its holder.
     fn lock(&self, checkpoint: &Path, path: &Path) -> io::Result<Result<Self::Lock, Option<u32>>>;
-    /// Makes the lock file `path` anew if the one there is not ours any more, and its folder too, or
-    /// says who has it.
+    /// Makes a new lock file `path`, and its folder, if the present one is not ours any more. If it is taken,
+    /// returns its holder.
     fn renew_lock(&self, lock: &mut Self::Lock, path: &Path)
     -> io::Result<Result<(), Option<u32>>>;
-    /// Which file the lock file is.
+    /// The lock file's id.
     fn lock_id(&self, lock: &Self::Lock) -> io::Result<FileId>;
-    /// The whole content, at most `limit` bytes and one.
+    /// The whole content, but at most `limit` + 1 bytes.
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
-    /// A new empty file, readable and writable for its owner only, in place of any before.
+    /// A new empty file, readable and writable for its owner only. Replaces an existing one.
     fn create(&self, path: &Path) -> io::Result<Self::File>;
-    /// Writes at the end of the file; says how many bytes were taken.
+    /// Writes at the end of the file. Returns the number of bytes taken.
     fn append(&self, file: &Self::File, bytes: &[u8]) -> io::Result<usize>;
     /// Returns when the content is on the medium.
     fn sync(&self, file: &Self::File) -> io::Result<()>;
-    /// Gives the file at `from` the name `to`, atomically in place of any other.
+    /// Renames `from` to `to`. Atomically replaces an existing file.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Gives the file at `from` the second name `to`, atomically in place of any other, and says
-    /// `true`; where the file system has no second names, makes a copy and says `false`.
+    /// Makes a hard link `to` of the file `from` and returns `true`. Atomically replaces an existing file.
+    /// Makes a copy and returns `false` where the file system has no hard links.
     fn link(&self, from: &Path, to: &Path) -> io::Result<bool>;
-    /// Gives the file at `from` the name `path`, and what has that name now the name `aside`, which
-    /// nothing has.
+    /// Renames `from` to `path`, and the present file at `path` to `aside`, an unused name.
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()>;
-    /// How an open file is now.
     fn status(&self, file: &Self::File) -> io::Result<FileStatus>;
-    /// Which file `path` names, if any.
+    /// The id of the file at `path`, if any.
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>>;
     /// The CRC-32C of the first `length` bytes at `path`.
     fn checksum(&self, path: &Path, length: u64) -> io::Result<u32>;
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Returns when the names in `folder` are on the medium.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;
-    /// The names in `folder`, as far as they are text.
+    /// The names in `folder` that are valid text.
     fn list(&self, folder: &Path) -> io::Result<Vec<String>>;
 }
 
-/// The file system of this machine.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Disk;
 
@@ -130,7 +124,7 @@ impl Storage for Disk {
         let mut path = std::path::absolute(path)?;
         for _ in 0..SYMLINKS_MAX {
             match fs::read_link(&path) {
-                // A relative target counts from the link's folder; an absolute one replaces it.
+                // A relative target starts at the link's folder; an absolute one replaces it.
                 Ok(target) => {
                     path.pop();
                     path.push(target);
@@ -160,7 +154,7 @@ impl Storage for Disk {
 
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
         let metadata = fs::metadata(path)?;
-        // A pipe would block in `open`.
+        // Opening a pipe would block.
         if !metadata.is_file() {
             return Err(io::Error::other("it is not a regular file"));
         }
@@ -175,10 +169,10 @@ impl Storage for Disk {
     }
 
     fn create(&self, path: &Path) -> io::Result<File> {
-        // Never write into an inode that has another name.
+        // Never write to an inode that has another name.
         remove_if_there(path)?;
         let file = Self::private().append(true).create_new(true).open(path)?;
-        // The umask can only have taken bits away.
+        // The umask can only have removed bits.
         file.set_permissions(fs::Permissions::from_mode(0o600))?;
         lock::claim(&file);
         Ok(file)
@@ -214,13 +208,13 @@ impl Storage for Disk {
             copy.sync_data()?;
         }
         fs::rename(&aside, to)?;
-        // Renaming a name over another one of the same file does nothing at all.
+        // Renaming over another name of the same file does nothing.
         remove_if_there(&aside)?;
         Ok(linked)
     }
 
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
-        // By way of the name that stays, so that a crash leaves ours under it and nothing lost.
+        // Through `aside`, which remains: after a crash our file is there, and nothing is lost.
         fs::rename(from, aside)?;
         let exchanged = rustix::fs::renameat_with(CWD, aside, CWD, path, RenameFlags::EXCHANGE);
         let Err(error) = exchanged else {
@@ -228,7 +222,7 @@ impl Storage for Disk {
         };
         fs::rename(aside, from)?;
         match error {
-            // Not on this file system, or not with this kernel.
+            // The file system or the kernel does not support it.
             Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP => {
                 fs::hard_link(path, aside).or_else(|_| fs::rename(path, aside))?;
                 fs::rename(from, path)

@@ -1,8 +1,8 @@
-//! Whether the file at the path is still the one that we write, and as we left it.
+//! Whether the file at the path is still ours and unchanged.
 //!
-//! Renaming its folder, unmounting its file system, cutting it off or overwriting it makes no write
-//! fail: all goes well into a file that nobody will find. So the path, the open file and the lock
-//! are compared with what we know, and what does not fit latches like a failed write.
+//! Renaming its folder, unmounting its file system, truncating or overwriting it makes no write fail: all
+//! writes succeed, into a file that cannot be found any more. So the path, the open file and the lock are
+//! compared with what is known, and a difference latches like a failed write.
 
 use std::io;
 use std::path::PathBuf;
@@ -14,32 +14,31 @@ use super::journal::Active;
 use super::storage::{FileId, FileStatus};
 use super::{Names, Storage, Store, StoreError};
 
-/// What somebody else did to the checkpoint.
+/// A change by another process.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum Change {
-    /// The path names nothing.
+    /// The path does not exist.
     #[error("it was removed or renamed, or its file system was unmounted")]
     Gone,
-    /// The path names another file.
+    /// The path is another file.
     #[error("another file has taken its place")]
     Replaced,
-    /// Truncated, or something was appended.
+    /// Truncated or appended to.
     #[error("it has {found} bytes instead of {expected}")]
     Length {
-        /// Bytes that we wrote.
         expected: u64,
         found: u64,
     },
     /// Overwritten in place.
     #[error("a part of it was overwritten")]
     Content,
-    /// The lock file's path names nothing, or another file.
+    /// The lock file's path does not exist, or is another file.
     #[error("its lock file was removed or replaced")]
     Lock,
 }
 
-/// Why a file cannot be relied on.
+/// Why a file is not reliable.
 #[derive(Debug)]
 enum Finding {
     Changed(Change),
@@ -52,8 +51,7 @@ impl From<io::Error> for Finding {
     }
 }
 
-/// Compares what is on disk with what should be there; from
-/// [`Store::check_job`](super::Store::check_job).
+/// Compares the disk with what should be there; see [`Store::check_job`](super::Store::check_job).
 #[must_use = "nothing is checked until it has run"]
 pub struct CheckJob<S: Storage> {
     storage: S,
@@ -61,11 +59,10 @@ pub struct CheckJob<S: Storage> {
     generation: u64,
     id: FileId,
     lock_id: FileId,
-    /// Length and check sum, if the content is to be read.
+    /// Length and check sum, if the content must be read.
     content: Option<(u64, u32)>,
 }
 
-/// What a check found.
 #[must_use = "give it to `Store::checked`"]
 pub struct Checked {
     generation: u64,
@@ -73,7 +70,7 @@ pub struct Checked {
 }
 
 impl<S: Storage> CheckJob<S> {
-    /// Checks; a few system calls, unless the file seems to have been overwritten and must be read.
+    /// Checks with a few system calls. Reads the file only if it may have been overwritten.
     pub fn run(self) -> Checked {
         Checked {
             generation: self.generation,
@@ -105,8 +102,8 @@ impl<S: Storage> Active<S> {
         self.snapshot_bytes + self.journal_bytes
     }
 
-    /// Compares the file's status with how we left it. Another time of modification alone proves
-    /// nothing: `touch` sets it, and some file systems do so late. The content is read then.
+    /// Compares the file's status with that after our last write. A different modification time alone proves
+    /// nothing: `touch` sets it, and some file systems update it late. The content is read then.
     pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), Change> {
         let expected = self.length();
         if status.length != expected {
@@ -122,9 +119,8 @@ impl<S: Storage> Active<S> {
 }
 
 impl<S: Storage> Store<S> {
-    /// The work that finds out whether the file is still the one at the path and as we left it, and
-    /// the lock ours; `None` if nothing is being recorded, or no longer, because its length already
-    /// tells.
+    /// The check that the file at the path is ours and unchanged, and that the lock is ours. `None` if
+    /// nothing is being recorded, or recording stops now because the length differs.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
         let active = self.active.as_mut()?;
         let status = self.storage.status(&active.file);
@@ -149,29 +145,29 @@ impl<S: Storage> Store<S> {
         })
     }
 
-    /// Takes note of a check.
+    /// Notes the result of a check.
     ///
     /// # Errors
     ///
-    /// If the file is not what it should be: the store is unprotected now.
+    /// If the file is not as expected: the store is now unprotected.
     pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
         let active = self.active.as_ref();
         let current = active.is_some_and(|active| active.generation == done.generation);
         match done.result {
             Err(finding) if current => Err(self.lose(finding)),
-            // Or it was of a file that has been replaced since.
+            // All is well, or the checked file has been replaced since.
             _ => Ok(()),
         }
     }
 
-    /// [`latch`](Self::latch) because of what somebody else did.
+    /// [`latch`](Self::latch) after a change by another process.
     pub(super) fn changed(&mut self, change: Change) -> StoreError {
         if matches!(change, Change::Lock) {
-            // While the open file, which is locked too, still keeps others out. A failure comes up again
-            // when the next generation is written.
+            // Taken again now, while the open file, which is locked too, keeps others out. A failure shows
+            // again when the next generation is written.
             let _ = self.hold_lock();
         } else {
-            // Whatever is at the path now is not ours to replace without keeping it.
+            // A foreign file may be at the path now: it must be kept when it is replaced.
             self.present = None;
         }
         let path = self.names.path.clone();
@@ -185,7 +181,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Takes care that the lock at the path is ours before anything is written there.
+    /// Makes sure that the lock at the path is ours before anything is written there.
     pub(super) fn hold_lock(&mut self) -> Result<(), StoreError> {
         let path = self.names.lock();
         let renewed = self.storage.renew_lock(&mut self.lock, &path);
@@ -204,7 +200,7 @@ impl<S: Storage> Store<S> {
         Err(self.latch(error))
     }
 
-    /// Under which name something was kept that was found at the path; told once.
+    /// The name under which a file found at the path was kept; returned once.
     pub fn take_kept(&mut self) -> Option<PathBuf> {
         self.kept.take()
     }

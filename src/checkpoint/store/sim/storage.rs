@@ -1,4 +1,4 @@
-//! What the store does with the disk.
+//! The simulated disk's operations.
 
 use std::io;
 use std::path::{Path, PathBuf};
