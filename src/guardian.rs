@@ -1,12 +1,11 @@
-//! The guardian: the parent process that keeps the listening sockets and keeps a worker alive.
+//! The guardian: the parent process that keeps the listening sockets and restarts the worker.
 //!
-//! A person's `rosrescue` is two processes. The guardian binds the sockets, starts the worker, which
-//! is the same program with the sockets passed on ([`handover`]), and starts it again when it dies
-//! ([`restart`]). Connections that come meanwhile wait in the kernel's queue; none is refused. The
-//! guardian does nothing else, so that there is little it could die of: it has no runtime and reads
-//! nothing from the network.
+//! An interactive `rosrescue` is two processes. The guardian binds the sockets, starts the worker, which is
+//! the same program with the sockets passed on ([`handover`]), and restarts it when it dies ([`restart`]).
+//! Connections that arrive meanwhile wait in the kernel's queue; none is refused. The guardian does nothing
+//! else, so that little can kill it: it has no runtime and reads nothing from the network.
 //!
-//! Under systemd a socket unit takes its place.
+//! Under systemd a socket unit replaces it.
 
 use std::{
     io::{self, Read},
@@ -34,30 +33,29 @@ pub mod restart;
 
 use restart::{End, Next, Restarts};
 
-/// The program that runs, also after its file has been replaced by another version.
+/// The running program, even after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
 
-/// How long a worker may take until it handles signals, before it is sent one all the same.
+/// How long to wait for a worker to handle signals before one is sent anyway.
 const START_TIME: Duration = Duration::from_secs(1);
 
 /// Why there is no worker. Exit status 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GuardianError {
-    /// The system would not start it.
+    /// The system refused to start it.
     #[error("cannot start the worker process: {0}; --no-guardian runs rosrescue without one")]
     Spawn(#[from] io::Error),
-    /// Cannot happen: every descriptor is given its own number.
+    /// Cannot happen: every descriptor gets its own number.
     #[error("cannot pass the sockets on: {0}")]
     Handover(#[from] FdMappingCollision),
 }
 
-/// Runs workers that serve `listeners` until one ends in order. Answers with the exit status.
+/// Runs workers that serve `listeners` until one ends in order. Returns the exit status.
 ///
 /// # Errors
 ///
-/// If the first worker cannot be started, or signals cannot be received. Later the guardian never
-/// gives up.
+/// If the first worker cannot be started, or signals cannot be received. Later the guardian never gives up.
 pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
@@ -90,8 +88,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     }
 }
 
-/// Starts a worker after `pause`, and tries until the system lets it. A signal ends the pause, and is
-/// answered with the worker: it is for it to end what the dead one has left.
+/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is returned with
+/// the worker, which must end what the dead one left running.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
@@ -108,12 +106,12 @@ fn start_again(
     }
 }
 
-/// Waits for `pause`, or until a signal comes that asks for the end.
+/// Waits for `pause`, or until a stop signal arrives.
 fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
     let until = Instant::now() + pause;
     loop {
         match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
-            // An orphan has ended, which is now our child.
+            // An orphan that we inherited has ended.
             Ok(SIGCHLD) => drop(reap(None)),
             Ok(signal) => return Ok(Some(signal)),
             Err(RecvTimeoutError::Timeout) => return Ok(None),
@@ -124,10 +122,9 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
     }
 }
 
-/// The process that does the work.
 struct Worker {
     pid: u32,
-    /// By it the worker tells how far it is, and sees that we have ended.
+    /// The worker reports its progress here, and notices the guardian's end.
     link: UnixStream,
     handles_signals: bool,
 }
@@ -156,13 +153,13 @@ impl Worker {
             .env(handover::GUARDIAN, std::process::id().to_string())
             .env_remove(handover::LISTEN_PID)
             .env_remove(handover::LISTEN_FDNAMES)
-            // A group of its own: what is typed in the terminal comes to us, and once through us.
+            // In a group of its own: terminal signals reach only the guardian, which passes them on once.
             .process_group(0);
         if sd_notify::watchdog_enabled().is_none() {
-            // It is for another process.
+            // It is meant for another process.
             command.env_remove("WATCHDOG_USEC");
         }
-        // The worker feeds systemd's watchdog in our place.
+        // The worker feeds systemd's watchdog for us.
         command.env_remove("WATCHDOG_PID");
         command.fd_mappings(mappings.collect())?;
         let pid = command.spawn()?.id();
@@ -173,7 +170,7 @@ impl Worker {
         })
     }
 
-    /// Waits for its end, and passes signals on until then; `stopping` is told of them.
+    /// Waits for the worker's end and passes signals on. `stopping` is called for each signal.
     fn attend(&mut self, signals: &Receiver<i32>, mut stopping: impl FnMut(i32)) -> End {
         loop {
             match signals.recv() {
@@ -192,7 +189,7 @@ impl Worker {
         }
     }
 
-    /// Sends it `signal`, once it handles signals: before, an orderly stop would be none.
+    /// Passes on `signal` once the worker handles signals: before, a signal would kill it.
     fn pass_on(&mut self, signal: i32) {
         if !std::mem::replace(&mut self.handles_signals, true) {
             self.has_said(handover::HANDLES_SIGNALS);
@@ -203,14 +200,13 @@ impl Worker {
             SIGQUIT => Signal::QUIT,
             _ => Signal::TERM,
         };
-        // It is a child that has not been waited for: nobody else has its process id.
+        // Our child, not waited for yet: its process id cannot be reused.
         if let Some(pid) = i32::try_from(self.pid).ok().and_then(Pid::from_raw) {
             let _ = kill_process(pid, signal);
         }
     }
 
-    /// Whether it says `word` before its end, or within [`START_TIME`]. What it said before `word` is
-    /// passed over.
+    /// Whether the worker writes `word` before it ends, or within [`START_TIME`]. Skips earlier words.
     fn has_said(&self, word: u8) -> bool {
         let mut said = [0];
         while (&self.link).read(&mut said).is_ok_and(|length| length > 0) {
@@ -222,8 +218,8 @@ impl Worker {
     }
 }
 
-/// Takes note of all children that have ended: as the first process of a container we are given those
-/// of others, too. Answers with the end of `worker` if it is among them.
+/// Reaps all children that have ended: the first process of a container also inherits other processes.
+/// Returns the end of `worker` if it is among them.
 fn reap(worker: Option<u32>) -> Option<End> {
     let mut end = None;
     while let Ok(Some((pid, status))) = rustix::process::wait(WaitOptions::NOHANG) {
@@ -257,11 +253,11 @@ fn receive_signals() -> io::Result<Receiver<i32>> {
     Ok(receiver)
 }
 
-/// Whether we were started with SIGHUP ignored, as by nohup: we are to outlive the terminal then.
+/// Whether we were started with SIGHUP ignored, as by nohup: then we must outlive the terminal.
 pub fn is_hangup_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    // The lowest bit is that of signal 1.
+    // The lowest bit is signal 1.
     mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
         .is_some_and(|mask| mask & 1 == 1)
 }

@@ -1,4 +1,4 @@
-//! Child processes: finds, starts and ends rosmaster and rosout. It reports, and never decides.
+//! Child processes: finds, starts and ends rosmaster and rosout. It reports and never decides.
 
 use std::{
     fs::{File, OpenOptions},
@@ -49,11 +49,11 @@ args=(os.environ['ROS_LOG_FILENAME'],'a', 50000000, 4)
 format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
 ";
 
-/// A child process that cannot be had.
+/// Why a child process cannot be started.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProcessError {
-    /// No rosmaster anywhere.
+    /// No rosmaster was found.
     #[error(
         "no rosmaster is on the PATH or in /opt/ros/*/bin: install it (apt-get install \
          python3-rosmaster, or ros-noetic-rosmaster), source ROS's setup.bash, or name it with \
@@ -63,32 +63,30 @@ pub enum ProcessError {
     /// `--rosmaster` names no program.
     #[error("--rosmaster: `{}` is not a program that can be run", path.display())]
     NotAProgram { path: PathBuf },
-    /// The port of the master is taken.
+    /// The master's port is taken.
     #[error("--master-port: port {port} on loopback is in use; choose another one")]
     PortInUse { port: u16 },
-    /// The system would not start it.
+    /// The system refused to start it.
     #[error("cannot start `{}`: {source}", program.display())]
     Spawn {
         program: PathBuf,
-        /// What the system said.
         source: io::Error,
     },
 }
 
-/// Starts rosmasters.
 #[derive(Debug)]
 pub(crate) struct Rosmaster {
     program: PathBuf,
     config: SupervisedConfig,
-    /// What the last one wrote to stdout and stderr.
+    /// Stdout and stderr of the last one.
     output: PathBuf,
-    /// The logging configuration that it is given.
+    /// The logging configuration for rosmaster.
     log_config: PathBuf,
     checkpoint: PathBuf,
 }
 
 impl Rosmaster {
-    /// Finds the program. Files for it will lie beside `checkpoint`.
+    /// Finds the program. Its files are created next to `checkpoint`.
     pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
         let program = match &config.rosmaster {
             Some(path) if is_program(path) => path.clone(),
@@ -104,7 +102,7 @@ impl Rosmaster {
         })
     }
 
-    /// Where its port should be: the given one, else `remembered` if that is free, else a free one.
+    /// The port for a master: the given one, else `remembered` if free, else a free one.
     pub(crate) fn choose_port(&self, remembered: Option<u16>) -> Result<u16, ProcessError> {
         if let Some(port) = self.config.port {
             return if is_free(port) {
@@ -123,8 +121,8 @@ impl Rosmaster {
         free_port().map_err(spawn_error)
     }
 
-    /// The rosmaster that an earlier rosrescue with this checkpoint left behind at `port`. Any that
-    /// does not listen there has never served, or never will: it is ended.
+    /// The rosmaster that an earlier rosrescue with this checkpoint left running at `port`. Others of its
+    /// rosmasters do not listen there and are of no use: they are ended.
     pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<u32> {
         let mut all = orphan::find(&orphan::owner(&self.checkpoint));
         all.retain(|pid| !runs(*pid, "rosout"));
@@ -144,7 +142,7 @@ impl Rosmaster {
         found
     }
 
-    /// Starts a rosmaster on `port` of loopback. It outlives us: dropping the child does not end it.
+    /// Starts a rosmaster on `port` of loopback. It outlives rosrescue: dropping the child does not end it.
     pub(crate) fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
         command.arg("--core").arg("-p").arg(port.to_string());
@@ -154,10 +152,10 @@ impl Rosmaster {
         }
         add_ros_paths(&mut command, &self.program, 2);
         command.env(orphan::OWNER, orphan::owner(&self.checkpoint));
-        // Loopback only: nodes come through us.
+        // Loopback only: nodes connect to rosrescue.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
-        // Unless the person has a configuration of his own; and without ours it is only slower.
+        // Not if the user has a configuration. If it cannot be written, rosmaster is only slower.
         let own = std::env::var_os("ROS_PYTHON_LOG_CONFIG_FILE").is_some_and(|own| !own.is_empty());
         if !own && self.write_log_config().is_ok() {
             command.env("ROS_PYTHON_LOG_CONFIG_FILE", &self.log_config);
@@ -169,7 +167,7 @@ impl Rosmaster {
             ),
             Err(_) => (Stdio::null(), Stdio::null()),
         };
-        // A group of its own: Ctrl-C in our terminal is for us to handle.
+        // In a group of its own: rosrescue handles Ctrl-C in the terminal.
         command
             .stdin(Stdio::null())
             .stdout(stdout)
@@ -188,13 +186,13 @@ impl Rosmaster {
         }
     }
 
-    /// The end of what the last rosmaster wrote, for the message that it died early.
+    /// The last output of the last rosmaster, for the message that it died early.
     pub(crate) fn last_words(&self) -> String {
         tail_of(&self.output)
     }
 }
 
-/// Runs `program`, without the variables that are for us alone.
+/// Runs `program`, without variables meant for rosrescue alone.
 fn command(program: &Path) -> Command {
     let mut command = Command::new(program);
     handover::keep_from(command.as_std_mut());
@@ -208,7 +206,7 @@ fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// The end of a file, for people; nothing if it cannot be read.
+/// The end of a file, for messages; empty if it cannot be read.
 fn tail_of(path: &Path) -> String {
     let text = std::fs::read(path).unwrap_or_default();
     let tail = text
@@ -226,9 +224,8 @@ fn create(path: &Path) -> io::Result<File> {
         .open(path)
 }
 
-/// A program of a ROS in `/opt/ros` finds its modules and libraries only with that ROS's paths, which
-/// `setup.bash` sets for a person and nobody sets for a service. `depth` is how far below the ROS's
-/// folder the program lies.
+/// Adds the paths of a ROS in `/opt/ros`, which its programs need to find modules and libraries. `setup.bash`
+/// sets them in a shell, but a service lacks them. `depth`: how far below the ROS's folder the program is.
 fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     let Some(prefix) = program
         .ancestors()
@@ -252,8 +249,8 @@ fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     }
 }
 
-/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with time to follow each. `ended` resolves when it
-/// has ended.
+/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with a pause after each. `ended` resolves when it has
+/// ended.
 pub(crate) async fn stop(pid: u32, ended: impl Future) {
     let mut ended = std::pin::pin!(ended);
     for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
@@ -265,7 +262,7 @@ pub(crate) async fn stop(pid: u32, ended: impl Future) {
     }
 }
 
-/// Sends a signal; a process that is not there needs none.
+/// Sends a signal. A missing process is no error.
 pub(crate) fn signal_process(pid: u32, signal: Signal) {
     if let Some(pid) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
         let _ = kill_process(pid, signal);
@@ -280,8 +277,8 @@ pub(crate) fn is_alive(pid: u32) -> bool {
         .is_some_and(|pid| test_kill_process(pid).is_ok())
 }
 
-/// Whether the process `pid` runs a program of this name, judged by its command line: a pid that we
-/// remember may be somebody else's by now.
+/// Whether the process `pid` runs a program of this name, by its command line. A remembered pid may belong to
+/// another process by now.
 pub(crate) fn runs(pid: u32, name: &str) -> bool {
     let command_line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     command_line.split(|byte| *byte == 0).any(|argument| {
@@ -292,7 +289,7 @@ pub(crate) fn runs(pid: u32, name: &str) -> bool {
     })
 }
 
-/// Returns when the process `pid`, which is no child of ours, has ended.
+/// Returns when the process `pid`, which is not our child, has ended.
 pub(crate) async fn ended(pid: u32) {
     if orphan::ended(pid).await.is_err() {
         while is_alive(pid) {
@@ -311,7 +308,7 @@ pub(crate) fn describe(status: ExitStatus) -> String {
     }
 }
 
-/// What `program` prints within `limit`, as roslaunch's `command=` would take it.
+/// The output of `program`, if it ends within `limit`, as roslaunch's `command=` would take it.
 pub(crate) async fn output_of(
     program: &str,
     arguments: &[&str],
@@ -345,7 +342,7 @@ fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
             .flatten()
             .map(|entry| entry.path())
             .collect();
-        // The latest by name, as in kinetic, melodic, noetic.
+        // The last by name, as in kinetic, melodic, noetic.
         distributions.sort();
         let candidates = distributions.iter().rev();
         let mut programs =
@@ -360,7 +357,7 @@ fn is_program(path: &Path) -> bool {
         .is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
 }
 
-/// Whether rosmaster, which sets SO_REUSEADDR, could listen there.
+/// Whether rosmaster, which sets SO_REUSEADDR, could listen on this port.
 fn is_free(port: u16) -> bool {
     bind_loopback(port).is_ok()
 }

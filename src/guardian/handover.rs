@@ -1,10 +1,10 @@
-//! Listening sockets that a process is given at its start, by the LISTEN_FDS protocol of systemd
-//! (`sd_listen_fds(3)`), and who gave them.
+//! Listening sockets inherited at the start, by the LISTEN_FDS protocol of systemd (`sd_listen_fds(3)`), and
+//! who passed them.
 //!
-//! In the protocol LISTEN_PID names the process that the sockets are for. A guardian cannot know that
-//! of its worker before the fork, so it names itself in `ROSRESCUE_GUARDIAN` instead. The last of its sockets
-//! is no listener but one end of a pair, the *link*: by it the worker tells how far it is, and sees the end
-//! of the guardian.
+//! In the protocol LISTEN_PID is the process that the sockets are meant for. A guardian cannot know its
+//! worker's before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. The last of its sockets is
+//! not a listener but one end of a pair, the *link*: through it the worker reports its progress, and sees the
+//! end of the guardian.
 
 use std::{
     io::{self, Write},
@@ -26,22 +26,21 @@ use crate::ros_env::Lookup;
 pub(super) const FIRST: RawFd = 3;
 /// How many there are.
 pub(super) const LISTEN_FDS: &str = "LISTEN_FDS";
-/// The process that they are for.
+/// The process that they are meant for.
 pub(super) const LISTEN_PID: &str = "LISTEN_PID";
 pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
-/// The process id of the guardian whose worker this is.
+/// The process id of the worker's guardian.
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
 
-/// What a worker writes to its guardian once it handles signals: before, one would kill it at once.
+/// Sent by a worker once it handles signals: before, a signal would kill it.
 pub(super) const HANDLES_SIGNALS: u8 = b'h';
-/// What it writes once it answers calls.
+/// Sent by a worker once it answers calls.
 pub const SERVES: u8 = b's';
 
-/// Sockets that cannot be served. Exit status 1.
+/// Why inherited sockets cannot be served. Exit status 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum HandoverError {
-    /// One is something else.
     #[error(
         "socket {number} that was passed to rosrescue is no TCP socket that listens: {source}; a \
          socket unit needs ListenStream= with a port, and Accept=no"
@@ -55,28 +54,28 @@ pub enum HandoverError {
 /// Sockets to serve.
 #[derive(Debug)]
 pub struct Sockets {
-    /// They do not block.
+    /// Non-blocking.
     pub listeners: Vec<TcpListener>,
     /// Who else keeps them.
     pub guard: Guard,
 }
 
-/// Who keeps the sockets, and starts rosrescue again, when it dies.
+/// Who keeps the sockets and restarts rosrescue when it dies.
 #[derive(Debug)]
 pub enum Guard {
-    /// Nobody that we know of.
+    /// No known supervisor.
     Nobody,
     /// systemd, or another supervisor with its protocol.
     Systemd,
     Guardian {
         pid: u32,
-        /// Closes when it ends.
+        /// Closes when the guardian ends.
         link: UnixStream,
     },
 }
 
 impl Sockets {
-    /// Those that this process was given, if it was. To be called first of all, once.
+    /// The sockets that this process has inherited, if any. Must be called once, before anything else.
     ///
     /// # Errors
     ///
@@ -86,7 +85,7 @@ impl Sockets {
         let Some(giver) = giver(&env, std::process::id(), parent_id()) else {
             return Ok(None);
         };
-        // It takes the variables out of the environment.
+        // Removes the variables from the environment.
         let mut given = ListenFd::from_env();
         let guard = match giver {
             Giver::Systemd => Guard::Systemd,
@@ -120,7 +119,7 @@ impl Sockets {
         Ok(Some(Self { listeners, guard }))
     }
 
-    /// Those that this process has bound itself.
+    /// Sockets that this process has bound itself.
     pub fn own(listeners: Vec<TcpListener>) -> Self {
         Self {
             listeners,
@@ -136,25 +135,25 @@ impl Sockets {
 }
 
 impl Guard {
-    /// Signals may come from now on.
+    /// Reports that this process handles signals now.
     pub fn handles_signals(&self) {
         if let Self::Guardian { link, .. } = self {
             let mut link = link;
-            // A guardian that has ended sends none.
+            // A guardian that has ended sends no signals.
             let _ = link.write_all(&[HANDLES_SIGNALS]);
         }
     }
 }
 
-/// Who gives sockets to a process.
+/// Who passes sockets to a process.
 #[derive(Debug, PartialEq, Eq)]
 enum Giver {
     Systemd,
     Guardian(u32),
 }
 
-/// Whose sockets those of the environment `env` are; none if they are not for the process `own`,
-/// whose parent is `parent`.
+/// Who passed the sockets, by the environment `env`; none if they are not meant for the process `own`, whose
+/// parent is `parent`.
 fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     let number = |name: &str| env(name)?.parse::<u32>().ok();
     number(LISTEN_FDS).filter(|count| *count > 0)?;
@@ -164,8 +163,7 @@ fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     }
 }
 
-/// Keeps from a child process what its parent was told by the guardian and by systemd: it is not meant
-/// for it.
+/// Hides from a child process the variables that the guardian and systemd have set for its parent.
 pub fn keep_from(command: &mut Command) {
     for name in [
         LISTEN_FDS,

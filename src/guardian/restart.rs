@@ -1,4 +1,4 @@
-//! What follows on the end of a worker. Pure: the time comes in as an argument.
+//! What to do after the end of a worker. Pure: the time is an argument.
 
 use std::{
     collections::VecDeque,
@@ -6,16 +6,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Deaths within [`SPAN`] after which the worker is started again at once.
+/// Deaths within [`SPAN`] after which the worker is restarted at once.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
 /// The first pause; each further one is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
-/// The longest pause. Six of it fit into a minute, so that workers that never live for long stay at
-/// it.
+/// The longest pause. Six of them fit into a minute, so workers that keep dying quickly stay at it.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
-/// The signal that no worker can answer.
+/// The signal that a process cannot handle.
 const SIGKILL: i32 = 9;
 /// The exit status of a Rust program that panicked.
 const PANIC: i32 = 101;
@@ -25,12 +24,11 @@ const PANIC: i32 = 101;
 pub enum End {
     /// By itself, with this exit status.
     Code(i32),
-    /// By a signal.
     Signal(i32),
 }
 
 impl End {
-    /// The exit status by which a shell would tell of it.
+    /// The exit status that a shell would report.
     fn status(self) -> i32 {
         match self {
             Self::Code(code) => code,
@@ -48,19 +46,17 @@ impl fmt::Display for End {
     }
 }
 
-/// What to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
     /// End with this status.
     Exit(i32),
     /// Start another worker.
     Restart {
-        /// How long to wait before.
         pause: Duration,
     },
 }
 
-/// Decides whether and when a worker is started again.
+/// Decides whether and when to restart the worker.
 #[derive(Debug, Default)]
 pub struct Restarts {
     /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
@@ -70,20 +66,20 @@ pub struct Restarts {
     /// Whether any worker has served.
     served: bool,
     stopping: bool,
-    /// A worker has been started to end what a killed one has left.
+    /// The present worker was started to end what a killed one left running.
     cleaning: bool,
 }
 
 impl Restarts {
-    /// A signal asks for the end: no worker is started again, but for one that ends what a killed one has left.
+    /// After a stop signal no worker is restarted, except one to end what a killed one left running.
     pub fn stop(&mut self) {
         self.stopping = true;
     }
 
-    /// A worker has ended at `now`; `served` says whether it answered calls before.
+    /// A worker has ended at `now`. `served`: whether it had answered calls.
     ///
-    /// An end with a status is an error of the start, such as a missing rosmaster, until a worker has
-    /// served; afterwards the same error may go away by itself.
+    /// Before any worker has served, an exit status is an error of the start, such as a missing rosmaster.
+    /// Later the same error may be temporary.
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
         match end {

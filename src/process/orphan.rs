@@ -1,8 +1,8 @@
-//! A rosmaster, or a rosout, that an earlier rosrescue left behind when it was killed.
+//! Orphans: rosmasters and rosouts that a killed rosrescue left running.
 //!
-//! It is known by its process and not by its port: since rosrescue died, anybody may have taken the
-//! port, another rosmaster too. Each process that is started bears the checkpoint's path in its
-//! environment, which nobody else writes and which the kernel shows for as long as the process lives.
+//! They are identified by their process, not by their port: another program may have taken the port since,
+//! even another rosmaster. Each started process has the checkpoint's path in its environment. No other
+//! program sets that variable, and the kernel shows it as long as the process lives.
 
 use std::{
     ffi::{OsStr, OsString},
@@ -15,13 +15,13 @@ use rustix::process::PidfdFlags;
 
 use super::pidfd;
 
-/// The environment variable that says whose a process is.
+/// The environment variable that identifies a process's owner.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
 
-/// What the processes of `checkpoint` bear in [`OWNER`].
+/// The value of [`OWNER`] for processes of `checkpoint`.
 pub(super) fn owner(checkpoint: &Path) -> OsString {
     let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
-    // The file itself may not be there yet.
+    // The file may not exist yet.
     let folder = absolute.parent().and_then(|path| path.canonicalize().ok());
     match (folder, absolute.file_name()) {
         (Some(folder), Some(name)) => folder.join(name).into(),
@@ -29,8 +29,8 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
     }
 }
 
-/// Living processes on this network that bear `owner` and whose rosrescue is gone. Another container
-/// may show us its processes, and have a checkpoint of the same path.
+/// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes of other
+/// containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     let mut wanted = format!("{OWNER}=").into_bytes();
     wanted.extend(owner.as_bytes());
@@ -44,17 +44,16 @@ pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     .collect()
 }
 
-/// The network that a process is in.
+/// The network namespace of a process.
 fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
     fs::read_link(format!("/proc/{process}/ns/net")).ok()
 }
 
-/// Whether the parent of `pid` is a rosrescue, so that nobody has left it behind. Our own parent is
-/// not meant: a guardian starts no masters, but gets those of dead workers as the first process of a
-/// container.
+/// Whether the parent of `pid` is a rosrescue, so that it is no orphan. Our own parent does not count: a
+/// guardian starts no masters, but as the first process of a container it inherits those of dead workers.
 fn has_rosrescue(pid: u32) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
-    // The command's name comes before, in parentheses, with whatever it likes in it.
+    // The command's name in parentheses comes first and may contain anything.
     let after = stat.rsplit(')').next().unwrap_or_default();
     let parent = after.split_whitespace().nth(1).unwrap_or_default();
     if parent == parent_id().to_string() {
@@ -86,11 +85,11 @@ pub(super) fn listens(pid: u32, port: u16) -> bool {
     })
 }
 
-/// Returns when the process `pid`, which is no child of ours, has ended.
+/// Returns when the process `pid`, which is not our child, has ended.
 ///
 /// # Errors
 ///
-/// What the system says: the process is gone, or the kernel is older than 5.3 and cannot watch it.
+/// The system's error: the process is gone, or the kernel is older than 5.3 and cannot watch it.
 pub(super) async fn ended(pid: u32) -> io::Result<()> {
     let pid = i32::try_from(pid).map_err(io::Error::other)?;
     let process = pidfd::open(pid, PidfdFlags::empty())?;

@@ -13,18 +13,17 @@ use super::{
     add_ros_paths, beside, command, create, find_program, is_program, orphan, runs, tail_of,
 };
 
-/// Starts rosouts.
 #[derive(Debug)]
 pub(crate) struct Rosout {
     program: PathBuf,
-    /// What the last one wrote to stderr.
+    /// Stderr of the last one.
     output: PathBuf,
-    /// Whose they are.
+    /// Their owner: the checkpoint.
     owner: OsString,
 }
 
 impl Rosout {
-    /// Finds the program, if there is one. A file for its last words will lie beside `checkpoint`.
+    /// Finds the program, if there is one. Its stderr goes to a file next to `checkpoint`.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
             Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
@@ -36,14 +35,14 @@ impl Rosout {
         })
     }
 
-    /// The rosout that an earlier rosrescue with this checkpoint left behind. It may not have
-    /// registered yet.
+    /// The rosout that an earlier rosrescue with this checkpoint left running. It may not have registered
+    /// yet.
     pub(crate) fn left_behind(&self) -> Option<u32> {
         let mut all = orphan::find(&self.owner).into_iter();
         all.find(|pid| runs(*pid, "rosout"))
     }
 
-    /// Starts one as a node of the master at `uri`. It outlives us: dropping the child does not end
+    /// Starts one as a node of the master at `uri`. It outlives rosrescue: dropping the child does not end
     /// it.
     pub(crate) fn spawn(&self, uri: &str) -> io::Result<Child> {
         let stderr = create(&self.output).map_or_else(|_| Stdio::null(), Stdio::from);
@@ -62,7 +61,7 @@ impl Rosout {
         command
     }
 
-    /// The end of what the last one wrote.
+    /// The last output of the last one.
     pub(crate) fn last_words(&self) -> String {
         tail_of(&self.output)
     }

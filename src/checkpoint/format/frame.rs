@@ -221,9 +221,9 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     Ok(header)
 }
 
-/// Whether a file without a whole first line and without a whole record is a damaged checkpoint and not another
-/// program's file: it is empty or begins with zeros, as after a crash of the machine, or most of the first
-/// line's start or of the document's frame remains.
+/// Whether a file without a whole first line and without a whole record is a damaged checkpoint and not
+/// another program's file: it is empty or begins with zeros, as after a crash of the machine, or most of the
+/// first line's start or of the document's frame remains.
 fn resembles(bytes: &[u8]) -> bool {
     let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
     let differing = bytes
