@@ -1,4 +1,4 @@
-//! Puts the parts together, from the first look at the checkpoint to the orderly stop.
+//! Assembles the program: startup, running, orderly stop.
 
 use std::{
     io,
@@ -39,22 +39,21 @@ use self::{
     startup::{Beginning, begin, kernel_id},
 };
 
-/// So many bodies of the largest size may be in memory at the same time.
+/// Bodies of the largest size that may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
 /// How long connections have to end at the stop.
 const DRAIN: Duration = Duration::from_millis(500);
 
-/// What prevents the work. Exit status 1.
+/// Why rosrescue cannot start or continue. Exit status 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
-    /// A socket cannot be served.
     #[error("cannot serve a socket: {0}")]
     Listen(#[from] io::Error),
-    /// The checkpoint belongs to somebody else.
+    /// The checkpoint cannot be used.
     #[error(transparent)]
     Checkpoint(OpenError),
-    /// No master can be run.
+    /// No master can be started.
     #[error(transparent)]
     Supervisor(#[from] ProcessError),
     /// The master's address is our own.
@@ -63,12 +62,12 @@ pub enum RunError {
          serve another one with --listen"
     )]
     Loop { master: MasterUri },
-    /// Cannot happen with what the kernel gives as an id.
+    /// Cannot happen with the kernel's ids.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),
 }
 
-/// Serves `sockets` until `stop`. `say` prints a line for the person who started us.
+/// Serves `sockets` until `stop`. `say` prints a line for the operator.
 pub async fn run(
     mut config: Config,
     sockets: Sockets,
@@ -95,12 +94,12 @@ pub async fn run(
     say(&format!("checkpoint: {}", config.checkpoint.display()));
     let last = beginning.session.master_uri.as_deref();
     let last = last.and_then(|uri| MasterUri::parse(uri).ok());
-    // Where we listen ourselves now, no master can be.
+    // No master can be at our own port.
     let last = last.filter(|uri| uri.port != config.advertised.port);
     let address = match (&config.master, &last) {
         (MasterConfig::External(address), _) => address.clone(),
         (_, Some(last)) => last.clone(),
-        // Until there is one.
+        // Until there is a master.
         (_, None) => MasterUri {
             host: "127.0.0.1".to_owned(),
             port: 0,
@@ -119,7 +118,7 @@ pub async fn run(
         restored,
         story,
     } = beginning;
-    // Counted for as long as the process lives.
+    // Lives as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
     let (gate_tx, gate) = gate::gate();
     let (board, slow, looped) = (Arc::new(Board::default()), Arc::default(), Arc::default());
@@ -200,7 +199,7 @@ pub async fn run(
         async move {
             stop.cancelled().await;
             if let Some(duties) = duties {
-                // A panic of theirs is no reason not to stop.
+                // A panic there must not prevent the stop.
                 let _ = duties.await;
             }
             halt.cancel();
@@ -281,7 +280,7 @@ pub async fn run(
         () = looped.notified() => return Err(RunError::Loop { master: upstream.address() }),
     };
     connections.close();
-    // Calls that still wait cannot be answered any more: their connections are closed.
+    // Calls that still wait cannot be answered: their connections are closed.
     let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
     tasks.shutdown().await;
     close(ledger).await;

@@ -1,8 +1,8 @@
-//! Judges a node's answers: whether it is the node that registered, and where the mirror differs from
-//! what it says.
+//! Judges a node's answers: whether it is the node that registered, and where the mirror differs from its
+//! report.
 //!
-//! Without evidence a node is what it is registered as: a robot that loses a healthy node is worse
-//! off than one that keeps a dead one.
+//! Without evidence to the contrary a node is the registered one: losing a healthy node is worse than keeping
+//! a dead one.
 
 mod backoff;
 mod repeats;
@@ -18,7 +18,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Topics that nodes of all kinds have: they tell no node from another.
+/// Topics that nodes of all kinds have: no evidence.
 const COMMON: [&str; 6] = [
     "/rosout",
     "/clock",
@@ -28,10 +28,10 @@ const COMMON: [&str; 6] = [
     "/diagnostics",
 ];
 
-/// Topics with their types, as a node lists them.
+/// Topics with their types, as listed by a node.
 type Topics = BTreeMap<String, String>;
 
-/// What a node says that it publishes and subscribes.
+/// What a node reports to publish and subscribe.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Claims {
     publications: Topics,
@@ -39,9 +39,8 @@ pub(crate) struct Claims {
 }
 
 impl Claims {
-    /// Reads what `getPublications` and `getSubscriptions` return: lists of topic and type. None
-    /// unless every entry is one that could be registered as it is: then it is not known what the
-    /// node means.
+    /// Reads the results of `getPublications` and `getSubscriptions`: lists of topic and type. None if any
+    /// entry could not be registered as it is: then the node's meaning is unclear.
     pub(crate) fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
         Some(Self {
             publications: topics(publications)?,
@@ -49,7 +48,7 @@ impl Claims {
         })
     }
 
-    /// Whether it has one of these topics that not every node has.
+    /// Whether it includes one of these topics, common ones excluded.
     pub(crate) fn shares(&self, topics: &[String]) -> bool {
         let mut own = self.all().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
@@ -74,33 +73,33 @@ fn topics(list: &Value) -> Option<Topics> {
     topics.collect()
 }
 
-/// What the node behind a port is to a name that is registered with that port.
+/// Whether the node behind a port is the one registered under a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// There is evidence that it bears this name.
+    /// There is evidence that it has this name.
     Itself,
-    /// There is evidence that it is another one.
+    /// There is evidence that it is another node.
     Another,
-    /// There is no evidence.
+    /// No evidence.
     Unknown,
 }
 
-/// A name that is registered with a port.
+/// A name registered with a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Name {
     /// The caller id.
     pub node: String,
-    /// The process id that was behind the port when somebody last asked.
+    /// The process id behind the port when it was last asked.
     pub known_pid: Option<i32>,
-    /// Whether it has registered something since then: it may be another process by now, which took
-    /// the port under the same name.
+    /// Whether it has registered something since: another process may have taken the port under the same
+    /// name.
     pub registered_since: bool,
-    /// A number that is the larger the later it last registered something; 0 if that is not known.
+    /// Grows with each registration; 0 if unknown.
     pub registered: u64,
 }
 
-/// Judges each of `names`, which are registered with the same port. `pid` and `claims` are what is
-/// said behind it now.
+/// Judges each of `names`, which are registered with the same port. `pid` and `claims` are the present
+/// answers from the port.
 pub(crate) fn judge(
     mirror: &Master,
     names: &[Name],
@@ -109,7 +108,7 @@ pub(crate) fn judge(
 ) -> Vec<Verdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
-    // How many of its topics are said, and whether those are all.
+    // How many of its topics are reported, and whether all are.
     let match_of = |node: &str| {
         let held = mirror.publications(node).chain(mirror.subscriptions(node));
         let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
@@ -124,11 +123,11 @@ pub(crate) fn judge(
     let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
         None => Verdict::Unknown,
         Some((0, _)) => Verdict::Another,
-        // It shares topics with the one that came after it.
+        // It only shares topics with a later node.
         Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Another,
         Some(_) => Verdict::Itself,
     };
-    // Who took a port may have been asked in the name of the one before.
+    // A new node at the port may have been asked under the previous node's name.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
     let last_of_pid = of_pid.map(|name| name.registered).max();
     let verdicts = names.iter().zip(&matches);
@@ -141,7 +140,7 @@ pub(crate) fn judge(
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
-    // A port has one process behind it: who registered with it before the one that is there is gone.
+    // A port has one process behind it: earlier registrants are gone.
     let present = names.iter().zip(&verdicts);
     let present = present.filter(|(_, verdict)| **verdict == Verdict::Itself);
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
@@ -163,7 +162,7 @@ pub(crate) struct Registration {
 }
 
 impl Registration {
-    /// The call by which the node itself would register it.
+    /// The call with which the node itself would register it.
     pub(crate) fn register(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::RegisterPublisher,
@@ -172,7 +171,7 @@ impl Registration {
         Request::new(method, [node, &self.topic, &self.topic_type, api])
     }
 
-    /// The call by which the node itself would take it back.
+    /// The call with which the node itself would unregister it.
     pub(crate) fn unregister(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::UnregisterPublisher,
@@ -190,24 +189,24 @@ impl Registration {
         format!("{node} {verb} {}", self.topic)
     }
 
-    /// Whether the two are the same but for the type.
+    /// Whether both are the same, types ignored.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         self.publishes == other.publishes && self.topic == other.topic
     }
 }
 
-/// In what the mirror differs from what a node says.
+/// Where the mirror differs from a node's report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Reconciliation {
-    /// What the node has and the mirror lacks.
+    /// Reported by the node, missing in the mirror.
     pub missing: Vec<Registration>,
-    /// What the mirror has and the node lacks. To be believed only if it stays so: a node may
-    /// register first and make its list after.
+    /// In the mirror, but not reported by the node. Must be confirmed: a node may register first and list the
+    /// topic later.
     pub extra: Vec<Registration>,
 }
 
 impl Reconciliation {
-    /// The difference for `node`. Services are left alone: nodes cannot be asked for theirs.
+    /// The difference for `node`. Services are excluded: nodes cannot be asked for theirs.
     pub(crate) fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
         let mut reconciliation = Self::default();
         let publications: Vec<&str> = mirror.publications(node).collect();
@@ -226,7 +225,7 @@ impl Reconciliation {
                     topic: topic.clone(),
                     topic_type: topic_type.clone(),
                 }));
-            // What a node with a strange name made of its topics is not comparable.
+            // Topics that a strange node name has changed cannot be compared.
             let extra = held
                 .iter()
                 .filter(|topic| master::is_plain_topic(topic) && !said.contains_key(**topic));
@@ -239,7 +238,6 @@ impl Reconciliation {
         reconciliation
     }
 
-    /// Whether there is nothing to mend.
     pub(crate) fn is_empty(&self) -> bool {
         self.missing.is_empty() && self.extra.is_empty()
     }

@@ -1,7 +1,7 @@
-//! When to connect, examine, probe, spawn, kill, and when the gate opens and shuts.
+//! Decides when to connect, examine, probe, spawn, kill, and when the gate opens and shuts.
 //!
-//! A state machine without IO: the shell feeds it what happened, with the time, and carries out
-//! what it answers. It owns every deadline, so that each can be tested without waiting for it.
+//! A state machine without IO: the shell passes in what happened and when, and carries out the returned
+//! actions. It owns every deadline, so that each can be tested without waiting.
 
 use std::{
     collections::VecDeque,
@@ -12,35 +12,34 @@ mod types;
 
 pub use types::{Action, Cause, Input, Probing, Supervision};
 
-/// Deaths older than this no longer count towards a crash loop.
+/// Older deaths do not count towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);
-/// So many deaths within [`DEATH_MEMORY`] are answered by a new master at once.
+/// Deaths within [`DEATH_MEMORY`] after which a new master is started at once.
 const DEATHS_AT_ONCE: usize = 5;
-/// The first pause of a crash loop; it doubles with each further death.
+/// The first pause in a crash loop; doubles with each further death.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
-/// The longest pause of a crash loop.
+/// The longest pause in a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that has served for this time ends a crash loop. One that always lived longer could not
-/// die more than [`DEATHS_AT_ONCE`] times within [`DEATH_MEMORY`].
+/// A master that has served for this time ends a crash loop. A series of masters that live longer cannot
+/// reach more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// How long a spawned master may take until it listens. A Raspberry Pi with a slow card needs some
-/// seconds; a rosmaster whose port was taken stays alive without ever listening.
+/// How long a spawned master may take to listen. A Raspberry Pi with a slow card needs some seconds. A
+/// rosmaster whose port was taken stays alive without ever listening.
 const START_LIMIT: Duration = Duration::from_secs(30);
-/// Pause before asking again something that is not a master.
+/// Pause before trying again after a server that is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     /// No master is connected.
     Seeking,
-    /// A master is connected and not yet known to hold the state.
+    /// A master is connected, but not known to hold the state yet.
     Examining,
     /// The gate is open.
     Serving,
     Stopped,
 }
 
-/// What a deadline is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Timer {
     Connect,
@@ -54,38 +53,36 @@ pub struct Lifecycle {
     supervision: Supervision,
     probing: Probing,
     phase: Phase,
-    /// A master has served since the start.
     served: bool,
-    /// The mirror comes from a checkpoint whose session goes on.
+    /// The mirror is from a checkpoint whose session continues.
     restored: bool,
     /// The mirror is known to be a master's state.
     known: bool,
-    /// When our child was spawned, or we were, if it was left to us; none while it is gone.
+    /// When our child was spawned; for an orphan, when rosrescue started. None while there is no child.
     child: Option<Instant>,
     /// Since when no master has been connected.
     seeking_since: Option<Instant>,
     /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
     deaths: VecDeque<Instant>,
-    /// How many deaths there have been.
     total_deaths: u64,
-    /// More than [`DEATHS_AT_ONCE`] within [`DEATH_MEMORY`], and no master has lived for [`CALM`]
+    /// More than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`], and no master has served for [`CALM`]
     /// since.
     crash_loop: bool,
     /// When the gate was opened; none while it is shut.
     serving_since: Option<Instant>,
-    /// A master of others has closed its connection, and it is not known yet whether it died.
+    /// An external master has closed its connection; it is not known yet whether it died.
     lost: bool,
-    /// A master of others was counted as dead, and neither has its port refused nor anybody answered
-    /// there since.
+    /// An external master was counted as dead. Since then its port has not refused, and no master has been
+    /// examined there.
     dying: bool,
     missed: u32,
-    /// Spawns that failed since the last that did not.
+    /// Consecutive failed spawns.
     failed_spawns: usize,
     timer: Option<(Instant, Timer)>,
 }
 
 impl Lifecycle {
-    /// A machine at rest; feed it [`Input::Start`].
+    /// A machine at rest; it starts with [`Input::Start`].
     pub fn new(supervision: Supervision, probing: Probing) -> Self {
         Self {
             supervision,
@@ -108,24 +105,24 @@ impl Lifecycle {
         }
     }
 
-    /// When to feed [`Input::Wake`]; ask again after every input.
+    /// When to pass in [`Input::Wake`]. Changes with every input.
     pub fn deadline(&self) -> Option<Instant> {
         let timer = self.timer.map(|(at, _)| at);
         timer.into_iter().chain(self.calm_at()).min()
     }
 
-    /// When a crash loop will be over, unless the master dies before.
+    /// When the crash loop ends, unless the master dies before.
     fn calm_at(&self) -> Option<Instant> {
         let since = self.serving_since.filter(|_| self.crash_loop)?;
         Some(since + CALM)
     }
 
-    /// Deaths of masters that were noticed since the start.
+    /// Deaths of masters since the start.
     pub fn deaths(&self) -> u64 {
         self.total_deaths
     }
 
-    /// Whether the mirror may stand in while the gate is shut: it is known to be a master's state.
+    /// Whether the mirror may stand in while the gate is shut: it must be a master's state.
     pub fn may_stand_in(&self) -> bool {
         self.known
     }
@@ -135,12 +132,12 @@ impl Lifecycle {
         self.served
     }
 
-    /// Whether a session begins that no master has served yet.
+    /// Whether this is a new session that no master has served yet.
     pub fn begins(&self) -> bool {
         !self.served && !self.restored
     }
 
-    /// Takes in what happened at `now`; answers what is to be done, in order.
+    /// Takes an input at `now`. Returns the actions, in order.
     ///
     /// ```
     /// use std::time::{Duration, Instant};
@@ -183,7 +180,7 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
-            // It died while it was being examined, or it closes every connection: not in a rush.
+            // It died during the examination, or closes every connection: wait before connecting.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
                 let again = std::mem::replace(&mut self.dying, true);
@@ -195,13 +192,13 @@ impl Lifecycle {
             Input::ThreadEnded | Input::BatchLost | Input::Slow if self.phase != Phase::Serving => {
                 Vec::new()
             }
-            // Not while one is under way.
+            // Not while a probe is under way.
             Input::Slow => match self.timer.take_if(|(_, timer)| *timer == Timer::Probe) {
                 Some(_) => vec![Action::Probe],
                 None => Vec::new(),
             },
-            // Of a killed master the rest follows within milliseconds; if not, connecting shows that it
-            // lives.
+            // If the master was killed, the rest of its end follows within milliseconds; if not, the next
+            // connect shows that it lives.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
@@ -271,7 +268,7 @@ impl Lifecycle {
     fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
         self.restored = restored;
-        // A master of ours begins with nothing but what we give it; what an earlier one holds must be seen.
+        // A new master of ours is empty, so the mirror is right. What an orphan holds must be read first.
         self.known = restored || (self.supervision == Supervision::Ours && !left);
         if self.supervision == Supervision::Ours && !left {
             return vec![Action::Spawn];
@@ -287,13 +284,13 @@ impl Lifecycle {
         self.seeking_since.get_or_insert(now);
     }
 
-    /// The master is gone, whatever was under way. `then` follows the shutting of the gate.
+    /// The master is gone. Shuts the gate, then does `then`.
     fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
         let was_serving = self.phase == Phase::Serving;
         self.seek(now);
         if cause == Cause::Exited {
-            // `spawn` has set it.
+            // Set by `spawn`.
             self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
         }
         let shut = was_serving.then_some(Action::ShutGate(cause));
@@ -315,13 +312,13 @@ impl Lifecycle {
         }
     }
 
-    /// Whether our child has been given its time, and still nobody at its port is a master.
+    /// Whether our child has had enough time, and there is still no master at its port.
     fn is_hopeless(&self, now: Instant) -> bool {
         let since = self.seeking_since.filter(|_| self.child.is_some());
         since.is_some_and(|since| now.duration_since(since) > START_LIMIT)
     }
 
-    /// Our child is no use. Its end is reported as `Exited`, which spawns the next one.
+    /// Kills our useless child. Its end arrives as `Exited`, which spawns the next one.
     fn give_up(&mut self, now: Instant) -> Vec<Action> {
         self.seek(now);
         vec![Action::Kill]
@@ -329,13 +326,13 @@ impl Lifecycle {
 
     fn unreachable(&mut self, now: Instant) -> Vec<Action> {
         match self.supervision {
-            // On this computer, silence at an accepting port is a hung process.
+            // On this computer, silence at an accepting port means a hung process.
             Supervision::Ours if self.phase == Phase::Examining => {
                 self.seek(now);
                 self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
                 vec![Action::Kill]
             }
-            // It does not even take connections: it is stopped, with as many waiting as there may be.
+            // It does not even accept connections: it is stopped, and its backlog is full.
             _ if self.is_hopeless(now) => self.give_up(now),
             _ => self.connect_later(now, true),
         }
@@ -360,12 +357,12 @@ impl Lifecycle {
             Supervision::Theirs => Vec::new(),
         };
         let actions = self.lost(now, Cause::Hung, then);
-        // The killed one's end comes as `Exited`.
+        // The end of the killed master arrives as `Exited`.
         self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
         actions
     }
 
-    /// A master has died and is ours to replace.
+    /// A master of ours has died: starts the next one.
     fn spawn(&mut self, now: Instant) -> Vec<Action> {
         self.count_death(now);
         let pause = self.pause_before_spawn();
@@ -377,8 +374,7 @@ impl Lifecycle {
         vec![Action::ReportCrashLoop(self.deaths.len())]
     }
 
-    /// A master of others has died. They may start the next one as fast as they like: a crash loop
-    /// is said once.
+    /// An external master has died. rosrescue does not slow its restarts; a crash loop is reported once.
     fn their_death(&mut self, now: Instant) -> Option<Action> {
         self.lost = false;
         let said = self.crash_loop;
@@ -411,8 +407,8 @@ fn pause_after(further: usize) -> Duration {
     (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
 }
 
-/// Eager at first, when a restart is a matter of milliseconds, and cheap later. A refused connect
-/// on one computer costs some 20 us; `far` ones have already waited for an answer.
+/// Short at first, when a restart may take only milliseconds, longer later. A refused connect on one computer
+/// costs some 20 us. `far`: the connect itself has waited for an answer.
 fn pause_before_connect(waited: Duration, far: bool) -> Duration {
     let pause = match waited.as_millis() {
         0..2_000 => Duration::from_millis(1),

@@ -15,12 +15,12 @@ use crate::{
     ros_env::MasterUri,
 };
 
-/// How long nodes have to show that a session goes on, and name servers to name their addresses.
+/// How long nodes have to answer, and name servers to resolve their hosts.
 const LIFE_SIGN: Duration = Duration::from_secs(1);
 
-/// Whether any node of `state` answers. After a boot of this computer (`same_boot` is false) only
-/// nodes elsewhere count: none of its own processes has survived, and a process at the port of one
-/// is a stranger.
+/// Whether any node of `state` answers. After a reboot of this computer (`same_boot` is false) only nodes on
+/// other computers count: none of its own processes has survived, and a process at such a port is a different
+/// one.
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     let call = master::get_pid();
     let mut questions = JoinSet::new();
@@ -39,7 +39,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     false
 }
 
-/// Whether `api` is on another computer. If its host has no address, there is nobody to ask.
+/// Whether `api` is on another computer. Not if its host has no address.
 async fn is_elsewhere(api: &str) -> bool {
     let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
         return false;
@@ -50,8 +50,8 @@ async fn is_elsewhere(api: &str) -> bool {
     }
 }
 
-/// Whether an address is this computer's own: the kernel talks to itself from the same one. Nothing is
-/// sent.
+/// Whether an address belongs to this computer: then the kernel routes to it from the same address. Nothing
+/// is sent.
 fn is_own(address: IpAddr) -> bool {
     let any = match address {
         IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),

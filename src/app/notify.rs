@@ -17,10 +17,10 @@ use crate::{
     status::{Board, Guarded},
 };
 
-/// How often systemd may be told another status.
+/// Shortest time between two status messages to systemd.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Begins to tell them. `stop` is told as the begin of the end.
+/// Starts reporting. `stop` is reported as the beginning of the stop.
 pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
@@ -37,7 +37,7 @@ pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) {
     }
 }
 
-/// What they are told.
+/// What the reports need.
 #[derive(Clone)]
 pub(super) struct Source {
     pub(super) board: Arc<Board>,
@@ -51,14 +51,14 @@ impl Source {
         self.board.read().line(self.gate.is_open(), unprotected)
     }
 
-    /// Returns when calls are answered, by a master or by the mirror.
+    /// Returns when calls are answered, by the master or the mirror.
     async fn answers(&self) {
         let mut gate = self.gate.clone();
         gate.wait_for(|state| state != State::Unknown).await;
     }
 }
 
-/// Tells the guardian when calls are answered, and people when the guardian is gone.
+/// Reports to the guardian when calls are answered, and logs the guardian's end.
 async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
     let link = link
         .set_nonblocking(true)
@@ -67,10 +67,10 @@ async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
     let (mut from, mut to) = link.split();
     let served = async {
         told.answers().await;
-        // If nobody takes it the other half tells.
+        // If the guardian is gone, the read below notices.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
-    // The guardian never writes: an answer is its end.
+    // The guardian never writes: the read ends only with it.
     let mut byte = [0];
     let ended = from.read(&mut byte);
     tokio::pin!(ended);
@@ -94,10 +94,10 @@ async fn report_ready(told: Source) {
     send(&[NotifyState::Ready, NotifyState::Status(&line)]);
 }
 
-/// Tells systemd the state in a line, and feeds its watchdog. That takes a timer and a thread of the
-/// runtime, and the locks of the board and of the mirror: what calls need, too.
+/// Reports the state to systemd in a line, and feeds its watchdog. This needs the runtime's timer and
+/// threads, and the locks of the board and the mirror, as calls do.
 async fn report_status(told: Source, stop: CancellationToken) {
-    // Twice as often as necessary, as systemd asks for.
+    // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));
     let mut ticks = interval(tick.max(Duration::from_millis(1)));

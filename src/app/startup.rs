@@ -1,4 +1,4 @@
-//! From the checkpoint to the state that rosrescue starts with.
+//! Determines the initial state from the checkpoint.
 
 use std::path::Path;
 
@@ -14,7 +14,7 @@ use crate::{
     master::{Master, Request},
 };
 
-/// What was found at the start.
+/// The initial state.
 pub(super) struct Beginning {
     pub(super) mirror: Master,
     pub(super) session: Session,
@@ -22,16 +22,16 @@ pub(super) struct Beginning {
     pub(super) pending: Vec<Request>,
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
-    /// In words, for the person who started us.
+    /// In words, for the operator.
     pub(super) story: String,
 }
 
-/// Reads the checkpoint and decides whether its session goes on.
+/// Reads the checkpoint and decides whether its session continues.
 pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let (mut store, loaded) = match Store::open(&config.checkpoint) {
         Ok((store, loaded)) => (Some(store), loaded),
         Err(error @ OpenError::Io { .. }) => {
-            // A robot without a disk still needs its master.
+            // A robot without a working disk still needs its master.
             tracing::error!(
                 %error,
                 "unprotected: the checkpoint cannot be used; calls are forwarded, but a crash of \
@@ -77,7 +77,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 beginning = Some((mirror, session, pending));
             }
             Decision::Fresh(why) => {
-                // A master that a rosrescue left behind when it crashed is taken over.
+                // A master that a crashed rosrescue left running is taken over.
                 master_uri = session.master_uri.filter(|_| !session.closed);
                 let kept = store.as_mut().map(|store| store.set_aside("session"));
                 let kept = match kept {
@@ -129,7 +129,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     })
 }
 
-/// An id from the kernel, or a constant where there is none: it is compared, not trusted.
+/// An id from the kernel, or a constant if there is none: it is compared, not trusted.
 pub(super) fn kernel_id(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }

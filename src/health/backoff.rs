@@ -1,8 +1,8 @@
-//! Pauses that grow.
+//! Growing pauses.
 
 use std::time::{Duration, Instant};
 
-/// When something is to be done next, and how long the pause after that is.
+/// When something is due next, and the pause after that.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Backoff {
     next: Instant,
@@ -10,7 +10,7 @@ pub(super) struct Backoff {
 }
 
 impl Backoff {
-    /// For the first time at `next`, and again after `pause`.
+    /// First due at `next`, then after `pause`.
     pub(super) fn new(next: Instant, pause: Duration) -> Self {
         Self { next, pause }
     }
@@ -19,7 +19,7 @@ impl Backoff {
         self.next
     }
 
-    /// It is done now. Pauses double up to `longest`.
+    /// It was done at `now`. Pauses double up to `longest`.
     pub(super) fn done(&mut self, now: Instant, longest: Duration) {
         self.next = now + self.pause;
         self.pause = (self.pause * 2).min(longest);

@@ -1,10 +1,10 @@
-//! Notifications that we send beside the master, whose own may be late.
+//! Notifications that rosrescue sends because the master's own may be late.
 //!
-//! rosmaster makes each list of publishers when something changes, and sends it when one of its
-//! threads gets to it: after minutes, where nodes that cannot be reached hold them up. So we tell the change
-//! ourselves, but not before the master would have done so if nothing held it up: a list of its
-//! that comes after a newer one of ours makes roscpp nodes drop links, until they are told anew. And
-//! we tell them again and again, because such a list may still be on its way.
+//! rosmaster makes each list of publishers when something changes, but sends it when one of its threads is
+//! free: after minutes, if unreachable nodes hold them up. So rosrescue sends the change itself, but not
+//! earlier than an unhindered master would: an old list from the master that arrives after our newer one
+//! makes roscpp nodes drop links until the next notification. Such a list may still be on its way, so our
+//! notification is repeated.
 
 use std::{
     collections::BTreeMap,
@@ -13,19 +13,19 @@ use std::{
 
 use super::backoff::Backoff;
 
-/// How long nothing must have changed before we tell it: idle threads of rosmaster look for work
+/// How long a subject must be unchanged before its notification: idle threads of rosmaster look for work
 /// every 100 ms.
 const QUIET: Duration = Duration::from_millis(300);
 /// Longest delay of a notification whose subject keeps changing.
 const LATEST: Duration = Duration::from_millis(600);
-/// Pause before it is told again.
+/// Pause before the first repetition.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after the last change it is told again: two connects of rosmaster that get no answer.
+/// How long after the last change it is repeated: two connects of rosmaster without an answer.
 const LIFE: Duration = Duration::from_secs(300);
 
-/// What has changed, and when it is to be told.
+/// Changed subjects, and when each notification is due.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Repeats<K: Ord> {
     of: BTreeMap<K, Wait>,
@@ -33,11 +33,11 @@ pub(crate) struct Repeats<K: Ord> {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
-    /// The first change that has not been told, if there is one.
+    /// The first change without a notification since, if any.
     untold: Option<Instant>,
     backoff: Backoff,
     end: Instant,
-    /// Somebody held up the master since the change.
+    /// Whether an unreachable node has held up the master since the change.
     held_up: bool,
 }
 
@@ -63,8 +63,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// What is to be told now. `holding_up`: there are nodes that do not answer. While all do, the
-    /// master notifies nodes itself.
+    /// The notifications due now. `holding_up`: there are unreachable nodes. Without them the master notifies
+    /// nodes itself.
     pub(crate) fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
@@ -82,7 +82,7 @@ impl<K: Ord + Clone> Repeats<K> {
         due
     }
 
-    /// When something is to be told next.
+    /// When the next notification is due.
     pub(crate) fn next(&self) -> Option<Instant> {
         self.of.values().map(|wait| wait.backoff.next()).min()
     }

@@ -7,19 +7,19 @@ use std::{
 
 use super::backoff::Backoff;
 
-/// Pause before an unreachable node is asked for the first time again.
+/// Pause before an unreachable node is asked again for the first time.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
-/// The addresses that are unreachable, and when each is to be asked again.
+/// The unreachable addresses, and when each is asked next.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Unreachable {
     of: BTreeMap<String, Backoff>,
 }
 
 impl Unreachable {
-    /// The node at `api` did not answer just now. Answers whether that is new.
+    /// Adds a node that has not answered. Returns whether that is new.
     pub(crate) fn add(&mut self, api: &str, now: Instant) -> bool {
         if self.of.contains_key(api) {
             return false;
@@ -29,7 +29,7 @@ impl Unreachable {
         true
     }
 
-    /// The node at `api` has answered, or is no more. Answers whether it was unreachable.
+    /// Removes a node that has answered or is gone. Returns whether it was unreachable.
     pub(crate) fn remove(&mut self, api: &str) -> bool {
         self.of.remove(api).is_some()
     }
@@ -39,7 +39,6 @@ impl Unreachable {
         self.of.retain(|api, _| registered(api));
     }
 
-    /// Whether the node at `api` is unreachable.
     pub(crate) fn contains(&self, api: &str) -> bool {
         self.of.contains_key(api)
     }
@@ -48,7 +47,7 @@ impl Unreachable {
         self.of.is_empty()
     }
 
-    /// Those to be asked now; the next time comes after a longer pause.
+    /// Addresses to ask now. Each following pause is longer.
     pub(crate) fn due(&mut self, now: Instant) -> Vec<String> {
         let mut due = Vec::new();
         for (api, backoff) in &mut self.of {
@@ -60,7 +59,7 @@ impl Unreachable {
         due
     }
 
-    /// When somebody is to be asked next.
+    /// When the next node is due.
     pub(crate) fn next(&self) -> Option<Instant> {
         self.of.values().map(Backoff::next).min()
     }

@@ -1,22 +1,22 @@
-//! What the lifecycle is told, and what it answers.
+//! Inputs and actions of the lifecycle.
 
 use std::time::Duration;
 
 /// Who starts masters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Supervision {
-    /// rosrescue does.
+    /// rosrescue.
     Ours,
-    /// Somebody else does; rosrescue waits.
+    /// Another program; rosrescue waits.
     Theirs,
 }
 
-/// How a hung master is told from a slow one.
+/// How a hung master is distinguished from a slow one.
 #[derive(Clone, Copy, Debug)]
 pub struct Probing {
     /// Pause between an answered probe and the next.
     pub interval: Duration,
-    /// So many missed probes in a row mean that the master hangs.
+    /// The master hangs after this many missed probes in a row.
     pub count: u32,
 }
 
@@ -25,16 +25,15 @@ pub struct Probing {
 pub enum Input {
     /// rosrescue starts.
     Start {
-        /// Whether a master that an earlier rosrescue spawned still runs. Its end is told as that of
-        /// a child.
+        /// Whether a master of an earlier rosrescue still runs. Its end is reported like a child's.
         left: bool,
-        /// Whether the mirror comes from a checkpoint whose session goes on.
+        /// Whether the mirror is from a checkpoint whose session continues.
         restored: bool,
     },
-    /// The master that is examined has answered, and is being brought to the mirror's state: if it ends now,
-    /// that is a death of its own.
+    /// The examined master has answered and is being brought to the mirror's state: if it ends now, that
+    /// counts as another death.
     Answered,
-    /// The connection to the master is there.
+    /// A connection to the master has been made.
     Connected,
     /// Nothing listens at the master's address.
     Refused,
@@ -46,14 +45,14 @@ pub enum Input {
     ThreadEnded,
     /// A batch of writes got no reply.
     BatchLost,
-    /// The master has not answered a call for longer than it should take.
+    /// The master takes too long to answer a call.
     Slow,
     /// The master holds the whole state.
     Examined {
-        /// It is not the incarnation that was served before.
+        /// Whether it is a new incarnation.
         new: bool,
     },
-    /// What listens there does not answer as a master does.
+    /// The server at the master's address is not a master.
     NotAMaster,
     /// The master answered a probe in time.
     ProbeAnswered,
@@ -70,7 +69,7 @@ pub enum Input {
     Exited,
     /// The time of [`Lifecycle::deadline`](super::Lifecycle::deadline) has come.
     Wake,
-    /// rosrescue is to stop.
+    /// rosrescue must stop.
     Stop,
 }
 
@@ -79,7 +78,7 @@ pub enum Input {
 pub enum Cause {
     /// The master's connection ended: it died, or it closed an idle connection.
     ConnectionLost,
-    /// A thread of the master ended: it dies, or it is being stopped in order.
+    /// A thread of the master ended: it is dying, or being stopped in order.
     ThreadEnded,
     /// The master's process ended.
     Exited,
@@ -102,30 +101,30 @@ impl Cause {
     }
 }
 
-/// What the shell is to do, in order. A new `Connect` or `Examine` cancels the step that is under way;
-/// a `Probe` leaves it alone.
+/// What the shell must do, in order. A new `Connect` or `Examine` cancels the step under way; a `Probe` does
+/// not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
-    /// Connect to the master; answer `Connected`, `Refused` or `Unreachable`.
+    /// Connect to the master. Results: `Connected`, `Refused` or `Unreachable`.
     Connect,
-    /// Bring the connected master to the mirror's state, or the mirror to its; answer `Examined`,
+    /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
     /// Let no call pass.
     ShutGate(Cause),
     /// Let calls pass.
     OpenGate,
-    /// Ask the master for a sign of life; answer `ProbeAnswered` or `ProbeMissed`.
+    /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
     Probe,
-    /// Start a master; answer `Spawned` or `SpawnFailed`.
+    /// Start a master. Results: `Spawned` or `SpawnFailed`.
     Spawn,
-    /// End the master at once.
+    /// Kill the master.
     Kill,
-    /// End rosrescue: no master can be started, and there is no state that a later one could be given. Better
-    /// to say what is wrong than to try for ever.
+    /// Stop rosrescue: no master can be started, and there is no state to give to a later one. Reporting the
+    /// error is better than retrying for ever.
     GiveUp,
-    /// Report a crash loop: the number of deaths within a minute.
+    /// Report a crash loop, with the number of deaths within a minute.
     ReportCrashLoop(usize),
-    /// Say that it no longer does.
+    /// Report the end of the crash loop.
     ReportCalm,
 }
