@@ -3,8 +3,8 @@
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
 //! * [`Request`]: a call, parsed once; its [`Method`] and its [`Kind`].
 //!
-//! Everything follows rosmaster 1.15.15 under Python 3.11, function by function; its quirks are
-//! kept, because clients see them. Only texts of errors that no ROS client provokes are our own.
+//! Everything follows rosmaster 1.15.15 under Python 3.11, function by function, including quirks that
+//! clients see. Only texts of errors that no ROS client provokes are our own.
 
 pub(crate) mod api;
 pub(crate) mod checks;

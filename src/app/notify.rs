@@ -94,8 +94,8 @@ async fn report_ready(told: Source) {
     send(&[NotifyState::Ready, NotifyState::Status(&line)]);
 }
 
-/// Reports the state to systemd in a line, and feeds its watchdog. This needs the runtime's timer and
-/// threads, and the locks of the board and the mirror, as calls do.
+/// Reports the state to systemd in a line, and feeds its watchdog. Feeding needs what calls need, so it shows
+/// that they work: a timer and a thread of the runtime, and the locks of the board and the mirror.
 async fn report_status(told: Source, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);

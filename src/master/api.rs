@@ -1,28 +1,28 @@
-//! The methods of the Master API, and the dispatcher in front of them.
+//! The methods of the Master API, and their dispatcher.
 
 use std::fmt;
 
 use super::{Kind, Master, Notice, NoticeSink, Request, returnable};
 use crate::xmlrpc::{Reply, Value};
 
-/// What a method returns: status code, message, value.
+/// Returned by a method: status code, message, value.
 pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 
 /// Why a method ends early.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Failure {
-    /// A check refuses a parameter: the text is the message.
+    /// A check refused a parameter: the text is the message.
     Refused(String),
-    /// Where rosmaster raises a `TypeError`: code -1, and a text of our own.
+    /// rosmaster raises a `TypeError`: code -1, with a text of our own.
     Type(&'static str),
-    /// Where it raises anything else: code 0.
+    /// rosmaster raises another error: code 0.
     Internal(&'static str),
 }
 
-/// What a method is called with.
+/// Arguments of a method.
 pub(crate) struct Args<'a> {
     pub(crate) caller_id: &'a str,
-    /// Those after the caller id.
+    /// The parameters after the caller id.
     params: &'a [Value],
     pub(crate) notices: &'a mut dyn NoticeSink,
 }
@@ -33,12 +33,12 @@ impl<'a> Args<'a> {
     }
 }
 
-/// What is known of a method of the Master API.
+/// Properties of a method of the Master API.
 struct Spec {
     kind: Kind,
     /// Number of parameters, the caller id included.
     arity: usize,
-    /// The value that goes with an error.
+    /// The value that is returned with an error.
     error: fn() -> Value,
     run: fn(&mut Master, Args<'_>) -> Answer,
 }
@@ -51,9 +51,9 @@ macro_rules! methods {
         #[derive(Clone, Debug, PartialEq, Eq, Hash)]
         pub enum Method {
             $(#[doc = concat!("`", $name, "`.")] $method,)*
-            /// `system.multicall`, which CPython's `xmlrpc.server` brings along.
+            /// `system.multicall`, from CPython's `xmlrpc.server`.
             Multicall,
-            /// None that a rosmaster has.
+            /// A method that rosmaster lacks.
             Unknown(Box<str>),
         }
 
@@ -121,7 +121,7 @@ impl fmt::Display for Method {
 }
 
 impl Method {
-    /// What it may do. [`Kind::Unknown`] for a multicall, whose entries decide.
+    /// Its kind. [`Kind::Unknown`] for a multicall, whose entries decide.
     pub(crate) fn kind(&self) -> Kind {
         self.spec().map_or(Kind::Unknown, |spec| spec.kind)
     }
@@ -135,19 +135,18 @@ pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
     Value::Array(texts.into_iter().map(Value::String).collect())
 }
 
-/// What a call answers, and which callbacks the master sends because of it.
+/// The answer to a call, and the callbacks that the master sends because of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Applied {
-    /// The answer.
     pub reply: Reply,
-    /// The callbacks, in the order in which the master queues them. Those to one address are sent
-    /// one after the other, those to different addresses at the same time.
+    /// The callbacks, in the order in which the master queues them. Those to one address are sent one after
+    /// another, those to different addresses at the same time.
     pub notices: Vec<Notice>,
 }
 
 impl Master {
-    /// Answers as rosmaster does, and changes as rosmaster does. `shutdown` is answered and changes nothing.
-    /// The texts of errors that no ROS client provokes are our own.
+    /// Answers and changes as rosmaster does. `shutdown` is answered and changes nothing. Texts of errors
+    /// that no ROS client provokes are our own.
     ///
     /// ```
     /// use rosrescue::master::{Master, Method, Notice, Request, is_success};
@@ -167,7 +166,7 @@ impl Master {
         Applied { reply, notices }
     }
 
-    /// Like [`Master::apply`], with the callbacks told to `notices`, which copies as much as it needs.
+    /// As [`Master::apply`], but passes the callbacks to `notices`, which copies only what it needs.
     pub fn apply_telling(&mut self, request: &Request, notices: &mut dyn NoticeSink) -> Reply {
         let result = match request.method() {
             Method::Multicall => self.run_multicall(request.entries(), notices),
@@ -182,7 +181,7 @@ impl Master {
         }
     }
 
-    /// Answers anything but a multicall. An error is the text of a fault.
+    /// Answers any method except for a multicall. An error is the text of a fault.
     pub(crate) fn dispatch(
         &mut self,
         request: &Request,

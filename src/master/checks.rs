@@ -56,8 +56,8 @@ pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<St
     }
 }
 
-/// `valid_type_name('topic_type')`. A date that reads `*` passes there too, as what it is; here it
-/// becomes the string.
+/// `valid_type_name('topic_type')`. rosmaster also accepts a date that reads `*`, and keeps it as a date;
+/// here it becomes a string.
 pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     match value {
         Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),

@@ -1,6 +1,6 @@
-//! What a call may do: read, write, or something known only to the master.
+//! Kinds of calls: reads, writes, and calls that only the master understands.
 
-/// What a call may do, by its method; for a multicall, by its entries.
+/// The kind of a call, by its method; for a multicall, by its entries.
 ///
 /// ```text
 ///            Shutdown
@@ -14,18 +14,17 @@
 ///            Identity
 /// ```
 ///
-/// A multicall is the least kind that is above all its entries, nested ones too: a call that
-/// unregisters and also does something unknown must be recorded and must go to the master, so it is
-/// a `Mutate`.
+/// The kind of a multicall is the lowest one above all its entries, nested ones too. A call that unregisters
+/// and also does something unknown must be recorded and must go to the master, so it is a `Mutate`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
     /// `getPid`, `getUri`: answers about the master's process.
     Identity,
     /// Changes nothing.
     Read,
-    /// `unregister*`, `unsubscribeParam`: takes something away that the caller registered.
+    /// `unregister*`, `unsubscribeParam`: removes something that the caller registered.
     Unregister,
-    /// A method that the Master API does not have, or a multicall that cannot run.
+    /// A method that the Master API lacks, or a multicall that cannot run.
     Unknown,
     /// `register*`, `setParam`, `deleteParam`, `subscribeParam`: changes state.
     Mutate,
@@ -34,12 +33,12 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// Whether the call may change the master's state, and so has to be recorded.
+    /// Whether the call may change the master's state, and so must be recorded.
     pub fn mutates(self) -> bool {
         matches!(self, Self::Unregister | Self::Mutate)
     }
 
-    /// The least kind above both.
+    /// The lowest kind above both.
     #[must_use]
     pub fn join(self, other: Self) -> Self {
         match (self, other) {

@@ -1,4 +1,4 @@
-//! The methods of the Master API, one by one: the body of `rosmaster/master_api.py`.
+//! The methods of the Master API: the body of `rosmaster/master_api.py`.
 
 use super::api::{Answer, Args, Failure, strings};
 use super::registry::Shared;
@@ -246,7 +246,7 @@ impl Master {
         Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
     }
 
-    /// Queues the list of the topic's publishers for its subscribers, whose addresses it gives.
+    /// Queues the topic's publisher list for its subscribers, and returns their addresses.
     fn notify_publishers(&self, topic: &str, notices: &mut dyn NoticeSink) -> Vec<String> {
         let subscribers = self.registry.apis(Shared::Subscribers, topic);
         if !subscribers.is_empty() {

@@ -1,11 +1,11 @@
-//! `system.multicall`, which CPython's `xmlrpc.server` brings along.
+//! `system.multicall`, from CPython's `xmlrpc.server`.
 
 use super::api::fault;
 use super::{Entry, Kind, Master, Method, NoticeSink, Request, names};
 use crate::xmlrpc::{Reply, Struct, Value};
 
 impl Master {
-    /// Runs a whole multicall: what it returns, or the text of its fault.
+    /// Runs a whole multicall. Returns its value, or the text of its fault.
     pub(crate) fn run_multicall(
         &mut self,
         entries: &[Entry],
@@ -54,8 +54,8 @@ impl Master {
         Ok(Value::Array(results))
     }
 
-    /// Whether all that the reads in a multicall answer takes no more than `most` bytes of memory, about.
-    /// Each answer is made and dropped. What is no multicall fits always.
+    /// Whether all answers to the reads of a multicall need no more than about `most` bytes of memory. Each
+    /// answer is made and dropped. Other calls always fit.
     pub fn fits(&mut self, request: &Request, mut most: usize) -> bool {
         if *request.method() != Method::Multicall {
             return true;
@@ -72,7 +72,7 @@ impl Master {
         })
     }
 
-    /// Remembers where a dict of the parameter tree is part of the result.
+    /// Notes where a dict of the parameter tree is part of the result.
     fn watch(&mut self, request: &Request, result: Option<&Value>, at: &[usize]) {
         let (key, subscribes) = match request.method() {
             Method::GetParam => (request.text(1), false),
@@ -91,7 +91,7 @@ impl Master {
         if subscribes {
             key = names::param_key(&key);
         }
-        // A subscription to what is not set gets a dict of its own.
+        // A subscription to an unset key gets a dict of its own.
         if self.params.has(&key) {
             let at = at.iter().copied().chain([2]).collect();
             self.params.watch(&key, at);
@@ -122,7 +122,7 @@ pub(crate) fn reply_entry(reply: Reply) -> Value {
     }
 }
 
-/// The reply that an entry of a multicall's result stands for.
+/// The reply contained in an entry of a multicall's result.
 pub fn entry_reply(result: &Value) -> Option<Reply> {
     match result {
         Value::Array(only) => match only.as_slice() {

@@ -1,11 +1,11 @@
 //! Graph resource names as `rosgraph/names.py` resolves them.
 //!
-//! rosmaster resolves more than it validates: a caller id such as `a/b` makes topics such as `a/t`,
-//! `/a//b` makes `/a//t`. They are stored as they come out, so everything here takes any text.
+//! rosmaster resolves more than it validates: a caller id such as `a/b` makes topics such as `a/t`, `/a//b`
+//! makes `/a//t`. The results are stored unchanged, so everything here accepts any text.
 
 use std::borrow::Cow;
 
-/// The name by which rosrescue itself calls a master.
+/// The caller id of rosrescue's own calls to a master.
 pub const CALLER_ID: &str = "/rosrescue";
 
 /// `canonicalize_name`: without doubled and trailing slashes.
@@ -32,7 +32,7 @@ pub(crate) fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 
-/// `namespace`: up to and with the last slash, one trailing slash not counted.
+/// `namespace`: up to and including the last slash, ignoring one trailing slash.
 pub(crate) fn namespace(name: &str) -> &str {
     let name = name.strip_suffix('/').unwrap_or(name);
     match name.rfind('/') {
@@ -41,7 +41,7 @@ pub(crate) fn namespace(name: &str) -> &str {
     }
 }
 
-/// `resolve_name` of a name that is not empty.
+/// `resolve_name` of a non-empty name.
 pub(crate) fn resolve(name: &str, caller_id: &str) -> String {
     let name = canonicalize(name);
     if name.starts_with('/') {
@@ -53,7 +53,7 @@ pub(crate) fn resolve(name: &str, caller_id: &str) -> String {
     }
 }
 
-/// `ns_join`, which leaves alone a name that starts with `/` or `~`, and needs no slash behind `~`.
+/// `ns_join`: leaves a name that starts with `/` or `~` unchanged, and adds no slash after `~`.
 pub(crate) fn join(namespace: &str, name: &str) -> String {
     if name.starts_with(['/', '~']) || namespace.is_empty() {
         name.to_owned()
@@ -64,7 +64,7 @@ pub(crate) fn join(namespace: &str, name: &str) -> String {
     }
 }
 
-/// The form in which parameter subscriptions are kept and announced: with a trailing slash.
+/// The stored and announced form of parameter subscriptions: with a trailing slash.
 pub(crate) fn param_key(key: &str) -> String {
     let mut key = canonicalize(key).into_owned();
     if key != "/" {
@@ -73,13 +73,13 @@ pub(crate) fn param_key(key: &str) -> String {
     key
 }
 
-/// What validators refuse in the name of a topic, service or node.
+/// Characters that validators refuse in the name of a topic, service or node.
 pub(crate) fn has_illegal_chars(name: &str) -> bool {
     name.contains([':', ' '])
 }
 
-/// A name that the master resolves to `key` when `caller_id` says it. Each key that a caller has
-/// ever registered has one.
+/// A name that the master resolves to `key` for `caller_id`. It exists for each key that a caller has ever
+/// registered.
 pub(crate) fn name_for(key: &str, caller_id: &str) -> Option<String> {
     let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
     if plain && canonicalize(key) == key {
@@ -90,7 +90,7 @@ pub(crate) fn name_for(key: &str, caller_id: &str) -> Option<String> {
     })
 }
 
-/// Like [`name_for`] for a key of a parameter subscription.
+/// As [`name_for`], for a key of a parameter subscription.
 pub(crate) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
     let trimmed = if key == "/" {
         key
@@ -103,7 +103,7 @@ pub(crate) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
 }
 
 fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<String> {
-    // The global namespace is refused as `/` and taken as `//`.
+    // The global namespace is refused as `/` but accepted as `//`.
     let absolute = if key == "/" { "//" } else { key };
     if names(absolute) {
         return Some(absolute.to_owned());
@@ -118,9 +118,8 @@ fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<Str
         .find(|name| !name.is_empty() && names(name))
 }
 
-/// A caller id and a name that the master resolves to `key`, where the caller id may be any that is
-/// `usable`, and is `preferred` wherever that can be. None for what no such call can name, such as a
-/// node that calls itself `/a/`.
+/// A caller id and a name that the master resolves to `key`. The caller id must be `usable`, and is
+/// `preferred` if possible. None if no call can name `key`, as for a node that calls itself `/a/`.
 pub(crate) fn reach(
     key: &str,
     preferred: &str,

@@ -2,7 +2,6 @@
 
 use crate::xmlrpc::Value;
 
-/// A callback that the master sends to a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Notice {
     /// `publisherUpdate('/master', topic, publishers)`.
@@ -10,19 +9,19 @@ pub enum Notice {
         /// Address of the subscriber.
         to: String,
         topic: String,
-        /// Addresses of all its publishers.
+        /// Addresses of all the topic's publishers.
         publishers: Vec<String>,
     },
     /// `paramUpdate('/master', key, value)`.
     ParamUpdate {
         /// Address of the subscriber.
         to: String,
-        /// What changed, with a trailing slash.
+        /// The changed key, with a trailing slash.
         key: String,
-        /// The new value; an empty struct for what is gone.
+        /// The new value; an empty struct for a deleted parameter.
         value: Value,
     },
-    /// `shutdown('/master', reason)`, to a node whose name another one took.
+    /// `shutdown('/master', reason)`, to a node whose name was taken.
     Shutdown {
         /// The old node's address.
         to: String,
@@ -30,8 +29,8 @@ pub enum Notice {
     },
 }
 
-/// Is told of callbacks as the master queues them. What they say is lent: one change may go to
-/// thousands of nodes, and each with a large value. What is not written here is not listened to.
+/// Receives callbacks as the master queues them. Arguments are borrowed: one change may go to thousands of
+/// nodes, each with a large value. By default callbacks are ignored.
 pub trait NoticeSink {
     /// A [`Notice::PublisherUpdate`] to each of these addresses.
     fn publisher_update(&mut self, _to: &[String], _topic: &str, _publishers: &[String]) {}
@@ -42,10 +41,10 @@ pub trait NoticeSink {
     fn shutdown(&mut self, _to: &str, _reason: &str) {}
 }
 
-/// Nobody listens.
+/// Ignores all callbacks.
 impl NoticeSink for () {}
 
-/// Every callback, with all that it says.
+/// Collects all callbacks.
 impl NoticeSink for Vec<Notice> {
     fn publisher_update(&mut self, to: &[String], topic: &str, publishers: &[String]) {
         self.extend(to.iter().map(|to| Notice::PublisherUpdate {

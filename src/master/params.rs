@@ -6,32 +6,30 @@ use super::registry::Registrations;
 use super::updates::{GONE, Update, updates};
 use crate::xmlrpc::{Struct, Value};
 
-/// Levels of the tree that are kept. rosmaster takes any depth, by a long key as well as by a deep
-/// value, and cannot return more than 491 levels at once. What lies deeper is kept as a nil: it bounds
-/// recursion over the tree, its drop included. rosmaster returns what lies there by a key that leads
-/// close enough; it could not be brought into a successor anyway.
+/// Kept levels of the tree. rosmaster accepts any depth, through long keys or deep values, and cannot return
+/// more than 491 levels at once. Deeper parts are kept as nil, which bounds recursion over the tree, its drop
+/// included. rosmaster returns them for a key that leads close enough; but they could not be injected into
+/// another master anyway.
 const DEEPEST_TREE: usize = 512;
 
-/// The parameter tree.
 #[derive(Clone, Default)]
 pub(crate) struct Params {
     tree: Struct,
-    /// Results of a multicall under way that are dicts of the tree itself: see [`Live`].
+    /// Results of the present multicall that are dicts of the tree itself: see [`Live`].
     live: Vec<Live>,
 }
 
-/// `getParam` returns the tree's own dict, and a multicall writes its results only after its last
-/// entry has run: a later `setParam` below that dict shows in the earlier result.
+/// `getParam` returns the tree's own dict, and a multicall encodes its results only after its last entry has
+/// run. So a later `setParam` below that dict shows in the earlier result.
 #[derive(Clone)]
 struct Live {
-    /// Where in the multicall's result the value goes.
+    /// The value's place in the multicall's result.
     at: Vec<usize>,
     path: Vec<String>,
-    /// The value once the dict is no longer part of the tree.
+    /// The value after the dict was removed from the tree.
     detached: Option<Value>,
 }
 
-/// What is found under a key.
 enum Found<'a> {
     Tree(&'a Struct),
     Value(&'a Value),
@@ -78,8 +76,7 @@ impl Params {
         Some(found)
     }
 
-    /// `set_param` of a key with a trailing slash. The tree changes even where working out the updates
-    /// fails.
+    /// `set_param` of a key with a trailing slash. The tree changes even if computing the updates fails.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
@@ -101,7 +98,7 @@ impl Params {
         updates
     }
 
-    /// Puts a value there; namespaces are made. Of what lies too deep only a nil is left.
+    /// Sets a value and creates its namespaces. Values that lie too deep become nil.
     pub(crate) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
         let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
@@ -141,7 +138,7 @@ impl Params {
             Some(Found::Tree(members) | Found::Value(Value::Struct(members))) => {
                 members.contains_key(*last)
             }
-            // Python finds part of a text, and an element of a list, and cannot delete them.
+            // Python's `in` finds a substring, or an element of a list, but cannot delete it.
             Some(Found::Value(Value::String(text))) if !text.contains(*last) => false,
             Some(Found::Value(Value::Array(elements))) if !elements.iter().any(is(last)) => false,
             Some(Found::Value(_)) => return Err(Failure::Type("this parameter is no namespace")),
@@ -172,7 +169,7 @@ impl Params {
         if key.starts_with('/') {
             return Ok(self.has(key).then(|| key.to_owned()));
         }
-        // Only the first part of the key has to exist.
+        // Only the first part of the key must exist.
         let Some(first) = names::parts(key).next() else {
             return Ok(None);
         };
@@ -189,7 +186,7 @@ impl Params {
         Ok(None)
     }
 
-    /// `get_param_names`: every key that is no dict.
+    /// `get_param_names`: every key whose value is not a dict.
     pub(crate) fn names(&self) -> Vec<String> {
         fn collect(key: &str, members: &Struct, found: &mut Vec<String>) {
             for (name, value) in members {
@@ -205,7 +202,7 @@ impl Params {
         found
     }
 
-    /// How many parameters are no dicts.
+    /// Number of parameters that are not dicts.
     pub(crate) fn leaves(&self) -> usize {
         fn count(members: &Struct) -> usize {
             let leaves = members.values().map(|value| match value {
@@ -226,7 +223,7 @@ impl Params {
         });
     }
 
-    /// The values of the dicts watched since the multicall began, and where they go.
+    /// The values of the dicts watched during the multicall, and their places in its result.
     pub(crate) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
         let live = std::mem::take(&mut self.live);
         live.into_iter()
@@ -240,7 +237,7 @@ impl Params {
             .collect()
     }
 
-    /// The dicts at `path` and below are about to leave the tree.
+    /// Detaches the dicts at `path` and below, before they leave the tree.
     fn detach(&mut self, path: &[&str]) {
         let mut live = std::mem::take(&mut self.live);
         for entry in &mut live {
@@ -255,7 +252,7 @@ impl Params {
     }
 }
 
-/// The namespace of that name, made if need be. A value in its way is silently lost.
+/// The namespace of that name, created if needed. Silently replaces a value.
 fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> {
     let value = members.entry(name.to_owned()).or_insert(Value::Nil);
     if !matches!(value, Value::Struct(_)) {
@@ -267,7 +264,7 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
     }
 }
 
-/// Tells whether an element of a list equals `name`, as Python has it.
+/// Returns whether an element of a list equals `name`, as in Python.
 fn is(name: &str) -> impl Fn(&Value) -> bool {
     move |value| matches!(value, Value::String(text) | Value::DateTime(text) if text == name)
 }
@@ -282,7 +279,7 @@ fn is_deeper(value: &Value, levels: usize) -> bool {
     }
 }
 
-/// The value with nil for the arrays and structs below so many levels of them.
+/// Replaces arrays and structs below that many levels by nil.
 fn cut(value: Value, levels: usize) -> Value {
     match value {
         Value::Array(_) | Value::Struct(_) if levels == 0 => Value::Nil,
@@ -304,7 +301,7 @@ fn cut(value: Value, levels: usize) -> Value {
     }
 }
 
-/// The path that `get_param` takes. It ignores what comes before the first slash.
+/// The path that `get_param` follows. It ignores what precedes the first slash.
 fn read_path(key: &str) -> impl Iterator<Item = &str> {
     key.split('/').skip(1).filter(|part| !part.is_empty())
 }

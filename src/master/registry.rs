@@ -1,4 +1,4 @@
-//! Who publishes, subscribes and provides: `rosmaster/registrations.py`.
+//! Publishers, subscribers and services: `rosmaster/registrations.py`.
 
 use indexmap::{IndexMap, IndexSet};
 
@@ -7,7 +7,7 @@ use super::snapshot::ServiceEntry;
 /// Caller ids by topic or parameter key, in the order in which they registered.
 pub(crate) type Registrations = IndexMap<String, Vec<String>>;
 
-/// The kinds of registration that many nodes may share.
+/// Kinds of registration that several nodes may share.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Shared {
     Publishers,
@@ -15,14 +15,14 @@ pub(crate) enum Shared {
     ParamSubscribers,
 }
 
-/// A node reference: what rosmaster counts before it forgets a node.
+/// A node reference: rosmaster forgets a node once it has no registration left.
 #[derive(Clone, Default, PartialEq)]
 pub(crate) struct Node {
     pub(crate) api: String,
     pub(crate) publications: IndexSet<String>,
     pub(crate) subscriptions: IndexSet<String>,
     pub(crate) param_subscriptions: IndexSet<String>,
-    /// Services that this node registered, those included that another one has taken over since.
+    /// Services that this node registered, including those that another node has taken over since.
     pub(crate) services: IndexSet<String>,
 }
 
@@ -52,7 +52,7 @@ pub(crate) struct Registry {
     pub(crate) subscribers: Registrations,
     pub(crate) param_subscribers: Registrations,
     pub(crate) services: IndexMap<String, ServiceEntry>,
-    /// Whether any service was ever registered: shows only in a message of `unregisterService`.
+    /// Whether any service was ever registered. Shows only in a message of `unregisterService`.
     pub(crate) had_services: bool,
 }
 
@@ -82,7 +82,7 @@ impl Registry {
             .collect()
     }
 
-    /// Registers; gives the address of the node that this bumps.
+    /// Registers. Returns the address of a node that this displaces.
     pub(crate) fn register(
         &mut self,
         kind: Shared,
@@ -98,7 +98,7 @@ impl Registry {
         bumped
     }
 
-    /// Like [`Registry::register`]: takes the service from its present provider, which keeps a reference.
+    /// As [`Registry::register`]. Takes the service from its present provider, which keeps a reference.
     pub(crate) fn register_service(
         &mut self,
         service: &str,
@@ -117,8 +117,8 @@ impl Registry {
         bumped
     }
 
-    /// The node's reference. Under another address it is a new node of the same name: the old
-    /// one's registrations go.
+    /// The node's reference. With another address it is a new node of the same name, and the old node's
+    /// registrations are removed.
     fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
         let mut bumped = None;
         if let Some(node) = self.nodes.get_mut(caller_id)
@@ -156,7 +156,7 @@ impl Registry {
         }
     }
 
-    /// Unregisters; gives the message and whether there was something to unregister.
+    /// Unregisters. Returns the message, and whether there was something to unregister.
     pub(crate) fn unregister(
         &mut self,
         kind: Shared,
@@ -176,7 +176,7 @@ impl Registry {
         (unregistered(caller_id, key), true)
     }
 
-    /// Like [`Registry::unregister`].
+    /// As [`Registry::unregister`].
     pub(crate) fn unregister_service(
         &mut self,
         service: &str,

@@ -3,14 +3,13 @@
 use super::{Kind, Method, names, returnable};
 use crate::xmlrpc::{self, Call, DecodeError, Struct, Value};
 
-/// Multicalls inside multicalls that are looked into. A decoded document has no more, because each takes
+/// Most levels of nested multicalls that are parsed. A decoded document cannot have more, because each takes
 /// three of its levels.
 const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 
 /// More parameters than any method takes.
 const TOO_MANY: usize = 5;
 
-/// A call of a master, parsed.
 ///
 /// ```
 /// use rosrescue::master::{Kind, Method, Request};
@@ -27,7 +26,7 @@ const TOO_MANY: usize = 5;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Request {
     method: Method,
-    /// Of a multicall none: they are its entries.
+    /// Empty for a multicall, which has entries instead.
     params: Vec<Value>,
     entries: Vec<Entry>,
 }
@@ -35,16 +34,16 @@ pub struct Request {
 /// One entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Entry {
-    /// Something that is run.
+    /// An entry to run.
     Request(Request),
-    /// Something that gets a fault of its own, with this text.
+    /// An entry that gets a fault of its own, with this text.
     Refused(&'static str),
-    /// Something that ends the multicall with a fault, after what came before it has run. Always the last.
+    /// An entry that ends the multicall with a fault after the previous ones have run. Always the last.
     Malformed(&'static str),
 }
 
 impl Request {
-    /// A call of `method`, which is no multicall.
+    /// A call of `method`, other than a multicall.
     pub fn new(method: Method, params: impl IntoIterator<Item = impl Into<Value>>) -> Self {
         Self {
             method,
@@ -87,7 +86,7 @@ impl Request {
         &self.method
     }
 
-    /// The parameters, the caller id first; none for a multicall.
+    /// The parameters, the caller id first; empty for a multicall.
     pub fn params(&self) -> &[Value] {
         &self.params
     }
@@ -104,7 +103,7 @@ impl Request {
         self.params.get(index)?.as_str()
     }
 
-    /// This call, or all within a multicall that are none themselves, in order.
+    /// This call or, for a multicall, all calls in it, in order; nested multicalls are flattened.
     pub fn calls(&self) -> Vec<&Self> {
         fn collect<'a>(request: &'a Request, found: &mut Vec<&'a Request>) {
             if request.method != Method::Multicall {
@@ -121,7 +120,6 @@ impl Request {
         found
     }
 
-    /// What it may do.
     pub fn kind(&self) -> Kind {
         if self.method != Method::Multicall {
             return self.method.kind();
@@ -129,16 +127,16 @@ impl Request {
         let kinds = self.entries.iter().enumerate();
         let kinds = kinds.map(|(index, entry)| match entry {
             Entry::Request(request) => request.kind(),
-            // What came before it has run, and the reply does not say how it went.
+            // The previous entries have run, and the reply does not show their results.
             Entry::Malformed(_) if index > 0 => Kind::Mutate,
             Entry::Refused(_) | Entry::Malformed(_) => Kind::Unknown,
         });
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror may answer the call alone: it, and every entry of a multicall, is one of the
-    /// Master API, well formed and no `shutdown`, so that the model answers it as any master does; and a
-    /// master can be brought to what it leads to, which one cannot to a parameter that it could not return.
+    /// Whether the mirror may answer the call alone. The call, and every entry of a multicall, must be of the
+    /// Master API, well formed and not a `shutdown`: then the model answers as any master does. Also, the
+    /// result must be restorable to a master: a parameter that no master can return is not.
     pub fn is_answerable(&self) -> bool {
         match self.method {
             Method::Multicall => self
@@ -150,7 +148,7 @@ impl Request {
         }
     }
 
-    /// Whether this `setParam` sets what a master can return, or is refused.
+    /// Whether this `setParam` is refused, or sets a value that a master can return.
     fn is_restorable(&self) -> bool {
         let [Value::String(caller_id), Value::String(key), value] = self.params.as_slice() else {
             return true;
@@ -159,7 +157,7 @@ impl Request {
         returnable::is_readable_at(names::parts(&key).count(), value)
     }
 
-    /// Caller id and address of the node that this call registers something for.
+    /// Caller id and address of the node for which this call registers something.
     pub fn registrant(&self) -> Option<(&str, &str)> {
         let at = match self.method {
             Method::RegisterPublisher | Method::RegisterSubscriber | Method::RegisterService => 3,
@@ -169,7 +167,7 @@ impl Request {
         Some((self.caller()?, self.text(at)?))
     }
 
-    /// This call as an entry of a multicall on the wire.
+    /// This call as an encoded entry of a multicall.
     pub(crate) fn into_entry(self) -> Value {
         Call::from(self).into_entry()
     }
@@ -181,7 +179,7 @@ impl From<Call> for Request {
     }
 }
 
-/// What was malformed in a multicall is a nil.
+/// A malformed entry of a multicall becomes a nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
         let mut params = request.params;
@@ -196,7 +194,7 @@ impl From<Request> for Call {
     }
 }
 
-/// The entries of a multicall with these parameters, up to the first that is malformed.
+/// The entries of a multicall with these parameters, up to the first malformed one.
 fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
     let list = match <[Value; 1]>::try_from(params) {
         Ok([list]) => items(list),
@@ -239,8 +237,8 @@ impl Entry {
     }
 }
 
-/// What Python finds in a value that it takes for a list: of a text its characters, of a struct its
-/// keys. Of those no more are made than tell what becomes of the call.
+/// Python's iteration over a value as a list: a text gives its characters, a struct its keys. Limited to as
+/// many as decide the outcome of the call.
 fn items(value: Value) -> Option<Vec<Value>> {
     match value {
         Value::Array(elements) => Some(elements),
@@ -258,7 +256,7 @@ fn items(value: Value) -> Option<Vec<Value>> {
 
 #[cfg(test)]
 impl Request {
-    /// This multicall with a malformed entry behind the others.
+    /// Adds a malformed entry at the end of this multicall.
     pub(crate) fn malformed(mut self) -> Self {
         self.entries.push(Entry::Malformed("malformed"));
         self

@@ -1,13 +1,13 @@
-//! Which values of parameters a master can return: `xmlrpc.client.dumps` cannot write all that it takes.
+//! Which parameter values a master can return: `xmlrpc.client.dumps` cannot encode all that it accepts.
 
 use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
 
-/// The text of the fault that rosmaster answers instead of a reply that it cannot write.
+/// The text of the fault that rosmaster answers for a reply that it cannot encode.
 pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
     error_within(reply, 0)
 }
 
-/// Like [`reply_error`] for a parameter's value, which travels in `[code, message, value]`.
+/// As [`reply_error`], for a parameter's value, which is returned in `[code, message, value]`.
 pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
     error_within(value, 1)
 }
@@ -22,8 +22,7 @@ fn error_within(value: &Value, depth: usize) -> Option<&'static str> {
     }
 }
 
-/// Whether a reply that holds this value, inside so many `levels` less than the deepest, is a document
-/// with that value in it.
+/// Whether a reply can hold this value if `levels` of nesting are left for it.
 fn is_returnable(value: &Value, levels: usize) -> bool {
     error_within(value, MAX_REPLY_DEPTH - levels).is_none() && !holds_markup(value)
 }
@@ -41,8 +40,8 @@ fn holds_markup(value: &Value) -> bool {
     }
 }
 
-/// Levels of a namespace within the tree that can be written in a multicall's result, where the tree
-/// lies in the result's list, the entry's, and the answer's.
+/// Most levels of a namespace within the tree in a multicall's result: the tree is inside the lists of the
+/// result, the entry and the answer.
 const DEEPEST_NAMESPACE: usize = MAX_REPLY_DEPTH - 4;
 
 /// Whether a multicall can return the whole tree.
@@ -61,7 +60,7 @@ pub(crate) fn is_readable_at(names: usize, value: &Value) -> bool {
     levels.is_some_and(|levels| is_returnable(value, levels))
 }
 
-/// The tree without what a master could take but never return, and the keys of what was left out.
+/// The tree without values that a master accepts but cannot return, and the keys that were left out.
 pub(crate) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();
     let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);

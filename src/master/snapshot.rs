@@ -1,16 +1,15 @@
-//! A master's whole state as plain data: what a checkpoint holds.
+//! A master's whole state as plain data, as in a checkpoint.
 
 use indexmap::IndexMap;
 
 use crate::xmlrpc::Struct;
 
-/// A master's whole state in the master's own terms. The order of every map and list is the
-/// master's, because it is visible in replies.
+/// A master's whole state. Every map and list has the master's order, because replies show it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Snapshot {
-    /// Node references by caller id, those included that no registration holds any more.
+    /// Node references by caller id, including those without any registration left.
     pub nodes: IndexMap<String, SnapshotNode>,
-    /// Topic types by topic. A type outlives its topic.
+    /// Types by topic. A type outlives its topic.
     pub topic_types: IndexMap<String, String>,
     /// Caller ids of the publishers of each topic.
     pub publishers: IndexMap<String, Vec<String>>,
@@ -18,10 +17,10 @@ pub struct Snapshot {
     pub subscribers: IndexMap<String, Vec<String>>,
     /// The provider of each service.
     pub services: IndexMap<String, ServiceEntry>,
-    /// Whether any service was ever registered. Where there is none it shows in a message of
-    /// `unregisterService`, and nowhere else.
+    /// Whether any service was ever registered. Without services this shows only in a message of
+    /// `unregisterService`.
     pub had_services: bool,
-    /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as the master's do.
+    /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as in the master.
     pub param_subscribers: IndexMap<String, Vec<String>>,
     pub params: Struct,
 }
@@ -31,8 +30,8 @@ pub struct Snapshot {
 pub struct SnapshotNode {
     /// The node's own XML-RPC address.
     pub api: String,
-    /// Services that this node registered and another node took over. The master never forgets
-    /// them, so such a node stays known to `lookupNode`.
+    /// Services that this node registered and another node took over. The master never forgets them, so
+    /// `lookupNode` still finds such a node.
     pub taken_over_services: Vec<String>,
 }
 

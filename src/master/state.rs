@@ -1,4 +1,4 @@
-//! The model's state, and its way to and from a [`Snapshot`].
+//! The model's state, to and from a [`Snapshot`].
 
 use std::fmt;
 
@@ -14,10 +14,10 @@ use super::updates::Update;
 use super::{Method, Request, names};
 use crate::xmlrpc::Struct;
 
-/// A complete master without IO: rosmaster's state, and its answers through [`Master::apply`].
+/// A complete master without IO: rosmaster's state, with answers through [`Master::apply`].
 ///
-/// Two are equal if no read tells them apart, orders included, and the same node references and
-/// parameter subscriptions are behind them. The identity is not compared.
+/// Two are equal if all reads give the same answers, orders included, and their node references and parameter
+/// subscriptions are the same. The identity is not compared.
 #[derive(Clone, Default)]
 pub struct Master {
     pub(crate) registry: Registry,
@@ -27,7 +27,7 @@ pub struct Master {
     pub(crate) uri: String,
 }
 
-/// How much a master holds.
+/// Sizes of a master's state.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
     /// Node references.
@@ -37,7 +37,7 @@ pub struct Counts {
     /// Subscribers of topics, each topic counted.
     pub subscribers: usize,
     pub services: usize,
-    /// Parameters that are no namespaces.
+    /// Parameters that are not namespaces.
     pub params: usize,
     /// Subscriptions to parameters, each key counted.
     pub param_subscribers: usize,
@@ -61,7 +61,7 @@ impl fmt::Display for Counts {
     }
 }
 
-/// Why a snapshot cannot be the state of a master.
+/// Why a snapshot is not a possible state of a master.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum InvalidSnapshot {
@@ -87,16 +87,16 @@ pub enum InvalidSnapshot {
         /// Topic or parameter key.
         key: String,
     },
-    /// A node that nothing refers to.
+    /// A node without any registration.
     #[error("the node `{caller_id}` has no registration: remove it")]
     EmptyNode { caller_id: String },
     /// A node without an address.
     #[error("the node `{caller_id}` has no api: add it, or remove the node and its registrations")]
     NoApi { caller_id: String },
-    /// A topic with publishers and no type.
+    /// A published topic without a type.
     #[error("the published topic `{topic}` has no type: add one, `*` if it is not known")]
     NoType { topic: String },
-    /// A service that was taken from the node that has it.
+    /// A service listed as taken over from its present provider.
     #[error(
         "the service `{service}` is listed as taken over from its own provider `{caller_id}`: remove it there"
     )]
@@ -104,19 +104,18 @@ pub enum InvalidSnapshot {
 }
 
 impl Master {
-    /// What `getPid` and `getUri` answer.
+    /// Sets the answers to `getPid` and `getUri`.
     pub fn set_identity(&mut self, pid: i32, uri: String) {
         self.pid = pid;
         self.uri = uri;
     }
 
-    /// The nodes by caller id, with their addresses.
+    /// The nodes' caller ids and addresses.
     pub fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
         let nodes = self.registry.nodes.iter();
         nodes.map(|(caller_id, node)| (caller_id.as_str(), node.api.as_str()))
     }
 
-    /// The address of a node.
     pub fn api_of(&self, caller_id: &str) -> Option<&str> {
         Some(self.registry.nodes.get(caller_id)?.api.as_str())
     }
@@ -136,7 +135,7 @@ impl Master {
         self.registry.subscribers.keys().map(String::as_str)
     }
 
-    /// The type of a topic, kept after its last publisher has gone.
+    /// The type of a topic. Kept after its last publisher has gone.
     pub fn type_of(&self, topic: &str) -> Option<&str> {
         self.topic_types.get(topic).map(String::as_str)
     }
@@ -157,7 +156,7 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// How much there is. Walks everything.
+    /// Sizes of the state. Walks everything.
     pub fn counts(&self) -> Counts {
         let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();
         Counts {
@@ -170,17 +169,16 @@ impl Master {
         }
     }
 
-    /// Whether there is nothing: no nodes, no topic types, no parameters.
+    /// Whether there are no nodes, no topic types and no parameters.
     pub fn is_empty(&self) -> bool {
         self.registry.nodes.is_empty()
             && self.topic_types.is_empty()
             && self.params.tree().is_empty()
     }
 
-    /// The calls that take a node out, as the node itself would send them at its end.
+    /// The calls that remove a node, as the node itself would send them at its end.
     ///
-    /// A reference that it keeps by a service that another node took over cannot be taken back;
-    /// rosmaster has no call for it.
+    /// A reference by a service that another node took over cannot be removed; rosmaster has no call for it.
     pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();
@@ -233,7 +231,7 @@ impl Master {
         }
     }
 
-    /// The services that the node registered and no longer provides.
+    /// Services that the node registered and no longer provides.
     pub(crate) fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,
@@ -245,11 +243,11 @@ impl Master {
         })
     }
 
-    /// The master with that state.
+    /// The master with this state.
     ///
     /// # Errors
     ///
-    /// Says what in the snapshot cannot be: no sequence of calls leads a master there.
+    /// Why no sequence of calls leads to this state.
     pub fn from_snapshot(snapshot: Snapshot) -> Result<Self, InvalidSnapshot> {
         let mut nodes: IndexMap<String, Node> = IndexMap::with_capacity(snapshot.nodes.len());
         for (caller_id, node) in snapshot.nodes {
@@ -334,7 +332,7 @@ fn unknown_node(key: &str, caller_id: &str) -> InvalidSnapshot {
 }
 
 impl Registry {
-    /// Queues the callbacks for changed parameters. A value that cannot be written is never sent.
+    /// Queues the callbacks for changed parameters. A value that cannot be encoded is never sent.
     pub(crate) fn notify_params(&self, updates: Vec<Update<'_>>, notices: &mut dyn NoticeSink) {
         for update in updates {
             if super::returnable::param_error(update.value).is_some() {
@@ -363,7 +361,7 @@ impl PartialEq for Master {
     }
 }
 
-/// Counts alone: values of parameters have no place in a log.
+/// Only sizes: parameter values must not be logged.
 impl fmt::Debug for Master {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_tuple("Master").field(&self.counts()).finish()

@@ -6,9 +6,9 @@ use super::registry::Shared;
 use super::{CALLER_ID, Master, Method, Request, names, returnable};
 use crate::xmlrpc::{Call, Struct, Value};
 
-/// The caller id under which rosmaster calls nodes.
+/// The caller id of rosmaster's calls to nodes.
 pub const MASTER: &str = "/master";
-/// The method by which a node is told of a topic's publishers.
+/// The method that notifies a node of a topic's publishers.
 pub const PUBLISHER_UPDATE: &str = "publisherUpdate";
 
 impl Master {
@@ -17,8 +17,8 @@ impl Master {
         publisher_update(topic, &self.publishers_of(topic))
     }
 
-    /// The `paramUpdate` with the value under `key`, which ends in a slash; an empty struct for what
-    /// is not set, as rosmaster has it. None for a value that rosmaster cannot send either.
+    /// The `paramUpdate` with the value under `key`, which ends in a slash; an empty struct if it is not set,
+    /// as in rosmaster. None for a value that rosmaster could not send either.
     pub fn param_update(&self, key: &str) -> Option<Call> {
         let value = self.params.get(key);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
@@ -41,8 +41,7 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// Every subscription of a parameter that is set: the subscriber's address and the key, with a
-    /// trailing slash.
+    /// Every subscription of a set parameter: the subscriber's address, and the key with a trailing slash.
     pub fn param_subscribers(&self) -> Vec<(String, Arc<str>)> {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).keys();
         let set = subscribers.filter(|key| self.is_set(key));
@@ -63,7 +62,7 @@ impl Master {
         self.any_at(api, nodes)
     }
 
-    /// Whether a node at `api` subscribes a key that `key` is in, or that is in `key`.
+    /// Whether a node at `api` subscribes `key`, a namespace above it, or a key below it.
     pub fn subscribes_param(&self, api: &str, key: &str) -> bool {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).iter();
         let mut related = subscribers.filter(|(subscribed, _)| {
@@ -79,8 +78,8 @@ impl Master {
             .any(|node| self.api_of(node) == Some(api))
     }
 
-    /// Whether `call` registers something and would take the name of a node at another address:
-    /// the master would shut that node down. The node, and the address that it has.
+    /// The node that `call` displaces, and its present address: the call registers something under the same
+    /// name at another address, so the master would shut that node down.
     pub fn displaced_by(&self, call: &Request) -> Option<(String, String)> {
         let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
@@ -108,12 +107,12 @@ pub fn shutdown(node: &str) -> Call {
     )
 }
 
-/// What rosmaster says to such a node.
+/// rosmaster's reason for it.
 pub(crate) fn bump_reason(node: &str) -> String {
     format!("[{node}] Reason: new node registered with same name")
 }
 
-/// A question to a node or a master: a method whose only parameter is who asks.
+/// A call to a node or a master whose only parameter is the caller id.
 pub fn question(method: &str) -> Call {
     Call::new(method, vec![CALLER_ID.into()])
 }
@@ -123,7 +122,7 @@ pub fn get_pid() -> Call {
     question(Method::GetPid.name())
 }
 
-/// Whether a node can have registered a topic of this name as it is: global and canonical.
+/// Whether a node can have registered this topic name unchanged: it is global and canonical.
 pub fn is_plain_topic(topic: &str) -> bool {
     topic.len() > 1
         && topic.starts_with('/')

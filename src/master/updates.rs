@@ -1,4 +1,4 @@
-//! The subscribers whom a changed parameter concerns: `compute_param_updates` of `rosmaster/paramserver.py`.
+//! The subscribers to notify of a changed parameter: `compute_param_updates` of `rosmaster/paramserver.py`.
 
 use std::{collections::HashSet, sync::LazyLock};
 
@@ -7,19 +7,19 @@ use super::names;
 use super::registry::Registrations;
 use crate::xmlrpc::{Struct, Value};
 
-/// The value of what is gone, in a `paramUpdate`.
+/// The value of a deleted parameter in a `paramUpdate`.
 pub(crate) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
-/// A `paramUpdate` to the subscribers of one key. The value is that of the call, or a part of it.
+/// A `paramUpdate` to the subscribers of one key. Its value is that of the call, or a part of it.
 pub(crate) struct Update<'a> {
     pub(crate) nodes: &'a [String],
-    /// Of these, the one that is not told: it made the change.
+    /// The one of them that made the change: it is not notified.
     pub(crate) ignored: Option<&'a str>,
     pub(crate) key: &'a str,
     pub(crate) value: &'a Value,
 }
 
-/// The updates of `key`, which ends in a slash and has this value now, but for those to `ignored`.
+/// The updates of `key`, which ends in a slash and has this value now. None go to `ignored`.
 pub(crate) fn updates<'a>(
     subscribers: &'a Registrations,
     key: &'a str,
@@ -62,7 +62,7 @@ pub(crate) fn updates<'a>(
     }
     let length = key.chars().count();
     for (changed, nodes) in below.found {
-        // Sliced by the length of the key that was set, even if it does not start with it.
+        // Cut off by the length of the key that was set, even if this key does not start with it.
         let rest: String = changed.chars().skip(length).collect();
         updates.push(Update {
             nodes,
@@ -74,21 +74,21 @@ pub(crate) fn updates<'a>(
     Ok(updates)
 }
 
-/// `_compute_all_keys`, without the keys that nobody subscribes: all together can be far longer than
-/// the call, because each member's holds the names of all that it is in.
+/// `_compute_all_keys`, without keys that have no subscribers: all keys together can be far longer than the
+/// call, because each contains the names of all its parents.
 struct Below<'a> {
     subscribers: &'a Registrations,
-    /// Length of the longest key that is subscribed.
+    /// Length of the longest subscribed key.
     longest: usize,
     /// Each key with its subscribers, in the order of the members.
     found: Vec<(&'a str, &'a [String])>,
 }
 
 impl Below<'_> {
-    /// Finds what is in `members`, whose key is `key`, and leaves that as it is.
+    /// Finds subscribed keys among `members`, whose key is `key`, which is left unchanged.
     fn find(&mut self, key: &mut String, members: &Struct) {
         for (name, value) in members {
-            // As `ns_join` has it: such a name stands alone.
+            // As in `ns_join`: such a name is not joined.
             let mut alone = String::new();
             let key = match name.starts_with(['/', '~']) {
                 true => &mut alone,
@@ -110,7 +110,7 @@ impl Below<'_> {
     }
 }
 
-/// Members whose names hold a slash are announced, and then not found.
+/// Members with a slash in their names are announced, but then not found.
 fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
         Value::Struct(members) => {
