@@ -1,10 +1,10 @@
-//! Knowing a master again, learning what it holds, and bringing it to the mirror's state.
+//! Recognises a master, reads its state, and brings it to the mirror's state.
 //!
-//! * [`Token`] and [`Inspection`]: recognising a master, and learning the state of an unknown one.
+//! * [`Token`] and [`Inspection`]: recognising a master, and reading the state of an unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
-//! * [`reconcile`]: what a master that was out of reach is to hold when it is reached again.
-//! * [`accepted`]: what of a call a master has done, by its reply.
-//! * [`difference`]: what two states do not have in common, for people.
+//! * [`reconcile`]: the state for a master that was unreachable.
+//! * [`accepted`]: which parts of a call a master has executed, by its reply.
+//! * [`difference`]: how two states differ, for people.
 
 mod accepted;
 mod difference;

@@ -1,23 +1,23 @@
-//! Which of a call's mutations a master has executed, and whether a mirror agrees.
+//! Which of a call's mutations a master has executed, and whether the mirror agrees.
 
 use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
 use crate::xmlrpc::{Reply, Value};
 
-/// A mutating call, taken out of multicalls, that a master has answered.
+/// An answered mutating call, possibly an entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Answered<'a> {
     pub call: &'a Request,
     /// The master's answer.
     pub reply: Reply,
-    /// Whether the master has changed its state by it.
+    /// Whether it changed the master's state.
     pub executed: bool,
 }
 
 impl Answered<'_> {
-    /// Whether the answer of a mirror of that master to the same call leaves both in the same state and is
-    /// of the same value. Two refusals are alike, whatever they say. `live`: parameters may have been
-    /// written later in the same request. `subscribeParam` may answer them already, for rosmaster writes
-    /// the dictionary itself, when all has been run; what could not be written may have been replaced by then.
+    /// Whether the mirror's answer to the same call leaves both in the same state and has the same value. Two
+    /// refusals agree, whatever their text. `live`: parameters may have been written later in the same
+    /// request. A `subscribeParam` may return those already, because rosmaster encodes the dictionary itself
+    /// after all calls have run; by then a value that could not be encoded may have been replaced.
     pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
@@ -31,23 +31,23 @@ impl Answered<'_> {
     }
 }
 
-/// The mutating calls, taken out of multicalls, that a master has answered.
+/// The answered mutating calls of a request, multicalls flattened.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Accepted<'a> {
     /// The calls in the order of their execution.
     pub calls: Vec<Answered<'a>>,
-    /// Whether that is known for certain. If not, the master's state has to be read again.
+    /// If false, the master's state must be read again.
     pub certain: bool,
 }
 
-/// Which mutating calls within `call` the master has answered, given its `reply`.
+/// The mutating calls in `call` that the master has answered, given its `reply`.
 ///
-/// A call has been executed if its answer's code is 1, and in the few cases where rosmaster changes
-/// its state and answers an error: a `setParam` whose callbacks cannot be worked out, a
-/// `subscribeParam` of what cannot be returned.
+/// A call has been executed if its answer's code is 1. In a few cases rosmaster also changes its state and
+/// answers an error: a `setParam` whose callbacks cannot be computed, a `subscribeParam` of a value that
+/// cannot be returned.
 ///
-/// A multicall that fails as a whole has run up to the entry at fault. Of such a one this gives what
-/// `mirror`, the state before the call, would have accepted, and says that it is not certain.
+/// A multicall that fails as a whole has run up to the faulty entry. For such a call this returns what
+/// `mirror`, the state before the call, would have accepted, and marks it as not certain.
 pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accepted<'a> {
     let mut walk = Walk {
         mirror,
@@ -64,7 +64,7 @@ pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accept
 
 struct Walk<'m, 'a> {
     mirror: &'m Master,
-    /// The mirror after the first `modelled` calls of `accepted`, once somebody has to know.
+    /// The mirror after the first `modelled` calls of `accepted`, made on demand.
     model: Option<Master>,
     modelled: usize,
     accepted: Accepted<'a>,
@@ -97,7 +97,7 @@ impl<'a> Walk<'_, 'a> {
         let results = match reply {
             Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
             Reply::Fault { .. } => return self.simulate(request),
-            // No rosmaster answers so: what has become of it only a look can show.
+            // Not a rosmaster's answer: only reading the master can show the effect.
             Reply::Value(_) => {
                 self.accepted.certain = false;
                 return;
@@ -113,7 +113,7 @@ impl<'a> Walk<'_, 'a> {
         }
     }
 
-    /// Runs the entries in the mirror, because the master's reply does not say how they went.
+    /// Runs the entries in the mirror, because the master's reply does not show their results.
     fn simulate(&mut self, request: &'a Request) {
         for call in request.calls() {
             if !call.kind().mutates() {
@@ -128,8 +128,8 @@ impl<'a> Walk<'_, 'a> {
         }
     }
 
-    /// What the mirror answers to a call after those that have been accepted. There may be many
-    /// multicalls to simulate: the model goes on from one to the next.
+    /// The mirror's answer to a call, after the accepted ones. The model is kept, because there may be many
+    /// multicalls to simulate.
     fn predict(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
@@ -140,12 +140,12 @@ impl<'a> Walk<'_, 'a> {
     }
 }
 
-/// Whether a mutating call has been executed, by its answer; none if it does not say.
+/// Whether a mutating call has been executed, by its answer; none if that is unclear.
 ///
-/// rosmaster has changed its state and answers an error
+/// rosmaster changes its state and answers an error
 ///
-/// * to `setParam`, when it fails in working out the callbacks (a struct with slashes in its keys),
-/// * to `subscribeParam` of a nil, and of anything that holds a value that it cannot write.
+/// * to `setParam`, if computing the callbacks fails (a struct with slashes in its keys),
+/// * to `subscribeParam` of a nil, or of anything with a value that it cannot encode.
 fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     let answer = match reply {
         Reply::Value(Value::Array(answer)) => answer.as_slice(),
@@ -169,7 +169,7 @@ fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     })
 }
 
-/// Whether a fault is about writing the reply and not about reading the call.
+/// Whether a fault is about encoding the reply and not about decoding the call.
 pub(super) fn is_write_error(text: &str) -> bool {
     [
         "TypeError",

@@ -5,11 +5,11 @@ use indexmap::IndexMap;
 use crate::master::Master;
 use crate::xmlrpc::{Struct, Value};
 
-/// Most sentences given.
+/// Most sentences.
 const MOST: usize = 20;
 
-/// What differs between `mirror` and `master`, as at most 20 short sentences. None if and only if
-/// the two are equal. Names keys, nodes and addresses, never the value of a parameter.
+/// The differences between `mirror` and `master`, as at most 20 short sentences. Empty if and only if the two
+/// are equal. Names keys, nodes and addresses, never the value of a parameter.
 pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     let mut words = Words(Vec::new());
     let (a, b) = (&mirror.registry, &master.registry);

@@ -1,4 +1,4 @@
-//! Learning the state of a master that may hold anything.
+//! Reads the state of a master that may hold anything.
 
 use std::collections::HashSet;
 
@@ -10,29 +10,29 @@ use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Why a reply to a look is not that of a master.
+/// Why a reply to an inspection is not a master's.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum NotAMaster {
-    /// The whole look was answered with a fault.
+    /// The whole inspection was answered with a fault.
     #[error(
         "the look was answered with a fault, `{text}`: this is no rosmaster, or it is in trouble"
     )]
     Fault { text: String },
-    /// The parameters cannot be read, because one of them cannot be returned: look again with
+    /// The parameters cannot be read, because one of them cannot be returned: inspect again with
     /// [`Inspection::call_without_params`].
     #[error(
         "the master holds a parameter that it cannot return ({text}): look again without parameters"
     )]
     ParamsUnreadable { text: String },
-    /// An answer has another form than a master's.
+    /// The answer's form differs from a master's.
     #[error(
         "the answer to {method} has another form than a master's: check that the upstream address is that of a rosmaster"
     )]
     Form { method: Method },
 }
 
-/// What a first look at a master shows.
+/// The first part of an inspection.
 #[derive(Clone, Debug)]
 pub struct Inspection {
     pid: i32,
@@ -42,12 +42,12 @@ pub struct Inspection {
     /// Provider by service.
     services: IndexMap<String, String>,
     topic_types: IndexMap<String, String>,
-    /// None if the look left them out, because they cannot be read.
+    /// None if they were left out because they cannot be read.
     params: Option<Struct>,
 }
 
 impl Inspection {
-    /// What a look at a rosmaster that has just been started would show. Its process is `pid`.
+    /// The inspection of a rosmaster that has just been started as process `pid`.
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
@@ -65,14 +65,14 @@ impl Inspection {
         self.params.is_some()
     }
 
-    /// The look itself: one multicall of `getPid`, `lookupNode` of the token and its session, `getSystemState`,
-    /// `getTopicTypes` and `getParam('/')`. Changes nothing.
+    /// The first request: a multicall of `getPid`, `lookupNode` of the token and its session,
+    /// `getSystemState`, `getTopicTypes` and `getParam('/')`. Changes nothing.
     pub fn call(token: &Token) -> Request {
         let params = Request::new(Method::GetParam, [CALLER_ID, "/"]);
         Request::multicall(Self::reads(token).into_iter().chain([params]))
     }
 
-    /// The look at a master whose parameters cannot be read.
+    /// The first request for a master whose parameters cannot be read.
     pub fn call_without_params(token: &Token) -> Request {
         Request::multicall(Self::reads(token))
     }
@@ -88,12 +88,12 @@ impl Inspection {
         ]
     }
 
-    /// Reads the reply to either look.
+    /// Decodes the reply to either request.
     ///
     /// # Errors
     ///
-    /// If no master answers so; [`NotAMaster::ParamsUnreadable`] asks for the second form of the
-    /// look.
+    /// If this is not a master's reply. After [`NotAMaster::ParamsUnreadable`], use
+    /// [`Inspection::call_without_params`].
     pub fn decode(reply: &Reply) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
         let [pid, token, session, state, types, params @ ..] = results else {
@@ -143,17 +143,16 @@ impl Inspection {
         })
     }
 
-    /// The process id of the master.
     pub fn pid(&self) -> i32 {
         self.pid
     }
 
-    /// Which token the master bears.
+    /// The master's token.
     pub fn bears(&self) -> Bears {
         self.bears
     }
 
-    /// Whether the master holds nothing that a look can show.
+    /// Whether the master holds nothing that an inspection shows.
     pub fn is_empty(&self) -> bool {
         self.publishers.is_empty()
             && self.subscribers.is_empty()
@@ -162,7 +161,7 @@ impl Inspection {
             && self.params.as_ref().is_some_and(Struct::is_empty)
     }
 
-    /// The nodes that this look shows, and those of `previous`, each once.
+    /// The nodes of this inspection and of `previous`, without duplicates.
     fn nodes<'a>(&'a self, previous: &'a Master) -> Vec<&'a str> {
         let shared = [&self.publishers, &self.subscribers];
         let registered = shared.into_iter().flat_map(IndexMap::values).flatten();
@@ -175,8 +174,8 @@ impl Inspection {
             .collect()
     }
 
-    /// Asks for every address: `lookupNode` of each node that the look shows or `previous` knows,
-    /// `lookupService` of each service. None if there is nothing to ask.
+    /// Asks for all addresses: `lookupNode` of each node of the inspection or `previous`, `lookupService` of
+    /// each service. None if there is nothing to ask.
     pub fn second_call(&self, previous: &Master) -> Option<Request> {
         let nodes = self.nodes(previous).into_iter();
         let nodes = nodes.filter_map(|node| lookup(Method::LookupNode, node));
@@ -187,16 +186,15 @@ impl Inspection {
         Some(Request::multicall(calls))
     }
 
-    /// The model of what that master holds.
+    /// The model of the master's state.
     ///
-    /// What cannot be read back is taken from `previous`, for nodes whose address is still the same:
-    /// parameter subscriptions, references by services that another node took over, and the
-    /// parameters if they cannot be read. What vanished between the two looks is left out.
+    /// What cannot be read back is taken from `previous`, for nodes with an unchanged address: parameter
+    /// subscriptions, references by services that another node took over, and the parameters if they cannot
+    /// be read. What vanished between the two requests is left out.
     ///
     /// # Errors
     ///
-    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not that of
-    /// a master.
+    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not a master's.
     pub fn into_master(
         self,
         second: Option<&Reply>,
@@ -268,7 +266,7 @@ impl Inspection {
     }
 }
 
-/// Gives each node that lives on without a registration the reference that explains it, or drops it.
+/// For each node without a registration, adds the service reference that explains it, or drops the node.
 fn keep_references(found: &mut Snapshot, previous: &Master) {
     let shared = [
         &found.publishers,
@@ -293,7 +291,8 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
             };
             let known = previous.taken_over(caller_id, before).filter(lost);
             node.taken_over_services = known.cloned().collect();
-            // It is still known and holds nothing: somebody took a service of it meanwhile.
+            // It is still known without a registration: another node has taken over a service of it
+            // meanwhile.
             if node.taken_over_services.is_empty() && !held.contains(caller_id) {
                 let lost = before.services.iter().filter(lost);
                 node.taken_over_services = lost.cloned().collect();
@@ -303,7 +302,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
     });
 }
 
-/// The registrations of those nodes; a list without nodes is dropped.
+/// The registrations of those nodes; empty lists are dropped.
 fn only(
     registrations: IndexMap<String, Vec<String>>,
     of: impl Fn(&str) -> bool,
@@ -315,7 +314,7 @@ fn only(
     lists.collect()
 }
 
-/// A lookup of `name`, if any call can name it.
+/// A lookup of `name`, if a call can name it.
 pub(super) fn lookup(method: Method, name: &str) -> Option<Request> {
     let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
     Some(Request::new(method, [caller_id, name]))
@@ -363,7 +362,7 @@ fn lists(value: &Value) -> Option<IndexMap<String, Vec<String>>> {
     lists.collect()
 }
 
-/// `[[topic, type], …]`. A date that reads `*` is taken for a type, and comes back as one.
+/// `[[topic, type], …]`. A date that reads `*` counts as a type, and is restored as a string.
 fn pairs(value: &Value) -> Option<IndexMap<String, String>> {
     let pairs = value.as_array()?.iter().map(|pair| match pair.as_array()? {
         [

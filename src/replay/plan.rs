@@ -1,4 +1,4 @@
-//! Bringing a new master to a state: one call, and what it must answer.
+//! Brings a new master to a state with one call, and checks the answer.
 
 use std::fmt;
 
@@ -10,40 +10,38 @@ use super::restore::{self, Restore};
 use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
-/// Most mismatches that are told apart.
+/// Most mismatches to list.
 const MOST_MISMATCHES: usize = 20;
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
 ///
 /// # Order
 ///
-/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, who are not told then.
-/// 2. Publishers, before there is anybody to be told of them. Types of topics that have neither
-///    publishers nor subscribers left, and those that the natural order of calls would put too late
-///    in `getTopicTypes`, are brought in silently: a subscription by a helper, undone at once. These
-///    are the fewest that give the order.
-/// 3. Services, each after the nodes that it was taken from.
+/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, who are then not notified.
+/// 2. Publishers, before there are subscribers to notify. Some types are set by a helper's subscription that
+///    is undone at once: those of topics without publishers and subscribers, and those that the order of
+///    calls would put too late in `getTopicTypes`. Only as many as the order requires.
+/// 3. Services, each after its former providers.
 /// 4. Subscribers, then subscribers of parameters.
-/// 5. Reads of everything, for [`Plan::verify`]. Of addresses only those that the master had before:
-///    a registration that was answered with success has the address that it was made with, and a
-///    question for each would cost a tenth of the injection.
-/// 6. The token: a master that bears it has been brought to the state as a whole.
+/// 5. Reads of everything, for [`Plan::verify`]. Of addresses only those that the master had before: a
+///    successful registration has the address of its call, and reading each would cost a tenth of the
+///    injection.
+/// 6. The token: a master that bears it has been brought to the whole state.
 ///
-/// On an empty master no callback is sent at all, and every read is answered afterwards as it was
-/// before.
+/// On an empty master no callback is sent, and afterwards every read is answered as before.
 ///
 /// # A master that is not empty
 ///
-/// What it holds is newer, and stays: a node that is there under another address is left out, so
-/// that the master bumps nobody, and so is a service that has a provider. Parameters are merged, and
-/// ours win. Where the new master has subscribers of a topic that lacks several publishers, they
-/// are taken out first and put back before the last publisher: they are told once, with the complete
-/// list, while every partial list would make a roscpp node drop its live connections.
+/// What it holds is newer, and stays. A node that has another address there is left out, so that the master
+/// shuts no node down; so is a service that has a provider. Parameters are merged, and ours win. If the new
+/// master has subscribers of a topic that lacks several publishers, they are unregistered first and registered
+/// again before the last publisher. So they are notified once, with the complete list; every partial list
+/// would make a roscpp node drop its live connections.
 ///
 /// # Memory
 ///
-/// Call and answer are text from the start. As values those of a thousand nodes take ten times as much,
-/// and the C library keeps most of what was once taken for so many small pieces.
+/// Call and answer are text from the start. As values those of a thousand nodes take ten times as much, and
+/// the C library keeps most of the memory of so many small allocations.
 ///
 /// # Example
 ///
@@ -64,40 +62,39 @@ const MOST_MISMATCHES: usize = 20;
 #[derive(Clone, Debug)]
 pub struct Plan {
     request: Bytes,
-    /// What the request must be answered with.
+    /// The expected answer.
     answer: Bytes,
     expected: Master,
     skipped: Vec<Skipped>,
 }
 
-/// Something of the state that is not brought into a master.
+/// A part of the state that is not brought to the master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Skipped {
-    /// A node that is there under another address.
+    /// The node has another address in the new master.
     Node {
         caller_id: String,
         /// Its address in the state.
         api: String,
-        /// Its address in the new master, which stays.
+        /// Its address in the new master, which is kept.
         found_api: String,
     },
-    /// A service that has a provider.
+    /// The service has another provider in the new master.
     Service {
         service: String,
         /// The provider in the state.
         caller_id: String,
-        /// The provider in the new master, which stays.
+        /// The provider in the new master, which is kept.
         found: String,
     },
-    /// The reference of a node by a service that another node took over.
+    /// A node's reference by a service that another node took over.
     Reference { caller_id: String, service: String },
-    /// The type `*` of a topic without publishers that has subscribers in the new master.
+    /// The type `*` of a topic without publishers, but with subscribers in the new master.
     Type { topic: String },
-    /// A parameter that the master would take and could not return, alone or in one reply with the
-    /// whole tree.
+    /// A parameter that the master would accept but could not return, alone or together with the whole tree.
     Param { key: String },
-    /// A registration whose key no name leads to.
+    /// A registration whose key no name resolves to.
     Unnameable { key: String, caller_id: String },
 }
 
@@ -143,14 +140,13 @@ impl fmt::Display for Skipped {
 impl Plan {
     /// The plan that brings a master that holds `found` to `target` and leaves `token`.
     ///
-    /// Tokens that `target` or `found` hold themselves are not brought over.
+    /// Tokens in `target` or `found` are ignored.
     pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
         Self::write(target, found, None, token)
     }
 
-    /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token
-    /// `before` by `token`: everything is taken out, subscribers first, and brought in anew. No node
-    /// is called back by it.
+    /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token `before`
+    /// by `token`. Everything is removed, subscribers first, and added again. No node is called back.
     pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
         Self::write(target, found, Some(before), token)
     }
@@ -162,7 +158,7 @@ impl Plan {
             request.push(&call.into_entry());
             answer.push(&multicall::reply_entry(predicted));
         };
-        // Tokens are no part of the mirror. They subscribe to what is not set.
+        // Tokens are not a part of the mirror. They subscribe unset keys.
         let aside = |call: Request| {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
@@ -202,27 +198,27 @@ impl Plan {
         &self.request
     }
 
-    /// The body that a rosmaster answers with if it answers each entry as the model predicted.
+    /// The answer's body if rosmaster answers each entry as the model predicted.
     pub fn answer(&self) -> &Bytes {
         &self.answer
     }
 
-    /// What the master holds afterwards, the token apart.
+    /// The master's state afterwards, without the token.
     pub fn expected(&self) -> &Master {
         &self.expected
     }
 
-    /// What of the target is not brought over.
+    /// The parts of the target that are not brought to the master.
     pub fn skipped(&self) -> &[Skipped] {
         &self.skipped
     }
 
-    /// Whether every entry was answered as the model predicted, refusals in whatever words. Not needed for a reply that is
-    /// [`Self::answer`] to the byte.
+    /// Whether every entry was answered as the model predicted; texts of refusals may differ. Not needed if
+    /// the reply equals [`Self::answer`] byte for byte.
     ///
     /// # Errors
     ///
-    /// A sentence for each entry that was not, up to 20 of them. They hold no values.
+    /// A sentence for each entry that was not, up to 20 of them. They hold no parameter values.
     pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
         let whole = |text: &str| {
             let sentence = format!("the injection as a whole was answered: {text}");
@@ -255,8 +251,8 @@ impl Plan {
     }
 }
 
-/// Reads that show everything a master in the target state can show, but for addresses that it was
-/// given in the same call.
+/// Reads that show everything that a master in the target state can show, except for addresses given in the
+/// same call.
 fn reads(model: &Master, found: &Master) -> Vec<Request> {
     let own = |method| Request::new(method, [CALLER_ID]);
     let mut calls = vec![own(Method::GetSystemState), own(Method::GetTopicTypes)];
@@ -271,14 +267,14 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     calls
 }
 
-/// Whether an entry was answered as predicted. Of a refusal the code counts, and not the text.
+/// Whether an entry was answered as predicted. Of a refusal only the code is compared.
 fn is_alike(result: &Value, predicted: &Value) -> bool {
     let code = |entry: &Value| entry.as_array()?.first()?.as_array()?.first()?.as_int();
     let refused = code(predicted).filter(|code| *code != 1);
     result == predicted || refused.is_some() && refused == code(result)
 }
 
-/// What is said of a call that was answered otherwise than predicted.
+/// Describes a call whose answer was not as predicted.
 fn mismatch(call: &Request) -> String {
     let method = call.method();
     let at = match method {

@@ -1,22 +1,22 @@
-//! What a master that was out of reach is to hold when it is reached again.
+//! The state for a master that was unreachable and is back.
 
 use super::{Token, restore};
 use crate::master::{Entry, Master, Method, Request, names};
 use crate::xmlrpc::Value;
 
-/// What counts where a master of the present incarnation and the mirror differ.
+/// Which side wins where a master of the present incarnation and the mirror differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
-    /// The mirror only where it has answered writes since the master was last known to equal it:
-    /// all other differences were made past us, and are newer.
+    /// The mirror only where it has answered writes since both were equal: all other differences were written
+    /// to the master directly, and are newer.
     PendingWrites,
-    /// The mirror wherever it knows something. Nobody knows when the two were equal last.
+    /// The mirror wherever it has an entry: it is unknown when both were equal last.
     Mirror,
 }
 
-/// The state that `held`, what a master of the present incarnation holds, and `mirror` come to.
-/// `pending` are the writes that the mirror has answered and the master may not have run; one that it
-/// has run may be among them, for running it twice leads to the same state.
+/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending`: the writes
+/// that the mirror has answered and the master may not have run. If it has run some of them, running them
+/// again leads to the same state.
 pub fn reconcile(
     mirror: &Master,
     held: &Master,
@@ -37,12 +37,12 @@ pub fn reconcile(
     target
 }
 
-/// What a master of the present incarnation may hold beside what can be read of it: the subscriptions of
-/// parameters that `mirror` has, and those that a pending write takes away.
+/// State of a master of the present incarnation that cannot be read from it: the parameter subscriptions in
+/// `mirror`, and those that a pending write removes.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        // One that has moved on has taken nothing along.
+        // Not if the node has another address now: its subscriptions ended.
         let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
         if *call.method() == Method::UnsubscribeParam
             && known.is_none_or(|known| call.text(1) == Some(known))
@@ -54,8 +54,8 @@ pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     master
 }
 
-/// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another
-/// address adds nothing.
+/// The calls that add to `mirror` what only `master` holds. A node that the mirror knows at another address
+/// adds nothing.
 fn additions(mirror: &Master, master: &Master) -> Vec<Request> {
     let mut calls = Vec::new();
     let tree = restore::merged(mirror.params(), master.params());
@@ -106,8 +106,8 @@ fn additions(mirror: &Master, master: &Master) -> Vec<Request> {
 }
 
 impl Master {
-    /// Whether `call` would change the state: false only if every write in it, one after the other, is
-    /// known to leave the state as it is. Unregistrations of what is not there change nothing.
+    /// Whether `call` would change the state. False only if every write in it, in order, is known to leave
+    /// the state unchanged. Unregistrations without effect change nothing.
     pub fn would_change(&self, call: &Request) -> bool {
         let entries = call.entries();
         !entries
@@ -116,13 +116,13 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state already is what `call` leads to; none if that is not known.
+    /// Whether the state is already the result of `call`; none if unknown.
     fn is_settled(&self, call: &Request) -> Option<bool> {
         let text = |index| call.text(index);
         let caller_id = call.caller()?;
         let name = |index| Some(names::resolve(text(index)?, caller_id));
         let key = |index| Some(names::param_key(&name(index)?));
-        // The node as it is registered at the address that the call gives.
+        // The node, if it is registered at the call's address.
         let node = |index| {
             let node = self.registry.nodes.get(caller_id);
             node.filter(|node| Some(node.api.as_str()) == text(index))
@@ -162,7 +162,7 @@ impl Master {
             }
             Method::SetParam => {
                 let value = call.params().get(2)?;
-                // Another order of a struct's members is another state.
+                // A different order of a struct's members is a different state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }

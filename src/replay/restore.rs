@@ -1,4 +1,4 @@
-//! The calls of an injection, each tried on the model of the new master as it is written.
+//! The calls of an injection, each tried on a model of the new master.
 
 use std::collections::HashMap;
 
@@ -9,19 +9,18 @@ use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, returnable};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Gives the calls that change state, each with its answer, to `write`; the model of the master after
-/// them.
+/// Passes the calls that change state, each with its answer, to `write`. `model` is the master after them.
 pub(super) struct Restore<'a, W> {
     write: W,
-    /// How many calls there were.
+    /// Number of calls.
     count: usize,
     pub(super) model: Master,
     pub(super) skipped: Vec<Skipped>,
     target: &'a Master,
     found: &'a Master,
-    /// How many of the target's topic types are in.
+    /// Number of the target's topic types that are in place.
     types_in: usize,
-    /// Whether the new master's topic types begin the target's; if not, their order is lost.
+    /// Whether the new master's topic types are the first of the target's; if not, their order is lost.
     ordered: bool,
 }
 
@@ -64,7 +63,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
         let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
-            // Even if it holds what a master cannot return: that stays where it is.
+            // Nothing to set. Parameters that a master cannot return stay in place.
             return;
         }
         let (tree, left_out) = returnable::writable(whole);
@@ -92,7 +91,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The address under which a node's registrations are brought in, unless it is left out.
+    /// The address for a node's registrations, unless the node is left out.
     fn api(&self, caller_id: &str) -> Option<&'a str> {
         let api = self.target.api_of(caller_id)?;
         let free = self
@@ -102,7 +101,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         (free && !Token::is_ours(caller_id)).then_some(api)
     }
 
-    /// Of `callers`, those who are brought in and not there yet: caller id, name for `key`, address.
+    /// Those of `callers` that are brought in and not present yet: caller id, name for `key`, address.
     fn missing(
         &mut self,
         key: &'a str,
@@ -136,7 +135,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The type to register a topic with. One that the new master knows already stays.
+    /// The type to register a topic with. A type known to the new master is kept.
     fn topic_type(&self, topic: &str) -> &'a str {
         let known = self.found.type_of(topic).filter(|known| *known != "*");
         known.or_else(|| self.target.type_of(topic)).unwrap_or("*")
@@ -175,8 +174,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Unregisters the new master's own subscribers of a topic, so that they are not told of each
-    /// publisher on its own.
+    /// Unregisters the new master's own subscribers of a topic, so that they are not notified of each
+    /// publisher separately.
     fn take_out_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
         let found = self.found;
         let subscribers = found
@@ -235,7 +234,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// A master that has ever had a service answers an `unregisterService` with another message.
+    /// A master that has ever had a service answers `unregisterService` with a different message.
     fn had_services(&mut self) {
         if self.target.registry.had_services
             && !self.model.registry.had_services
@@ -250,7 +249,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.push(Method::UnregisterService, [helper, service, NO_API]);
     }
 
-    /// Whether a service has a provider in the new master. Then it and who lost it are left out.
+    /// Whether a service has a provider in the new master. Then the service and its former providers are left
+    /// out.
     fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
         let Some(found) = self.found.registry.services.get(service) else {
             return false;
@@ -278,7 +278,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         true
     }
 
-    /// Registers a service for the nodes that it was taken from.
+    /// Registers a service for its former providers.
     fn lose(&mut self, service: &str, losers: &[&str]) {
         for caller_id in losers {
             let Some(api) = self.api(caller_id) else {
@@ -296,7 +296,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The same where nobody provides the service any more: a helper takes it and gives it up.
+    /// As [`Self::lose`], for a service without a provider: a helper registers and unregisters it last.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
@@ -340,7 +340,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Brings in the types that stand before that of a topic about to be registered.
+    /// Adds the types that precede that of a topic about to be registered.
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
             && !self.model.topic_types.contains_key(topic)
@@ -350,8 +350,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Types `*` of topics without publishers can only come from a publisher, and before there are
-    /// subscribers who would be told of it.
+    /// Adds types `*` of topics without publishers. Only a publisher can set them, and it must come before
+    /// the subscribers, who would be notified of it.
     fn star_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in &target.topic_types {
@@ -362,7 +362,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Brings in the first `end` of the target's types.
+    /// Adds the first `end` of the target's types.
     fn types_before(&mut self, end: usize) {
         let target = self.target;
         let types = target.topic_types.iter().take(end).skip(self.types_in);
@@ -372,7 +372,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.types_in = self.types_in.max(end);
     }
 
-    /// A caller id that is no node's, and the name by which it says `key`.
+    /// A caller id that is not a node's, and the name with which it addresses `key`.
     fn helper(&self, key: &str) -> Option<(String, String)> {
         let is_node = |caller_id: &str| {
             let nodes = [self.target, self.found].map(|master| &master.registry.nodes);
@@ -396,7 +396,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
-            // A second attempt comes at the end.
+            // Tried again at the end: listed once.
             if !self.skipped.contains(&skipped) {
                 self.skipped.push(skipped);
             }
@@ -407,8 +407,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 }
 
-/// The calls that empty a master that holds `found`, for one that is to hold `target` exactly: what
-/// would be told comes before nobody is left to be told of it. Parameters stay if they are right.
+/// The calls that empty a master that holds `found`, so that it can hold exactly `target`. Subscribers are
+/// removed first, so that they are not notified of the rest. Parameters stay if they are right.
 pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));

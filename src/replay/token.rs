@@ -1,45 +1,44 @@
-//! The incarnation token: what we leave in a master to know this very process again.
+//! The incarnation token: left in a master to recognise its process again.
 
 use crate::{
     master::{self, Method, Request},
     xmlrpc::Reply,
 };
 
-/// The namespace of tokens. Without a leading slash no node's name and no parameter that
-/// `getParam('/')` shows can be in it.
+/// The namespace of tokens. It has no leading slash, so no node's name and no parameter in `getParam('/')`
+/// can be in it.
 const NAMESPACE: &str = "rosrescue/";
 /// The caller id of registrations that are undone at once.
 pub(super) const HELPER: &str = "rosrescue/injection";
-/// An address that rosmaster takes and never connects to: `xmlrpc.client` refuses its scheme.
+/// An address that rosmaster accepts but never connects to: `xmlrpc.client` refuses its scheme.
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
-/// Two parameter subscriptions by caller ids that nobody else has: one bears the session's id, the
-/// other the id and the number of the incarnation. A master with the first and not the second was
-/// ours once and has been succeeded since.
+/// Two parameter subscriptions by unique caller ids: one has the session's id, the other the id and the
+/// incarnation's number. A master with only the first was ours and has been succeeded since.
 ///
-/// Each makes a node reference that `lookupNode` finds and no other read shows: no registration, no
-/// parameter, no topic type. The subscribed key is outside the tree that starts at `/`, so no
-/// `setParam` or `deleteParam` below `/`, not even one of `/` itself, ever queues a callback to it.
+/// Each makes a node reference that only `lookupNode` finds: it has no registration, parameter or topic type
+/// that another read could show. The subscribed key is outside the tree that starts at `/`, so no `setParam` or
+/// `deleteParam` below `/`, or of `/` itself, ever queues a callback to it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Token {
     session: String,
     name: String,
 }
 
-/// Which token a master bears.
+/// The token in a master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bears {
-    /// That of the incarnation asked for: it has been brought to the state as a whole.
+    /// Of the incarnation asked for: it has been brought to the whole state.
     Present,
-    /// That of an earlier incarnation of the same session.
+    /// Of an earlier incarnation of the same session.
     Earlier,
-    /// None of this session.
+    /// No token of this session.
     Nothing,
 }
 
 impl Token {
-    /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII
-    /// notifications, digits and `-` become `_`.
+    /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII letters,
+    /// digits and `-` become `_`.
     pub fn new(id: &str, number: u64) -> Self {
         let safe = |c: char| {
             if c.is_ascii_alphanumeric() || c == '-' {
@@ -55,32 +54,32 @@ impl Token {
         }
     }
 
-    /// The calls that leave it, in order: a master that bears the number has all of it.
+    /// The calls that leave it, in order: the incarnation's number is last.
     pub fn leave(&self) -> [Request; 2] {
         [&self.session, &self.name].map(|name| subscription(Method::SubscribeParam, name))
     }
 
-    /// The call that takes the number away.
+    /// The call that removes the incarnation's number.
     pub fn remove(&self) -> Request {
         subscription(Method::UnsubscribeParam, &self.name)
     }
 
-    /// The call that looks for the number: answered with code 1 if it is there.
+    /// The call that looks up the incarnation's number: answered with code 1 if it is there.
     pub fn lookup(&self) -> Request {
         lookup(&self.name)
     }
 
-    /// The call that looks for the session.
+    /// The call that looks up the session.
     pub(super) fn lookup_session(&self) -> Request {
         lookup(&self.session)
     }
 
-    /// Whether the reply to [`Self::lookup`] says that the token is there.
+    /// Whether the reply to [`Self::lookup`] means that the token is there.
     pub fn is_found(reply: &Reply) -> bool {
         master::is_success(reply)
     }
 
-    /// Whether a caller id is that of a token.
+    /// Whether a caller id belongs to a token.
     pub fn is_ours(caller_id: &str) -> bool {
         caller_id.starts_with(NAMESPACE)
     }
