@@ -1,5 +1,5 @@
-//! The wall clock, for people's eyes only: no decision may hang on it, because robots start without
-//! a battery-backed clock and jump by years when the network comes.
+//! The wall clock, only for display. No decision may depend on it: robots start without a battery-backed
+//! clock, and it jumps by years when the network comes up.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 

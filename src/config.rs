@@ -1,4 +1,4 @@
-//! Validated configuration: what the command line and the environment come to.
+//! Validated configuration from the command line and the environment.
 
 use std::{
     net::{IpAddr, SocketAddr},
@@ -20,10 +20,10 @@ mod files;
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
-/// The least pause between two probes.
+/// Shortest pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
 
-/// A command line that is well formed and still cannot be meant. Exit status 2.
+/// A command line that is well formed but makes no sense. Exit status 2.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum UsageError {
@@ -33,7 +33,7 @@ pub enum UsageError {
     /// `ROS_MASTER_URI` is not a URI.
     #[error("ROS_MASTER_URI: {0}")]
     MasterUri(UriError),
-    /// `ROS_HOSTNAME` or `ROS_IP` is nothing by which a computer could be reached.
+    /// `ROS_HOSTNAME` or `ROS_IP` is neither a host name nor an address.
     #[error(
         "{variable}: `{given}` is not a host name or an address; write one, as in robot or 10.0.0.7"
     )]
@@ -45,40 +45,38 @@ pub enum UsageError {
     #[error("--listen: `{given}` is not an address; write {form}")]
     Listen {
         given: String,
-        /// What the option takes.
+        /// The accepted forms.
         form: &'static str,
     },
-    /// A number of seconds that is no duration.
+    /// A number of seconds that is not a valid duration.
     #[error("{option}: `{given}` is not a number of seconds between 0 and {most}")]
     Seconds {
-        /// The option.
         option: &'static str,
         given: f64,
-        /// The largest value.
         most: f64,
     },
-    /// The proxy and the master would have the same port on loopback.
+    /// Proxy and master would have the same port on loopback.
     #[error(
         "--master-port {port} is the port that nodes use; the real master needs one of its own"
     )]
     SamePort { port: u16 },
 }
 
-/// What rosrescue runs with.
+/// The configuration of rosrescue.
 #[derive(Clone, Debug)]
 pub struct Config {
-    /// The addresses to serve; the first must be had, the others when the computer can.
+    /// The addresses to serve. The first is required, the others are served if possible.
     pub listen: Vec<SocketAddr>,
-    /// What others use as `ROS_MASTER_URI`.
+    /// The `ROS_MASTER_URI` for others.
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
     pub restore: Restore,
-    /// When the journal is forced to the disk.
+    /// When the journal is synced.
     pub sync: SyncPolicy,
-    /// Pause between two such times with [`SyncPolicy::Interval`].
+    /// Pause between two syncs with [`SyncPolicy::Interval`].
     pub sync_interval: Duration,
-    /// How long a call that only a master can answer waits for one.
+    /// How long a call waits if only a master can answer it.
     pub hold: Duration,
     /// When a master counts as hung.
     pub probing: Probing,
@@ -86,13 +84,13 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well, if there are to be any.
+    /// Pause between two health checks while all is well; none to disable them.
     pub reap_interval: Option<Duration>,
-    /// Pause between two comparisons of the mirror with the master, if there are to be any.
+    /// Pause between two comparisons of the mirror with the master; none to disable them.
     pub resync_interval: Option<Duration>,
-    /// Connections to the master for reads.
+    /// Most connections to the master for reads.
     pub master_connections: usize,
-    /// Connections of clients.
+    /// Most connections of clients.
     pub max_connections: usize,
     /// Largest request body in bytes.
     pub max_body: usize,
@@ -101,15 +99,14 @@ pub struct Config {
 /// Where the master is, or how to run it.
 #[derive(Clone, Debug)]
 pub enum MasterConfig {
-    /// Somebody else runs it here.
+    /// An external master at this address.
     External(MasterUri),
     /// rosrescue runs it.
     Supervised(SupervisedConfig),
 }
 
 impl MasterConfig {
-    /// How long a connection to it may be idle, if that is known: the sentinel is renewed with each
-    /// probe.
+    /// How long a connection to it may be idle, if known: the watched connection is renewed with each probe.
     fn idle_limit(&self) -> Option<Duration> {
         let Self::Supervised(supervised) = self else {
             return None;
@@ -122,21 +119,21 @@ impl MasterConfig {
 /// How to run a rosmaster and rosout.
 #[derive(Clone, Debug)]
 pub struct SupervisedConfig {
-    /// Its port, if it is not to be a free one.
+    /// Its port; none for a free one.
     pub port: Option<u16>,
-    /// The program, if it is not to be searched for.
+    /// The program; none to search for it.
     pub rosmaster: Option<PathBuf>,
     /// Its notifier threads.
     pub numworkers: u32,
-    /// Its socket timeout in seconds; none if 0.
+    /// Its socket timeout in seconds; 0 for none.
     pub timeout: f64,
     pub rosout: bool,
-    /// Where it keeps its log, and we the log configuration that it is given.
+    /// The folder for its log, and for the log configuration that rosrescue writes for it.
     pub log_dir: PathBuf,
 }
 
 impl Config {
-    /// What `rosrescue core` with `args` means in the environment `env` on the computer `hostname`.
+    /// The configuration of `rosrescue core` with `args` in the environment `env` on the computer `hostname`.
     pub fn core(
         args: &CoreArgs,
         env: Lookup<'_>,
@@ -170,7 +167,7 @@ impl Config {
         Self::common(&args.common, env, listen, MasterUri { host, port }, master)
     }
 
-    /// What `rosrescue proxy` with `args` means in the environment `env` on the computer `hostname`.
+    /// The configuration of `rosrescue proxy` with `args` in the environment `env` on the computer `hostname`.
     pub fn proxy(
         args: &ProxyArgs,
         env: Lookup<'_>,
@@ -200,7 +197,7 @@ impl Config {
         }
     }
 
-    /// Serves `addresses` instead, which somebody else has bound.
+    /// Serves `addresses` instead, which another process has bound.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
         let single = addresses.first().filter(|address| {
             !address.ip().is_unspecified() && ros_env::address_override(env).is_none()
@@ -279,8 +276,8 @@ fn seconds(option: &'static str, given: f64, most: f64) -> Result<Duration, Usag
     Duration::try_from_secs_f64(given).map_err(|_| error)
 }
 
-/// The host by which others reach us. Without a word of the environment it is the address that is
-/// served, if that is a single one: nothing listens at the others.
+/// The host name or address for others. Unless the environment sets it, it is the served address, if there is
+/// only one: nothing listens at the others.
 fn advertised_host(
     listen: &[SocketAddr],
     env: Lookup<'_>,
@@ -313,7 +310,7 @@ fn listen_addresses(given: Option<&str>, env: Lookup<'_>) -> Result<Vec<SocketAd
     let usual_addresses = || ros_env::bind_addresses(env);
     let (addresses, port) = match given.map(|text| (text, text.parse())) {
         None => (usual_addresses(), usual_port()?),
-        // As `core` has it: both may read the same environment.
+        // As for `core`: both may use the same environment.
         Some((_, Ok(address))) => (vec![address], usual_port()?),
         Some((text, Err(_))) => {
             let (address, port) = text.rsplit_once(':').unwrap_or(("", text));

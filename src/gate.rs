@@ -1,4 +1,4 @@
-//! Whether calls pass to the master. One writer, the recovery's driver; everybody may look and wait.
+//! Whether calls pass to the master. The recovery's driver is the only writer; any task may read and wait.
 
 use std::time::Duration;
 
@@ -7,17 +7,17 @@ use tokio::{sync::watch, time::Instant};
 /// Where calls go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// To the master of this incarnation number.
+    /// To the master of this incarnation.
     Open {
         /// See [`Token`](crate::replay::Token).
         incarnation: u64,
     },
     /// The mirror answers reads and writes: the master is away.
     StandingIn,
-    /// The mirror answers reads, and writes that change nothing. Other writes wait: a master is being
-    /// brought to its state.
+    /// The mirror answers reads, and writes that change nothing. Other writes wait: an injection is under
+    /// way.
     Injecting,
-    /// Nowhere: no master was ever seen, and nobody knows what its state would be.
+    /// Nowhere: no master has been seen yet, so its state is unknown.
     Unknown,
 }
 
@@ -35,7 +35,7 @@ struct Gate {
     shut_since: Option<Instant>,
 }
 
-/// A gate that is shut, in two halves.
+/// A shut gate, as its two halves.
 pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
@@ -49,7 +49,7 @@ pub(crate) fn gate() -> (Tx, Rx) {
 pub(crate) struct Tx(watch::Sender<Gate>);
 
 impl Tx {
-    /// Changes the state; waiters see it at once. The same state again wakes nobody.
+    /// Changes the state; waiters see it at once. Setting the same state wakes no waiter.
     pub(crate) fn set(&self, state: State) {
         self.0.send_if_modified(|gate| {
             if gate.state == state {
@@ -70,7 +70,7 @@ impl Tx {
     }
 }
 
-/// Looks at the gate and waits for it.
+/// Reads the gate and waits for it.
 #[derive(Clone, Debug)]
 pub struct Rx(watch::Receiver<Gate>);
 
@@ -84,32 +84,32 @@ impl Rx {
         self.state().is_open()
     }
 
-    /// Since when no call has passed; none while calls pass.
+    /// When calls stopped passing; none while they pass.
     pub fn shut_since(&self) -> Option<Instant> {
         self.0.borrow().shut_since
     }
 
-    /// Returns when the state has changed since the last look by this method or by
-    /// [`Self::look`]. Cancel safe. Pends for ever once the sender is gone.
+    /// Returns when the state has changed since the last [`Self::look`] or the last return of this method.
+    /// Cancel safe. Never returns once the sender is gone.
     pub async fn changed(&mut self) {
         if self.0.changed().await.is_err() {
             std::future::pending::<()>().await;
         }
     }
 
-    /// As [`Self::look`], and whether the state has changed since the last look or since
+    /// As [`Self::look`]. Also returns whether the state has changed since the last look, or since
     /// [`Self::changed`] returned.
     pub fn look_changed(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
     }
 
-    /// The state now, and the point from which [`Self::changed`] looks for changes.
+    /// The present state. [`Self::changed`] waits for changes after it.
     pub fn look(&mut self) -> State {
         self.0.borrow_and_update().state
     }
 
-    /// Returns when the state is one that `is_it` says yes to. Cancel safe.
+    /// Returns when `is_it` accepts the state. Cancel safe.
     pub async fn wait_for(&mut self, is_it: impl Fn(State) -> bool) -> State {
         loop {
             let state = self.look();
@@ -120,14 +120,14 @@ impl Rx {
         }
     }
 
-    /// Returns when no call has passed for `time` in one piece, counted from now at the earliest.
-    /// Never returns while the gate is open. Cancel safe, but the count starts anew.
+    /// Returns when no call has passed for an uninterrupted `time`, counted from now at the earliest. Never
+    /// returns while the gate is open. Cancel safe, but the count restarts.
     pub async fn shut_for(&mut self, time: Duration) {
         loop {
             self.wait_for(|state| !state.is_open()).await;
             let deadline = Instant::now() + time;
             tokio::select! {
-                // On a busy computer both may have come to pass by now.
+                // On a busy computer both may be ready.
                 biased;
                 _ = self.wait_for(State::is_open) => {}
                 () = tokio::time::sleep_until(deadline) => return,

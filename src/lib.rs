@@ -1,38 +1,38 @@
-//! rosrescue stands where the ROS 1 master stood. When the master dies it answers in its place, and brings
-//! a new one to the same state.
+//! rosrescue is a proxy in front of the ROS 1 master. When the master dies, it answers in the master's place,
+//! and brings a new one to the same state.
 //!
 //! # Layout
 //!
-//! The *core* is pure: no runtime, no sockets, no files, no clock. Time comes in as an argument and
-//! work goes out as values.
+//! The *core* is pure: no runtime, no sockets, no files, no clock. Time is an argument and work is returned
+//! as values.
 //!
-//! * [`xmlrpc`]: XML-RPC text to values and back; knows nothing of ROS.
+//! * [`xmlrpc`]: XML-RPC text to values and back; independent of ROS.
 //! * [`master`]: the Master API as a state machine.
-//! * [`replay`]: knowing a master again, learning what it holds, and the one call that brings it to a state.
+//! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
-//! * `health`: what is to be made of what a node says of itself; which nodes are unreachable.
-//! * [`checkpoint::session`]: whether a checkpoint's session goes on, and what state it holds.
+//! * `health`: judging what a node reports; which nodes are unreachable.
+//! * [`checkpoint::session`]: whether a checkpoint's session continues, and the state that it holds.
 //! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
 //!
 //! The *shell* does IO and decides as little as possible. From the bottom to the top:
 //!
-//! * [`cli`], [`config`], [`ros_env`]: what is to be run, and what ROS's environment means.
-//! * `clock`, `resolver`, `wait`: the wall clock; addresses of hosts; waiting for what may not be there.
+//! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
+//! * `clock`, `resolver`, `wait`: the wall clock; addresses of hosts; waiting for optional events.
 //! * `gate`: whether calls pass to the master.
-//! * `status`: plain data for people and monitors, which others fill.
+//! * `status`: plain data for people and monitors, filled by other modules.
 //! * [`checkpoint::store`]: the checkpoint on the disk.
 //! * `ledger`: mirror and journal under one lock.
 //! * `upstream`: connections to the master.
-//! * `write_queue`: where writes wait for the master.
-//! * `process`: the processes of rosmaster and rosout, and those that an earlier rosrescue left behind.
+//! * `write_queue`: writes on their way to the master, in order.
+//! * `process`: the processes of rosmaster and rosout, and orphans of an earlier rosrescue.
 //! * `nodes`: calls to nodes: health check and notifications.
 //! * `recovery`: watching the master, examining and injecting.
 //! * `roscore`: roscore's other duties.
-//! * `server`: what clients talk to.
-//! * [`guardian`]: the parent process that keeps the sockets and starts the worker again.
-//! * [`app`]: puts it all together.
+//! * `server`: the side that clients talk to.
+//! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
+//! * [`app`]: assembles the program.
 //!
-//! `docs/architecture.md` follows a call, and a record, through them by the names of functions.
+//! `docs/architecture.md` follows a call, and a record, through these modules by function names.
 
 pub mod app;
 pub mod checkpoint;

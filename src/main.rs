@@ -22,17 +22,16 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
 
-/// How long work beside the main one may go on when all is done.
+/// How long threads may still run after everything is done.
 const LAST_JOBS: Duration = Duration::from_millis(500);
-/// A signal to all processes called rosrescue, as by killall, comes to a worker twice: by itself and
-/// through its guardian. A second signal within this time is taken for the first.
+/// A signal to all processes named rosrescue, as by killall, reaches a worker twice: directly and through
+/// its guardian. A second signal within this time counts as the first.
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
-/// More threads than these do not make a master faster that is Python; each keeps a heap of its own,
-/// as large as its largest task was.
+/// More threads do not make a Python master faster, and each keeps a heap as large as its largest task.
 const THREADS_MAX: usize = 4;
 
 fn main() -> ExitCode {
-    // Before anything else: it takes them out of the environment, and there is one thread.
+    // Must be first: it removes them from the environment, which requires a single thread.
     let sockets = match Sockets::inherited() {
         Ok(sockets) => sockets,
         Err(error) => {
@@ -41,7 +40,7 @@ fn main() -> ExitCode {
         }
     };
     if sockets.is_some() {
-        // A worker was started as /proc/self/exe, and would be called `exe` in lists of processes.
+        // A worker is started as /proc/self/exe, and would be listed as `exe`.
         let _ = rustix::thread::set_name(c"rosrescue");
     }
     let cli = Cli::read();
@@ -73,7 +72,7 @@ fn main() -> ExitCode {
     };
     let mut config = match config {
         Ok(config) => config,
-        // Exit status 2, as all usage errors.
+        // Exit status 2, like all usage errors.
         Err(error) => Cli::command()
             .error(ErrorKind::ValueValidation, error)
             .exit(),
@@ -97,7 +96,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Serves `sockets`, or guards a worker that does.
+/// Serves `sockets`, or runs the guardian of a worker that does.
 fn start(
     mut config: Config,
     sockets: Option<Sockets>,
@@ -126,9 +125,9 @@ fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn
         .enable_all()
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));
-    // The closing checkpoint is on the disk, and is newer than any write still under way. What still
-    // runs in a thread may be a question to a name server that never answers: the end of a process
-    // does not wait for that, but the drop of a runtime would.
+    // The closing checkpoint is on the disk and newer than any write still under way. A thread may still wait
+    // for a name server that never answers: the end of the process does not wait for it, but dropping the
+    // runtime would.
     runtime.shutdown_timeout(LAST_JOBS);
     ended
 }
@@ -139,7 +138,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
-    // The terminal was closed. Under nohup that is to be ignored.
+    // The terminal was closed. Ignored under nohup.
     let mut hangup = match guardian::is_hangup_ignored() {
         true => None,
         false => Some(signal(SignalKind::hangup())?),
@@ -168,7 +167,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
     Ok(())
 }
 
-/// Prints a line; a reader that has gone away is no reason to stop.
+/// Prints a line. A closed stdout is no reason to stop.
 fn say(line: &str) {
     let mut stdout = std::io::stdout();
     let colour = stdout.is_terminal() && colour_is_welcome();
@@ -198,7 +197,7 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_target(false)
-        // It would be told on stderr, and panic where the terminal is gone.
+        // They would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)
         .with_ansi(ansi);
     match args.log_format {
@@ -208,8 +207,7 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
     Ok(())
 }
 
-/// As many files as the system lets us have; the usual limit of 1024 is soon reached. Answers how
-/// many that is.
+/// Raises the limit on open files as far as allowed; the usual 1024 are soon reached. Returns the limit.
 fn raise_file_limit() -> u64 {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);

@@ -1,6 +1,5 @@
-//! Looks up the addresses of hosts. A name is looked up once for all who ask at the same time, in a
-//! thread of its own: neither the runtime nor the end of the process waits for a name server that
-//! does not answer.
+//! Resolves host names. Concurrent lookups of a name share one, in a thread of its own: neither the runtime
+//! nor the end of the process waits for a name server that does not answer.
 
 use std::{
     collections::BTreeMap,
@@ -11,8 +10,7 @@ use std::{
 
 use tokio::sync::{Semaphore, watch};
 
-/// Names that are looked up at the same time. A name server that does not answer costs a thread for
-/// some ten seconds.
+/// Most lookups at a time. A name server that does not answer costs a thread for some ten seconds.
 const LOOKUPS: usize = 64;
 
 /// A name's addresses, without a port, or why there are none.
@@ -26,11 +24,11 @@ fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Fo
     UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The addresses of `host`, IPv4 first, as roscpp does, with `port`.
+/// The addresses of `host` with `port`. IPv4 first, as in roscpp.
 ///
 /// # Errors
 ///
-/// If it has none, or nobody can tell.
+/// If it has none, or the lookup fails.
 pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(vec![SocketAddr::new(address, port)]);
@@ -56,7 +54,7 @@ pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAdd
     }
 }
 
-/// Of an IPv6 address the scope stays.
+/// Keeps the scope of an IPv6 address.
 fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
     address.set_port(port);
     address
@@ -75,11 +73,11 @@ async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
             addresses.dedup();
             addresses.into()
         });
-        // First: who asks from now on gets a fresh answer.
+        // Removed first: later callers get a fresh answer.
         under_way().remove(&name);
         tell.send_replace(Some(found));
     };
-    // Without a thread the sender is dropped, which is an answer too.
+    // Without a thread the sender is dropped, which waiters notice.
     let named = std::thread::Builder::new().name("lookup".to_owned());
     if named.spawn(search).is_err() {
         under_way().remove(&host);

@@ -1,4 +1,4 @@
-//! What the ROS environment variables mean, as rosgraph and rospkg read them.
+//! ROS environment variables, as rosgraph and rospkg read them.
 //!
 //! Sources: `rosgraph/network.py`, `rosgraph/rosenv.py`, `rospkg/environment.py` of Noetic.
 
@@ -9,13 +9,13 @@ use std::{
 
 use thiserror::Error;
 
-/// The port of a master when `ROS_MASTER_URI` names none.
+/// The master's port if `ROS_MASTER_URI` has none.
 pub const DEFAULT_MASTER_PORT: u16 = 11311;
 
-/// Looks up an environment variable; a parameter, so that no test touches the environment.
+/// Looks up an environment variable. A parameter, so that tests need not change the environment.
 pub type Lookup<'a> = &'a dyn Fn(&str) -> Option<String>;
 
-/// A `ROS_MASTER_URI` or `--master` that cannot be used.
+/// An invalid `ROS_MASTER_URI` or `--master`.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum UriError {
@@ -31,12 +31,11 @@ pub enum UriError {
 pub struct MasterUri {
     /// Name or address, without the brackets of IPv6.
     pub host: String,
-    /// TCP port.
     pub port: u16,
 }
 
 impl MasterUri {
-    /// Reads `http://HOST[:PORT][/]`; without a port it is 11311.
+    /// Parses `http://HOST[:PORT][/]`; the default port is 11311.
     pub fn parse(uri: &str) -> Result<Self, UriError> {
         let malformed = || UriError::Malformed {
             uri: uri.to_owned(),
@@ -89,7 +88,7 @@ impl std::fmt::Display for MasterUri {
     }
 }
 
-/// The port that `ROS_MASTER_URI` names, else 11311.
+/// The port in `ROS_MASTER_URI`, else 11311.
 pub fn master_port(env: Lookup<'_>) -> Result<u16, UriError> {
     match env("ROS_MASTER_URI").filter(|uri| !uri.is_empty()) {
         Some(uri) => Ok(MasterUri::parse(&uri)?.port),
@@ -97,17 +96,17 @@ pub fn master_port(env: Lookup<'_>) -> Result<u16, UriError> {
     }
 }
 
-/// What `ROS_HOSTNAME`, else `ROS_IP`, says of this computer's own address.
+/// This computer's own address from `ROS_HOSTNAME`, else `ROS_IP`.
 pub fn address_override(env: Lookup<'_>) -> Option<String> {
     env("ROS_HOSTNAME")
         .or_else(|| env("ROS_IP"))
         .filter(|address| !address.is_empty())
 }
 
-/// The variable and the value of an [`address_override`] with which no address can be made.
+/// The variable and value of an invalid [`address_override`].
 pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     let host = address_override(env)?;
-    // A scope as in fe80::1%eth0 is none of ours to check.
+    // A scope as in fe80::1%eth0 is not checked.
     let bare = host.split('%').next().unwrap_or_default();
     let is_name = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
     if host.chars().all(is_name) || bare.parse::<IpAddr>().is_ok() && !host.contains(['/', ' ']) {
@@ -120,7 +119,7 @@ pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     Some((variable, host))
 }
 
-/// The addresses a master listens on: all, or only loopback when its own address is a loopback one.
+/// The addresses to listen on, as a master does: all, or only loopback if its own address is a loopback one.
 /// The first is tried first; an address family that the computer lacks may be left out.
 pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     match address_override(env) {
@@ -141,8 +140,8 @@ pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     }
 }
 
-/// The host by which others reach this computer, as rosgraph chooses it: the override, else the
-/// host name unless it is a loopback one, else `local_address`.
+/// This computer's host for others, as rosgraph chooses it: the override, else the host name unless it is a
+/// loopback one, else `local_address`.
 pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<IpAddr>) -> String {
     if let Some(address) = address_override(env) {
         return address;

@@ -23,28 +23,25 @@ use crate::{
 
 /// How long `rosversion` may take: it is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
-/// Pause before a rosout that has ended is started again, as roslaunch's respawn has it. It doubles
-/// with each one that did not live for [`LONGEST_RESPAWN`].
+/// Pause before rosout is restarted, as with roslaunch's respawn. It doubles after each rosout that did not
+/// live for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
-/// The longest of these pauses.
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 const ROSOUT: &str = "/rosout";
 
-/// What its duties need.
 pub(crate) struct Roscore {
-    /// Whether the parameters are set already.
+    /// Knows whether the parameters are set already.
     pub ledger: Arc<Ledger>,
-    /// The way to the master.
     pub write_queue: WriteQueue,
-    /// Whether calls pass to it.
+    /// Whether calls pass to the master.
     pub gate: gate::Rx,
     /// Our own address.
     pub uri: String,
-    /// The checkpoint's path, which tells our rosout from others.
+    /// The checkpoint's path. It distinguishes our rosout from others.
     pub checkpoint: PathBuf,
     /// How long a node may take to answer.
     pub node_timeout: Duration,
-    /// Process id of rosout, if we run it; else 0.
+    /// Process id of our rosout; 0 if there is none.
     pub rosout: AtomicU32,
 }
 
@@ -62,18 +59,18 @@ fn run_id(roscore: &Roscore) -> Request {
     set("/run_id", &roscore.ledger.session().id)
 }
 
-/// Gives a new session its run id before there is a master: it is injected with the rest, so that
-/// no roslaunch ever sees a master without one. Not if there may be a master that has one.
+/// Sets a new session's run id before there is a master: it is injected with the rest, so no roslaunch ever
+/// sees a master without one. Not set if the master may have one already.
 pub(crate) fn seed_run_id(roscore: &Roscore) {
     if !has(roscore, "/run_id") {
         roscore.ledger.seed(&run_id(roscore));
     }
 }
 
-/// Does the rest once the master is there, until `stop`; then ends rosout.
+/// Does the rest once there is a master, until `stop`; then ends rosout.
 pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
     let duties = async {
-        // They take their time: while the master starts, too.
+        // Slow, so they run while the master starts.
         let versions = tokio::join!(
             version(&roscore, "/rosversion", "roslaunch"),
             version(&roscore, "/rosdistro", "-d"),
@@ -100,16 +97,15 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
         () = stop.cancelled() => {}
     }
     stop.cancelled().await;
-    // Only now nobody starts another one. It still takes itself out of the master.
+    // After this point none is started. rosout still unregisters itself from the master.
     end_rosout(&roscore).await;
 }
 
-/// Returns when calls have passed to a master for the first time.
 async fn first_opening(roscore: &Roscore) {
     roscore.gate.clone().wait_for(gate::State::is_open).await;
 }
 
-/// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, line feed included.
+/// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, including the line feed.
 async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
     if has(roscore, key) {
         return None;
@@ -121,7 +117,7 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     version.map(|version| set(key, &version))
 }
 
-/// Keeps a rosout running: ours, or one that is there already.
+/// Keeps a rosout running: ours, or an existing one.
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!("no rosout is installed (apt-get install rosout): /rosout is not collected");
@@ -170,18 +166,18 @@ async fn living_rosout(roscore: &Roscore) -> Option<u32> {
     }
 }
 
-/// By then a process that was started shows its command line.
+/// Time after which a new process shows its command line.
 const STARTED: Duration = Duration::from_millis(500);
 
 /// Ends rosout in order.
 async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
-        // One may have been left to us, and not have been found yet.
+        // There may be an orphan that has not been found yet.
         0 => Rosout::find(&roscore.checkpoint).and_then(|rosout| rosout.left_behind()),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };
-    // A process that has just been started has no command line for a moment.
+    // A new process has no command line for a moment.
     let named = async {
         while process::is_alive(pid) && !process::runs(pid, "rosout") {
             tokio::time::sleep(Duration::from_millis(1)).await;

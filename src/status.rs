@@ -1,4 +1,4 @@
-//! The status: plain data for people and monitors, which others fill. Nothing waits on it.
+//! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
 
 pub(crate) mod report;
 pub(crate) mod stats;
@@ -10,10 +10,10 @@ use std::{
 
 use self::report::Report;
 
-/// What is known of the master's health and ours.
+/// The health of the master and of rosrescue.
 #[derive(Clone, Debug, Default)]
 pub struct Facts {
-    /// The master dies again and again.
+    /// The master keeps dying.
     pub crash_loop: bool,
     /// Masters that have died since the start.
     pub deaths: u64,
@@ -23,22 +23,21 @@ pub struct Facts {
     pub guarded: Guarded,
 }
 
-/// Who keeps the port and starts rosrescue again when it dies.
+/// Who keeps the port and restarts rosrescue when it dies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Guarded {
-    /// Nobody that we know of.
+    /// No known supervisor.
     #[default]
     Nobody,
-    /// systemd, by a socket unit.
+    /// systemd, with a socket unit.
     Systemd,
-    /// The guardian, which is this process.
+    /// The guardian, with this process id.
     Guardian(u32),
-    /// Nobody since the guardian, which was this process, has ended.
+    /// Nothing any more: the guardian, with this process id, has ended.
     NoLonger(u32),
 }
 
 impl Guarded {
-    /// Whether somebody does.
     pub fn is_guarded(self) -> bool {
         matches!(self, Self::Systemd | Self::Guardian(_))
     }
@@ -60,7 +59,7 @@ impl fmt::Display for Guarded {
 }
 
 impl Facts {
-    /// The state in a line. `open`: whether calls pass to the master; `unprotected`: why it is not recorded.
+    /// The state in a line. `open`: whether calls pass to the master. `unprotected`: why it is not recorded.
     pub fn line(&self, open: bool, unprotected: Option<String>) -> String {
         let mut line = match (unprotected, open) {
             (Some(reason), _) => format!("unprotected: {reason}"),
@@ -71,12 +70,12 @@ impl Facts {
         if let Guarded::NoLonger(pid) = self.guarded {
             line += &format!("; unguarded: the guardian, process {pid}, has ended");
         }
-        // A newline would begin another assignment.
+        // A newline would start another assignment.
         line.replace('\n', " ")
     }
 }
 
-/// Where [`Facts`] are written and read.
+/// Holds the present [`Facts`].
 #[derive(Debug, Default)]
 pub struct Board(Mutex<Facts>);
 
@@ -85,7 +84,6 @@ impl Board {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// All facts now.
     pub fn read(&self) -> Facts {
         self.lock().clone()
     }

@@ -1,8 +1,8 @@
-//! Waiting for what may not be there.
+//! Waiting for optional events.
 
 use tokio::time::Instant;
 
-/// Sleeps until `deadline`; for ever without one.
+/// Sleeps until `deadline`; for ever if there is none.
 pub(crate) async fn until(deadline: Option<Instant>) {
     match deadline {
         Some(deadline) => tokio::time::sleep_until(deadline).await,
@@ -10,7 +10,7 @@ pub(crate) async fn until(deadline: Option<Instant>) {
     }
 }
 
-/// What `future` comes to; never without one. Cancel safe: the future stays where it is.
+/// The result of `future`; never if there is none. Cancel safe: the future stays with the caller.
 pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
     match future {
         Some(future) => future.await,
@@ -18,7 +18,7 @@ pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Ou
     }
 }
 
-/// The next tick of an interval; for ever without one. Cancel safe.
+/// The next tick of an interval; never if there is none. Cancel safe.
 pub(crate) async fn tick(interval: &mut Option<tokio::time::Interval>) {
     match interval {
         Some(interval) => {

@@ -1,4 +1,4 @@
-//! XML-RPC: values, and their way from text and to text. Nothing here knows of ROS.
+//! XML-RPC: values, and their decoding and encoding. Independent of ROS.
 
 mod decode;
 mod encode;

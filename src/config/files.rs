@@ -1,18 +1,18 @@
-//! File descriptors: how many of the process's connections may take.
+//! File descriptors: how many client connections may use.
 
 use super::Config;
 
-/// Clients do not get these: health check and notifications open up to 320 at a time.
+/// Reserved: health check and notifications open up to 320 at a time.
 const RESERVED: u64 = 320;
-/// Where there are few, clients get one in so many. The checkpoint, the connections to the master and
-/// its process take some 30 of the others; health check and notifications do with what is left, and try again.
+/// With few descriptors, clients get one in four. The checkpoint, the connections to the master and its
+/// process take some 30 of the others; health check and notifications share the rest, and retry.
 const SHARE: u64 = 4;
-/// Connections that clients may always hold, if they are to.
+/// Client connections that are always allowed, if configured.
 const FEWEST: u64 = 16;
 
 impl Config {
-    /// Leaves file descriptors for the master, the nodes and the checkpoint, out of `files` that the
-    /// process may have.
+    /// Reserves file descriptors for the master, the nodes and the checkpoint, out of the process's limit of
+    /// `files`.
     pub fn fit_into(&mut self, files: u64) {
         let most = files
             .saturating_sub(RESERVED)

@@ -34,7 +34,7 @@ impl Answered<'_> {
 /// The answered mutating calls of a request, multicalls flattened.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Accepted<'a> {
-    /// The calls in the order of their execution.
+    /// In the order of execution.
     pub calls: Vec<Answered<'a>>,
     /// If false, the master's state must be read again.
     pub certain: bool,

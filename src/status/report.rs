@@ -7,24 +7,24 @@ use tracing::field::debug;
 
 use crate::master::Counts;
 
-/// How the present master came to hold the state.
+/// How the present master got its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// An empty master, and nothing to bring to it: a session begins.
+    /// An empty master and an empty mirror: a new session.
     Begun,
     /// A new incarnation was brought to the mirror's state.
     Injected,
     /// The mirror took over what a running master holds.
     Adopted,
-    /// It is the same incarnation as before, and was brought to the mirror's state again.
+    /// The same incarnation as before was brought to the mirror's state again.
     Reconciled,
-    /// It is the same incarnation as before.
+    /// The same incarnation as before, unchanged.
     Resumed,
 }
 
 impl Outcome {
-    /// Whether the master is not the incarnation that was served before.
+    /// Whether the master is a new incarnation.
     pub fn is_new(self) -> bool {
         !matches!(self, Self::Reconciled | Self::Resumed)
     }
@@ -47,38 +47,36 @@ impl fmt::Display for Outcome {
 pub struct Phases {
     /// From the shut gate to the master's open port.
     pub absence_ms: f64,
-    /// The look at what the master holds.
+    /// Reading what the master holds.
     pub look_ms: f64,
-    /// Injection and reading back.
+    /// Injecting and reading back.
     pub injection_ms: f64,
     /// From the shut gate to the open gate.
     pub total_ms: f64,
 }
 
-/// One recovery.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Why the gate was shut.
     pub cause: &'static str,
-    /// When the gate was shut: seconds since 1970 by the wall clock, for comparison with logs.
+    /// When the gate was shut: seconds since 1970 by the wall clock, to compare with logs.
     pub detected_at: f64,
-    /// How the master came to hold the state.
+    /// How the master got its state.
     pub outcome: Outcome,
-    /// The master's process id, as it says.
+    /// The process id that the master reports.
     pub master_pid: i32,
-    /// How long it took.
     pub phases: Phases,
-    /// From the open gate to the end of the health check, in milliseconds; none while it lasts.
+    /// From the open gate to the end of the health check, in milliseconds; none until then.
     pub health_check_ms: Option<f64>,
     /// What the master holds now.
     pub restored: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
-    /// Where the master, read back, differs from what was injected. Should be empty.
+    /// Differences between the master, read back, and what was injected. Should be empty.
     pub mismatches: Vec<String>,
-    /// Nodes that were found dead and taken out.
+    /// Nodes that were found dead and unregistered.
     pub removed: Vec<String>,
-    /// Registrations that were added (`+`) or taken back (`-`), because the node itself says so.
+    /// Registrations that were added (`+`) or removed (`-`), because the node itself reports so.
     pub reconciled: Vec<String>,
     /// Nodes that did not answer and were kept.
     pub unreachable: Vec<String>,
@@ -87,7 +85,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Adds what the health check found.
+    /// Adds the results of the health check.
     pub(crate) fn add(&mut self, check: HealthCheck) {
         self.health_check_ms = Some(ms(check.duration));
         self.removed = check.removed;
@@ -96,7 +94,7 @@ impl Report {
         self.notified = check.notified;
     }
 
-    /// Logs all of it in one line, but what is empty.
+    /// Logs the non-empty parts in one line.
     pub(crate) fn log(&self, message: &str) {
         let some = |list: &Vec<String>| (!list.is_empty()).then(|| debug(list.clone()));
         let Phases {
@@ -130,14 +128,14 @@ pub(crate) fn ms(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1e5).round() / 1e2
 }
 
-/// What the health check after a recovery found.
+/// Results of the health check after a recovery.
 #[derive(Debug, Default)]
 pub(crate) struct HealthCheck {
     /// From the open gate to its end.
     pub duration: Duration,
-    /// Nodes that are dead and have been taken out, through the master, so that others are told.
+    /// Dead nodes that were unregistered at the master, so that others are notified.
     pub removed: Vec<String>,
-    /// Registrations that were added or taken back, because the node itself says so.
+    /// Registrations that were added or removed, because the node itself reports so.
     pub reconciled: Vec<String>,
     /// Nodes that did not answer and were kept.
     pub unreachable: Vec<String>,

@@ -1,8 +1,8 @@
-//! Counters of what went through, for the status page and the metrics.
+//! Counters for the status page and the metrics.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// One number that only grows.
+/// A number that only grows.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
@@ -15,28 +15,27 @@ impl Counter {
         self.0.fetch_add(number, Ordering::Relaxed);
     }
 
-    /// The number now.
     pub fn value(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// What is counted, from the start of this process.
+/// Counters since the start of this process.
 #[derive(Debug, Default)]
 pub struct Stats {
-    /// Calls that clients made.
+    /// Calls by clients.
     pub calls: Counter,
-    /// Calls that were answered by the mirror: the master was away, or did not answer in time.
+    /// Calls that the mirror answered: the master was away, or did not answer in time.
     pub stood_in: Counter,
-    /// Calls whose connection was closed because only a master could answer and none came in time.
+    /// Calls closed without an answer: only a master could answer, and none came in time.
     pub hold_expired: Counter,
-    /// Writes that were answered with success and went into the journal.
+    /// Successful writes that were journaled.
     pub recorded: Counter,
     /// Round trips to the master with writes.
     pub batches: Counter,
-    /// Notifications that we sent to nodes.
+    /// Notifications that rosrescue sent to nodes.
     pub notifications: Counter,
-    /// Requests that could not be decoded, and were forwarded as they were.
+    /// Requests that could not be decoded and were forwarded unchanged.
     pub undecoded: Counter,
     /// Replies in which the mirror and the master differed.
     pub divergences: Counter,
