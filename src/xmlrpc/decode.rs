@@ -1,7 +1,7 @@
-//! From text to values, as CPython's `xmlrpc.client.Unmarshaller` under expat does it.
+//! Decodes text as CPython's `xmlrpc.client.Unmarshaller` under expat does.
 //!
-//! The unmarshaller there is a stack machine that looks at tags one by one and hardly at how they
-//! lie inside each other. Clients live off that leniency, so this is the same machine.
+//! That unmarshaller is a stack machine: it handles tags one by one and hardly checks their nesting. Clients
+//! depend on that leniency, so this is the same machine.
 
 use std::borrow::Cow;
 
@@ -11,18 +11,18 @@ use super::prolog::text_of;
 use super::scan::{Event, LineEnds, Scanner};
 use super::value::{Call, Reply, Struct, Value};
 
-/// How deep arrays and structs may lie inside each other.
+/// Most levels of nested arrays and structs.
 ///
-/// rosmaster takes any depth (measured: 20,000), but returns at most 492 levels, its own
-/// `[code, message, value]` included; for anything deeper it answers a fault. So this keeps all
-/// that can be read back, and bounds recursion over values, their drop included.
+/// rosmaster accepts any depth (measured: 20,000), but returns at most 492 levels, its own `[code, message,
+/// value]` included; for anything deeper it answers a fault. So this limit keeps everything that can be read
+/// back, and bounds recursion over values, their drop included.
 pub const MAX_DEPTH: usize = 512;
 
-/// How many elements may be open. A level takes three (`value`, `struct`, `member` or `value`,
-/// `array`, `data`); there is room for the frame, and for clients that wrap a little more.
+/// Most open elements. A level takes three (`value`, `struct`, `member` or `value`, `array`, `data`). The
+/// rest is for the frame, and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
-/// Reads a request.
+/// Decodes a request.
 ///
 /// ```
 /// use rosrescue::xmlrpc::{Value, decode_call};
@@ -37,7 +37,7 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 ///
 /// # Errors
 ///
-/// Where CPython raises, and in the few cases that are named at [`DecodeError`].
+/// Where CPython raises, and in the few cases listed at [`DecodeError`].
 pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     let wanted = "call";
     let document = unmarshal(body, wanted, Writer::Any)?;
@@ -52,14 +52,13 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     Ok(Call::new(method, document.values))
 }
 
-/// Reads an answer, as CPython's server meant it: it escapes neither a carriage return, which a reader
-/// of XML takes for a line feed, nor a date's text, in which it would find references. So this does
-/// neither, and what a master holds is read as it is.
+/// Decodes an answer as CPython's server meant it. That server does not escape a carriage return, which XML
+/// reads as a line feed, nor a date's text, in which XML would find references. So neither is interpreted
+/// here, and a master's values are read unchanged.
 ///
 /// # Errors
 ///
-/// Where CPython raises, where there is not exactly one value, and in the few cases that are named
-/// at [`DecodeError`].
+/// Where CPython raises, if there is not exactly one value, and in the few cases listed at [`DecodeError`].
 pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     let wanted = "reply";
     let document = unmarshal(body, wanted, Writer::Python)?;
@@ -92,7 +91,7 @@ pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     }
 }
 
-/// What the machine has found at the end.
+/// The machine's result.
 struct Document {
     values: Vec<Value>,
     method: Option<String>,
@@ -102,10 +101,10 @@ struct Document {
 /// Who wrote a document.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 enum Writer {
-    /// Anybody who knows XML.
+    /// Any XML writer.
     #[default]
     Any,
-    /// CPython's server, which leaves two things unescaped.
+    /// CPython's server: it does not escape carriage returns and dates.
     Python,
 }
 
@@ -124,7 +123,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
         match event {
             Event::Start(tag) => machine.start(tag.name().0, scanner.at())?,
             Event::End(tag) => machine.end(tag.name().0, scanner.at())?,
-            // Adding to no text borrows the piece; mostly there is but one.
+            // Mostly there is one piece, which is borrowed when added to an empty text.
             Event::Text(piece) => machine.text += piece,
             Event::Reference(reference, _) if machine.is_unescaped => {
                 machine.text += "&";
@@ -145,14 +144,14 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
     })
 }
 
-/// What the last of these elements was; CPython lets it decide.
+/// The last of these elements; it decides for CPython.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Call,
     Fault,
 }
 
-/// The elements that CPython's unmarshaller knows; it passes over all others.
+/// The elements that CPython's unmarshaller knows; it ignores all others.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Tag {
     Value,
@@ -172,7 +171,7 @@ enum Tag {
 }
 
 impl Tag {
-    /// By the name without its prefix.
+    /// The element of this name, prefix removed.
     fn named(name: &str) -> Option<Self> {
         Some(match name {
             "value" => Self::Value,
@@ -204,14 +203,14 @@ struct Unmarshaller<'a> {
     kind: Option<Kind>,
     method: Option<String>,
     stack: Vec<Value>,
-    /// How long the stack was at the start of each open array and struct.
+    /// Length of the stack at the start of each open array and struct.
     marks: Vec<usize>,
     /// Character data since the last start tag.
     text: Cow<'a, str>,
-    /// A `<value>` has begun and no element in it: so far it is an untyped string.
+    /// A `<value>` is open without an element in it: an untyped string so far.
     is_bare: bool,
     writer: Writer,
-    /// What looks like a reference is text, because the writer does not escape this element's.
+    /// References are text, because the writer does not escape this element's content.
     is_unescaped: bool,
 }
 
@@ -268,7 +267,7 @@ impl Unmarshaller<'_> {
         Ok(())
     }
 
-    /// Names and values take turns on the stack.
+    /// Names and values alternate on the stack.
     fn end_struct(&mut self, at: usize) -> Result<Value, DecodeError> {
         let mark = self.marks.pop().unwrap_or_default();
         let mut members = Struct::with_capacity((self.stack.len() - mark) / 2);
@@ -282,7 +281,7 @@ impl Unmarshaller<'_> {
                 let tag = "struct";
                 return Err(bad_text(tag, &name, at));
             };
-            // A name that comes again keeps its place and takes the new value, as in a dict.
+            // A repeated name keeps its place and takes the new value, as in a dict.
             members.insert(name, value);
         }
         Ok(Value::Struct(members))

@@ -1,4 +1,4 @@
-//! From values to text: the compact form that we send, and the form of CPython's server.
+//! Encodes values as text: compact requests, and answers as CPython's server writes them.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -8,20 +8,19 @@ use std::slice;
 use super::number::repr;
 use super::value::{Call, Reply, Struct, Value};
 
-/// How many arrays and structs inside each other rosmaster can still return. Its Python may go
-/// 1000 calls deep, and marshalling takes two a level. Measured with Python 3.11 on the real one,
-/// which marshals every reply from the same depth.
+/// Deepest nesting that rosmaster can return. Its Python allows 1000 nested calls, and marshalling takes two
+/// a level. Measured with Python 3.11 on a real one, which marshals every reply from the same depth.
 pub(crate) const MAX_REPLY_DEPTH: usize = 492;
 
 /// Bytes in one line of base64: 76 characters.
 const BASE64_LINE: usize = 57;
 
-/// Writes a request in few bytes.
+/// Encodes a request compactly.
 ///
-/// Its forms are those that CPython, and roscpp's much pickier xmlrpcpp, both take: untyped strings
-/// and `i4`, nothing self-closing but nil, no white space between tags. A carriage return goes as a
-/// reference, because a bare one would arrive as a line feed. Characters that XML does not have
-/// (they cannot come out of a decoded document) go as they are, and the other side refuses them.
+/// Uses only forms that both CPython and roscpp's much stricter xmlrpcpp accept: untyped strings and `i4`, no
+/// self-closing elements except nil, no white space between tags. A carriage return is written as a
+/// reference, because XML reads a bare one as a line feed. Characters that XML lacks (a decoded document has
+/// none) are written unchanged, and the other side refuses them.
 pub fn encode_call(call: &Call) -> Vec<u8> {
     let mut writer = Writer::request(&call.method);
     for param in &call.params {
@@ -33,11 +32,11 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Writes an answer as rosmaster does, byte for byte: as `_marshaled_dispatch` of CPython's
+/// Encodes an answer byte for byte like rosmaster: as `_marshaled_dispatch` of CPython's
 /// `SimpleXMLRPCServer`.
 ///
-/// A value that it cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes the
-/// fault that it answers then. Like there, a date's text is not escaped.
+/// A value that rosmaster cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes its fault
+/// for that. As there, a date's text is not escaped.
 ///
 /// ```
 /// use rosrescue::xmlrpc::{Reply, Value, decode_reply, encode_reply};
@@ -72,24 +71,24 @@ fn encode_fault(code: i32, text: &str) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Room for a long text, beyond 32 MiB: what is larger the C library maps for itself, gives back when
-/// it is freed, and does not take as a hint to keep more of what is freed later. Pages that nobody
-/// writes to are none.
+/// Initial capacity for a long text, beyond 32 MiB. The C library maps such large memory separately, returns
+/// it when it is freed, and does not keep more of later freed memory because of it. Pages that are never
+/// written take no memory.
 const ROOM: usize = 33 << 20;
 
-/// A request or an answer whose only value is an array, written element by element: as text it takes
-/// a tenth of the memory that all of its values would take.
+/// A request or an answer whose only value is an array, encoded element by element: as text it takes a tenth
+/// of the memory of its values.
 pub struct ListWriter(Writer);
 
 impl ListWriter {
-    /// A request of `method`, as [`encode_call`] writes it.
+    /// A request of `method`, as from [`encode_call`].
     pub fn request(method: &str) -> Self {
         let mut writer = Writer::request(method);
         writer.raw("<param>");
         Self::open(writer)
     }
 
-    /// An answer, as [`encode_reply`] writes it.
+    /// An answer, as from [`encode_reply`].
     pub fn answer() -> Self {
         Self::open(Writer::answer())
     }
@@ -127,7 +126,7 @@ enum Form {
     Python,
 }
 
-/// An array or struct that is being written.
+/// An array or struct being encoded.
 enum Open<'v> {
     Array(slice::Iter<'v, Value>),
     Struct {
@@ -139,7 +138,7 @@ enum Open<'v> {
 struct Writer {
     form: Form,
     out: String,
-    /// Why CPython would have raised, the first time. What is written after that is of no use.
+    /// The first error that CPython would have raised. The text is useless after that.
     refusal: Option<&'static str>,
 }
 
@@ -179,7 +178,7 @@ impl Writer {
         self.out.push_str(text);
     }
 
-    /// A tag at whose end CPython breaks the line.
+    /// A tag after which CPython breaks the line.
     fn line(&mut self, text: &str) {
         self.out.push_str(text);
         if self.form == Form::Python {
@@ -215,7 +214,7 @@ impl Writer {
         self.value_at(value, 0);
     }
 
-    /// One value inside `outer` arrays, of any depth and without recursion.
+    /// One value inside `outer` arrays, of any depth, without recursion.
     fn value_at(&mut self, value: &Value, outer: usize) {
         let mut open: Vec<Open<'_>> = Vec::new();
         let mut next = Some(value);
@@ -313,19 +312,18 @@ impl Writer {
     }
 }
 
-/// The text of the fault that rosmaster answers if this value is inside `depth` arrays and structs
-/// of a reply.
+/// The text of rosmaster's fault for this value inside `depth` arrays and structs of a reply.
 pub(crate) fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
     match value {
         _ if depth > MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
         Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
-        // Python calls more functions for these.
+        // Python nests more function calls for these.
         Value::Double(_) | Value::DateTime(_) if depth >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         _ => None,
     }
 }
 
-/// The fault of a reply that is nested too deep. What rosmaster says depends on what it was doing.
+/// The fault for a reply with too many levels. rosmaster's text depends on where it failed.
 pub(crate) const TOO_DEEP: &str = "<class 'RecursionError'>:maximum recursion depth exceeded";

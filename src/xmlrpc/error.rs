@@ -2,25 +2,24 @@
 
 use thiserror::Error;
 
-/// Why a document was not decoded: CPython would raise too, or it would take something that is
-/// deliberately not decoded here (see [`DecodeError::Unsupported`]).
+/// Why a document was not decoded: CPython would raise too, or would accept something that is deliberately
+/// not decoded here (see [`DecodeError::Unsupported`]).
 ///
-/// Never a reason to fail a call: the bytes can still be forwarded as they came, and whoever gets
-/// them judges them.
+/// Never a reason to fail a call: the bytes can be forwarded unchanged, and the receiver decides.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum DecodeError {
     /// Expat refuses it too.
     #[error("not well-formed XML at byte {at}: {what}; forward the body as it came")]
     Syntax {
-        /// Where in the body, after a byte order mark.
+        /// Byte in the body, not counting a byte order mark.
         at: usize,
         what: &'static str,
     },
-    /// CPython would take it, but no known ROS client sends it; not decoding beats decoding wrongly.
+    /// CPython would accept it, but no known ROS client sends it; not decoding is better than decoding
+    /// wrongly.
     #[error("not decoded here: {what} at byte {at}; forward the body as it came")]
     Unsupported {
-        /// Where in the body, after a byte order mark.
         at: usize,
         what: &'static str,
     },
@@ -30,21 +29,19 @@ pub enum DecodeError {
     /// The bytes are not in the document's encoding.
     #[error("byte {at} is not {encoding}; forward the body as it came")]
     NotText {
-        /// Where in the body, after a byte order mark.
         at: usize,
         encoding: &'static str,
     },
-    /// Arrays and structs, or elements, lie inside each other beyond the limit.
+    /// Too many levels of arrays, structs or elements.
     #[error("nested deeper than {limit} levels at byte {at}; forward the body as it came")]
     TooDeep {
-        /// Where in the body, after a byte order mark.
         at: usize,
         limit: usize,
     },
-    /// A `<value>` holds an element that is no type.
+    /// A `<value>` holds an element that is not a type.
     #[error("unknown type <{tag}> at byte {at}; forward the body as it came")]
     UnknownType {
-        /// Behind the tag.
+        /// Byte after the tag.
         at: usize,
         /// Its name without a prefix.
         tag: String,
@@ -52,18 +49,17 @@ pub enum DecodeError {
     /// The text of a value does not fit its type.
     #[error("{text:?} is no {tag} (before byte {at}); forward the body as it came")]
     BadText {
-        /// Behind the end of the element.
+        /// Byte after the end of the element.
         at: usize,
         tag: &'static str,
         /// The text, cut to a few characters.
         text: String,
     },
-    /// Well-formed, but not the call or reply that was asked for.
+    /// Well-formed, but not the expected call or reply.
     #[error("not a {wanted}: {what}; forward the body as it came")]
     Shape {
         /// `call` or `reply`.
         wanted: &'static str,
-        /// What is missing or too much.
         what: &'static str,
     },
 }

@@ -2,14 +2,14 @@
 
 use super::value::Value;
 
-/// How many digits Python's `int()` takes from text (`sys.int_info.default_max_str_digits`, since
-/// 3.11.0; leading zeros count).
+/// Most digits that Python's `int()` accepts in text (`sys.int_info.default_max_str_digits`, since 3.11.0;
+/// leading zeros count).
 const MAX_DIGITS: usize = 4300;
 
-/// The characters that Python strips off a number, as far as they are ASCII and in XML.
+/// The characters that Python strips off a number, limited to ASCII and XML.
 const SPACE: [char; 4] = [' ', '\t', '\n', '\r'];
 
-/// Python's `int(text)`, for text in ASCII.
+/// Python's `int(text)`, for ASCII text.
 pub(super) fn int(text: &str) -> Option<Value> {
     if text.len() <= MAX_DIGITS
         && let Ok(number) = text.parse()
@@ -38,10 +38,10 @@ pub(super) fn int(text: &str) -> Option<Value> {
     })
 }
 
-/// Python's `float(text)`, for text in ASCII. Every `nan` becomes the same one, as their signs and
-/// payloads are not in Python's text for them.
+/// Python's `float(text)`, for ASCII text. All `nan`s become the same one, because Python's text does not
+/// show their signs and payloads.
 pub(super) fn float(text: &str) -> Option<f64> {
-    // Without blanks and underscores, Rust takes exactly what Python takes.
+    // Without blanks and underscores, Rust accepts exactly what Python accepts.
     let number: f64 = match text.parse() {
         Ok(number) => number,
         Err(_) => without_underscores(text.trim_matches(SPACE))?
@@ -51,7 +51,7 @@ pub(super) fn float(text: &str) -> Option<f64> {
     Some(if number.is_nan() { f64::NAN } else { number })
 }
 
-/// `text` without its underscores; nothing if one of them is not between two digits.
+/// `text` without its underscores; none if one of them is not between two digits.
 fn without_underscores(text: &str) -> Option<String> {
     let mut plain = String::with_capacity(text.len());
     let mut parts = text.split('_').peekable();
@@ -68,8 +68,8 @@ fn without_underscores(text: &str) -> Option<String> {
     Some(plain)
 }
 
-/// Python's `repr(number)`: the fewest digits that mean this number, with an exponent below 1e-4
-/// and from 1e16 on.
+/// Python's `repr(number)`: the fewest digits that identify the number, with an exponent below 1e-4 and from
+/// 1e16 on.
 pub(super) fn repr(number: f64) -> String {
     if number.is_nan() {
         return "nan".to_owned();
@@ -102,16 +102,16 @@ pub(super) fn repr(number: f64) -> String {
     format!("{sign}{digits}")
 }
 
-/// The fewest digits that mean this number, as `d.ddde-7`.
+/// The fewest digits that identify the number, as `d.ddde-7`.
 ///
-/// Where two texts of that length are equally near, Rust takes the upper and Python the even one
-/// (-823967287502993.25 is `…993.3` and `…993.2`); rounding to so many digits settles it as Python does.
+/// If two texts of that length are equally near, Rust takes the upper and Python the even one
+/// (-823967287502993.25 is `…993.3` and `…993.2`). Rounding to that many digits gives Python's.
 fn shortest(number: f64) -> String {
     let shortest = format!("{number:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
     let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
-    // Two texts of up to 15 digits mean the same number only below 1e-307, and the numbers there have
-    // far too many digits to lie halfway.
+    // Two texts of up to 15 digits identify the same number only below 1e-307, and the numbers there have far
+    // too many digits to lie halfway.
     if digits <= 15 {
         return shortest;
     }
@@ -123,8 +123,8 @@ fn shortest(number: f64) -> String {
     }
 }
 
-/// Python's `binascii.a2b_base64(text)`, lenient as `base64.decodebytes` uses it: characters that
-/// are not in the alphabet are passed over, and what follows a complete padding is not read.
+/// Python's `binascii.a2b_base64(text)`, lenient as in `base64.decodebytes`: characters outside the alphabet
+/// are skipped, and text after complete padding is ignored.
 pub(super) fn base64_bytes(text: &str) -> Option<Vec<u8>> {
     let mut bytes = Vec::with_capacity(text.len() / 4 * 3);
     let mut place = 0_u8;

@@ -8,13 +8,12 @@ use quick_xml::reader::Reader;
 use super::error::DecodeError;
 use super::scan::{checked_attributes, is_in_xml};
 
-/// The document's text behind a byte order mark.
+/// The document's text, without a byte order mark.
 ///
 /// # Errors
 ///
-/// An encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython every
-/// codec with 8 bits), bytes that are not in it, characters that are not in XML, or a bad
-/// declaration.
+/// An encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython every 8-bit
+/// codec), bytes that do not fit it, characters that XML lacks, or a bad declaration.
 pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     let encoding = match Reader::from_reader(body).read_event() {
         Ok(Event::Decl(declaration)) => declared(&declaration)?,
@@ -36,7 +35,7 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
         "ISO-8859-1" => body.iter().map(|&b| char::from(b)).collect(),
         _ => return Err(DecodeError::Encoding { name }),
     };
-    // A second mark is text, but quick-xml would pass over it.
+    // A second mark is text, but quick-xml would skip it.
     let second = text.starts_with('\u{feff}').then_some(0);
     if let Some(at) = second.or_else(|| text.find(|c| !is_in_xml(c))) {
         let what = "a character that XML does not have";

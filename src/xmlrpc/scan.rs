@@ -1,9 +1,9 @@
-//! XML as expat takes it, as a row of events.
+//! XML as expat accepts it, as a sequence of events.
 //!
-//! CPython reads XML-RPC with expat, so what expat refuses must be refused: a document that is
-//! decoded here although the master faulted it would be a write that never was. quick-xml finds
-//! the markup; the rules of XML that it leaves to its user are checked here. What expat takes and
-//! no XML-RPC client writes (a document type, names beyond ASCII) is refused as unsupported.
+//! CPython reads XML-RPC with expat, so everything that expat refuses must be refused: a document decoded
+//! here but faulted by the master would be recorded as a write that never happened. quick-xml finds the
+//! markup; the XML rules that it does not check are checked here. What expat accepts but no XML-RPC client
+//! writes (a document type, names beyond ASCII) is refused as unsupported.
 
 use std::borrow::Cow;
 
@@ -15,29 +15,29 @@ use quick_xml::reader::Reader;
 
 use super::error::DecodeError;
 
-/// One event. An empty element is a start and an end.
+/// One event. An empty element gives a start and an end.
 pub(super) enum Event<'a> {
     Start(BytesStart<'a>),
     End(BytesEnd<'a>),
-    /// A piece of text; its line ends are already made `\n` where XML's rule counts.
+    /// A piece of text; its line ends are `\n` already unless they are kept.
     Text(Cow<'a, str>),
-    /// A reference, and the character that it stands for.
+    /// A reference and its character.
     Reference(BytesRef<'a>, Cow<'static, str>),
 }
 
-/// What becomes of line ends in text.
+/// How line ends in text are treated.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum LineEnds {
-    /// Each becomes `\n`, as XML has it.
+    /// Each becomes `\n`, as XML requires.
     Normal,
-    /// They stay.
+    /// Unchanged.
     Kept,
 }
 
-/// Walks over a document and checks it on the way.
+/// Reads a document and checks it.
 pub(super) struct Scanner<'a> {
     reader: Reader<&'a [u8]>,
-    /// How many elements are open.
+    /// Number of open elements.
     open: usize,
     max_open: usize,
     line_ends: LineEnds,
@@ -45,8 +45,7 @@ pub(super) struct Scanner<'a> {
 }
 
 impl<'a> Scanner<'a> {
-    /// Begins at the start of `text`, which has only characters of XML; `max_open` bounds the open
-    /// elements.
+    /// Starts at the beginning of `text`, which has only XML characters. `max_open` limits the open elements.
     pub(super) fn new(text: &'a str, max_open: usize, line_ends: LineEnds) -> Self {
         let mut reader = Reader::from_str(text);
         let config = reader.config_mut();
@@ -61,12 +60,12 @@ impl<'a> Scanner<'a> {
         }
     }
 
-    /// How many bytes have been read.
+    /// Number of bytes read.
     pub(super) fn at(&self) -> usize {
         offset(self.reader.buffer_position())
     }
 
-    /// The next event; nothing at the end of a whole document.
+    /// The next event; none at the end of a whole document.
     pub(super) fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         loop {
             let at = self.at();
@@ -95,7 +94,7 @@ impl<'a> Scanner<'a> {
                 Markup::Text(_) | Markup::CData(_) | Markup::GeneralRef(_) if is_outside => {
                     "text outside of the root element"
                 }
-                // Looking for one character alone is much faster, and encoders write `&gt;`.
+                // Searching for one character is much faster, and encoders write `&gt;`.
                 Markup::Text(text) if text.contains('>') && text.contains("]]>") => "]]> in text",
                 Markup::Text(text) => {
                     return Ok(Some(Event::Text(match self.line_ends {
@@ -129,14 +128,14 @@ impl<'a> Scanner<'a> {
                 Markup::Eof if !is_outside => "an element is not closed",
                 Markup::Eof if !self.seen_root => "there is no element",
                 Markup::Eof => return Ok(None),
-                // Empty elements come as a start and an end.
+                // Empty elements are reported as a start and an end.
                 Markup::Comment(_) | Markup::Empty(_) => continue,
             };
             return Err(DecodeError::Syntax { at, what });
         }
     }
 
-    /// What stopped quick-xml, and where.
+    /// quick-xml's error and its position.
     fn broken(&self, error: &Error) -> DecodeError {
         let what = match error {
             Error::IllFormed(IllFormedError::UnclosedReference) => "a reference without semicolon",
@@ -153,7 +152,7 @@ fn offset(position: u64) -> usize {
     usize::try_from(position).unwrap_or(usize::MAX)
 }
 
-/// The character that a reference stands for.
+/// The character of a reference.
 fn character(reference: &BytesRef<'_>) -> Option<Cow<'static, str>> {
     match reference.resolve_char_ref().ok()? {
         Some(character) => is_in_xml(character).then(|| character.to_string().into()),
@@ -161,7 +160,7 @@ fn character(reference: &BytesRef<'_>) -> Option<Cow<'static, str>> {
     }
 }
 
-/// The attributes of a start tag or the like, at byte `at`.
+/// The attributes of a tag or declaration at byte `at`.
 pub(super) fn checked_attributes<'t>(
     tag: &'t BytesStart<'_>,
     at: usize,
@@ -171,7 +170,7 @@ pub(super) fn checked_attributes<'t>(
     let check = |attribute: Attribute<'t>| {
         let name = attribute.key.0;
         check_name(name, at)?;
-        // quick-xml takes a name right behind another value, too. Both are parts of `raw`.
+        // quick-xml accepts a name directly after another value. Both are parts of `raw`.
         let start = name.as_ptr().addr().wrapping_sub(raw.as_ptr().addr());
         let before = raw.as_bytes().get(..start).and_then(<[u8]>::last);
         if !before.is_some_and(|&byte| is_space(byte)) {
@@ -189,7 +188,7 @@ pub(super) fn checked_attributes<'t>(
         .collect()
 }
 
-/// Whether this is a name, and in ASCII.
+/// Checks that this is an ASCII name.
 fn check_name(name: &str, at: usize) -> Result<(), DecodeError> {
     let is_inner = |b: u8| b.is_ascii_digit() || b == b'-' || b == b'.';
     let is_name = |b: u8| b.is_ascii_alphabetic() || b == b'_' || b == b':' || is_inner(b);
@@ -208,7 +207,7 @@ fn is_space(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\n' | b'\r')
 }
 
-/// Whether XML 1.0 has this character. Expat knows only the first plane's two non-characters.
+/// Whether XML 1.0 allows this character. Expat knows only the first plane's two non-characters.
 pub(super) fn is_in_xml(character: char) -> bool {
     matches!(character, '\t' | '\n' | '\r' | ' '..='\u{fffd}' | '\u{10000}'..)
 }

@@ -2,31 +2,31 @@
 
 use indexmap::IndexMap;
 
-/// A struct: like a Python dict, it keeps the order in which its keys came.
+/// A struct. Keeps the order of its keys, like a Python dict.
 pub type Struct = IndexMap<String, Value>;
 
 /// One XML-RPC value.
 ///
-/// Equality is that of the wire: two doubles are equal if their bits are, so `nan` equals `nan` and
-/// `-0.0` differs from `0.0`; `1`, `1.0` and `true` all differ. Structs are equal only if the order
-/// of their keys is the same too, because that order is visible in replies.
+/// Values are equal if their wire forms are: doubles with the same bits, so `nan` equals `nan` and `-0.0`
+/// differs from `0.0`; `1`, `1.0` and `true` all differ. Structs are equal only with the same order of keys,
+/// because replies show it.
 #[derive(Clone, Debug)]
 pub enum Value {
-    /// `<nil/>`: rosmaster takes it inside values and can never return it.
+    /// `<nil/>`: rosmaster accepts it inside values but can never return it.
     Nil,
     /// `<boolean>`.
     Bool(bool),
-    /// `<int>` or `<i4>`: what fits 32 bits.
+    /// `<int>` or `<i4>`: fits 32 bits.
     Int(i32),
-    /// An integer beyond 32 bits, in canonical decimal: rosmaster takes it and can never return it.
+    /// An integer beyond 32 bits, in canonical decimal: rosmaster accepts it but can never return it.
     BigInt(String),
     /// `<double>`.
     Double(f64),
     /// `<string>`, or text without a type.
     String(String),
-    /// `<dateTime.iso8601>`: its text, which CPython keeps without looking at it.
+    /// `<dateTime.iso8601>`: its text, which CPython does not parse.
     DateTime(String),
-    /// `<base64>`: the bytes.
+    /// `<base64>`: the decoded bytes.
     Base64(Vec<u8>),
     /// `<array>`.
     Array(Vec<Self>),
@@ -55,7 +55,7 @@ impl PartialEq for Value {
 impl Eq for Value {}
 
 impl Value {
-    /// About how much memory this takes, in bytes.
+    /// Approximate memory use, in bytes.
     pub fn size(&self) -> usize {
         let within = match self {
             Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),
@@ -72,7 +72,6 @@ impl Value {
         size_of::<Self>() + within
     }
 
-    /// The text, if this is a string.
     pub fn as_str(&self) -> Option<&str> {
         match self {
             Self::String(text) => Some(text),
@@ -80,7 +79,6 @@ impl Value {
         }
     }
 
-    /// The number, if this is an integer of 32 bits.
     pub fn as_int(&self) -> Option<i32> {
         match self {
             Self::Int(number) => Some(*number),
@@ -88,7 +86,6 @@ impl Value {
         }
     }
 
-    /// The elements, if this is an array.
     pub fn as_array(&self) -> Option<&[Self]> {
         match self {
             Self::Array(elements) => Some(elements),
@@ -96,7 +93,6 @@ impl Value {
         }
     }
 
-    /// The members, if this is a struct.
     pub fn as_struct(&self) -> Option<&Struct> {
         match self {
             Self::Struct(members) => Some(members),
@@ -177,13 +173,13 @@ impl Call {
 /// One answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reply {
-    /// What the method returned.
+    /// The method's result.
     Value(Value),
-    /// The method, or the server, raised an error.
+    /// An error of the method or the server.
     Fault {
-        /// CPython's server always says 1.
+        /// Always 1 from CPython's server.
         code: i32,
-        /// CPython's server says `<class 'NAME'>:TEXT`.
+        /// `<class 'NAME'>:TEXT` from CPython's server.
         text: String,
     },
 }
