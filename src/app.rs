@@ -41,7 +41,7 @@ use self::{
 
 /// Bodies of the largest size that may be in memory at the same time.
 const LARGE_BODIES: usize = 4;
-/// How long connections have to end at the stop.
+/// How long connections may take to end at the stop.
 const DRAIN: Duration = Duration::from_millis(500);
 
 /// Why rosrescue cannot start or continue. Exit status 1.

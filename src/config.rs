@@ -167,7 +167,7 @@ impl Config {
         Self::common(&args.common, env, listen, MasterUri { host, port }, master)
     }
 
-    /// The configuration of `rosrescue proxy` with `args` in the environment `env` on the computer `hostname`.
+    /// As [`Self::core`], for `rosrescue proxy`.
     pub fn proxy(
         args: &ProxyArgs,
         env: Lookup<'_>,

@@ -68,10 +68,7 @@ pub enum ProcessError {
     PortInUse { port: u16 },
     /// The system refused to start it.
     #[error("cannot start `{}`: {source}", program.display())]
-    Spawn {
-        program: PathBuf,
-        source: io::Error,
-    },
+    Spawn { program: PathBuf, source: io::Error },
 }
 
 #[derive(Debug)]

@@ -37,10 +37,7 @@ pub enum ConnectError {
     Refused { master: String },
     /// There is no route, or no answer.
     #[error("cannot reach {master}: {source}")]
-    Unreachable {
-        master: String,
-        source: io::Error,
-    },
+    Unreachable { master: String, source: io::Error },
 }
 
 /// A call without a reply. Whether the master may have run it decides what may follow.

@@ -145,15 +145,10 @@ pub enum SnapshotError {
     },
     /// The content differs from what was written.
     #[error("the snapshot's check sum is {found:08x}, not {expected:08x}")]
-    Checksum {
-        expected: u32,
-        found: u32,
-    },
+    Checksum { expected: u32, found: u32 },
     /// The bytes are as written, but are not a valid snapshot.
     #[error("the snapshot is whole and does not make sense: {why}")]
-    Content {
-        why: String,
-    },
+    Content { why: String },
 }
 
 /// A damaged place in a file.

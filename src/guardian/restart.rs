@@ -51,9 +51,7 @@ pub enum Next {
     /// End with this status.
     Exit(i32),
     /// Start another worker.
-    Restart {
-        pause: Duration,
-    },
+    Restart { pause: Duration },
 }
 
 /// Decides whether and when to restart the worker.

@@ -10,6 +10,7 @@ const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 /// More parameters than any method takes.
 const TOO_MANY: usize = 5;
 
+/// A call to a master, parsed once.
 ///
 /// ```
 /// use rosrescue::master::{Kind, Method, Request};

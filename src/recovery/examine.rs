@@ -120,9 +120,11 @@ pub(crate) enum Known {
     ServedIfPresent,
     /// If it bears the token, it has been injected but never confirmed.
     InjectedIfPresent,
-    /// This process has just started it on a free loopback port, as the successor of one that it served. So it
-    /// is empty and not read before the injection; reading back would show if it were not.
-    New { pid: i32 },
+    /// This process has just started it on a free loopback port, as the successor of one that it served. So
+    /// it is empty and not read before the injection; reading back would show if it were not.
+    New {
+        pid: i32,
+    },
 }
 
 /// The state to bring to a master, and what it holds now.

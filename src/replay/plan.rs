@@ -34,8 +34,8 @@ const MOST_MISMATCHES: usize = 20;
 ///
 /// What it holds is newer, and stays. A node that has another address there is left out, so that the master
 /// shuts no node down; so is a service that has a provider. Parameters are merged, and ours win. If the new
-/// master has subscribers of a topic that lacks several publishers, they are unregistered first and registered
-/// again before the last publisher. So they are notified once, with the complete list; every partial list
+/// master has subscribers of a topic that lacks several publishers, they are unregistered first and
+/// registered again before the last publisher. So they are notified once, with the complete list; every partial list
 /// would make a roscpp node drop its live connections.
 ///
 /// # Memory

@@ -17,8 +17,8 @@ pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 /// incarnation's number. A master with only the first was ours and has been succeeded since.
 ///
 /// Each makes a node reference that only `lookupNode` finds: it has no registration, parameter or topic type
-/// that another read could show. The subscribed key is outside the tree that starts at `/`, so no `setParam` or
-/// `deleteParam` below `/`, or of `/` itself, ever queues a callback to it.
+/// that another read could show. The subscribed key is outside the tree that starts at `/`, so no `setParam`
+/// or `deleteParam` below `/`, or of `/` itself, ever queues a callback to it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Token {
     session: String,

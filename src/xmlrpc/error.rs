@@ -19,25 +19,16 @@ pub enum DecodeError {
     /// CPython would accept it, but no known ROS client sends it; not decoding is better than decoding
     /// wrongly.
     #[error("not decoded here: {what} at byte {at}; forward the body as it came")]
-    Unsupported {
-        at: usize,
-        what: &'static str,
-    },
+    Unsupported { at: usize, what: &'static str },
     /// The XML declaration names another encoding than UTF-8, US-ASCII or ISO-8859-1.
     #[error("encoding {name:?} is not decoded here; forward the body as it came")]
     Encoding { name: String },
     /// The bytes are not in the document's encoding.
     #[error("byte {at} is not {encoding}; forward the body as it came")]
-    NotText {
-        at: usize,
-        encoding: &'static str,
-    },
+    NotText { at: usize, encoding: &'static str },
     /// Too many levels of arrays, structs or elements.
     #[error("nested deeper than {limit} levels at byte {at}; forward the body as it came")]
-    TooDeep {
-        at: usize,
-        limit: usize,
-    },
+    TooDeep { at: usize, limit: usize },
     /// A `<value>` holds an element that is not a type.
     #[error("unknown type <{tag}> at byte {at}; forward the body as it came")]
     UnknownType {

@@ -6,9 +6,9 @@
 //! - {seq: 8, call: "setParam", params: [...]} #H R
 //! ```
 //!
-//! S is the number of the last record that the snapshot contains. C is of the snapshot, H of the first line before it, R of the record's line before it. All are
-//! CRC-32C in eight lower-case hexadecimal digits. Every record repeats H, the *stamp*: a whole
-//! line that a disk brings back from another life of the file is told by it.
+//! S is the number of the last record in the snapshot. C is the check sum of the snapshot, H of the first
+//! line before it, R of the record's line before it. All are CRC-32C in eight lower-case hexadecimal digits. Every
+//! record repeats H, the *stamp*: it exposes a whole line that a disk brings back from an older file.
 
 use std::io::{BufRead, Write};
 use std::ops::Range;

@@ -26,10 +26,7 @@ pub enum Change {
     Replaced,
     /// Truncated or appended to.
     #[error("it has {found} bytes instead of {expected}")]
-    Length {
-        expected: u64,
-        found: u64,
-    },
+    Length { expected: u64, found: u64 },
     /// Overwritten in place.
     #[error("a part of it was overwritten")]
     Content,
