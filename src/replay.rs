@@ -2,6 +2,7 @@
 //!
 //! * [`Token`] and [`Inspection`]: recognising a master, and reading the state of an unknown one.
 //! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
+//! * [`treatment`]: what is done with a master, by what it bears and what is known of it.
 //! * [`reconcile`]: the state for a master that was unreachable.
 //! * [`accepted`]: which parts of a call a master has executed, by its reply.
 //! * [`difference`]: how two states differ, for people.
@@ -13,6 +14,7 @@ mod plan;
 mod reconcile;
 mod restore;
 mod token;
+mod treatment;
 
 pub use accepted::{Accepted, Answered, accepted};
 pub use difference::difference;
@@ -20,3 +22,4 @@ pub use inspect::{Inspection, NotAMaster};
 pub use plan::{Plan, Skipped};
 pub use reconcile::{Authority, may_hold, reconcile};
 pub use token::{Bears, Token};
+pub use treatment::{Known, Treatment, treatment};

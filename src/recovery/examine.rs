@@ -15,7 +15,7 @@ use crate::{
     ledger::{Basis, Ledger},
     lifecycle::{Input, Probing, Supervision},
     master::{Counts, Master, Method, Request},
-    replay::{self, Authority, Bears, Inspection, Plan, Token},
+    replay::{self, Authority, Bears, Inspection, Known, Plan, Token, Treatment},
     status::stats::Stats,
     upstream::{
         CallError, Connection, Upstream,
@@ -110,21 +110,6 @@ pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
             plan,
         }
     })
-}
-
-/// What is known of a master before it is examined.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum Known {
-    Nothing,
-    /// If it bears the token, this process has served it before.
-    ServedIfPresent,
-    /// If it bears the token, it has been injected but never confirmed.
-    InjectedIfPresent,
-    /// This process has just started it on a free loopback port, as the successor of one that it served. So
-    /// it is empty and not read before the injection; reading back would show if it were not.
-    New {
-        pid: i32,
-    },
 }
 
 /// The state to bring to a master, and what it holds now.
@@ -270,31 +255,19 @@ impl Examiner {
             pending,
         } = self.ledger.begin_injection();
         let before = self.ledger.token();
-        // An empty mirror takes over a running system.
-        let takes_over = !found.is_empty() && mirror.is_empty();
-        let (state, replaced) = match bears {
-            Bears::Nothing => {
-                examination.outcome = if takes_over {
-                    Outcome::Adopted
-                } else if mirror.is_empty() {
-                    Outcome::Begun
-                } else {
-                    Outcome::Injected
-                };
-                (mirror.clone(), None)
-            }
-            // It was succeeded by another incarnation: the mirror is newer than anything it holds.
-            Bears::Earlier => {
-                examination.outcome = Outcome::Injected;
-                (mirror.clone(), Some(before))
-            }
-            Bears::Present => {
-                let (authority, outcome) = match manner.known {
-                    Known::ServedIfPresent => (Authority::PendingWrites, Outcome::Reconciled),
-                    Known::Nothing => (Authority::Mirror, Outcome::Adopted),
-                    _ => (Authority::Mirror, Outcome::Injected),
-                };
-                examination.outcome = outcome;
+        let treatment = replay::treatment(bears, manner.known, mirror.is_empty(), found.is_empty());
+        examination.outcome = match treatment {
+            Treatment::Begin => Outcome::Begun,
+            Treatment::TakeOver => Outcome::Adopted,
+            Treatment::Inject | Treatment::Replace => Outcome::Injected,
+            Treatment::Reconcile(Authority::PendingWrites) => Outcome::Reconciled,
+            Treatment::Reconcile(_) if manner.known == Known::Nothing => Outcome::Adopted,
+            Treatment::Reconcile(_) => Outcome::Injected,
+        };
+        let (state, replaced) = match treatment {
+            Treatment::Begin | Treatment::TakeOver | Treatment::Inject => (mirror.clone(), None),
+            Treatment::Replace => (mirror.clone(), Some(before)),
+            Treatment::Reconcile(authority) => {
                 let state = replay::reconcile(&mirror, &found, &pending, authority);
                 // Reading a master does not show its parameter subscribers.
                 let hidden = |call: &Request| {
