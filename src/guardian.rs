@@ -60,12 +60,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
     let mut worker = Worker::start(listeners)?;
-    let mut asked = None;
     loop {
-        let end = worker.attend(&signals, |signal| {
-            restarts.stop();
-            asked = Some(signal);
-        });
+        let end = worker.attend(&signals, |signal| restarts.stop(signal));
         let pause = match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
             Next::Exit(status) => return Ok(status),
             Next::Restart { pause } => pause,
@@ -81,8 +77,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         }
         let stop;
         (worker, stop) = start_again(listeners, &signals, pause)?;
-        if let Some(signal) = stop.or(asked) {
-            restarts.stop();
+        if let Some(signal) = stop.or_else(|| restarts.stopped_by()) {
+            restarts.stop(signal);
             worker.pass_on(signal);
         }
     }

@@ -14,8 +14,6 @@ const PAUSE_LEAST: Duration = Duration::from_millis(500);
 /// The longest pause. Six of them fit into a minute, so workers that keep dying quickly stay at it.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
-/// The signal that a process cannot handle.
-const SIGKILL: i32 = 9;
 /// The exit status of a Rust program that panicked.
 const PANIC: i32 = 101;
 
@@ -63,15 +61,29 @@ pub struct Restarts {
     pause: Duration,
     /// Whether any worker has served.
     served: bool,
-    stopping: bool,
+    /// The signal that asks for the end.
+    stop: Option<i32>,
     /// The present worker was started to end what a killed one left running.
     cleaning: bool,
 }
 
 impl Restarts {
     /// After a stop signal no worker is restarted, except one to end what a killed one left running.
-    pub fn stop(&mut self) {
-        self.stopping = true;
+    pub fn stop(&mut self, signal: i32) {
+        self.stop = Some(signal);
+    }
+
+    /// The signal that asked for the end, if one did.
+    pub fn stopped_by(&self) -> Option<i32> {
+        self.stop
+    }
+
+    /// Whether a worker that was to stop ended otherwise, and may have left its master running.
+    fn died_stopping(&self, end: End) -> bool {
+        match end {
+            End::Signal(signal) => self.stop.is_some_and(|stop| stop != signal),
+            End::Code(code) => self.stop.is_some() && code == PANIC,
+        }
     }
 
     /// A worker has ended at `now`. `served`: whether it had answered calls.
@@ -81,12 +93,12 @@ impl Restarts {
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
         match end {
-            End::Signal(SIGKILL) if self.stopping && !self.cleaning => {
+            _ if self.died_stopping(end) && !self.cleaning => {
                 self.cleaning = true;
                 let pause = Duration::ZERO;
                 Next::Restart { pause }
             }
-            _ if self.stopping => Next::Exit(end.status()),
+            _ if self.stop.is_some() => Next::Exit(end.status()),
             End::Code(0) => Next::Exit(0),
             End::Code(code) if code != PANIC && !self.served => Next::Exit(code),
             _ => Next::Restart {
@@ -157,11 +169,10 @@ mod tests {
         let now = Instant::now();
         let mut restarts = Restarts::default();
         assert_eq!(restarts.ended(End::Code(0), true, now), Next::Exit(0));
-        restarts.stop();
+        restarts.stop(15);
         for (end, status) in [
             (End::Code(0), 0),
             (End::Code(130), 130),
-            (End::Code(PANIC), PANIC),
             (End::Signal(15), 143),
         ] {
             assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
@@ -170,5 +181,10 @@ mod tests {
         let pause = Duration::ZERO;
         assert_eq!(restarts.ended(KILLED, true, now), Next::Restart { pause });
         assert_eq!(restarts.ended(KILLED, true, now), Next::Exit(137));
+        let mut restarts = Restarts::default();
+        restarts.stop(15);
+        let panicked = End::Code(PANIC);
+        assert_eq!(restarts.ended(panicked, true, now), Next::Restart { pause });
+        assert_eq!(restarts.ended(panicked, true, now), Next::Exit(PANIC));
     }
 }
