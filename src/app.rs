@@ -24,7 +24,7 @@ use crate::{
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},
     ros_env::MasterUri,
     roscore::{self, Roscore},
-    server::{Server, calls::Calls, clients::Clients, idle::Idle, listener, pages::Pages},
+    server::{Server, body, calls::Calls, clients::Clients, idle::Idle, listener, pages::Pages},
     status::{Board, stats::Stats},
     upstream::{Upstream, pool::Pool},
     write_queue,
@@ -39,8 +39,6 @@ use self::{
     startup::{Beginning, begin, kernel_id},
 };
 
-/// Bodies of the largest size that may be in memory at the same time.
-const LARGE_BODIES: usize = 4;
 /// How long connections may take to end at the stop.
 const DRAIN: Duration = Duration::from_millis(500);
 
@@ -138,7 +136,7 @@ pub async fn run(
         config.probe_timeout,
         config.probing.count,
     ));
-    let (write_queue, worker) = write_queue::write_queue(
+    let (write_queue, drain) = write_queue::write_queue(
         ledger.clone(),
         upstream.clone(),
         gate.clone(),
@@ -219,7 +217,7 @@ pub async fn run(
         clients: clients.clone(),
         idle: Idle::among(config.max_connections),
         max_body: config.max_body,
-        bodies: Semaphore::new(LARGE_BODIES * (config.max_body >> 10)),
+        bodies: body::budget(config.max_body),
         stats,
         calls: Calls {
             gate: gate.clone(),
@@ -256,7 +254,7 @@ pub async fn run(
         ));
     }
     drop(server);
-    tasks.spawn(worker.run());
+    tasks.spawn(drain.run());
     tasks.spawn(checkpointer::run(
         ledger.clone(),
         config.checkpoint,

@@ -1,4 +1,7 @@
-//! Whether calls pass to the master. The recovery's driver is the only writer; any task may read and wait.
+//! Whether calls pass to the master. Any task may read and wait; the only [`Tx`] is the recovery's.
+//!
+//! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], `Examiner::inject` sets
+//! [`State::Injecting`], and `Examiner::open_gate` sets [`State::Open`].
 
 use std::time::Duration;
 

@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// Most pending writes beside which unregistrations without effect on the mirror are kept.
-const IDLE_PENDING: usize = 1000;
+const UNCHANGED_PENDING_MAX: usize = 1000;
 
 /// Memory for the answers to the reads of one multicall, in bytes. A few short reads of a large state could
 /// ask for any amount; larger ones wait for the master.
@@ -155,7 +155,11 @@ impl Ledger {
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
     /// Nodes are notified as by a master. Returns the journal's last record too: the earlier write that made
     /// this one redundant may be as new as that.
-    pub fn answer_idle(&self, now: Instant, write: &Request) -> Option<(Reply, Option<u64>)> {
+    pub fn answer_if_unchanged(
+        &self,
+        now: Instant,
+        write: &Request,
+    ) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         // An unregistration may concern a registration that is still on its way to the master.
         let idle = !write.calls().into_iter().any(is_unregistration)
@@ -285,7 +289,7 @@ impl Ledger {
         if !changes {
             // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
             // before the reply.
-            let room = inner.pending.calls().len() < IDLE_PENDING;
+            let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
         }
         if writes.is_empty() {

@@ -1,4 +1,5 @@
-//! Decides when to connect, examine, probe, spawn, kill, and when the gate opens and shuts.
+//! Decides when to connect, examine, probe, spawn, kill, and when calls may pass to the master and when no
+//! longer. In between, `recovery::examine` shuts the gate to writes for the time of an injection.
 //!
 //! A state machine without IO: the shell passes in what happened and when, and carries out the returned
 //! actions. It owns every deadline, so that each can be tested without waiting.
@@ -20,8 +21,8 @@ const DEATHS_AT_ONCE: usize = 5;
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause in a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that has served for this time ends a crash loop. A series of masters that live longer cannot
-/// reach more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`].
+/// A master that has served for this time ends the report of a crash loop. The pauses go on for as long as
+/// more than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
 /// How long a spawned master may take to listen. A Raspberry Pi with a slow card needs some seconds. A
 /// rosmaster whose port was taken stays alive without ever listening.

@@ -113,7 +113,7 @@ impl Driver {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
         let mut input = Input::Start { left, restored };
         loop {
-            self.note_death(input);
+            self.end_contact(input);
             let actions = self.lifecycle.on(Instant::now(), input);
             let deaths = self.lifecycle.deaths();
             self.board.update(|facts| facts.deaths = deaths);
@@ -149,8 +149,9 @@ impl Driver {
         }
     }
 
-    /// The master has died: drops the step under way.
-    fn note_death(&mut self, input: Input) {
+    /// After an input that ends the contact with the master: tells the lifecycle first whether that master had
+    /// answered, and drops the step under way.
+    fn end_contact(&mut self, input: Input) {
         if !matches!(
             input,
             Input::ConnectionLost | Input::Exited | Input::Unreachable | Input::NotAMaster

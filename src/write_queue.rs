@@ -3,9 +3,9 @@
 //! answers them, in the same order.
 
 pub(crate) mod batch;
+mod drain;
 mod outdated;
 mod round_trip;
-mod worker;
 
 use std::{sync::Arc, time::Duration};
 
@@ -15,7 +15,7 @@ use tokio::{
 };
 
 use self::batch::{Answer, Condition, Item};
-pub(crate) use self::worker::Worker;
+pub(crate) use self::drain::Drain;
 use crate::{
     gate,
     ledger::Ledger,
@@ -88,12 +88,12 @@ pub(crate) fn write_queue(
     gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
-) -> (WriteQueue, Worker) {
+) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
     let lost = Arc::new(Notify::new());
     let (tell_sent, sent) = watch::channel(None);
     let link = Link { ledger, upstream };
-    let worker = Worker::new(
+    let drain = Drain::new(
         rx,
         link,
         gate,
@@ -102,7 +102,7 @@ pub(crate) fn write_queue(
         lost.clone(),
         tell_sent,
     );
-    (WriteQueue { items, lost, sent }, worker)
+    (WriteQueue { items, lost, sent }, drain)
 }
 
 /// What a round trip needs.

@@ -40,7 +40,7 @@ pub struct Session {
     pub boot_id: String,
     /// Whether the session ended by an orderly stop.
     pub closed: bool,
-    /// The caller id that marks the master's incarnation.
+    /// The session's part of the incarnation token, equal to `id`; see [`Token`](crate::replay::Token).
     pub mark: String,
     /// The master's address, if there was one yet.
     pub master_uri: Option<String>,

@@ -51,6 +51,8 @@ pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
     with(true) != with(false)
 }
 
+/// Whether the recorded session goes on, and why: it does after a kill, and after an orderly stop or a boot
+/// only if one of its nodes is alive.
 pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     let Evidence {
         same_boot,

@@ -167,11 +167,14 @@ fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
     ledger.stand_in(now, &watch);
     let bye = call("unregisterPublisher", &["/n", "/gone", "http://n:1/"]);
-    assert!(ledger.answer_idle(now, &watch).is_some());
+    assert!(ledger.answer_if_unchanged(now, &watch).is_some());
     for calls in [vec![bye.clone()], vec![watch.clone(), bye.clone()]] {
-        assert_eq!(ledger.answer_idle(now, &Request::multicall(calls)), None);
+        assert_eq!(
+            ledger.answer_if_unchanged(now, &Request::multicall(calls)),
+            None
+        );
     }
-    assert_eq!(ledger.answer_idle(now, &bye), None);
+    assert_eq!(ledger.answer_if_unchanged(now, &bye), None);
 }
 
 /// What loggers say all the time takes no room, and does not outdate an injection that is made ready.
@@ -180,12 +183,12 @@ fn what_changes_nothing_leaves_no_trace() {
     let ledger = ledger();
     let now = Instant::now();
     let watch = call("subscribeParam", &["/n", "http://n:1/", "/a"]);
-    assert_eq!(ledger.answer_idle(now, &watch), None);
+    assert_eq!(ledger.answer_if_unchanged(now, &watch), None);
     ledger.stand_in(now, &watch);
     let (version, pending_before) = (ledger.version(), pending(&ledger));
     // There is no journal that it could have a place in.
     let expected = Some((answered(&watch, &mut Master::default()), None));
-    assert_eq!(ledger.answer_idle(now, &watch), expected);
+    assert_eq!(ledger.answer_if_unchanged(now, &watch), expected);
     assert_eq!(ledger.stand_in(now, &watch), expected);
     assert_eq!(
         (ledger.version(), pending(&ledger)),
@@ -237,10 +240,10 @@ fn what_takes_nothing_away_is_pending_within_limits() {
         ledger.stand_in(now, &bye(0));
     }
     assert_eq!(pending(&ledger), [bye(0)]);
-    for number in 0..2 * IDLE_PENDING {
+    for number in 0..2 * UNCHANGED_PENDING_MAX {
         ledger.stand_in(now, &bye(number));
     }
-    assert_eq!(pending(&ledger).len(), IDLE_PENDING);
+    assert_eq!(pending(&ledger).len(), UNCHANGED_PENDING_MAX);
     let publish = publish("/late");
     let reply = ledger.with_mirror(|mirror| answered(&publish, &mut mirror.clone()));
     ledger.record(now, 0, &[(&publish, &reply)]).unwrap();

@@ -24,6 +24,14 @@ const RATE: u64 = 64 << 10;
 /// hold a part of the budget each.
 static LAST: Semaphore = Semaphore::const_new(1);
 
+/// Bodies of the largest size that may be in memory at the same time.
+const LARGE_BODIES: usize = 4;
+
+/// Memory for large bodies, in KiB, where none is larger than `max_body` bytes.
+pub(crate) fn budget(max_body: usize) -> Semaphore {
+    Semaphore::new(LARGE_BODIES * (max_body >> 10))
+}
+
 /// Why there is no body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum BodyError {

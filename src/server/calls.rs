@@ -169,7 +169,7 @@ impl Calls {
         call: Option<Arc<Request>>,
     ) -> Result<HttpReply, Closed> {
         if self.gate.state() == State::Injecting
-            && let Some(reply) = self.answer_idle(call.as_deref()).await
+            && let Some(reply) = self.answer_if_unchanged(call.as_deref()).await
         {
             return Ok(reply);
         }
@@ -214,7 +214,7 @@ impl Calls {
                     }
                     patient = false;
                     self.slow.notify_one();
-                    if let Some(reply) = self.answer_idle(call).await {
+                    if let Some(reply) = self.answer_if_unchanged(call).await {
                         return Ok(reply);
                     }
                 }
@@ -233,9 +233,9 @@ impl Calls {
     }
 
     /// The mirror's answer to a write that changes nothing; none if it does.
-    async fn answer_idle(&self, call: Option<&Request>) -> Option<HttpReply> {
+    async fn answer_if_unchanged(&self, call: Option<&Request>) -> Option<HttpReply> {
         let call = call.filter(|call| call.is_answerable())?;
-        let (reply, seq) = self.ledger.answer_idle(Instant::now(), call)?;
+        let (reply, seq) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
         // The write that made this one redundant may not be on the disk yet.
         if let Some(seq) = self.ledger.to_await(seq) {
             self.ledger.durable(seq).await;

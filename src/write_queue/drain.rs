@@ -43,7 +43,7 @@ struct InFlight {
     done: Pin<Box<dyn Future<Output = Done> + Send>>,
 }
 
-pub(crate) struct Worker {
+pub(crate) struct Drain {
     link: Link,
     gate: gate::Rx,
     stats: &'static Stats,
@@ -76,7 +76,7 @@ struct Opaque {
     seq: Option<u64>,
 }
 
-impl Worker {
+impl Drain {
     pub(super) fn new(
         items: mpsc::Receiver<Item>,
         link: Link,

@@ -221,6 +221,29 @@ fn files_and_functions_that_documents_name_exist() {
 }
 
 #[test]
+fn tests_that_the_table_of_decisions_names_exist() {
+    let text = read(root().join("docs/architecture.md"));
+    let (_, table) = text.split_once("## Where it is decided").unwrap();
+    let table = table.split("\n## ").next().unwrap();
+    let sources: Vec<_> = ["src", "tests"]
+        .iter()
+        .flat_map(|folder| rust_files(&root().join(folder)))
+        .map(read)
+        .collect();
+    let mut tests = 0;
+    for row in table.lines().filter(|line| line.starts_with("| ")) {
+        let column = row.split('|').nth(3).unwrap();
+        for name in quoted(column) {
+            let declared = format!("fn {name}(");
+            let exists = sources.iter().any(|source| source.contains(&declared));
+            assert!(exists, "docs/architecture.md names the test {name}");
+            tests += 1;
+        }
+    }
+    assert!(tests > 10, "{tests}");
+}
+
+#[test]
 fn every_decision_is_numbered_dated_and_in_the_index() {
     let folder = root().join("docs/decisions");
     let index = read(folder.join("README.md"));
