@@ -172,7 +172,7 @@ impl Drain {
         }
         if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
             // The doubt concerned the previous master.
-            self.resync_due = false;
+            (self.resync_due, self.resync_at) = (false, None);
         }
         self.resync_due |= self.link.ledger.take_doubt();
         if self.in_flight.is_some() || self.retry_at.is_some() || self.lost {
@@ -184,15 +184,16 @@ impl Drain {
         {
             let _ = own.answer.send(Answer::Close);
         }
-        let items = match self.resync_due {
-            true => Vec::new(),
-            false => batch::pack(&mut self.queue),
+        let items = if std::mem::take(&mut self.resync_due) {
+            self.resync_at = None;
+            Vec::new()
+        } else {
+            let items = batch::pack(&mut self.queue);
+            if items.is_empty() {
+                return;
+            }
+            items
         };
-        if items.is_empty() && !self.resync_due {
-            return;
-        }
-        self.resync_due = false;
-        self.resync_at = None;
         let connection = self
             .connection
             .take()

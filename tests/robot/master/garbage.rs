@@ -167,6 +167,27 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
     assert_eq!(status(&client)["state"]["params"], 1);
 }
 
+/// Nor is it forgotten that the master must be read because other calls pass in between.
+#[test]
+fn a_look_that_fails_is_taken_again() {
+    let garbled = Garbled::start(Vec::new());
+    let client = garbled.rescue.client();
+    // Of the call, and of each look that follows.
+    garbled.say(b"getTopicTypes", &with_status("200 OK", FAULT.as_bytes()));
+    let set = Call::new("setParam", params!["/c", "/garbled", 1]);
+    let types = Call::new("getTopicTypes", params!["/c"]);
+    let request = http_request(&encode_call(
+        "system.multicall",
+        Call::multicall([set, types]).params,
+    ));
+    assert_eq!(client.exchange(&request).unwrap().text(), FAULT);
+    client.set_param("/kept", 1);
+    garbled.say(b"/no call says this", b"");
+    eventually("the mirror is as the master", || {
+        status(&client)["state"]["params"] == 1
+    });
+}
+
 /// Each answer is to the byte that of a master that is well, and is true as soon as this one is well again.
 #[test]
 fn a_master_whose_answers_are_no_http_counts_as_away() {
