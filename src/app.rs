@@ -175,7 +175,7 @@ pub async fn run(
         ledger: ledger.clone(),
         gate: gate.clone(),
     };
-    notify::start(guard, told, stop.clone());
+    let notified = notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
     let duties = rosout.map(|rosout| {
         let roscore = Roscore {
@@ -285,6 +285,8 @@ pub async fn run(
     if let Some(process) = process {
         process.stop().await;
     }
+    // systemd may read nothing.
+    let _ = tokio::time::timeout(DRAIN, notified).await;
     Ok(())
 }
 

@@ -1,12 +1,13 @@
 //! Reports readiness and status to the guardian and to systemd (`sd_notify(3)`).
 
-use std::{os::unix::net::UnixStream as StdLink, sync::Arc, time::Duration};
+use std::{io, os::unix::net::UnixStream as StdLink, sync::Arc, time::Duration};
 
 use sd_notify::NotifyState;
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::UnixStream,
-    time::{Instant, MissedTickBehavior, interval},
+    task::JoinHandle,
+    time::{MissedTickBehavior, interval},
 };
 use tokio_util::sync::CancellationToken;
 
@@ -20,8 +21,8 @@ use crate::{
 /// Shortest time between two status messages to systemd.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Starts reporting. `stop` is reported as the beginning of the stop.
-pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) {
+/// Starts reporting. The task that is returned reports `stop` and ends.
+pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
@@ -31,10 +32,18 @@ pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) {
         }
     };
     told.board.update(|facts| facts.guarded = guarded);
-    if std::env::var_os("NOTIFY_SOCKET").is_some() {
+    let is_notified = std::env::var_os("NOTIFY_SOCKET").is_some();
+    if is_notified {
         tokio::spawn(report_ready(told.clone()));
-        tokio::spawn(report_status(told, stop));
+        tokio::spawn(report_status(told, stop.clone()));
     }
+    tokio::spawn(async move {
+        stop.cancelled().await;
+        if is_notified {
+            let state = [NotifyState::Stopping, NotifyState::Status("stopping")];
+            send(move || sd_notify::notify(&state)).await;
+        }
+    })
 }
 
 /// What the reports need.
@@ -91,7 +100,7 @@ async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
 async fn report_ready(told: Source) {
     told.answers().await;
     let line = told.line();
-    send(&[NotifyState::Ready, NotifyState::Status(&line)]);
+    send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }
 
 /// Reports the state to systemd in a line, and feeds its watchdog. Feeding needs what calls need, so it shows
@@ -104,31 +113,26 @@ async fn report_status(told: Source, stop: CancellationToken) {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut last = String::new();
     let mut fed = None;
-    let mut stopping = false;
     loop {
-        let now = tokio::select! {
-            now = ticks.tick() => now,
-            () = stop.cancelled(), if !stopping => {
-                stopping = true;
-                send(&[NotifyState::Stopping, NotifyState::Status("stopping")]);
-                Instant::now()
-            }
-        };
+        let now = ticks.tick().await;
         let line = told.line();
-        if !stopping && line != last {
-            send(&[NotifyState::Status(&line)]);
-            last = line;
+        if !stop.is_cancelled() && line != last {
+            last.clone_from(&line);
+            send(move || sd_notify::notify(&[NotifyState::Status(&line)])).await;
         }
         let due = |pause| fed.is_none_or(|fed| now.saturating_duration_since(fed) + tick > pause);
         if watchdog.is_some_and(due) {
-            send(&[NotifyState::Watchdog]);
+            send(|| sd_notify::notify(&[NotifyState::Watchdog])).await;
             fed = Some(now);
         }
     }
 }
 
-fn send(state: &[NotifyState<'_>]) {
-    if let Err(error) = sd_notify::notify(state) {
+/// Sends a message to systemd. That blocks while systemd reads none, and must not hold up a thread of the
+/// runtime then.
+async fn send(notify: impl FnOnce() -> io::Result<()> + Send + 'static) {
+    let sent = tokio::task::spawn_blocking(notify).await;
+    if let Err(error) = sent.map_err(io::Error::other).flatten() {
         tracing::debug!(%error, "systemd is not told");
     }
 }

@@ -1,12 +1,15 @@
 //! rosrescue under systemd: sockets by `sd_listen_fds(3)`, its state by `sd_notify(3)`. The test
 //! speaks systemd's part.
 
+use std::fs;
 use std::net::TcpListener;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixDatagram;
 use std::process::Command;
 
-use crate::support::{Client, PATIENCE, Rosmaster, Scratch, Setup, behind, free_port, status};
+use crate::support::{
+    Client, PATIENCE, Rosmaster, Scratch, Setup, behind, eventually, free_port, status,
+};
 use command_fds::{CommandFdExt, FdMapping};
 use rustix::process::Signal;
 
@@ -126,8 +129,39 @@ fn the_worker_of_a_guardian_speaks_to_systemd() {
         .spawn();
     manager.wait("READY=1");
     manager.wait("WATCHDOG=1");
-    assert_eq!(rescue.terminate().code(), Some(0));
+    rescue.signal(Signal::TERM);
     manager.wait("STOPPING=1");
+    assert_eq!(rescue.wait().code(), Some(0));
+}
+
+/// Its notification socket fills up. On one core rosrescue has one thread for all calls.
+#[test]
+fn a_systemd_that_reads_nothing_holds_nobody_up() {
+    let scratch = Scratch::new();
+    let manager = Manager::new(&scratch);
+    let mut rescue = Setup::core(&scratch, free_port())
+        .args(["--no-rosout"])
+        .env("NOTIFY_SOCKET", scratch.path("notify"))
+        .env("WATCHDOG_USEC", "2000")
+        .wrapped(|own| {
+            let status = fs::read_to_string("/proc/self/status").unwrap();
+            let list = status.split_once("Cpus_allowed_list:").unwrap().1;
+            let core = list.trim().split(|c: char| !c.is_ascii_digit()).next();
+            let mut pinned = Command::new("taskset");
+            pinned.args(["-c", core.unwrap()]);
+            behind(pinned, own)
+        })
+        .start();
+    let full = UnixDatagram::unbound().unwrap();
+    full.set_nonblocking(true).unwrap();
+    full.connect(scratch.path("notify")).unwrap();
+    eventually("the socket is full", || full.send(b"X=1").is_err());
+    let client = rescue.client();
+    for round in 0..100 {
+        client.set_param("/round", round);
+    }
+    assert_eq!(rescue.terminate().code(), Some(0));
+    drop(manager);
 }
 
 #[test]
