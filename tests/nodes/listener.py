@@ -7,6 +7,7 @@ With EVERY it says each EVERYth message of a publisher, the first one, and every
 rospy has no call-back for links of a subscriber, so this wraps the places where it makes and ends them.
 """
 
+import threading
 import time
 
 import rospy
@@ -63,11 +64,14 @@ def watch_reconnects():
 def watch_links(subscriber):
     """Says how many publishers are connected whenever that changes."""
     impl = subscriber.impl
+    saying = threading.Lock()
 
     def watched(original):
         def method(connection):
             answer = original(connection)
-            say("links", impl.get_num_connections())
+            # Two threads at once would say their numbers in any order.
+            with saying:
+                say("links", impl.get_num_connections())
             return answer
 
         return method
