@@ -342,7 +342,7 @@ impl Driver {
     /// Keeps `connection` to notice the master's end. Renewed with each probe: the kernel closes the
     /// descriptors of a dying process one by one, the newest first, and a master has one for each node that
     /// it has ever called.
-    fn watch(&mut self, connection: Connection) {
+    fn watch(&mut self, mut connection: Connection) {
         self.ended = Some(Box::pin(connection.ended()));
         self.connection = Some(connection);
     }

@@ -1,13 +1,18 @@
 //! One connection to the master.
 
-use std::{io, net::SocketAddr};
+use std::{
+    io,
+    net::SocketAddr,
+    pin::Pin,
+    task::{Context, Poll, Waker},
+};
 
 use bytes::Bytes;
 use http_body_util::{BodyExt, Collected, Full, Limited};
 use hyper::{
     Request,
     body::Body,
-    client::conn::http1::SendRequest,
+    client::conn::http1::{self, SendRequest},
     header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
 };
 use hyper_util::rt::TokioIo;
@@ -19,16 +24,57 @@ use crate::{
     xmlrpc::{self, Call, Reply},
 };
 
+/// Sends and receives what hyper's handle is given.
+type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
+
 /// A keep-alive connection to the master, for one call at a time.
+///
+/// It is driven by whoever makes a call, in the same task: a task of its own would have to be woken twice for
+/// each call. So nobody notices its end between two calls; [`Self::is_closed`] looks.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
-    ended: watch::Receiver<()>,
+    driver: Drive,
     local: bool,
     peer: SocketAddr,
     host: HeaderValue,
     instance: HeaderValue,
     max_reply: usize,
+}
+
+/// Who drives a connection.
+#[derive(Debug)]
+enum Drive {
+    /// The caller; none if it has ended. With it ends the count of connections for writes.
+    Caller(Option<(Box<Driver>, Option<Writer>)>),
+    /// A task, whose end is the connection's.
+    Task(watch::Receiver<()>),
+}
+
+impl Drive {
+    /// Runs `work`, which waits for the connection.
+    async fn run<T>(&mut self, work: impl Future<Output = T>) -> T {
+        let mut work = std::pin::pin!(work);
+        std::future::poll_fn(|context| {
+            if let Poll::Ready(done) = work.as_mut().poll(context) {
+                return Poll::Ready(done);
+            }
+            self.poll(context);
+            // What has arrived is seen at once.
+            work.as_mut().poll(context)
+        })
+        .await
+    }
+
+    fn poll(&mut self, context: &mut Context<'_>) {
+        if let Self::Caller(driven) = self
+            && let Some((driver, _)) = driven
+            && Pin::new(driver).poll(context).is_ready()
+        {
+            // The call under way gets its error, if any.
+            *driven = None;
+        }
+    }
 }
 
 impl Connection {
@@ -52,21 +98,15 @@ impl Connection {
     ) -> io::Result<Self> {
         stream.set_nodelay(true)?;
         let (local, peer) = (is_local(&stream)?, stream.peer_addr()?);
-        let (sender, driver) = hyper::client::conn::http1::Builder::new()
+        let (sender, driver) = http1::Builder::new()
             .title_case_headers(true)
             .handshake(TokioIo::new(stream))
             .await
             .map_err(io::Error::other)?;
-        let (end, ended) = watch::channel(());
-        tokio::spawn(async move {
-            // The call under way gets its error, if any.
-            let _ = driver.await;
-            drop((end, writer));
-        });
         let host = HeaderValue::from_str(&address.authority()).map_err(io::Error::other)?;
         Ok(Self {
             sender,
-            ended,
+            driver: Drive::Caller(Some((Box::new(driver), writer))),
             local,
             peer,
             host,
@@ -75,8 +115,9 @@ impl Connection {
         })
     }
 
-    /// Whether the connection is known to have ended.
-    pub fn is_closed(&self) -> bool {
+    /// Whether the connection has ended.
+    pub fn is_closed(&mut self) -> bool {
+        self.driver.poll(&mut Context::from_waker(Waker::noop()));
         self.sender.is_closed()
     }
 
@@ -90,8 +131,23 @@ impl Connection {
         self.peer
     }
 
-    pub fn ended(&self) -> impl Future<Output = ()> + Send + 'static {
-        let mut ended = self.ended.clone();
+    /// Has the connection driven by a task from now on. Returns when it has ended.
+    pub fn ended(&mut self) -> impl Future<Output = ()> + Send + 'static {
+        let mut ended = match &mut self.driver {
+            Drive::Task(ended) => ended.clone(),
+            Drive::Caller(driven) => {
+                let (end, ended) = watch::channel(());
+                let driven = driven.take();
+                tokio::spawn(async move {
+                    if let Some((driver, _writer)) = driven {
+                        let _ = driver.await;
+                    }
+                    drop(end);
+                });
+                self.driver = Drive::Task(ended.clone());
+                ended
+            }
+        };
         async move {
             // Nothing is ever sent: it ends when the sender is dropped.
             while ended.changed().await.is_ok() {}
@@ -134,26 +190,30 @@ impl Connection {
         let request = request
             .body(Full::new(body))
             .map_err(|error| CallError::BrokenReply(error.into()))?;
-        if let Err(error) = self.sender.ready().await {
-            return Err(CallError::NotSent(error));
-        }
-        let reply = match self.sender.send_request(request).await {
-            Ok(reply) => reply,
-            Err(error) if error.is_canceled() => return Err(CallError::NotSent(error)),
-            Err(error) => return Err(CallError::MaybeSent(error)),
+        let (sender, max_reply) = (&mut self.sender, self.max_reply);
+        let exchange = async {
+            if let Err(error) = sender.ready().await {
+                return Err(CallError::NotSent(error));
+            }
+            let reply = match sender.send_request(request).await {
+                Ok(reply) => reply,
+                Err(error) if error.is_canceled() => return Err(CallError::NotSent(error)),
+                Err(error) => return Err(CallError::MaybeSent(error)),
+            };
+            let (parts, body) = reply.into_parts();
+            let body = Limited::new(body, max_reply);
+            let body = match predicted {
+                Some(predicted) => collect(body, predicted).await,
+                None => body.collect().await.map(Collected::to_bytes),
+            };
+            Ok(RawReply {
+                status: parts.status,
+                reason: parts.extensions.get().cloned(),
+                headers: parts.headers,
+                body: body.map_err(CallError::BrokenReply)?,
+            })
         };
-        let (parts, body) = reply.into_parts();
-        let body = Limited::new(body, self.max_reply);
-        let body = match predicted {
-            Some(predicted) => collect(body, predicted).await,
-            None => body.collect().await.map(Collected::to_bytes),
-        };
-        Ok(RawReply {
-            status: parts.status,
-            reason: parts.extensions.get().cloned(),
-            headers: parts.headers,
-            body: body.map_err(CallError::BrokenReply)?,
-        })
+        self.driver.run(exchange).await
     }
 
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {

@@ -109,7 +109,7 @@ impl Pool {
 
     fn take_idle(&self, incarnation: u64) -> Option<Connection> {
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        idle.retain(|(of, connection)| *of == incarnation && !connection.is_closed());
+        idle.retain_mut(|(of, connection)| *of == incarnation && !connection.is_closed());
         idle.pop().map(|(_, connection)| connection)
     }
 

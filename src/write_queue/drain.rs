@@ -194,10 +194,8 @@ impl Drain {
             }
             items
         };
-        let connection = self
-            .connection
-            .take()
-            .filter(|(of, connection)| *of == incarnation && !connection.is_closed());
+        let mut connection = self.connection.take();
+        connection.take_if(|(of, connection)| *of != incarnation || connection.is_closed());
         self.stats.batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
