@@ -222,6 +222,7 @@ pub async fn run(
         calls: Calls {
             gate: gate.clone(),
             ledger: ledger.clone(),
+            reads: config.reads,
             pool: Arc::new(pool),
             write_queue,
             slow,

@@ -196,6 +196,12 @@ pub struct CommonArgs {
     )]
     #[arg(allow_negative_numbers = true)]
     pub resync_interval: f64,
+    /// Who answers calls that only read while there is a master. The mirror is several times faster and
+    /// sees every write that was acknowledged; what it would not answer to the byte as the master does is
+    /// forwarded. Choose the master where somebody calls it past rosrescue
+    /// [default: mirror for core, master for proxy]
+    #[arg(long, env = "ROSRESCUE_READS", value_enum)]
+    pub reads: Option<Reads>,
     /// Connections to the master for calls that only read
     #[arg(
         long,
@@ -266,6 +272,15 @@ pub enum SyncPolicy {
     Interval,
     /// When the system likes
     Never,
+}
+
+/// Who answers reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Reads {
+    /// The mirror
+    Mirror,
+    /// The master, as long as there is one
+    Master,
 }
 
 /// Form of the log.

@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use crate::{
     checkpoint::session::Restore,
-    cli::{CommonArgs, CoreArgs, ProxyArgs, SyncPolicy},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, SyncPolicy},
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
 };
@@ -88,6 +88,8 @@ pub struct Config {
     pub reap_interval: Option<Duration>,
     /// Pause between two comparisons of the mirror with the master; none to disable them.
     pub resync_interval: Option<Duration>,
+    /// Who answers reads while there is a master.
+    pub reads: Reads,
     /// Most connections to the master for reads.
     pub master_connections: usize,
     /// Most connections of clients.
@@ -226,10 +228,16 @@ impl Config {
         let interval = master.idle_limit().map_or(interval, |limit| {
             interval.min((limit / 2).max(SHORTEST_INTERVAL))
         });
+        let reads = args.reads.unwrap_or(match master {
+            // Nobody else knows the master's port.
+            MasterConfig::Supervised(_) => Reads::Mirror,
+            MasterConfig::External(_) => Reads::Master,
+        });
         Ok(Self {
             listen,
             advertised,
             master,
+            reads,
             checkpoint: checkpoint.unwrap_or_else(|| ros_env::log_dir(env).join(CHECKPOINT_NAME)),
             restore: args.restore,
             sync: args.sync,

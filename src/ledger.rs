@@ -4,6 +4,7 @@
 //! arrives after the injection's state was taken is not acknowledged.
 
 pub(crate) mod activity;
+mod answers;
 pub(crate) mod checkpointer;
 mod durability;
 mod injection;
@@ -26,18 +27,11 @@ use crate::{
         store::Store,
     },
     cli::SyncPolicy,
-    master::{Kind, Master, Method, Request},
+    master::{Master, Method, Request},
     replay::{self, Answered, Token},
     status::stats::Stats,
     xmlrpc::Reply,
 };
-
-/// Most pending writes beside which unregistrations without effect on the mirror are kept.
-const UNCHANGED_PENDING_MAX: usize = 1000;
-
-/// Memory for the answers to the reads of one multicall, in bytes. A few short reads of a large state could
-/// ask for any amount; larger ones wait for the master.
-const ANSWER_MOST: usize = 64 << 20;
 
 /// The answer does not count, and the master must be asked again: another incarnation has taken over, or the
 /// mirror has changed since.
@@ -91,6 +85,7 @@ struct Inner {
     diverged: HashSet<Method>,
     /// An injection is under way: the mirror must not change.
     injecting: bool,
+    /// The present master may differ from the mirror and must be read again.
     doubted: bool,
     /// The present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
@@ -143,32 +138,6 @@ impl Ledger {
 
     pub fn with_mirror<T>(&self, look: impl FnOnce(&Master) -> T) -> T {
         look(&self.lock().mirror)
-    }
-
-    /// The master's predicted answer to a read; none if it is a multicall that asks for too much.
-    pub fn answer(&self, read: &Request) -> Option<Reply> {
-        let mirror = &mut self.lock().mirror;
-        let fits = mirror.fits(read, ANSWER_MOST);
-        fits.then(|| mirror.apply_telling(read, &mut ()))
-    }
-
-    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
-    /// Nodes are notified as by a master. Returns the journal's last record too: the earlier write that made
-    /// this one redundant may be as new as that.
-    pub fn answer_if_unchanged(
-        &self,
-        now: Instant,
-        write: &Request,
-    ) -> Option<(Reply, Option<u64>)> {
-        let mut inner = self.lock();
-        // An unregistration may concern a registration that is still on its way to the master.
-        let idle = !write.calls().into_iter().any(is_unregistration)
-            && !inner.mirror.would_change(write)
-            && inner.mirror.fits(write, ANSWER_MOST);
-        idle.then(|| {
-            let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
-            (reply, inner.last_seq())
-        })
     }
 
     /// Sets the answers to getPid and getUri.
@@ -240,6 +209,7 @@ impl Ledger {
                 entries.push(Entry::call(answered.call.clone().into()));
             }
         }
+        inner.doubted |= recorded.doubtful;
         if !entries.is_empty() {
             self.stats.recorded.add(entries.len() as u64);
             recorded.seq = inner.append(&entries);
@@ -249,64 +219,11 @@ impl Ledger {
         Ok(recorded)
     }
 
-    /// The master's predicted answer to this call.
-    pub fn predict(&self, call: &Request) -> Reply {
-        let mut model = self.with_mirror(Clone::clone);
-        model.apply_telling(call, &mut ())
-    }
-
     /// Records and applies a call of our own before there is a master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
         inner.append(&[Entry::call(call.clone().into())]);
-    }
-
-    /// Answers a call of the Master API as an absent master would: records its changes as pending, applies
-    /// them, and has nodes notified. Returns the journal's last record too: that of the call or, if it
-    /// changes nothing, of what made it redundant.
-    ///
-    /// None during an injection, or if the call also reads too much: it has to wait.
-    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Option<u64>)> {
-        let mut inner = self.lock();
-        if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
-            return None;
-        }
-        let changes = inner.mirror.would_change(call);
-        let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
-        let mut writes: Vec<&Request> = match reply {
-            // The writes were applied; only the answer could not be encoded. A refused one is refused again.
-            Reply::Fault { .. } => {
-                let writes = call.calls().into_iter();
-                writes.filter(|call| call.kind().mutates()).collect()
-            }
-            Reply::Value(_) => {
-                let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
-                let executed = accepted.into_iter().filter(|of| of.executed);
-                executed.map(|of| of.call).collect()
-            }
-        };
-        if !changes {
-            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
-            // before the reply.
-            let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
-            writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
-        }
-        if writes.is_empty() {
-            return Some((reply, inner.last_seq()));
-        }
-        // Makes an inspection under way outdated: it could bring back what this call takes away.
-        inner.version += u64::from(!changes);
-        self.stats.recorded.add(writes.len() as u64);
-        let entries = writes.iter().map(|&call| Entry::Call {
-            call: call.clone().into(),
-            pending: true,
-        });
-        let seq = inner.append(&entries.collect::<Vec<_>>());
-        inner.add_pending(writes.into_iter().cloned());
-        drop(inner);
-        self.work.notify_one();
-        Some((reply, seq))
     }
 
     /// Number of writes that the present incarnation may not have run.
@@ -322,12 +239,15 @@ impl Ledger {
 
     /// The present master may differ from the mirror and must be read again.
     pub fn doubt(&self) {
-        self.lock().doubted = true;
+        let mut inner = self.lock();
+        inner.doubted = true;
+        // A look that is under way may have come too early.
+        inner.version += 1;
     }
 
-    /// Whether there was such a doubt. Clears it.
-    pub fn take_doubt(&self) -> bool {
-        std::mem::take(&mut self.lock().doubted)
+    /// Whether there is such a doubt.
+    pub fn is_doubted(&self) -> bool {
+        self.lock().doubted
     }
 
     /// The mirror's version: equal versions mean equal states.
@@ -356,6 +276,7 @@ impl Ledger {
             return Err(Superseded);
         }
         let difference = inner.adopt(state);
+        inner.doubted = false;
         drop(inner);
         self.work.notify_one();
         Ok(difference)
@@ -369,11 +290,6 @@ impl Ledger {
         } = &mut *inner;
         work(mirror, activity)
     }
-}
-
-/// Whether a call, other than a multicall, is an unregistration.
-fn is_unregistration(call: &Request) -> bool {
-    *call.method() != Method::Multicall && call.kind() == Kind::Unregister
 }
 
 impl Inner {
@@ -402,14 +318,15 @@ impl Inner {
     }
 
     fn adopt(&mut self, state: Master) -> Vec<String> {
-        if self.mirror == state {
-            return Vec::new();
+        let mut difference = Vec::new();
+        if self.mirror != state {
+            difference = replay::difference(&self.mirror, &state);
+            self.version += 1;
+            self.changed_unrecorded();
         }
-        let difference = replay::difference(&self.mirror, &state);
+        // Also if it is equal: it may be known more exactly.
         self.mirror = state;
         self.set_identity(self.identity.clone());
-        self.version += 1;
-        self.changed_unrecorded();
         difference
     }
 

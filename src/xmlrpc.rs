@@ -11,7 +11,7 @@ mod tests;
 mod value;
 
 pub use decode::{MAX_DEPTH, decode_call, decode_reply};
-pub use encode::{ListWriter, encode_call, encode_reply};
+pub use encode::{ListWriter, encode_call, encode_reply, encode_result};
 pub(crate) use encode::{MAX_REPLY_DEPTH, TOO_DEEP, refusal};
 pub use error::DecodeError;
 pub use value::{Call, Reply, Struct, Value};

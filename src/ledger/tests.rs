@@ -1,4 +1,5 @@
 use super::activity::NOTICE_MEMORY;
+use super::answers::UNCHANGED_PENDING_MAX;
 use super::*;
 use crate::{
     checkpoint::store::StoreError,
@@ -69,6 +70,21 @@ fn a_master_that_answers_otherwise_than_the_mirror_casts_doubt() {
         .unwrap();
     assert!(recorded.doubtful);
     assert_eq!(ledger.stats.divergences.value(), 1);
+}
+
+#[test]
+fn a_mirror_in_doubt_leaves_reads_to_the_master_until_it_was_read() {
+    let ledger = ledger();
+    let get = Request::new(Method::GetParam, ["/n", "/unset"]);
+    assert!(ledger.exact_answer(&get).is_some());
+    let early = ledger.version();
+    ledger.doubt();
+    assert_eq!(ledger.exact_answer(&get), None);
+    let state = ledger.with_mirror(Clone::clone);
+    assert!(ledger.adopt_if(0, early, state.clone()).is_err());
+    assert!(ledger.is_doubted());
+    assert!(ledger.adopt_if(0, ledger.version(), state).is_ok());
+    assert!(ledger.exact_answer(&get).is_some());
 }
 
 #[test]

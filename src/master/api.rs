@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use super::{Kind, Master, Notice, NoticeSink, Request, returnable};
+use super::{Entry, Kind, Master, Notice, NoticeSink, Request, returnable};
 use crate::xmlrpc::{Reply, Value};
 
 /// Returned by a method: status code, message, value.
@@ -179,6 +179,33 @@ impl Master {
             },
             Err(text) => fault(&text),
         }
+    }
+
+    /// The result of a read, if rosmaster's is the same to the byte. None for any other call, and where the
+    /// wording may differ.
+    pub fn exact_answer(&mut self, read: &Request) -> Option<Value> {
+        if self.is_inexact() {
+            return None;
+        }
+        let Some(spec) = read.method().spec() else {
+            let entries = read.entries().iter().map(|entry| match entry {
+                Entry::Request(read) => Some(Value::Array(vec![self.exact_answer(read)?])),
+                Entry::Refused(_) | Entry::Malformed(_) => None,
+            });
+            let is_multicall = *read.method() == Method::Multicall;
+            let results = entries.collect::<Option<_>>().filter(|_| is_multicall)?;
+            return Some(Value::Array(results));
+        };
+        if !matches!(spec.kind, Kind::Read | Kind::Identity) {
+            return None;
+        }
+        let (code, message, value) = self
+            .validate_and_run(spec, read.params(), &mut ())
+            .ok()
+            .filter(|(_, _, value)| *value != Value::Nil)?;
+        // A node that only subscribes parameters may have registered past rosrescue: nothing shows it.
+        let hidden = *read.method() == Method::LookupNode && code != 1;
+        (!hidden).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
     /// Answers any method except for a multicall. An error is the text of a fault.

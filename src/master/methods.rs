@@ -20,7 +20,7 @@ impl Master {
 
     pub(crate) fn register_publisher(&mut self, of: Args<'_>) -> Answer {
         let caller_id = of.caller_id;
-        let (topic, topic_type, api) = topic_params(&of)?;
+        let (topic, topic_type, api) = self.topic_params(&of)?;
         let bumped = self
             .registry
             .register(Shared::Publishers, &topic, caller_id, api);
@@ -35,7 +35,7 @@ impl Master {
     }
 
     pub(crate) fn register_subscriber(&mut self, of: Args<'_>) -> Answer {
-        let (topic, topic_type, api) = topic_params(&of)?;
+        let (topic, topic_type, api) = self.topic_params(&of)?;
         let bumped = self
             .registry
             .register(Shared::Subscribers, &topic, of.caller_id, api);
@@ -255,15 +255,18 @@ impl Master {
         }
         subscribers
     }
-}
 
-fn topic_params<'a>(of: &Args<'a>) -> Result<(String, &'a str, &'a str), Failure> {
-    let [topic, topic_type, api] = of.params()?;
-    Ok((
-        checks::resource("topic", topic, of.caller_id)?,
-        checks::topic_type(topic_type)?,
-        checks::api("caller_api", api)?,
-    ))
+    fn topic_params<'a>(&mut self, of: &Args<'a>) -> Result<(String, &'a str, &'a str), Failure> {
+        let [topic, topic_type, api] = of.params()?;
+        let params = (
+            checks::resource("topic", topic, of.caller_id)?,
+            checks::topic_type(topic_type)?,
+            checks::api("caller_api", api)?,
+        );
+        // A date: rosmaster keeps it as one.
+        self.inexact |= topic_type.as_str().is_none();
+        Ok(params)
+    }
 }
 
 fn pair(topic: &str, topic_type: &str) -> Value {

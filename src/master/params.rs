@@ -15,6 +15,8 @@ const DEEPEST_TREE: usize = 512;
 #[derive(Clone, Default)]
 pub(crate) struct Params {
     tree: Struct,
+    /// Whether a part below [`DEEPEST_TREE`] was left out.
+    cut: bool,
     /// Results of the present multicall that are dicts of the tree itself: see [`Live`].
     live: Vec<Live>,
 }
@@ -48,12 +50,16 @@ impl Params {
     pub(crate) fn new(tree: Struct) -> Self {
         Self {
             tree,
-            live: Vec::new(),
+            ..Self::default()
         }
     }
 
     pub(crate) fn tree(&self) -> &Struct {
         &self.tree
+    }
+
+    pub(crate) fn is_cut(&self) -> bool {
+        self.cut
     }
 
     pub(crate) fn get(&self, key: &str) -> Option<Value> {
@@ -92,7 +98,7 @@ impl Params {
             };
         }
         let updates = updates(subscribers, key, value, Some(caller_id));
-        let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE).collect();
+        let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE + 1).collect();
         self.detach(&path);
         self.put(&path, value.clone())?;
         updates
@@ -102,10 +108,12 @@ impl Params {
     pub(crate) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
         let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
-        let value = match value {
-            _ if levels == 0 => Value::Nil,
-            value if is_deeper(&value, levels) => cut(value, levels),
-            value => value,
+        let fits = levels > 0 && !is_deeper(&value, levels);
+        self.cut |= !fits;
+        let value = match levels {
+            0 => Value::Nil,
+            _ if fits => value,
+            _ => cut(value, levels),
         };
         match (path.split_last(), value) {
             (None, Value::Struct(tree)) => self.tree = tree,

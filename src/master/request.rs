@@ -1,7 +1,7 @@
 //! A call, parsed once: the method, its parameters, and the entries of a multicall.
 
 use super::{Kind, Method, names, returnable};
-use crate::xmlrpc::{self, Call, DecodeError, Struct, Value};
+use crate::xmlrpc::{self, Call, DecodeError, Value};
 
 /// Most levels of nested multicalls that are parsed. A decoded document cannot have more, because each takes
 /// three of its levels.
@@ -219,7 +219,7 @@ impl Entry {
         let Value::Struct(mut members) = element else {
             return Self::Malformed("an entry of a multicall is no struct");
         };
-        let mut member = |name| Struct::swap_remove(&mut members, name);
+        let mut member = |name| members.swap_remove(name);
         let (Some(name), Some(params)) = (member("methodName"), member("params")) else {
             return Self::Malformed("an entry of a multicall lacks methodName or params");
         };
@@ -244,7 +244,7 @@ fn items(value: Value) -> Option<Vec<Value>> {
     match value {
         Value::Array(elements) => Some(elements),
         Value::Struct(members) => {
-            let keys = members.into_keys().take(TOO_MANY);
+            let keys = members.into_iter().map(|(key, _)| key).take(TOO_MANY);
             Some(keys.map(Value::String).collect())
         }
         Value::String(text) => {
@@ -267,6 +267,7 @@ impl Request {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::xmlrpc::Struct;
 
     fn call(method: &str) -> Request {
         Request::from(Call::new(method, vec!["/n".into()]))

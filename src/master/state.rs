@@ -23,6 +23,9 @@ pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
+    /// Whether something is kept otherwise than rosmaster keeps it, so that answers may differ. No ROS client
+    /// sends such a thing.
+    pub(crate) inexact: bool,
     pub(crate) pid: i32,
     pub(crate) uri: String,
 }
@@ -108,6 +111,11 @@ impl Master {
     pub fn set_identity(&mut self, pid: i32, uri: String) {
         self.pid = pid;
         self.uri = uri;
+    }
+
+    /// Whether the answers to reads may differ from rosmaster's. The state itself is compared without that.
+    pub fn is_inexact(&self) -> bool {
+        self.inexact || self.params.is_cut()
     }
 
     /// The nodes' caller ids and addresses.
@@ -357,7 +365,7 @@ impl PartialEq for Master {
             && a.had_services == b.had_services
             && a.param_subscribers.iter().eq(&b.param_subscribers)
             && self.topic_types.iter().eq(&other.topic_types)
-            && self.params.tree().iter().eq(other.params.tree())
+            && self.params.tree() == other.params.tree()
     }
 }
 

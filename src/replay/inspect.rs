@@ -158,7 +158,7 @@ impl Inspection {
             && self.subscribers.is_empty()
             && self.services.is_empty()
             && self.topic_types.is_empty()
-            && self.params.as_ref().is_some_and(Struct::is_empty)
+            && self.params.as_ref().is_some_and(|params| params.is_empty())
     }
 
     /// The nodes of this inspection and of `previous`, without duplicates.
@@ -262,7 +262,11 @@ impl Inspection {
             }
         }
         keep_references(&mut found, previous);
-        Master::from_snapshot(found).map_err(|_| form(Method::GetSystemState))
+        let master = Master::from_snapshot(found).map_err(|_| form(Method::GetSystemState))?;
+        Ok(Master {
+            inexact: self.params.is_none(),
+            ..master
+        })
     }
 }
 

@@ -12,9 +12,10 @@ use tokio::sync::{Notify, oneshot};
 
 use super::{
     admission,
-    replies::{HttpReply, forwarded, made, no_shutdown, xml},
+    replies::{self, HttpReply, forwarded, made, no_shutdown, xml},
 };
 use crate::{
+    cli::Reads,
     gate::{self, State},
     ledger::Ledger,
     master::{Kind, Method, Request},
@@ -42,6 +43,8 @@ pub struct Calls {
     /// Whether calls pass to the master.
     pub gate: gate::Rx,
     pub ledger: Arc<Ledger>,
+    /// Who answers reads while there is a master.
+    pub reads: Reads,
     /// Connections for reads.
     pub pool: Arc<Pool>,
     pub write_queue: WriteQueue,
@@ -90,7 +93,16 @@ impl Calls {
         }
     }
 
-    /// Forwards a read. The mirror answers while the master is away, fails or takes too long.
+    /// The mirror's answer to a read while there is a master; none if the master's may differ.
+    async fn exact_answer(&self, call: Option<&Request>) -> Option<HttpReply> {
+        let read = call.filter(|_| self.reads == Reads::Mirror)?;
+        let reply = replies::result(self.ledger.exact_answer(read)?).await?;
+        self.stats.mirrored.count();
+        Some(reply)
+    }
+
+    /// Answers a read from the mirror, or forwards it. The mirror answers while the master is away, fails or
+    /// takes too long.
     async fn read(
         &self,
         head: Head,
@@ -109,6 +121,9 @@ impl Calls {
         loop {
             match gate.look() {
                 State::Open { incarnation } => {
+                    if let Some(reply) = self.exact_answer(call).await {
+                        return Ok(reply);
+                    }
                     let patience = self.patience();
                     if patience <= tokio::time::Instant::now()
                         && let Some(reply) = from_mirror()

@@ -14,6 +14,9 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
+/// Values that are encoded outside of the runtime, in bytes of memory.
+const LARGE: usize = 64 << 10;
+
 /// What hyper sends.
 pub(crate) type HttpReply = Response<Full<Bytes>>;
 
@@ -50,7 +53,23 @@ fn plain(raw: RawReply) -> HttpReply {
 }
 
 pub(super) fn xml(reply: &Reply) -> HttpReply {
-    let mut http = Response::new(Full::new(Bytes::from(xmlrpc::encode_reply(reply))));
+    xml_text(xmlrpc::encode_reply(reply))
+}
+
+/// A method's result; none if rosmaster cannot marshal it. A long one takes milliseconds to encode, and must
+/// not hold up a thread of the runtime.
+pub(super) async fn result(value: Value) -> Option<HttpReply> {
+    let is_large = value.is_larger_than(LARGE);
+    let encode = move || xmlrpc::encode_result(&value).ok();
+    let text = match is_large {
+        true => tokio::task::spawn_blocking(encode).await.ok()?,
+        false => encode(),
+    };
+    text.map(xml_text)
+}
+
+fn xml_text(text: Vec<u8>) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(text)));
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http

@@ -25,6 +25,8 @@ impl Counter {
 pub struct Stats {
     /// Calls by clients.
     pub calls: Counter,
+    /// Reads that the mirror answered while there was a master.
+    pub mirrored: Counter,
     /// Calls that the mirror answered: the master was away, or did not answer in time.
     pub stood_in: Counter,
     /// Calls closed without an answer: only a master could answer, and none came in time.
@@ -47,9 +49,14 @@ pub struct Stats {
 
 impl Stats {
     /// Names, meanings and values, for pages.
-    pub fn list(&self) -> [(&'static str, &'static str, u64); 10] {
+    pub fn list(&self) -> [(&'static str, &'static str, u64); 11] {
         [
             ("calls", "calls that clients made", self.calls.value()),
+            (
+                "mirrored",
+                "reads answered by the mirror while there was a master, see --reads",
+                self.mirrored.value(),
+            ),
             (
                 "stood_in",
                 "calls answered by the mirror: the master was away, or did not answer in time",

@@ -174,7 +174,7 @@ impl Drain {
             // The doubt concerned the previous master.
             (self.resync_due, self.resync_at) = (false, None);
         }
-        self.resync_due |= self.link.ledger.take_doubt();
+        self.resync_due |= self.resync_at.is_none() && self.link.ledger.is_doubted();
         if self.in_flight.is_some() || self.retry_at.is_some() || self.lost {
             return;
         }
@@ -318,8 +318,8 @@ impl Drain {
         else {
             return self.take_back(items);
         };
-        self.resync_due |= recorded.doubtful || opaque;
         if opaque {
+            self.link.ledger.doubt();
             // Answers may be waiting already: after a failed read, calls are sent before the next one.
             self.opaque.incarnation = incarnation;
             self.opaque.seq = self.opaque.seq.max(recorded.seq);
@@ -348,7 +348,7 @@ impl Drain {
             calls = items.len(),
             "the master did not answer each call of a multicall"
         );
-        self.resync_due = true;
+        self.link.ledger.doubt();
         for item in items {
             let _ = item.answer.send(Answer::Close);
         }

@@ -74,7 +74,7 @@ pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     let member = |name| members.and_then(|members| members.get(name));
     match (member("faultCode"), member("faultString")) {
         (Some(Value::Int(code)), Some(Value::String(text)))
-            if members.map(Struct::len) == Some(2) =>
+            if members.map(|members| members.len()) == Some(2) =>
         {
             let (code, text) = (*code, text.clone());
             Ok(Reply::Fault { code, text })

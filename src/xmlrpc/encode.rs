@@ -46,12 +46,22 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
 /// ```
 pub fn encode_reply(reply: &Reply) -> Vec<u8> {
     match reply {
-        Reply::Value(value) => {
-            let mut writer = Writer::answer();
-            writer.value(value);
-            writer.end_answer()
-        }
+        Reply::Value(value) => encode_result(value).unwrap_or_else(|text| encode_fault(1, text)),
         Reply::Fault { code, text } => encode_fault(*code, text),
+    }
+}
+
+/// As [`encode_reply`], for a method's result.
+///
+/// # Errors
+///
+/// If rosmaster cannot marshal the value: the text of its fault.
+pub fn encode_result(value: &Value) -> Result<Vec<u8>, &'static str> {
+    let mut writer = Writer::answer();
+    writer.value(value);
+    match writer.refusal {
+        None => Ok(writer.end_answer()),
+        Some(text) => Err(text),
     }
 }
 

@@ -1,9 +1,87 @@
 //! The values of XML-RPC, as CPython's `xmlrpc` package understands them.
 
+use std::{
+    ops::{Deref, DerefMut},
+    sync::Arc,
+};
+
 use indexmap::IndexMap;
 
+/// The members of a [`Struct`].
+type Members = IndexMap<String, Value>;
+
 /// A struct. Keeps the order of its keys, like a Python dict.
-pub type Struct = IndexMap<String, Value>;
+///
+/// A clone shares its members until one of the two is changed. Then these members are copied, and structs
+/// within them stay shared. So a copy of a large parameter tree costs nothing, and a change of the tree while
+/// there is a copy costs as much as the namespaces on the way to it have members.
+#[derive(Clone, Debug, Default)]
+pub struct Struct(Arc<Members>);
+
+impl Struct {
+    /// Without members.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Without members, and with room for `count`.
+    pub fn with_capacity(count: usize) -> Self {
+        Self(Arc::new(Members::with_capacity(count)))
+    }
+}
+
+impl Deref for Struct {
+    type Target = Members;
+
+    fn deref(&self) -> &Members {
+        &self.0
+    }
+}
+
+impl DerefMut for Struct {
+    fn deref_mut(&mut self) -> &mut Members {
+        Arc::make_mut(&mut self.0)
+    }
+}
+
+/// With the order of the members.
+impl PartialEq for Struct {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0) || self.iter().eq(other.iter())
+    }
+}
+
+impl Eq for Struct {}
+
+impl FromIterator<(String, Value)> for Struct {
+    fn from_iter<I: IntoIterator<Item = (String, Value)>>(members: I) -> Self {
+        Self(Arc::new(members.into_iter().collect()))
+    }
+}
+
+impl<const N: usize> From<[(String, Value); N]> for Struct {
+    fn from(members: [(String, Value); N]) -> Self {
+        members.into_iter().collect()
+    }
+}
+
+impl IntoIterator for Struct {
+    type Item = (String, Value);
+    type IntoIter = indexmap::map::IntoIter<String, Value>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        Arc::unwrap_or_clone(self.0).into_iter()
+    }
+}
+
+impl<'a> IntoIterator for &'a Struct {
+    type Item = (&'a String, &'a Value);
+    type IntoIter = indexmap::map::Iter<'a, String, Value>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.iter()
+    }
+}
 
 /// One XML-RPC value.
 ///
@@ -46,7 +124,7 @@ impl PartialEq for Value {
             | (Self::DateTime(a), Self::DateTime(b)) => a == b,
             (Self::Base64(a), Self::Base64(b)) => a == b,
             (Self::Array(a), Self::Array(b)) => a == b,
-            (Self::Struct(a), Self::Struct(b)) => a.iter().eq(b.iter()),
+            (Self::Struct(a), Self::Struct(b)) => a == b,
             _ => false,
         }
     }
@@ -57,19 +135,38 @@ impl Eq for Value {}
 impl Value {
     /// Approximate memory use, in bytes.
     pub fn size(&self) -> usize {
+        let mut size = 0;
+        self.visit_sizes(&mut |part| {
+            size += part;
+            true
+        });
+        size
+    }
+
+    /// Whether it uses about more than so many bytes. Looks no further than that.
+    pub fn is_larger_than(&self, mut bytes: usize) -> bool {
+        !self.visit_sizes(&mut |part| {
+            let rest = bytes.checked_sub(part);
+            bytes = rest.unwrap_or_default();
+            rest.is_some()
+        })
+    }
+
+    /// Passes the sizes of all parts to `visit` as long as it returns true. Returns whether it always did.
+    fn visit_sizes(&self, visit: &mut impl FnMut(usize) -> bool) -> bool {
         let within = match self {
             Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),
             Self::Base64(bytes) => bytes.len(),
-            Self::Array(elements) => elements.iter().map(Self::size).sum(),
-            Self::Struct(members) => {
-                let members = members.iter();
-                let sizes =
-                    members.map(|(key, value)| size_of::<String>() + key.len() + value.size());
-                sizes.sum()
-            }
-            Self::Nil | Self::Bool(_) | Self::Int(_) | Self::Double(_) => 0,
+            _ => 0,
         };
-        size_of::<Self>() + within
+        visit(size_of::<Self>() + within)
+            && match self {
+                Self::Array(elements) => elements.iter().all(|element| element.visit_sizes(visit)),
+                Self::Struct(members) => members.iter().all(|(key, value)| {
+                    visit(size_of::<String>() + key.len()) && value.visit_sizes(visit)
+                }),
+                _ => true,
+            }
     }
 
     pub fn as_str(&self) -> Option<&str> {

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use rosrescue::master::{Master, Request};
+use rosrescue::master::{Kind, Master, Request};
 use rosrescue::replay::{Inspection, Plan, Skipped, Token};
-use rosrescue::xmlrpc::Call;
+use rosrescue::xmlrpc::{Call, encode_call};
 use rustix::process::Signal;
 
 use crate::dice::{Cast, Dice};
@@ -12,7 +12,7 @@ use crate::nodes::{Node, patience};
 use crate::real::{Rosmaster, Wire};
 use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
-use crate::support::{Rescue, Scratch, Setup, free_port, signal, status};
+use crate::support::{Client, Rescue, Scratch, Setup, free_port, http_request, signal, status};
 
 /// A sequence with so many crashes.
 pub(crate) fn script(seed: u64, calls: usize, crashes: usize, nodes: usize) -> Script {
@@ -64,8 +64,8 @@ struct Rig {
 }
 
 impl Rig {
-    /// With `core`, rosrescue runs the master and rosout itself.
-    fn start(core: bool) -> Self {
+    /// With `core`, rosrescue runs the master and rosout itself. `reads`: who answers them.
+    fn start(core: bool, reads: &str) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
         let (setup, master) = match core {
@@ -77,7 +77,7 @@ impl Rig {
             }
         };
         // What only a master answers waits as long as a busy computer needs.
-        let rescue = setup.args(["--hold", "60"]).start();
+        let rescue = setup.args(["--hold", "60", "--reads", reads]).start();
         Self {
             supervised: core,
             master,
@@ -115,6 +115,19 @@ impl Rig {
         let (pid, uri) = wire.identity();
         model.set_identity(pid, uri);
         model
+    }
+
+    /// Whether rosrescue answers a read to the byte as the master behind it does.
+    fn same_bytes(&self, read: &Call) -> Result<(), Failure> {
+        let request = http_request(&encode_call(read));
+        let [ours, theirs] = [self.rescue.port(), self.master_port].map(|port| {
+            let response = Client::new(port).exchange(&request);
+            response.map(|response| response.text())
+        });
+        match (ours, theirs) {
+            (Ok(ours), Ok(theirs)) if ours == theirs => Ok(()),
+            (ours, theirs) => Err(format!("{ours:?}\ninstead of\n{theirs:?}")),
+        }
     }
 
     /// SIGKILL for the master. Another one is on its way when this returns.
@@ -203,9 +216,10 @@ pub(crate) fn run(
     script: &Script,
     nodes: &[Node],
     core: bool,
+    reads: &str,
     tally: &mut Tally,
 ) -> Result<(), Failure> {
-    let mut rig = Rig::start(core);
+    let mut rig = Rig::start(core, reads);
     let model = rig.state();
     let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
     let mut stage = Stage::new(nodes, wires, model);
@@ -230,7 +244,10 @@ pub(crate) fn run(
                 }
                 stage.away &= !rig.is_open();
                 match std::mem::take(&mut in_flight) {
-                    false => stage.call(by, &call),
+                    false => stage.call(by, &call).and_then(|()| match request.kind() {
+                        Kind::Read if !stage.away => rig.same_bytes(&call),
+                        _ => Ok(()),
+                    }),
                     true => crash_under(&mut rig, &mut stage, by, &call, nth),
                 }
             }

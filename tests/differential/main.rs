@@ -52,6 +52,8 @@ const CALLS: u64 = 200;
 const CRASHES: u64 = 3;
 /// A core takes a while to start.
 const CORE_EACH: u64 = 6;
+/// Who answers reads; the mirror in two of three sequences.
+const READS: [&str; 2] = ["master", "mirror"];
 /// Nodes that listen.
 const NODES: usize = 5;
 /// Runs that are worth a shorter script.
@@ -137,8 +139,9 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
     let (scripts, alone) = scripts();
     for (path, script) in &scripts {
         for core in [false, true] {
-            println!("{path}, core: {core}");
-            crashes::run(script, &nodes, core, &mut tally).unwrap();
+            let reads = READS[usize::from(core)];
+            println!("{path}, core: {core}, reads: {reads}");
+            crashes::run(script, &nodes, core, reads, &mut tally).unwrap();
         }
     }
     if alone {
@@ -152,12 +155,13 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
     for seed in first..first + count {
         let script = crashes::script(seed, calls, crashes, NODES);
         let core = seed % CORE_EACH == 0;
+        let reads = READS[usize::from(seed % 3 > 0)];
         let what = format!(
-            "seed {seed} with {crashes} crashes{}",
+            "seed {seed} with {crashes} crashes{}, --reads {reads}",
             if core { " of core" } else { "" }
         );
         hold(&what, &script, |script| {
-            crashes::run(script, &nodes, core, &mut tally)
+            crashes::run(script, &nodes, core, reads, &mut tally)
         });
         played += script.calls();
     }

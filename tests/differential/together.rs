@@ -231,13 +231,15 @@ fn same(seed: u64, calls: &[Call], theirs: &[Vec<u8>], ours: &[Vec<u8>]) {
 }
 
 /// Plays all callers. With `unreturnable` there are values that a master cannot return; without, the master
-/// behind rosrescue is killed at the end, and its successor has to answer as it did.
-fn play(seed: u64, unreturnable: bool) {
+/// behind rosrescue is killed at the end, and its successor has to answer as it did. `reads`: who answers them.
+fn play(seed: u64, unreturnable: bool, reads: &str) {
     let mut bare = Rosmaster::start();
     let mut behind = Rosmaster::start();
     drop((bare.ready(), behind.ready()));
     let scratch = Scratch::new();
-    let rescue = Setup::proxy(&scratch, behind.port).start();
+    let rescue = Setup::proxy(&scratch, behind.port)
+        .args(["--reads", reads])
+        .start();
     // What nodes hear has its own tests. One that does not answer is not taken for dead.
     let silent = TcpListener::bind(("127.0.0.1", 0)).unwrap();
     let address = silent.local_addr().unwrap().to_string();
@@ -278,8 +280,9 @@ fn play(seed: u64, unreturnable: bool) {
     let (shared, alone): (Vec<_>, Vec<_>) =
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
     let batches = usize::try_from(counter("batches")).unwrap() - alone.len();
+    assert_eq!(counter("mirrored") > 100, reads == "mirror");
     println!(
-        "seed {seed}, unreturnable {unreturnable}: {} calls, of which {} went alone and {} in {batches} batches",
+        "seed {seed}, unreturnable {unreturnable}, reads by the {reads}: {} calls, of which {} went alone and {} in {batches} batches",
         CALLERS * CALLS,
         alone.len(),
         shared.len()
@@ -320,6 +323,8 @@ fn play(seed: u64, unreturnable: bool) {
 #[test]
 fn callers_at_the_same_time_get_the_bytes_of_a_bare_rosmaster() {
     let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
-    play(seed, false);
-    play(seed, true);
+    for reads in ["mirror", "master"] {
+        play(seed, false, reads);
+        play(seed, true, reads);
+    }
 }

@@ -63,6 +63,7 @@ mod clients {
     mod connections;
     mod forwarding;
     mod hostile;
+    mod reads;
 }
 
 /// Memory, connections and files.

@@ -1,6 +1,7 @@
 //! The model on its own. That it is rosmaster's equal is for `tests/differential.rs`.
 
 mod costs;
+mod exact;
 mod inspect;
 mod params;
 mod planning;

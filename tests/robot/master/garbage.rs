@@ -22,8 +22,8 @@ struct Garbled {
 }
 
 impl Garbled {
-    /// Calls that mention `/garbled` get `answer`.
-    fn start(answer: Vec<u8>) -> Self {
+    /// Calls that mention `/garbled` get `answer`. `reads`: who answers them.
+    fn start(answer: Vec<u8>, reads: &str) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);
         let master = real.client();
@@ -40,7 +40,7 @@ impl Garbled {
             }
         });
         let rescue = Setup::proxy(&scratch, fake.port())
-            .args(["--hold", "2", "--probe-interval", "100"])
+            .args(["--hold", "2", "--probe-interval", "100", "--reads", reads])
             .start();
         Self {
             rescue,
@@ -130,7 +130,7 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
         whole("500 Internal Server Error", b"<html>oops</html>"),
         whole("503 Busy", fine.as_bytes()),
     ];
-    let garbled = Garbled::start(Vec::new());
+    let garbled = Garbled::start(Vec::new(), "master");
     let client = garbled.rescue.client();
     let node = FakeNode::start("/c");
     let [changes, reads] = garbled_calls(&node);
@@ -167,10 +167,11 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
     assert_eq!(status(&client)["state"]["params"], 1);
 }
 
-/// Nor is it forgotten that the master must be read because other calls pass in between.
+/// Nor is it forgotten that the master must be read because other calls pass in between. Until then it
+/// answers reads itself.
 #[test]
 fn a_look_that_fails_is_taken_again() {
-    let garbled = Garbled::start(Vec::new());
+    let garbled = Garbled::start(Vec::new(), "mirror");
     let client = garbled.rescue.client();
     // Of the call, and of each look that follows.
     garbled.say(b"getTopicTypes", &with_status("200 OK", FAULT.as_bytes()));
@@ -182,6 +183,8 @@ fn a_look_that_fails_is_taken_again() {
     ));
     assert_eq!(client.exchange(&request).unwrap().text(), FAULT);
     client.set_param("/kept", 1);
+    assert_eq!(client.param("/garbled"), None);
+    assert_eq!(status(&client)["state"]["params"], 2);
     garbled.say(b"/no call says this", b"");
     eventually("the mirror is as the master", || {
         status(&client)["state"]["params"] == 1
@@ -204,7 +207,7 @@ fn a_master_whose_answers_are_no_http_counts_as_away() {
         broken("HTTP/1.1 200 OK\r\nContent-Length: 10000000000", fine),
         broken("HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked", "zz\r\n"),
     ];
-    let garbled = Garbled::start(Vec::new());
+    let garbled = Garbled::start(Vec::new(), "master");
     let client = garbled.rescue.client();
     let real = garbled.real.client();
     let twin = Rosmaster::start(&garbled.scratch);
@@ -244,7 +247,7 @@ fn a_master_whose_answers_are_no_http_counts_as_away() {
 /// Such as a master that is out of memory.
 #[test]
 fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
-    let garbled = Garbled::start(Vec::new());
+    let garbled = Garbled::start(Vec::new(), "master");
     let client = garbled.rescue.client();
     client.set_param("/kept", 1);
     let fault = with_status("200 OK", FAULT.as_bytes());
@@ -293,7 +296,7 @@ fn unusual_but_right_answers_of_the_master() {
         ),
     ];
     for answer in answers {
-        let garbled = Garbled::start(answer.clone().into_bytes());
+        let garbled = Garbled::start(answer.clone().into_bytes(), "master");
         let call = encode_call("setParam", params!["/c", "/garbled", 1]);
         let response = garbled
             .rescue

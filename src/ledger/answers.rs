@@ -1,0 +1,115 @@
+//! The mirror's answers: for the master, beside it, and while it is away.
+
+use std::time::Instant;
+
+use super::Ledger;
+use crate::{
+    checkpoint::format::Entry,
+    master::{Kind, Method, Request},
+    replay,
+    xmlrpc::{Reply, Value},
+};
+
+/// Most pending writes beside which unregistrations without effect on the mirror are kept.
+pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
+
+/// Memory for the answers to the reads of one multicall, in bytes. A few short reads of a large state could
+/// ask for any amount; larger ones wait for the master.
+const ANSWER_MOST: usize = 64 << 20;
+
+/// The same for a multicall of reads while there is a master, which answers larger ones.
+const EXACT_ANSWER_MOST: usize = 1 << 20;
+
+impl Ledger {
+    /// The master's predicted answer to a read; none if it is a multicall that asks for too much.
+    pub fn answer(&self, read: &Request) -> Option<Reply> {
+        let mirror = &mut self.lock().mirror;
+        let fits = mirror.fits(read, ANSWER_MOST);
+        fits.then(|| mirror.apply_telling(read, &mut ()))
+    }
+
+    /// The result of a read, if the present master's is the same to the byte. It shows every write that was
+    /// acknowledged.
+    pub fn exact_answer(&self, read: &Request) -> Option<Value> {
+        let inner = &mut *self.lock();
+        let fits = !inner.doubted && inner.mirror.fits(read, EXACT_ANSWER_MOST);
+        fits.then(|| inner.mirror.exact_answer(read))?
+    }
+
+    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
+    /// Nodes are notified as by a master. Returns the journal's last record too: the earlier write that made
+    /// this one redundant may be as new as that.
+    pub fn answer_if_unchanged(
+        &self,
+        now: Instant,
+        write: &Request,
+    ) -> Option<(Reply, Option<u64>)> {
+        let mut inner = self.lock();
+        // An unregistration may concern a registration that is still on its way to the master.
+        let idle = !write.calls().into_iter().any(is_unregistration)
+            && !inner.mirror.would_change(write)
+            && inner.mirror.fits(write, ANSWER_MOST);
+        idle.then(|| {
+            let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
+            (reply, inner.last_seq())
+        })
+    }
+
+    /// The master's predicted answer to this call.
+    pub fn predict(&self, call: &Request) -> Reply {
+        let mut model = self.with_mirror(Clone::clone);
+        model.apply_telling(call, &mut ())
+    }
+
+    /// Answers a call of the Master API as an absent master would: records its changes as pending, applies
+    /// them, and has nodes notified. Returns the journal's last record too: that of the call or, if it
+    /// changes nothing, of what made it redundant.
+    ///
+    /// None during an injection, or if the call also reads too much: it has to wait.
+    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Option<u64>)> {
+        let mut inner = self.lock();
+        if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
+            return None;
+        }
+        let changes = inner.mirror.would_change(call);
+        let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
+        let mut writes: Vec<&Request> = match reply {
+            // The writes were applied; only the answer could not be encoded. A refused one is refused again.
+            Reply::Fault { .. } => {
+                let writes = call.calls().into_iter();
+                writes.filter(|call| call.kind().mutates()).collect()
+            }
+            Reply::Value(_) => {
+                let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
+                let executed = accepted.into_iter().filter(|of| of.executed);
+                executed.map(|of| of.call).collect()
+            }
+        };
+        if !changes {
+            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
+            // before the reply.
+            let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
+            writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
+        }
+        if writes.is_empty() {
+            return Some((reply, inner.last_seq()));
+        }
+        // Makes an inspection under way outdated: it could bring back what this call takes away.
+        inner.version += u64::from(!changes);
+        self.stats.recorded.add(writes.len() as u64);
+        let entries = writes.iter().map(|&call| Entry::Call {
+            call: call.clone().into(),
+            pending: true,
+        });
+        let seq = inner.append(&entries.collect::<Vec<_>>());
+        inner.add_pending(writes.into_iter().cloned());
+        drop(inner);
+        self.work.notify_one();
+        Some((reply, seq))
+    }
+}
+
+/// Whether a call, other than a multicall, is an unregistration.
+fn is_unregistration(call: &Request) -> bool {
+    *call.method() != Method::Multicall && call.kind() == Kind::Unregister
+}

@@ -1,0 +1,73 @@
+//! Reads that the model answers to the byte as rosmaster does, and calls that it leaves to the master.
+
+use super::*;
+use crate::xmlrpc::MAX_DEPTH;
+
+fn master() -> Master {
+    after([publish("/n", "/t", "a/B"), set("/a/b", 1)])
+}
+
+#[test]
+fn a_read_is_answered_as_by_apply() {
+    let mut master = master();
+    let reads = [
+        call("getParam", &["/c", "/a"]),
+        call("getParam", &["/c", "/unset"]),
+        call("searchParam", &["/c", "a"]),
+        call("hasParam", &["/c", "/a/b"]),
+        call("lookupNode", &["/c", "/n"]),
+        call("lookupService", &["/c", "/none"]),
+        call("getSystemState", &["/c"]),
+        call("getTopicTypes", &["/c"]),
+        call("getPid", &["/c"]),
+    ];
+    let together = Request::multicall([Request::multicall(reads.clone()), reads[0].clone()]);
+    for read in reads.iter().chain([&together]) {
+        let reply = master.apply(read).reply;
+        assert_eq!(
+            master.exact_answer(read).map(Reply::Value),
+            Some(reply),
+            "{read:?}"
+        );
+    }
+}
+
+#[test]
+fn what_may_differ_from_the_master_is_not_answered_exactly() {
+    let mut master = master();
+    let get = call("getParam", &["/c", "/a"]);
+    let with = |other: Request| Request::multicall([get.clone(), other]);
+    for other in [
+        call("nonsense", &["/c"]),
+        call("getParam", &["/c"]),
+        call("getParam", &["/c", ""]),
+        call("searchParam", &["c", "a"]),
+        call("lookupNode", &["/c", "/somebody"]),
+        call("setParam", &["/c", "/a", "1"]),
+        call("shutdown", &["/c", "now"]),
+    ] {
+        assert_eq!(master.exact_answer(&other), None, "{other:?}");
+        assert_eq!(master.exact_answer(&with(other)), None);
+    }
+    assert!(master.exact_answer(&with(get.clone())).is_some());
+    assert_eq!(master.exact_answer(&with(get.clone()).malformed()), None);
+}
+
+#[test]
+fn a_state_that_is_kept_otherwise_is_not_answered_exactly() {
+    let get = call("getParam", &["/c", "/a"]);
+    let deep = "/x".repeat(513);
+    let nested = (0..MAX_DEPTH / 3).fold(Value::Int(1), |inner, _| vec![inner].into());
+    let star = Value::DateTime("*".to_owned());
+    let typed = ["/n".into(), "/t".into(), star, api("/n").into()];
+    for inexact in [
+        set(&deep, 1),
+        set(&format!("/a{}", "/x".repeat(500)), nested),
+        Request::new(Method::RegisterPublisher, typed),
+    ] {
+        let mut master = master();
+        assert!(master.exact_answer(&get).is_some());
+        master.apply(&inexact);
+        assert_eq!(master.exact_answer(&get), None);
+    }
+}

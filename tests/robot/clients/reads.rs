@@ -1,0 +1,79 @@
+//! Reads that the mirror answers while there is a master.
+
+use std::sync::atomic::{AtomicI32, Ordering};
+use std::thread;
+
+use crate::support::{Mode, Robot};
+use rosrescue::xmlrpc::Value;
+
+const WRITERS: usize = 6;
+const READERS: usize = 4;
+const ROUNDS: i32 = 300;
+
+/// Whichever connection it came on.
+fn a_read_shows_every_write_that_was_acknowledged(mode: Mode) {
+    let robot = Robot::start_with(mode, &["--reads", "mirror"]);
+    let acknowledged = [const { AtomicI32::new(0) }; WRITERS];
+    let is_over = || {
+        acknowledged
+            .iter()
+            .all(|last| last.load(Ordering::SeqCst) == ROUNDS)
+    };
+    thread::scope(|scope| {
+        for (number, last) in acknowledged.iter().enumerate() {
+            let client = robot.client();
+            scope.spawn(move || {
+                for round in 1..=ROUNDS {
+                    client.set_param(&format!("/writer/{number}"), round);
+                    last.store(round, Ordering::SeqCst);
+                }
+            });
+        }
+        for _ in 0..READERS {
+            let client = robot.client();
+            let acknowledged = &acknowledged;
+            scope.spawn(move || {
+                while !is_over() {
+                    let before: Vec<_> = acknowledged
+                        .iter()
+                        .map(|last| last.load(Ordering::SeqCst))
+                        .collect();
+                    let tree = client.param("/writer");
+                    let tree = tree.as_ref().and_then(Value::as_struct);
+                    for (number, before) in before.into_iter().enumerate().filter(|(_, n)| *n > 0) {
+                        let value = tree.and_then(|tree| tree.get(&number.to_string()));
+                        let value = value.and_then(Value::as_int);
+                        assert!(value >= Some(before), "{value:?} after {before}");
+                    }
+                }
+            });
+        }
+    });
+    assert!(robot.counter("mirrored") > 100);
+    assert_eq!(robot.counter("stood_in"), 0);
+}
+
+#[test]
+fn a_core_answers_reads_though_its_master_hangs() {
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let before = robot.counter("mirrored");
+    crate::support::stop(robot.master_pid());
+    assert_eq!(client.param("/gain"), Some(7.into()));
+    assert_eq!(robot.counter("mirrored"), before + 1);
+}
+
+/// As for a proxy, where somebody may write past it.
+#[test]
+fn a_core_forwards_reads_if_it_is_told_to() {
+    let robot = Robot::start_with(Mode::Core, &["--reads", "master"]);
+    let client = robot.client();
+    client.set_param("/gain", 7);
+    let past = robot.bare();
+    past.set_param("/gain", 8);
+    assert_eq!(client.param("/gain"), Some(8.into()));
+    assert_eq!(robot.counter("mirrored"), 0);
+}
+
+crate::support::in_both_modes!(a_read_shows_every_write_that_was_acknowledged);
