@@ -27,8 +27,6 @@ const LAST_JOBS: Duration = Duration::from_millis(500);
 /// A signal to all processes named rosrescue, as by killall, reaches a worker twice: directly and through
 /// its guardian. A second signal within this time counts as the first.
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
-/// More threads do not make a Python master faster, and each keeps a heap as large as its largest task.
-const THREADS_MAX: usize = 4;
 
 fn main() -> ExitCode {
     // Must be first: it removes them from the environment, which requires a single thread.
@@ -119,9 +117,10 @@ fn start(
 }
 
 fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    // With more threads each call wakes others, which costs a third more time of a core. One answers tens of
+    // thousands of reads a second, and what takes long goes elsewhere (`block_in_place`, `spawn_blocking`).
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(cores.min(THREADS_MAX))
+        .worker_threads(1)
         .enable_all()
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));

@@ -113,6 +113,15 @@ impl Master {
         self.uri = uri;
     }
 
+    /// A master with the same parameters and nothing else. Shares them, at no cost.
+    pub fn with_params_only(&self) -> Self {
+        Self {
+            params: self.params.clone(),
+            inexact: self.inexact,
+            ..Self::default()
+        }
+    }
+
     /// Whether the answers to reads may differ from rosmaster's. The state itself is compared without that.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()

@@ -268,7 +268,9 @@ impl Examiner {
             Treatment::Begin | Treatment::TakeOver | Treatment::Inject => (mirror.clone(), None),
             Treatment::Replace => (mirror.clone(), Some(before)),
             Treatment::Reconcile(authority) => {
-                let state = replay::reconcile(&mirror, &found, &pending, authority);
+                let state = tokio::task::block_in_place(|| {
+                    replay::reconcile(&mirror, &found, &pending, authority)
+                });
                 // Reading a master does not show its parameter subscribers.
                 let hidden = |call: &Request| {
                     let method = call.method();
@@ -311,10 +313,10 @@ impl Examiner {
             replaced,
         } = target;
         let mut next = ready.unwrap_or_else(|| {
-            let plan = match replaced {
+            let plan = tokio::task::block_in_place(|| match replaced {
                 Some(before) => Plan::replace(state, found, before, token),
                 None => Plan::new(state, found, token),
-            };
+            });
             Prepared {
                 basis: None,
                 complete: plan.expected() == state,
@@ -355,7 +357,7 @@ impl Examiner {
             let first = self.first_look(connection).await?;
             let found = inspect::second(first, connection, plan.expected());
             let found = self.while_alive(found).await?;
-            let plan = Plan::new(state, &found, token);
+            let plan = tokio::task::block_in_place(|| Plan::new(state, &found, token));
             next = Prepared {
                 basis: None,
                 complete: plan.expected() == state,

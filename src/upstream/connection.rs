@@ -24,6 +24,9 @@ use crate::{
     xmlrpc::{self, Call, Reply},
 };
 
+/// Replies that take a millisecond to decode, in bytes.
+const LONG: usize = 256 << 10;
+
 /// Sends and receives what hyper's handle is given.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
@@ -218,7 +221,11 @@ impl Connection {
 
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
         let body = Bytes::from(xmlrpc::encode_call(call));
-        self.forward(&Head::default(), body).await?.decode()
+        let reply = self.forward(&Head::default(), body).await?;
+        match reply.body.len() > LONG {
+            true => tokio::task::block_in_place(|| reply.decode()),
+            false => reply.decode(),
+        }
     }
 }
 

@@ -64,5 +64,7 @@ pub(crate) async fn second(
         Some(call) => Some(connection.call(&call.into()).await?),
         None => None,
     };
-    Ok(first.into_master(second.as_ref(), previous)?)
+    Ok(tokio::task::block_in_place(|| {
+        first.into_master(second.as_ref(), previous)
+    })?)
 }
