@@ -5,6 +5,7 @@
 pub(crate) mod batch;
 mod drain;
 mod outdated;
+pub(crate) mod parts;
 mod round_trip;
 
 use std::{sync::Arc, time::Duration};

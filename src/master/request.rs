@@ -55,10 +55,15 @@ impl Request {
 
     /// `system.multicall` of `requests`, in order.
     pub fn multicall(requests: impl IntoIterator<Item = Self>) -> Self {
+        Self::of_entries(requests.into_iter().map(Entry::Request).collect())
+    }
+
+    /// `system.multicall` with these entries.
+    pub(crate) fn of_entries(entries: Vec<Entry>) -> Self {
         Self {
             method: Method::Multicall,
             params: Vec::new(),
-            entries: requests.into_iter().map(Entry::Request).collect(),
+            entries,
         }
     }
 
@@ -94,6 +99,10 @@ impl Request {
 
     pub fn entries(&self) -> &[Entry] {
         &self.entries
+    }
+
+    pub(crate) fn into_entries(self) -> Vec<Entry> {
+        self.entries
     }
 
     pub fn caller(&self) -> Option<&str> {

@@ -12,7 +12,7 @@ use tokio::sync::{Notify, oneshot};
 
 use super::{
     admission,
-    replies::{self, HttpReply, forwarded, made, no_shutdown, xml},
+    replies::{self, HttpReply, encoded, forwarded, made, no_shutdown, xml},
 };
 use crate::{
     cli::Reads,
@@ -23,8 +23,10 @@ use crate::{
     upstream::{Head, pool::Pool},
     write_queue::{
         WriteQueue,
-        batch::{Answer, Item},
+        batch::{self, Answer, Item},
+        parts::Parts,
     },
+    xmlrpc::{self, ListWriter, Reply, Value},
 };
 
 /// The connection is closed without an answer. A node retries after that. An error made up by rosrescue would
@@ -36,6 +38,8 @@ pub struct Closed(pub(super) &'static str);
 /// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
 /// millisecond, and within some ten behind a call that keeps its interpreter busy.
 const PATIENCE: Duration = Duration::from_millis(100);
+/// Why a write is not answered.
+const UNANSWERED: &str = "the master gave no answer";
 /// Why a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "so many answers at once are left to the master";
 
@@ -88,7 +92,7 @@ impl Calls {
                 self.read(head, body, call.as_ref(), kind).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-                self.write(head, body, call.map(Arc::new)).await
+                self.write(head, body, call).await
             }
         }
     }
@@ -175,18 +179,68 @@ impl Calls {
         }
     }
 
-    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection,
-    /// or while the master takes too long, it does so only if the write changes nothing.
+    /// Answers a write. A long multicall goes in parts; the answer is that to the whole.
     async fn write(
         &self,
         head: Head,
         body: Bytes,
-        call: Option<Arc<Request>>,
+        mut call: Option<Request>,
     ) -> Result<HttpReply, Closed> {
+        if let Some(parts) = Parts::of(&mut call, body.len()) {
+            drop(body);
+            return self.write_parts(&head, parts).await;
+        }
+        let call = call.map(Arc::new);
+        let answer = self.queue(head, body, call.clone()).await?;
+        self.http(call.as_deref(), answer)
+    }
+
+    /// Makes one part after the other. If one gets no result for each entry, its answer is that to the whole.
+    async fn write_parts(&self, head: &Head, parts: Parts) -> Result<HttpReply, Closed> {
+        let mut whole = ListWriter::answer();
+        for part in parts {
+            let part = Arc::new(part);
+            let body = xmlrpc::encode_call(&Request::clone(&part).into());
+            let answer = self
+                .queue(head.clone(), body.into(), Some(part.clone()))
+                .await?;
+            let reply = match &answer {
+                Answer::Made(reply) => Some(reply.clone()),
+                Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
+                Answer::Close => None,
+            };
+            match reply.map(|reply| batch::with_uri(&part, reply, &self.uri)) {
+                Some(Reply::Value(Value::Array(results)))
+                    if results.len() == part.entries().len() =>
+                {
+                    results.iter().for_each(|result| whole.push(result));
+                }
+                _ => return self.http(Some(&part), answer),
+            }
+        }
+        Ok(encoded(whole.finish()))
+    }
+
+    fn http(&self, call: Option<&Request>, answer: Answer) -> Result<HttpReply, Closed> {
+        match answer {
+            Answer::Raw(raw) => Ok(forwarded(&self.uri, call, raw)),
+            Answer::Made(reply) => Ok(made(&self.uri, call, &reply)),
+            Answer::Close => Err(Closed(UNANSWERED)),
+        }
+    }
+
+    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection,
+    /// or while the master takes too long, it does so only if the write changes nothing.
+    async fn queue(
+        &self,
+        head: Head,
+        body: Bytes,
+        call: Option<Arc<Request>>,
+    ) -> Result<Answer, Closed> {
         if self.gate.state() == State::Injecting
             && let Some(reply) = self.answer_if_unchanged(call.as_deref()).await
         {
-            return Ok(reply);
+            return Ok(Answer::Made(reply));
         }
         let (answer, mut answered) = oneshot::channel();
         let item = Item {
@@ -212,11 +266,7 @@ impl Calls {
         let mut patient = true;
         loop {
             tokio::select! {
-                answer = &mut answered => return match answer {
-                    Ok(Answer::Raw(raw)) => Ok(forwarded(&self.uri, call, raw)),
-                    Ok(Answer::Made(reply)) => Ok(made(&self.uri, call, &reply)),
-                    Ok(Answer::Close) | Err(_) => Err(Closed("the master gave no answer")),
-                },
+                answer = &mut answered => return answer.map_err(|_| Closed(UNANSWERED)),
                 () = &mut held => {
                     self.stats.hold_expired.count();
                     return Err(Closed("the master did not come back in time, see --hold"));
@@ -230,7 +280,7 @@ impl Calls {
                     patient = false;
                     self.slow.notify_one();
                     if let Some(reply) = self.answer_if_unchanged(call).await {
-                        return Ok(reply);
+                        return Ok(Answer::Made(reply));
                     }
                 }
             }
@@ -248,7 +298,7 @@ impl Calls {
     }
 
     /// The mirror's answer to a write that changes nothing; none if it does.
-    async fn answer_if_unchanged(&self, call: Option<&Request>) -> Option<HttpReply> {
+    async fn answer_if_unchanged(&self, call: Option<&Request>) -> Option<Reply> {
         let call = call.filter(|call| call.is_answerable())?;
         let (reply, seq) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
         // The write that made this one redundant may not be on the disk yet.
@@ -256,6 +306,6 @@ impl Calls {
             self.ledger.durable(seq).await;
         }
         self.stats.stood_in.count();
-        Some(xml(&reply))
+        Some(reply)
     }
 }

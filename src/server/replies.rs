@@ -53,7 +53,7 @@ fn plain(raw: RawReply) -> HttpReply {
 }
 
 pub(super) fn xml(reply: &Reply) -> HttpReply {
-    xml_text(xmlrpc::encode_reply(reply))
+    encoded(xmlrpc::encode_reply(reply))
 }
 
 /// A method's result; none if rosmaster cannot marshal it. A long one takes milliseconds to encode, and must
@@ -65,11 +65,12 @@ pub(super) async fn result(value: Value) -> Option<HttpReply> {
         true => tokio::task::spawn_blocking(encode).await.ok()?,
         false => encode(),
     };
-    text.map(xml_text)
+    text.map(encoded)
 }
 
-fn xml_text(text: Vec<u8>) -> HttpReply {
-    let mut http = Response::new(Full::new(Bytes::from(text)));
+/// A reply of our own that is encoded already.
+pub(super) fn encoded(reply: Vec<u8>) -> HttpReply {
+    let mut http = Response::new(Full::new(Bytes::from(reply)));
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http

@@ -16,9 +16,9 @@ use crate::{
 
 /// Most calls in a batch. A compact multicall costs the master some 40 us a call, so a call waits for a few
 /// milliseconds at most.
-const CALLS_MAX: usize = 100;
+pub(super) const CALLS_MAX: usize = 100;
 /// Most bytes of bodies in a batch.
-const BYTES_MAX: usize = 1 << 20;
+pub(super) const BYTES_MAX: usize = 1 << 20;
 
 #[derive(Debug)]
 pub(crate) enum Answer {

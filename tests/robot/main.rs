@@ -66,10 +66,11 @@ mod clients {
     mod reads;
 }
 
-/// Memory, connections and files.
+/// Memory, connections, files and turns of writes.
 mod limits {
     mod connections;
     mod memory;
+    mod writes;
 }
 
 /// Options, start and stop.

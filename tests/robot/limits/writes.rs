@@ -1,0 +1,132 @@
+//! One client's writes do not keep the others' waiting.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{Client, Mode, Robot, Twins, encode_call, eventually, http_request, params};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+
+fn sets(name: &str, count: i32) -> impl Iterator<Item = Call> {
+    let name = name.to_owned();
+    (0..count).map(move |i| Call::new("setParam", params!["/test", format!("/{name}/p{i}"), i]))
+}
+
+/// The results of a multicall.
+#[track_caller]
+fn results(client: &Client, calls: impl IntoIterator<Item = Call>) -> Vec<Value> {
+    let Call { method, params } = Call::multicall(calls);
+    match client.call(&method, params) {
+        Ok(Reply::Value(Value::Array(results))) => results,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// How long each `setParam` takes while `load` runs, and how long that does.
+fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, Duration) {
+    client.set_param("/mine", 0);
+    thread::scope(|scope| {
+        let start = Instant::now();
+        let load = scope.spawn(move || {
+            load();
+            start.elapsed()
+        });
+        let mut waits = Vec::new();
+        while !load.is_finished() {
+            let sent = Instant::now();
+            client.set_param("/mine", 1);
+            waits.push(sent.elapsed());
+        }
+        (waits, load.join().unwrap())
+    })
+}
+
+#[test]
+fn writes_pass_a_long_multicall() {
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    let Call { method, params } = Call::multicall(sets("long", 20_000));
+    let request = http_request(&encode_call(&method, params));
+    let (waits, time) = waits_beside(&client, || {
+        client.exchange(&request).unwrap();
+    });
+    let longest = waits.iter().max().unwrap();
+    println!("{} writes, {longest:?} at most, in {time:?}", waits.len());
+    assert!(*longest < time / 20, "{longest:?} of {time:?}");
+}
+
+#[test]
+fn the_answer_to_a_long_multicall_is_the_masters_own() {
+    let twins = Twins::start();
+    let of = |method: &str, params: Vec<Value>| Call::new(method, params);
+    let mixed = |i: i32| {
+        let name = format!("/long/{i}");
+        let api = "http://127.0.0.1:1/";
+        [
+            of("setParam", params!["/test", name.clone(), i]),
+            of("setParam", params!["/test", "/", i]),
+            of("setParam", params!["/test"]),
+            of("deleteParam", params!["/test", format!("/long/{}", i / 2)]),
+            of("hasParam", params!["/test", name.clone()]),
+            of(
+                "registerService",
+                params!["/test", name.clone(), "rosrpc://127.0.0.1:2", api],
+            ),
+            of("lookupService", params!["/test", name.clone()]),
+            of(
+                "unregisterService",
+                params!["/test", name, "rosrpc://127.0.0.1:3"],
+            ),
+        ]
+    };
+    let calls: Vec<_> = (0..200).flat_map(mixed).collect();
+    let Reply::Value(Value::Array(results)) = ({
+        let Call { method, params } = Call::multicall(calls.clone());
+        twins.same_call(&method, params)
+    }) else {
+        panic!("no list")
+    };
+    assert_eq!(results.len(), calls.len());
+    // Some whose entries decide about each other.
+    let read = of("getParam", params!["/test", "/long"]);
+    let unknown = of("no_such_method", params![]);
+    let nested = Call::multicall([unknown.clone()]);
+    for last in [read, unknown, nested] {
+        let calls = calls.iter().cloned().chain([last]);
+        let Call { method, params } = Call::multicall(calls);
+        twins.same_call(&method, params);
+    }
+    let large: Value = "<&>".repeat(1 << 19).into();
+    let calls = (0..3).map(|_| of("setParam", params!["/test", "/large", large.clone()]));
+    let Call { method, params } = Call::multicall(calls);
+    twins.same_call(&method, params);
+    let whole = |client: &Client| client.call("getParam", params!["/test", "/"]).unwrap();
+    assert_eq!(whole(&twins.behind), whole(&twins.bare));
+}
+
+/// What the dead master has answered is kept, the rest is made up for.
+#[test]
+fn a_long_multicall_outlives_the_master() {
+    const COUNT: i32 = 5_000;
+    let mut robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    let dead = robot.master_pid();
+    let results = thread::scope(|scope| {
+        let long = scope.spawn(|| results(&client, sets("long", COUNT)));
+        let bare = robot.bare();
+        eventually("a part has run", || {
+            bare.param("/long/p1000").is_some() || long.is_finished()
+        });
+        robot.kill_master_at_once(dead);
+        long.join().unwrap()
+    });
+    let set = |i| {
+        let done = params![1, format!("parameter /long/p{i} set"), 0];
+        Value::from(vec![Value::from(done)])
+    };
+    assert_eq!(results, (0..COUNT).map(set).collect::<Vec<_>>());
+    robot.await_recovery(dead);
+    let Some(Value::Struct(long)) = robot.bare().param("/long") else {
+        panic!("no parameters")
+    };
+    assert_eq!(long.len(), COUNT as usize);
+}
