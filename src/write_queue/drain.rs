@@ -29,6 +29,11 @@ use crate::{
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// Pause before reading the master's state again after a failure.
 const LOOK_PAUSE: Duration = Duration::from_secs(1);
+/// Reading the master's state keeps writes waiting, the longer the larger it is. After each time they pass for
+/// this many times as long; whoever needs a reading meanwhile shares the next one.
+const REST_TIMES: u32 = 10;
+/// But not for longer: answers may wait for it.
+const REST_MOST: Duration = Duration::from_secs(30);
 /// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master
 /// closes its connections within milliseconds; one that only closed an idle connection answers.
 const GRACE: Duration = Duration::from_millis(5);
@@ -61,8 +66,10 @@ pub(crate) struct Drain {
     /// The incarnation for which the gate was open last.
     incarnation: u64,
     resync_due: bool,
-    /// When to retry a resync that failed.
+    /// When to try a resync that failed, or has to wait, again.
     resync_at: Option<tokio::time::Instant>,
+    /// Before this time there is no resync.
+    rest_until: Option<tokio::time::Instant>,
     retry_at: Option<tokio::time::Instant>,
     /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
     /// read from the master again and holds their effects.
@@ -102,6 +109,7 @@ impl Drain {
             incarnation: 0,
             resync_due: false,
             resync_at: None,
+            rest_until: None,
             retry_at: None,
             opaque: Opaque::default(),
         }
@@ -184,8 +192,14 @@ impl Drain {
         {
             let _ = own.answer.send(Answer::Close);
         }
-        let items = if std::mem::take(&mut self.resync_due) {
-            self.resync_at = None;
+        let rests = self
+            .rest_until
+            .filter(|end| tokio::time::Instant::now() < *end);
+        if self.resync_due {
+            self.resync_at = rests;
+        }
+        let items = if self.resync_due && rests.is_none() {
+            self.resync_due = false;
             Vec::new()
         } else {
             let items = batch::pack(&mut self.queue);
@@ -214,12 +228,17 @@ impl Drain {
             incarnation,
             version,
             items,
+            sent,
             ..
         }) = self.in_flight.take()
         else {
             return;
         };
         self.connection = done.connection;
+        let connected = !matches!(done.result, Err(RoundTripError::Connect(_)));
+        if items.is_empty() && connected {
+            self.rest_until = Some(tokio::time::Instant::now() + rest_after(sent.elapsed()));
+        }
         match done.result {
             Ok(Received::Held(state)) => self.resync(incarnation, version, *state),
             Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
@@ -420,6 +439,11 @@ impl Drain {
             send();
         });
     }
+}
+
+/// How long writes pass after a reading of the master's state that took `time`.
+fn rest_after(time: Duration) -> Duration {
+    (time * REST_TIMES).min(REST_MOST)
 }
 
 /// Whether `call`, or an entry of it, subscribes a parameter. The reply holds the parameter's value.

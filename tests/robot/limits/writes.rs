@@ -3,8 +3,10 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::support::{Client, Mode, Robot, Twins, encode_call, eventually, http_request, params};
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use crate::support::{
+    Client, Mode, Robot, Twins, encode_call, eventually, http_request, params, unreadable,
+};
+use rosrescue::xmlrpc::{Call, Reply, Struct, Value};
 
 fn sets(name: &str, count: i32) -> impl Iterator<Item = Call> {
     let name = name.to_owned();
@@ -23,7 +25,6 @@ fn results(client: &Client, calls: impl IntoIterator<Item = Call>) -> Vec<Value>
 
 /// How long each `setParam` takes while `load` runs, and how long that does.
 fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, Duration) {
-    client.set_param("/mine", 0);
     thread::scope(|scope| {
         let start = Instant::now();
         let load = scope.spawn(move || {
@@ -33,7 +34,8 @@ fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, 
         let mut waits = Vec::new();
         while !load.is_finished() {
             let sent = Instant::now();
-            client.set_param("/mine", 1);
+            // One that changes nothing is not kept waiting.
+            client.set_param("/mine", i32::try_from(waits.len()).unwrap());
             waits.push(sent.elapsed());
         }
         (waits, load.join().unwrap())
@@ -129,4 +131,36 @@ fn a_long_multicall_outlives_the_master() {
         panic!("no parameters")
     };
     assert_eq!(long.len(), COUNT as usize);
+}
+
+/// rosrescue must read the master's state before it answers such a call: they share that.
+#[test]
+fn writes_pass_calls_that_only_the_master_understands() {
+    const CALLS: i32 = 40;
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    let many = (0..5_000).map(|i| (format!("p{i}"), Value::from(format!("the value of {i}"))));
+    client.set_param("/many", Value::Struct(Struct::from_iter(many)));
+    let start = Instant::now();
+    for value in 0..100 {
+        client.set_param("/mine", value);
+    }
+    let alone = start.elapsed() / 100;
+    let (waits, time) = waits_beside(&client, || {
+        thread::scope(|scope| {
+            for number in 0..CALLS {
+                let request = unreadable(&format!("/unreadable_{number}"), number);
+                let client = &client;
+                scope.spawn(move || client.exchange(&request).unwrap());
+                thread::sleep(Duration::from_millis(70));
+            }
+        });
+    });
+    println!("{} writes in {time:?}, {alone:?} each alone", waits.len());
+    let possible = time.as_secs_f64() / alone.as_secs_f64();
+    assert!(waits.len() as f64 > possible / 16.0, "{possible} alone");
+    for number in 0..CALLS {
+        let key = format!("/unreadable_{number}");
+        assert_eq!(robot.bare().param(&key), Some(number.into()));
+    }
 }
