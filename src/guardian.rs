@@ -155,6 +155,10 @@ impl Worker {
             // It is meant for another process.
             command.env_remove("WATCHDOG_USEC");
         }
+        let (name, value) = handover::TUNABLES;
+        if std::env::var_os(name).is_none() {
+            command.env(name, value);
+        }
         // The worker feeds systemd's watchdog for us.
         command.env_remove("WATCHDOG_PID");
         command.fd_mappings(mappings.collect())?;

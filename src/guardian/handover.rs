@@ -31,6 +31,13 @@ pub(super) const LISTEN_PID: &str = "LISTEN_PID";
 pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
 /// The process id of the worker's guardian.
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
+/// The worker's memory, unless the user has said otherwise: one heap, and large pieces apart from it. What a
+/// large call has taken goes back to the system after it. By default glibc keeps most of it, in a heap for
+/// each thread.
+pub(super) const TUNABLES: (&str, &str) = (
+    "GLIBC_TUNABLES",
+    "glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=131072:glibc.malloc.trim_threshold=131072",
+);
 
 /// Sent by a worker once it handles signals: before, a signal would kill it.
 pub(super) const HANDLES_SIGNALS: u8 = b'h';
@@ -174,6 +181,10 @@ pub fn keep_from(command: &mut Command) {
         "WATCHDOG_PID",
         "WATCHDOG_USEC",
     ] {
+        command.env_remove(name);
+    }
+    let (name, value) = TUNABLES;
+    if std::env::var_os(name).is_some_and(|of| of == value) {
         command.env_remove(name);
     }
 }

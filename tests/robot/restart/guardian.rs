@@ -157,7 +157,7 @@ fn a_rosout_that_has_just_been_started_is_adopted() {
 }
 
 #[test]
-fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
+fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);
     let guardian = rescue.pid();
@@ -170,6 +170,10 @@ fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
     };
     // IPv4 and, where there is one, IPv6.
     assert!(shared(worker(&scratch)) >= 1);
+    assert_eq!(
+        process_with(&scratch, "GLIBC_TUNABLES="),
+        Some(worker(&scratch))
+    );
     for program in ["rosmaster --core", "rosout/rosout"] {
         let pid = process_of(&scratch, program);
         assert_eq!(shared(pid), 0, "{program} has inherited a socket");
@@ -177,6 +181,7 @@ fn a_guardian_is_small_and_its_sockets_are_for_the_worker_alone() {
         let environment = String::from_utf8_lossy(&environment);
         assert!(!environment.contains("LISTEN_FDS"), "{program}");
         assert!(!environment.contains("ROSRESCUE_GUARDIAN"), "{program}");
+        assert!(!environment.contains("GLIBC_TUNABLES"), "{program}");
     }
     let memory = fs::read_to_string(format!("/proc/{guardian}/smaps_rollup")).unwrap();
     let line = memory
