@@ -5,9 +5,11 @@
 //! a dead one.
 
 mod backoff;
+mod rates;
 mod repeats;
 mod unreachable;
 
+pub(crate) use rates::Rates;
 pub(crate) use repeats::Repeats;
 pub(crate) use unreachable::Unreachable;
 
@@ -30,6 +32,15 @@ const COMMON: [&str; 6] = [
 
 /// Topics with their types, as listed by a node.
 type Topics = BTreeMap<String, String>;
+
+/// The part of a node's address that says where to connect: what follows the port is not sent. Names whose
+/// addresses differ only there share a port, and what is asked there.
+pub(crate) fn port_of(api: &str) -> &str {
+    let api = api.trim();
+    let host = api.find("//").map_or(0, |at| at + 2);
+    let end = api.match_indices('/').find(|(at, _)| *at >= host);
+    end.map_or(api, |(end, _)| api.split_at(end).0)
+}
 
 /// What a node reports to publish and subscribe.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

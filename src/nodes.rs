@@ -2,7 +2,9 @@
 
 pub(crate) mod client;
 pub(crate) mod health_check;
+mod identify;
 pub(crate) mod notifications;
+mod visits;
 
 use std::{
     collections::HashSet,
@@ -16,22 +18,25 @@ use std::{
 use tokio::sync::Notify;
 use tracing::Instrument;
 
-use self::{client::Sign, health_check::CheckResult, notifications::Notifications};
+use self::{
+    client::Sign,
+    health_check::CheckResult,
+    identify::{IDENTIFY_AFTER, New},
+    notifications::Notifications,
+    visits::Visits,
+};
 use crate::{
     gate::{self, State},
-    health::{Repeats, Unreachable},
+    health::{Repeats, Unreachable, port_of},
     ledger::{
         Ledger,
         activity::{Change, Notification, Owed},
     },
-    master,
     status::{report::HealthCheck, stats::Stats},
     wait,
     write_queue::WriteQueue,
 };
 
-/// A node is asked for its process id this long after its last registration: starting nodes are busy.
-const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
 /// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most
 /// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
@@ -45,6 +50,8 @@ pub struct Nodes {
     /// How long a node may take to answer.
     timeout: Duration,
     pub(super) notifications: Notifications,
+    visits: Visits,
+    new: New,
     unreachable: Mutex<Unreachable>,
     /// Recoveries whose health check is not over.
     checks: AtomicUsize,
@@ -69,6 +76,8 @@ impl Nodes {
             stats,
             timeout,
             notifications: Notifications::default(),
+            visits: Visits::default(),
+            new: New::default(),
             unreachable: Mutex::default(),
             checks: AtomicUsize::new(0),
             unanswered: AtomicUsize::new(0),
@@ -82,8 +91,8 @@ impl Nodes {
             .unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub fn is_unreachable(&self, api: &str) -> bool {
-        self.lock().contains(api)
+    pub fn is_unreachable(&self, port: &str) -> bool {
+        self.lock().contains(port)
     }
 
     /// The names of the nodes that are unreachable.
@@ -91,21 +100,24 @@ impl Nodes {
         // Never hold both locks here.
         let unreachable = self.lock().clone();
         let mut names: Vec<String> = self.ledger.with_mirror(|mirror| {
-            let nodes = mirror.nodes().filter(|(_, api)| unreachable.contains(api));
+            let nodes = mirror.nodes();
+            let nodes = nodes.filter(|(_, api)| unreachable.contains(port_of(api)));
             nodes.map(|(name, _)| name.to_owned()).collect()
         });
         names.sort();
         names
     }
 
-    /// The node at `api` did not answer.
-    pub(super) fn mark_unreachable(&self, api: &str) {
+    /// The node at `port` did not answer.
+    pub(super) fn mark_unreachable(&self, port: &str) {
         let now = Instant::now();
-        if !self.lock().add(api, now) {
+        let new = self.lock().add(port, now);
+        // It may be due before the others.
+        self.changed.notify_one();
+        if !new {
             return;
         }
-        tracing::debug!(api, "a node does not answer");
-        self.changed.notify_one();
+        tracing::debug!(port, "a node does not answer");
         if self.update_notifying() {
             // The master may be about to notify this very node of recent changes, before all others.
             self.ledger
@@ -114,9 +126,9 @@ impl Nodes {
         }
     }
 
-    /// The node at `api` has answered, or is gone. Returns whether it was unreachable.
-    pub(super) fn clear(&self, api: &str) -> bool {
-        let was = self.lock().remove(api);
+    /// The node at `port` has answered, or is gone. Returns whether it was unreachable.
+    pub(super) fn clear(&self, port: &str) -> bool {
+        let was = self.lock().remove(port);
         if was {
             self.update_notifying();
         }
@@ -189,9 +201,8 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
                     tell(&nodes, change);
                 }
             }
-            // A new unreachable node may be due before the others.
             () = nodes.changed.notified() => {}
-            () = wait::until(identify_at) => identify_new_nodes(&nodes),
+            () = wait::until(identify_at) => identify::new_nodes(&nodes),
             () = wait::tick(&mut reaping) => {
                 if nodes.gate.is_open() {
                     let check = reap(nodes.clone());
@@ -247,19 +258,19 @@ fn tell(nodes: &Arc<Nodes>, change: Change) {
 
 fn ask_unreachable(nodes: &Arc<Nodes>) {
     let registered = nodes.ledger.with_mirror(|mirror| {
-        let apis = mirror.nodes().map(|(_, api)| api.to_owned());
-        apis.collect::<HashSet<_>>()
+        let ports = mirror.nodes().map(|(_, api)| port_of(api).to_owned());
+        ports.collect::<HashSet<_>>()
     });
     let due = {
         let mut unreachable = nodes.lock();
-        unreachable.retain(|api| registered.contains(api));
+        unreachable.retain(|port| registered.contains(port));
         unreachable.due(Instant::now())
     };
     nodes.update_notifying();
-    for api in due {
+    for port in due {
         let nodes = nodes.clone();
         tokio::spawn(async move {
-            let outcome = health_check::visit(&nodes, api).await;
+            let outcome = health_check::visit(&nodes, port).await;
             if outcome.sign != Sign::Silent {
                 say(&outcome, "an unreachable node answers again");
             }
@@ -275,36 +286,6 @@ fn say(outcome: &CheckResult, what: &str) {
     } = outcome;
     let names = &outcome.names;
     tracing::info!(?names, ?removed, ?reconciled, "{what}");
-}
-
-/// Asks newly registered nodes for their process ids. A different process id at the same port will mean a
-/// different node.
-fn identify_new_nodes(nodes: &Arc<Nodes>) {
-    let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
-        return;
-    };
-    let new = nodes.ledger.with_activity(|mirror, activity| {
-        let new = activity.take_unidentified(before).into_iter();
-        let new = new.filter_map(|name| {
-            let api = mirror.api_of(&name)?.to_owned();
-            let registered = activity.last_calls(&name).registered;
-            Some((name, api, registered))
-        });
-        new.collect::<Vec<_>>()
-    });
-    for (name, api, registered) in new {
-        let nodes = nodes.clone();
-        tokio::spawn(async move {
-            let permit = health_check::permit().await;
-            let answer = client::ask_for(&api, &master::get_pid(), nodes.timeout).await;
-            drop(permit);
-            if let Some(pid) = answer.1.and_then(|pid| pid.as_int()) {
-                nodes.ledger.with_activity(|_, activity| {
-                    activity.remember_pid(&name, &api, registered, pid);
-                });
-            }
-        });
-    }
 }
 
 /// The regular health check.

@@ -1,6 +1,7 @@
 //! Whether nodes of a recorded session are alive.
 
 use std::{
+    collections::BTreeSet,
     io,
     net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket},
     time::Duration,
@@ -9,6 +10,7 @@ use std::{
 use tokio::{task::JoinSet, time::timeout};
 
 use crate::{
+    health::port_of,
     master::{self, Master},
     nodes::client::{self, Sign},
     resolver,
@@ -24,8 +26,9 @@ const LIFE_SIGN: Duration = Duration::from_secs(1);
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     let call = master::get_pid();
     let mut questions = JoinSet::new();
-    for (_, api) in state.nodes() {
-        let (api, call) = (api.to_owned(), call.clone());
+    let ports: BTreeSet<_> = state.nodes().map(|(_, api)| port_of(api)).collect();
+    for port in ports {
+        let (api, call) = (port.to_owned(), call.clone());
         questions.spawn(async move {
             (same_boot || is_elsewhere(&api).await)
                 && client::ask(&api, &call, LIFE_SIGN).await == Sign::Alive

@@ -42,6 +42,20 @@ fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<V
 }
 
 #[test]
+fn names_share_a_port_whatever_follows_it() {
+    for (api, port) in [
+        ("http://n:1/", "http://n:1"),
+        ("http://n:1", "http://n:1"),
+        (" http://n:1/a/b", "http://n:1"),
+        ("http://[::1]:1/", "http://[::1]:1"),
+        ("n", "n"),
+        ("", ""),
+    ] {
+        assert_eq!(port_of(api), port);
+    }
+}
+
+#[test]
 fn another_process_id_is_another_node() {
     use Verdict::{Another, Itself};
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);

@@ -12,56 +12,71 @@ const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
-/// The unreachable addresses, and when each is asked next.
+/// The unreachable ports, and when each is asked next.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Unreachable {
-    of: BTreeMap<String, Backoff>,
+    of: BTreeMap<String, Wait>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Wait {
+    backoff: Backoff,
+    /// It is due, and has not answered yet.
+    asked: bool,
 }
 
 impl Unreachable {
-    /// Adds a node that has not answered. Returns whether that is new.
-    pub(crate) fn add(&mut self, api: &str, now: Instant) -> bool {
-        if self.of.contains_key(api) {
+    /// Adds a port that has not answered, or notes that it has not answered again. Returns whether that is
+    /// new.
+    pub(crate) fn add(&mut self, port: &str, now: Instant) -> bool {
+        if let Some(wait) = self.of.get_mut(port) {
+            if std::mem::take(&mut wait.asked) {
+                wait.backoff.done(now, LONGEST_PAUSE);
+            }
             return false;
         }
-        let backoff = Backoff::new(now + FIRST_PAUSE, FIRST_PAUSE * 2);
-        self.of.insert(api.to_owned(), backoff);
+        let wait = Wait {
+            backoff: Backoff::new(now + FIRST_PAUSE, FIRST_PAUSE * 2),
+            asked: false,
+        };
+        self.of.insert(port.to_owned(), wait);
         true
     }
 
-    /// Removes a node that has answered or is gone. Returns whether it was unreachable.
-    pub(crate) fn remove(&mut self, api: &str) -> bool {
-        self.of.remove(api).is_some()
+    /// Removes a port that has answered or has nobody. Returns whether it was unreachable.
+    pub(crate) fn remove(&mut self, port: &str) -> bool {
+        self.of.remove(port).is_some()
     }
 
     /// Drops those that are not registered any more.
     pub(crate) fn retain(&mut self, registered: impl Fn(&str) -> bool) {
-        self.of.retain(|api, _| registered(api));
+        self.of.retain(|port, _| registered(port));
     }
 
-    pub(crate) fn contains(&self, api: &str) -> bool {
-        self.of.contains_key(api)
+    pub(crate) fn contains(&self, port: &str) -> bool {
+        self.of.contains_key(port)
     }
 
     pub(crate) fn is_empty(&self) -> bool {
         self.of.is_empty()
     }
 
-    /// Addresses to ask now. Each following pause is longer.
+    /// Ports to ask now. None is returned again before it has been added again: however long it has to wait
+    /// for its visit, there is one at a time. Each following pause is longer.
     pub(crate) fn due(&mut self, now: Instant) -> Vec<String> {
-        let mut due = Vec::new();
-        for (api, backoff) in &mut self.of {
-            if backoff.next() <= now {
-                backoff.done(now, LONGEST_PAUSE);
-                due.push(api.clone());
-            }
-        }
-        due
+        let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
+        let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);
+        due.map(|(port, wait)| {
+            wait.asked = true;
+            port.clone()
+        })
+        .collect()
     }
 
-    /// When the next node is due.
+    /// When the next one is due.
     pub(crate) fn next(&self) -> Option<Instant> {
-        self.of.values().map(Backoff::next).min()
+        let waiting = self.of.values().filter(|wait| !wait.asked);
+        waiting.map(|wait| wait.backoff.next()).min()
     }
 }
 
@@ -78,6 +93,7 @@ mod tests {
         while asked.len() < 9 {
             let next = unreachable.next().unwrap();
             assert_eq!(unreachable.due(next), ["a"]);
+            assert!(!unreachable.add("a", next));
             asked.push((next - start).as_secs());
         }
         assert_eq!(asked, [1, 3, 7, 15, 31, 63, 123, 183, 243]);
@@ -87,11 +103,24 @@ mod tests {
     }
 
     #[test]
+    fn who_is_being_asked_is_not_asked_again() {
+        let start = Instant::now();
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", start);
+        let late = start + Duration::from_secs(100);
+        assert_eq!(unreachable.due(late), ["a"]);
+        assert_eq!(unreachable.next(), None);
+        assert_eq!(unreachable.due(late), Vec::<String>::new());
+        unreachable.add("a", late);
+        assert_eq!(unreachable.next(), Some(late + FIRST_PAUSE * 2));
+    }
+
+    #[test]
     fn who_is_not_registered_any_more_is_not_unreachable() {
         let mut unreachable = Unreachable::default();
         unreachable.add("a", Instant::now());
         unreachable.add("b", Instant::now());
-        unreachable.retain(|api| api == "b");
+        unreachable.retain(|port| port == "b");
         assert!(!unreachable.contains("a") && unreachable.contains("b"));
     }
 }

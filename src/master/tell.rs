@@ -56,26 +56,26 @@ impl Master {
         all.collect()
     }
 
-    /// Whether a node at `api` subscribes a topic.
-    pub fn subscribes(&self, api: &str, topic: &str) -> bool {
+    /// Whether a node whose address is `at` subscribes a topic.
+    pub fn subscribes(&self, at: impl Fn(&str) -> bool, topic: &str) -> bool {
         let nodes = self.registry.shared(Shared::Subscribers).get(topic);
-        self.any_at(api, nodes)
+        self.any_at(&at, nodes)
     }
 
-    /// Whether a node at `api` subscribes `key`, a namespace above it, or a key below it.
-    pub fn subscribes_param(&self, api: &str, key: &str) -> bool {
+    /// Whether a node whose address is `at` subscribes `key`, a namespace above it, or a key below it.
+    pub fn subscribes_param(&self, at: impl Fn(&str) -> bool, key: &str) -> bool {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).iter();
         let mut related = subscribers.filter(|(subscribed, _)| {
             key.starts_with(subscribed.as_str()) || subscribed.starts_with(key)
         });
-        related.any(|(_, nodes)| self.any_at(api, Some(nodes)))
+        related.any(|(_, nodes)| self.any_at(&at, Some(nodes)))
     }
 
-    fn any_at(&self, api: &str, nodes: Option<&Vec<String>>) -> bool {
+    fn any_at(&self, at: &impl Fn(&str) -> bool, nodes: Option<&Vec<String>>) -> bool {
         nodes
             .into_iter()
             .flatten()
-            .any(|node| self.api_of(node) == Some(api))
+            .any(|node| self.api_of(node).is_some_and(at))
     }
 
     /// The node that `call` displaces, and its present address: the call registers something under the same
@@ -152,7 +152,9 @@ mod tests {
         let list = update.params.get(2).unwrap().as_array().unwrap();
         assert_eq!(list, [Value::from("http://p:1/")]);
         assert_eq!(told.len(), 1);
-        assert!(master.subscribes("http://s:1/", "/t") && !master.subscribes("http://p:1/", "/t"));
+        let at = |api: &'static str| move |at: &str| at == api;
+        assert!(master.subscribes(at("http://s:1/"), "/t"));
+        assert!(!master.subscribes(at("http://p:1/"), "/t"));
 
         let set = Request::new(
             Method::SetParam,
@@ -164,8 +166,8 @@ mod tests {
         };
         let update = master.param_update(key).unwrap();
         assert_eq!(update.params.get(2), Some(value));
-        assert!(master.subscribes_param("http://s:1/", key));
-        assert!(!master.subscribes_param("http://s:1/", "/b/"));
+        assert!(master.subscribes_param(|api| api == "http://s:1/", key));
+        assert!(!master.subscribes_param(|api| api == "http://s:1/", "/b/"));
         let gone = master.param_update("/not/there/").unwrap();
         assert_eq!(gone.params.get(2), Some(&Value::Struct(Struct::new())));
     }

@@ -1,6 +1,9 @@
 //! Talking to a node at its own port.
 
-use std::time::Duration;
+use std::{
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use hyper::header::HeaderValue;
 use tokio::{net::TcpStream, time::timeout};
@@ -50,6 +53,13 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, O
         .unwrap_or((Sign::Silent, None))
 }
 
+/// The host of `api`, or the first of its addresses; none if it gets none within `limit`.
+pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
+    let MasterUri { host, port } = MasterUri::parse(api).ok()?;
+    let found = timeout(limit, resolver::addresses(&host, port)).await;
+    found.ok()?.ok()?.first().map(SocketAddr::ip)
+}
+
 /// What a node reports of itself.
 #[derive(Debug)]
 pub(crate) struct Interview {
@@ -57,6 +67,15 @@ pub(crate) struct Interview {
     pub pid: Option<i32>,
     /// What it publishes and subscribes, if known.
     pub claims: Option<Claims>,
+}
+
+impl Interview {
+    /// There was no answer.
+    pub(super) const SILENT: Self = Self {
+        sign: Sign::Silent,
+        pid: None,
+        claims: None,
+    };
 }
 
 /// Asks the node at `api` for its process id, within `limit`. If it answers, also for what it publishes and

@@ -5,15 +5,12 @@
 //! before that call is done.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
-use tokio::{
-    sync::{Semaphore, SemaphorePermit},
-    task::JoinSet,
-};
+use tokio::task::JoinSet;
 
 use super::{
     Nodes,
@@ -25,29 +22,18 @@ use tracing::Instrument;
 
 use crate::{
     gate::State,
-    health::{Name, Reconciliation, Registration, Verdict, judge},
-    ledger::activity::Activity,
-    master::{self, CALLER_ID, Kind, Master, Method, Request},
+    health::{Name, Reconciliation, Registration, Verdict, judge, port_of},
+    master::{self, CALLER_ID, Kind, Method, Request},
     replay::Token,
     ros_env::MasterUri,
     write_queue::batch::{self, Condition},
     xmlrpc::Reply,
 };
 
-/// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
-const AT_ONCE: usize = 64;
 /// Pause before a node is asked again, to confirm what is to be removed from it.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
 /// Most questions to a node with changing answers.
 const QUESTIONS: u32 = 4;
-
-static PERMITS: Semaphore = Semaphore::const_new(AT_ONCE);
-
-/// Permission to ask a node.
-pub(crate) async fn permit() -> Option<SemaphorePermit<'static>> {
-    // Never closed.
-    PERMITS.acquire().await.ok()
-}
 
 /// The result of asking one port.
 #[derive(Debug)]
@@ -107,21 +93,21 @@ async fn barrier(nodes: &Nodes) {
     nodes.write_queue.call(last).await;
 }
 
-/// Asks every node, all at the same time.
+/// Asks every node, all at the same time, with the limits of [`Visits`](super::visits::Visits).
 pub(crate) async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
     collect(begin_visits(nodes)).await
 }
 
 fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
-    let apis: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
+    let ports: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-        let apis = nodes.map(|(_, api)| api.to_owned());
         // Addresses that rosrescue cannot call, the master cannot call either.
-        apis.filter(|api| MasterUri::parse(api).is_ok()).collect()
+        let nodes = nodes.filter(|(_, api)| MasterUri::parse(api).is_ok());
+        nodes.map(|(_, api)| port_of(api).to_owned()).collect()
     });
     let mut visits = JoinSet::new();
-    for api in apis {
-        visits.spawn(visit(nodes, api));
+    for port in ports {
+        visits.spawn(visit(nodes, port));
     }
     visits
 }
@@ -139,32 +125,17 @@ async fn collect(mut visits: JoinSet<CheckResult>) -> HealthCheck {
     check
 }
 
-/// Who is registered at `api`.
-pub(crate) fn names_at(mirror: &Master, activity: &Activity, api: &str) -> Vec<Name> {
-    let nodes = mirror.nodes().filter(|(_, at)| *at == api);
-    let names = nodes.map(|(node, _)| {
-        let pid = activity.pid_of(node, api);
-        Name {
-            node: node.to_owned(),
-            known_pid: pid.map(|(pid, _)| pid),
-            registered_since: pid.is_some_and(|(_, since)| since),
-            registered: activity.last_calls(node).registered,
-        }
-    });
-    names.collect()
-}
-
-/// Asks the node behind `api` until its answers allow a verdict.
+/// Asks the node behind `port` until its answers allow a verdict on each name there.
 pub(crate) fn visit(
     nodes: &Arc<Nodes>,
-    api: String,
+    port: String,
 ) -> impl Future<Output = CheckResult> + Send + 'static {
     let (nodes, waiting) = (nodes.clone(), Waiting::new(nodes));
-    let span = tracing::debug_span!("visit", api);
-    async move { converse(&nodes, &api, waiting).await }.instrument(span)
+    let span = tracing::debug_span!("visit", port);
+    async move { converse(&nodes, &port, waiting).await }.instrument(span)
 }
 
-async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResult {
+async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResult {
     let mut waiting = Some(waiting);
     let mut outcome = CheckResult {
         sign: Sign::Silent,
@@ -172,49 +143,54 @@ async fn converse(nodes: &Arc<Nodes>, api: &str, waiting: Waiting) -> CheckResul
         removed: Vec::new(),
         reconciled: Vec::new(),
     };
-    let mut before = Findings::default();
+    let mut before = BTreeMap::new();
     for question in 0..QUESTIONS {
         if question > 0 {
             tokio::time::sleep(SECOND_QUESTION).await;
         }
-        let asked = Asked::new(nodes, api);
-        if asked.names.is_empty() {
-            nodes.clear(api);
+        let admitted = nodes.visits.admit(port, nodes.timeout).await;
+        let asked = Asked::all(nodes, port);
+        if asked.is_empty() {
+            nodes.clear(port);
             break;
         }
-        let permit = permit().await;
-        let interview = client::interview(api, nodes.timeout).await;
-        drop(permit);
+        let interview = match &admitted {
+            Some(_) => client::interview(port, nodes.timeout).await,
+            None => Interview::SILENT,
+        };
+        drop(admitted);
         outcome.sign = interview.sign;
-        outcome.names = asked.names.iter().map(|name| name.node.clone()).collect();
+        let names = asked.iter().flat_map(|asked| &asked.names);
+        outcome.names = names.map(|name| name.node.clone()).collect();
         match interview.sign {
             Sign::Silent => {
-                nodes.mark_unreachable(api);
+                nodes.mark_unreachable(port);
                 break;
             }
             Sign::Dead => {
-                for name in &asked.names {
-                    if remove(nodes, name, api).await {
-                        outcome.removed.push(name.node.clone());
-                    }
-                }
-                nodes.clear(api);
+                outcome.removed = remove_all(nodes, asked).await;
+                nodes.clear(port);
                 break;
             }
             Sign::Alive => {
-                if nodes.clear(api) {
+                if nodes.clear(port) {
                     // Notifications that were held back meanwhile.
-                    notifications::notify_of_all(nodes, api);
+                    notifications::notify_of_all(nodes, port);
                 }
             }
         }
         drop(waiting.take());
-        let findings = asked.findings(nodes, api, &interview);
-        findings.act(nodes, api, &before, &mut outcome).await;
-        if findings.is_settled() {
+        let mut found = BTreeMap::new();
+        for asked in asked {
+            let findings = asked.findings(nodes, &interview);
+            let before = before.remove(&asked.api).unwrap_or_default();
+            findings.act(nodes, &asked.api, &before, &mut outcome).await;
+            found.insert(asked.api, findings);
+        }
+        if found.values().all(Findings::is_settled) {
             break;
         }
-        before = findings;
+        before = found;
     }
     outcome
 }
@@ -235,8 +211,10 @@ impl Drop for Waiting {
     }
 }
 
-/// The names at a port before the question, and when each last unregistered something.
+/// The names at an address before the question, and when each last unregistered something.
+#[derive(Default)]
 struct Asked {
+    api: String,
     names: Vec<Name>,
     unregistered: Vec<u64>,
 }
@@ -249,19 +227,32 @@ struct Findings {
 }
 
 impl Asked {
-    fn new(nodes: &Nodes, api: &str) -> Self {
+    /// The addresses with this port.
+    fn all(nodes: &Nodes, port: &str) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
-            let names = names_at(mirror, activity, api);
-            let last = names.iter().map(|name| activity.last_calls(&name.node));
-            Self {
-                unregistered: last.map(|last_calls| last_calls.unregistered).collect(),
-                names,
+            let mut all = BTreeMap::<_, Self>::new();
+            for (node, api) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
+                let pid = activity.pid_of(node, api);
+                let last_calls = activity.last_calls(node);
+                let asked = all.entry(api).or_insert_with(|| Self {
+                    api: api.to_owned(),
+                    ..Self::default()
+                });
+                asked.names.push(Name {
+                    node: node.to_owned(),
+                    known_pid: pid.map(|(pid, _)| pid),
+                    registered_since: pid.is_some_and(|(_, since)| since),
+                    registered: last_calls.registered,
+                });
+                asked.unregistered.push(last_calls.unregistered);
             }
+            all.into_values().collect()
         })
     }
 
     /// The findings about nodes that have registered nothing since the question.
-    fn findings(&self, nodes: &Nodes, api: &str, interview: &Interview) -> Findings {
+    fn findings(&self, nodes: &Nodes, interview: &Interview) -> Findings {
+        let api = self.api.as_str();
         let Interview { pid, claims, .. } = interview;
         let mut findings = Findings::default();
         nodes.ledger.with_activity(|mirror, activity| {
@@ -373,6 +364,18 @@ async fn reconcile(
 fn is_done(reply: &Reply) -> bool {
     let replies = batch::unpack(reply, 1).unwrap_or_default();
     replies.iter().any(master::is_success)
+}
+
+/// Unregisters all of `asked`: their port refuses. Returns who was.
+async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
+    let mut removals = JoinSet::new();
+    for Asked { api, names, .. } in asked {
+        for name in names {
+            let (nodes, api) = (nodes.clone(), api.clone());
+            removals.spawn(async move { remove(&nodes, &name, &api).await.then_some(name.node) });
+        }
+    }
+    removals.join_all().await.into_iter().flatten().collect()
 }
 
 /// Unregisters a node as it would do itself. Not if it has come back since it was asked: its address is

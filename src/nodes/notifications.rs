@@ -1,6 +1,6 @@
 //! Notifications to nodes that the master would send, has not sent, or will send late.
 //!
-//! Each node gets its notifications in order, one at a time; a node that does not answer delays no other. A
+//! Each port gets its notifications in order, one at a time; a node that does not answer delays no other. A
 //! node ignores a list of publishers that it knows already, but a stale list could make it drop links. So a
 //! repeated notification takes its content from the mirror when it is sent, and if that changes on the way,
 //! another one follows.
@@ -19,7 +19,7 @@ use super::{
     client::{self, Sign},
 };
 use crate::{
-    health::Claims,
+    health::{Claims, port_of},
     ledger::activity::{Displaced, Notification},
     master::{self, Master},
     xmlrpc::{Call, Value},
@@ -39,7 +39,7 @@ const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 /// The notifications under way.
 #[derive(Debug)]
 pub(crate) struct Notifications {
-    /// Waiting notifications by address. An address being notified has an entry, which may be empty.
+    /// Waiting notifications by port. A port being notified has an entry, which may be empty.
     pending: Mutex<HashMap<String, VecDeque<Notification>>>,
     permits: Semaphore,
     slow: Semaphore,
@@ -72,10 +72,10 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     !subscribers.is_empty()
 }
 
-/// Notifies the node at `api` of every topic and parameter that it subscribes.
-pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, api: &str) {
+/// Notifies the node at `port` of every topic and parameter that it subscribes.
+pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
     let notifications = nodes.ledger.with_mirror(|mirror| {
-        let names = mirror.nodes().filter(|(_, at)| *at == api);
+        let names = mirror.nodes().filter(|(_, api)| port_of(api) == port);
         let notifications = names.flat_map(|(name, _)| {
             let topics = mirror.subscriptions(name).map(str::to_owned);
             // Nothing to send for a parameter that is not set, and may never have been.
@@ -88,29 +88,36 @@ pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, api: &str) {
         notifications.collect::<Vec<_>>()
     });
     for notification in notifications {
-        send(nodes, api, notification);
+        send(nodes, port, notification);
     }
 }
 
 /// Notifies the node at `api`, unless it is unreachable: such a node gets everything once it answers. A node
 /// that does not take a notification becomes unreachable.
 pub(crate) fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
-    if nodes.is_unreachable(api) {
+    let port = port_of(api);
+    if nodes.is_unreachable(port) {
         return;
     }
     let mut pending = nodes.notifications.lock();
-    if let Some(queue) = pending.get_mut(api) {
+    if let Some(queue) = pending.get_mut(port) {
         add(queue, notification);
         return;
     }
-    pending.insert(api.to_owned(), VecDeque::from([notification]));
+    pending.insert(port.to_owned(), VecDeque::from([notification]));
     drop(pending);
-    tokio::spawn(deliver(nodes.clone(), api.to_owned()));
+    tokio::spawn(deliver(nodes.clone(), port.to_owned()));
 }
 
 fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
-    let repeated = !matches!(notification, Notification::Call(_));
-    if repeated && queue.contains(&notification) {
+    let repeated = match &notification {
+        // For another name at the port.
+        Notification::Call(call) => queue.iter().any(
+            |waiting| matches!(waiting, Notification::Call(waiting) if Arc::ptr_eq(waiting, call)),
+        ),
+        _ => queue.contains(&notification),
+    };
+    if repeated {
         return;
     }
     queue.push_back(notification);
@@ -136,15 +143,15 @@ fn latest(notification: Notification) -> Option<Notification> {
     })
 }
 
-async fn deliver(nodes: Arc<Nodes>, api: String) {
+async fn deliver(nodes: Arc<Nodes>, port: String) {
     let notifications = &nodes.notifications;
     loop {
         let notification = {
             let mut pending = notifications.lock();
-            match pending.get_mut(&api).and_then(VecDeque::pop_front) {
+            match pending.get_mut(&port).and_then(VecDeque::pop_front) {
                 Some(notification) => notification,
                 None => {
-                    pending.remove(&api);
+                    pending.remove(&port);
                     return;
                 }
             }
@@ -152,13 +159,13 @@ async fn deliver(nodes: Arc<Nodes>, api: String) {
         let compose = || {
             nodes
                 .ledger
-                .with_mirror(|mirror| compose(mirror, &api, &notification))
+                .with_mirror(|mirror| compose(mirror, &port, &notification))
         };
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
         let Some(call) = compose() else { continue };
         nodes.stats.notifications.count();
-        let mut asked = pin!(client::ask(&api, &call, nodes.timeout));
+        let mut asked = pin!(client::ask(&port, &call, nodes.timeout));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
             Err(_) => {
@@ -167,26 +174,27 @@ async fn deliver(nodes: Arc<Nodes>, api: String) {
             }
         };
         if sign != Sign::Alive {
-            notifications.lock().remove(&api);
-            nodes.mark_unreachable(&api);
+            notifications.lock().remove(&port);
+            nodes.mark_unreachable(&port);
             return;
         }
         if compose().is_some_and(|now| now != call)
-            && let Some(queue) = notifications.lock().get_mut(&api)
+            && let Some(queue) = notifications.lock().get_mut(&port)
         {
             add(queue, notification);
         }
     }
 }
 
-/// The call to send to the node at `api` now; none if it no longer concerns that node.
-fn compose(mirror: &Master, api: &str, notification: &Notification) -> Option<Arc<Call>> {
+/// The call to send to the node at `port` now; none if it no longer concerns that node.
+fn compose(mirror: &Master, port: &str, notification: &Notification) -> Option<Arc<Call>> {
+    let at = |api: &str| port_of(api) == port;
     match notification {
         Notification::Call(call) => Some(call.clone()),
         Notification::Topic(topic) => mirror
-            .subscribes(api, topic)
+            .subscribes(at, topic)
             .then(|| mirror.publisher_update(topic).into()),
-        Notification::Param(key) => match mirror.subscribes_param(api, key) {
+        Notification::Param(key) => match mirror.subscribes_param(at, key) {
             true => mirror.param_update(key).map(Arc::new),
             false => None,
         },
@@ -203,8 +211,14 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             if is_taken(&nodes, &displaced.api) {
                 return;
             }
-            // Never closed.
-            let permit = nodes.notifications.permits.acquire().await;
+            // Held until it has been told.
+            let Some(_admitted) = nodes
+                .visits
+                .admit(port_of(&displaced.api), nodes.timeout)
+                .await
+            else {
+                continue;
+            };
             let interview = client::interview(&displaced.api, nodes.timeout).await;
             match interview.sign {
                 Sign::Dead => return,
@@ -223,7 +237,6 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                 nodes.stats.notifications.count();
                 client::ask(api, &master::shutdown(node), nodes.timeout).await;
             }
-            drop(permit);
             return;
         }
     });

@@ -110,7 +110,7 @@ impl TrueLists {
 fn is_true_param(state: &Master, api: &str, call: &Call) -> bool {
     let key = call.params.get(1).and_then(Value::as_str);
     key.is_some_and(|key| {
-        state.subscribes_param(api, key)
+        state.subscribes_param(|at| at == api, key)
             && state.param_update(key).map(blank).as_ref() == Some(call)
     })
 }

@@ -70,6 +70,7 @@ mod clients {
 mod limits {
     mod connections;
     mod memory;
+    mod visits;
     mod writes;
 }
 

@@ -1,0 +1,96 @@
+//! Asks newly registered nodes for their process ids. A different process id at the same port will mean a
+//! different node.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use super::{Nodes, client};
+use crate::{health::port_of, master};
+
+/// A node is asked this long after its last registration: starting nodes are busy.
+pub(super) const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
+
+/// The names that wait for an answer, by port. One question is for all of a port.
+#[derive(Debug, Default)]
+pub(super) struct New(Mutex<BTreeMap<String, Vec<Name>>>);
+
+#[derive(Debug)]
+struct Name {
+    node: String,
+    api: String,
+    /// Its last registration.
+    registered: u64,
+}
+
+impl New {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Vec<Name>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether any names wait at `port`. If not, the next one needs a task of its own.
+    fn go_on(&self, port: &str) -> bool {
+        let mut new = self.lock();
+        let waiting = new.get(port).is_some_and(|names| !names.is_empty());
+        if !waiting {
+            new.remove(port);
+        }
+        waiting
+    }
+}
+
+/// Asks the nodes that are due.
+pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
+    let Some(before) = Instant::now().checked_sub(IDENTIFY_AFTER) else {
+        return;
+    };
+    let due = nodes.ledger.with_activity(|mirror, activity| {
+        let due = activity.take_unidentified(before).into_iter();
+        let due = due.filter_map(|node| {
+            let api = mirror.api_of(&node)?.to_owned();
+            let registered = activity.last_calls(&node).registered;
+            Some(Name {
+                node,
+                api,
+                registered,
+            })
+        });
+        due.collect::<Vec<_>>()
+    });
+    let mut new = nodes.new.lock();
+    for name in due {
+        let port = port_of(&name.api).to_owned();
+        let names = new.entry(port.clone()).or_insert_with(|| {
+            tokio::spawn(identify(nodes.clone(), port));
+            Vec::new()
+        });
+        names.push(name);
+    }
+}
+
+async fn identify(nodes: Arc<Nodes>, port: String) {
+    while nodes.new.go_on(&port) {
+        let admitted = nodes.visits.admit(&port, nodes.timeout).await;
+        // With those that have come meanwhile.
+        let names = nodes.new.lock().get_mut(&port).map(std::mem::take);
+        // An unreachable one is asked again by the health check.
+        let answer = match admitted.is_some() && !nodes.is_unreachable(&port) {
+            true => {
+                client::ask_for(&port, &master::get_pid(), nodes.timeout)
+                    .await
+                    .1
+            }
+            false => None,
+        };
+        let Some(pid) = answer.and_then(|pid| pid.as_int()) else {
+            continue;
+        };
+        nodes.ledger.with_activity(|_, activity| {
+            for name in names.into_iter().flatten() {
+                activity.remember_pid(&name.node, &name.api, name.registered, pid);
+            }
+        });
+    }
+}

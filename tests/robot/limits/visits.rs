@@ -1,0 +1,136 @@
+//! Whoever registers names cannot have rosrescue flood the host that they point to.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crate::support::{Client, Mode, Robot, eventually, names, params};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+
+/// A host that counts connections and closes them without an answer.
+struct Host {
+    ports: Vec<u16>,
+    connections: Arc<Mutex<Vec<Instant>>>,
+    done: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Host {
+    fn with_ports(count: usize) -> Self {
+        let listen = |_| {
+            let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+            listener.set_nonblocking(true).unwrap();
+            listener
+        };
+        let listeners: Vec<_> = (0..count).map(listen).collect();
+        let port = |listener: &TcpListener| listener.local_addr().unwrap().port();
+        let ports = listeners.iter().map(port).collect();
+        let connections = Arc::<Mutex<Vec<_>>>::default();
+        let done = Arc::<AtomicBool>::default();
+        let (seen, stop) = (connections.clone(), done.clone());
+        let accept = move || {
+            while !stop.load(Ordering::Relaxed) {
+                for listener in &listeners {
+                    while listener.accept().is_ok() {
+                        seen.lock().unwrap().push(Instant::now());
+                    }
+                }
+                thread::sleep(Duration::from_millis(1));
+            }
+        };
+        Self {
+            ports,
+            connections,
+            done,
+            thread: Some(thread::spawn(accept)),
+        }
+    }
+
+    /// The connections since `start`.
+    fn since(&self, start: Instant) -> usize {
+        let connections = self.connections.lock().unwrap();
+        connections.iter().filter(|at| **at >= start).count()
+    }
+
+    /// Registers so many names, each with an address of its own, their ports taken in turn.
+    fn register(&self, client: &Client, count: usize) {
+        let call = |(name, port): (usize, &u16)| {
+            let api = format!("http://127.0.0.1:{port}/{name}/");
+            let name = format!("/name{name}");
+            let call = params![name, "/topic", "std_msgs/String", api];
+            Call::new("registerPublisher", call)
+        };
+        let calls: Vec<_> = (0..count)
+            .zip(self.ports.iter().cycle())
+            .map(call)
+            .collect();
+        for some in calls.chunks(200) {
+            let Call { method, params } = Call::multicall(some.iter().cloned());
+            let reply = client.call(&method, params).unwrap();
+            let Reply::Value(Value::Array(results)) = reply else {
+                panic!("{reply:?}");
+            };
+            assert_eq!(results.len(), some.len());
+        }
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        self.done.store(true, Ordering::Relaxed);
+        let _ = self.thread.take().unwrap().join();
+    }
+}
+
+/// Registers `count` names at the ports of `host`, and crashes the master after 5 s. Returns the connections
+/// before, and for each of `windows` those within so many seconds after the recovery.
+fn connections<const N: usize>(
+    robot: &mut Robot,
+    host: &Host,
+    count: usize,
+    windows: [u64; N],
+) -> (usize, [usize; N]) {
+    let start = Instant::now();
+    host.register(&robot.client(), count);
+    thread::sleep(Duration::from_secs(5).saturating_sub(start.elapsed()));
+    let before = host.since(start);
+    robot.crash_master();
+    let start = Instant::now();
+    let after = windows.map(|seconds| {
+        thread::sleep(Duration::from_secs(seconds).saturating_sub(start.elapsed()));
+        host.since(start)
+    });
+    let ports = host.ports.len();
+    println!("{count} names at {ports} ports: {before} connections, {after:?} after {windows:?} s");
+    (before, after)
+}
+
+#[test]
+fn names_at_one_port_share_a_visit() {
+    let mut robot = Robot::start(Mode::Core);
+    let host = Host::with_ports(1);
+    let (before, after) = connections(&mut robot, &host, 2000, [2, 12]);
+    // A question for those who came together; a visit after the recovery, and again after 1, 3 and 7 s.
+    assert!(before <= 20, "{before}");
+    assert!(after[0] <= 4 && after[1] <= 10, "{after:?}");
+    let unreachable = names(&robot.status().unwrap()["unreachable"]).len();
+    assert_eq!(unreachable, 2000);
+    // One refusal is for all.
+    drop(host);
+    eventually("the dead are taken out", || {
+        let nodes = robot.status().unwrap()["state"]["nodes"].as_u64();
+        nodes < Some(10)
+    });
+}
+
+/// 400 at once, and 100 a second.
+#[test]
+fn the_ports_of_a_host_share_a_rate() {
+    let mut robot = Robot::start(Mode::Core);
+    let host = Host::with_ports(1200);
+    let (before, after) = connections(&mut robot, &host, 1200, [2]);
+    assert!(before <= 900, "{before}");
+    assert!(after[0] <= 700, "{after:?}");
+}
