@@ -24,7 +24,10 @@ use crate::{
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},
     ros_env::MasterUri,
     roscore::{self, Roscore},
-    server::{Server, body, calls::Calls, clients::Clients, idle::Idle, listener, pages::Pages},
+    server::{
+        Server, answers::Answers, body, calls::Calls, clients::Clients, idle::Idle, listener,
+        pages::Pages,
+    },
     status::{Board, stats::Stats},
     upstream::{Upstream, pool::Pool},
     write_queue,
@@ -218,6 +221,7 @@ pub async fn run(
         idle: Idle::among(config.max_connections),
         max_body: config.max_body,
         bodies: body::budget(config.max_body),
+        answers: Answers::within(2 * config.max_body),
         stats,
         calls: Calls {
             gate: gate.clone(),

@@ -1,6 +1,7 @@
 //! The side that clients talk to: listener, admission, calls and pages.
 
 pub(crate) mod admission;
+pub(crate) mod answers;
 pub(crate) mod body;
 pub(crate) mod calls;
 pub(crate) mod clients;
@@ -15,7 +16,7 @@ use std::sync::Arc;
 
 use tokio::sync::{Notify, Semaphore};
 
-use self::{calls::Calls, clients::Clients, idle::Idle, pages::Pages};
+use self::{answers::Answers, calls::Calls, clients::Clients, idle::Idle, pages::Pages};
 use crate::status::stats::Stats;
 
 /// What every request needs.
@@ -33,6 +34,8 @@ pub struct Server {
     pub max_body: usize,
     /// Memory for large bodies, in KiB.
     pub bodies: Semaphore,
+    /// Memory for large answers.
+    pub answers: Arc<Answers>,
     pub stats: &'static Stats,
     pub calls: Calls,
     pub pages: Pages,

@@ -21,7 +21,10 @@ use tokio::{
     time::{Instant, Sleep},
 };
 
-use super::idle::{Idle, Idling};
+use super::{
+    answers::Reader,
+    idle::{Idle, Idling},
+};
 
 /// Time in which a request's head must arrive, from its first byte.
 const HEAD_TIME: Duration = Duration::from_secs(10);
@@ -32,6 +35,7 @@ const WRITE_TIME: Duration = Duration::from_secs(60);
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Deadlines {
     place: Arc<AtomicU8>,
+    pub(super) reader: Arc<Reader>,
 }
 
 const IDLE: u8 = 0;
@@ -53,6 +57,11 @@ impl Deadlines {
     /// No request has begun since the last answer was sent.
     pub(crate) fn is_idle(&self) -> bool {
         self.is(IDLE)
+    }
+
+    /// An answer is ready and has not been sent in full.
+    pub(crate) fn is_replying(&self) -> bool {
+        self.is(REPLYING)
     }
 
     fn is(&self, place: u8) -> bool {
@@ -95,6 +104,9 @@ impl<'a, S> Timed<'a, S> {
         polled: Poll<io::Result<usize>>,
     ) -> Poll<io::Result<usize>> {
         let was_stuck = std::mem::replace(&mut self.stuck, polled.is_pending());
+        if let Poll::Ready(Ok(bytes)) = polled {
+            self.deadlines.reader.took(bytes);
+        }
         if !self.stuck {
             return polled;
         }
@@ -103,6 +115,12 @@ impl<'a, S> Timed<'a, S> {
         }
         let overdue = self.deadline.as_mut().poll(cx);
         overdue.map(|()| Err(io::ErrorKind::TimedOut.into()))
+    }
+}
+
+impl<S> Timed<'_, S> {
+    pub(crate) fn stream(&self) -> &S {
+        &self.stream
     }
 }
 

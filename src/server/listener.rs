@@ -175,12 +175,11 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
             request,
         ))
     };
-    let connection = hyper::server::conn::http1::Builder::new()
+    let mut connection = hyper::server::conn::http1::Builder::new()
         .title_case_headers(true)
         .half_close(true)
         .max_buf_size(BUFFER)
         .serve_connection(TokioIo::new(timed), service_fn(service));
-    let mut connection = std::pin::pin!(connection);
     let ended = loop {
         tokio::select! {
             // A request that has arrived goes first.
@@ -192,8 +191,17 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
                     return;
                 }
             }
+            () = deadlines.reader.is_to_close() => {
+                if deadlines.is_replying() && deadlines.reader.is_slow() {
+                    tracing::debug!(%peer, "closed: it reads too slowly, and others need the room");
+                    // A reset, so that the kernel keeps nothing of the answer, and its client calls again.
+                    let stream = connection.into_parts().io.into_inner();
+                    let _ = SockRef::from(stream.stream()).set_linger(Some(Duration::ZERO));
+                    return;
+                }
+            }
             () = stop.cancelled() => {
-                connection.as_mut().graceful_shutdown();
+                std::pin::Pin::new(&mut connection).graceful_shutdown();
                 break connection.await;
             }
         }

@@ -8,13 +8,14 @@ use hyper::{Method, Request, StatusCode, body::Incoming, header::CONTENT_ENCODIN
 use super::{
     Server,
     admission::{self, Refusal},
+    answers,
     body::{self, BodyError, Room},
     calls::Closed,
     deadlines::Deadlines,
     replies::{HttpReply, text, xml},
 };
 use crate::{
-    master,
+    master::{self, Kind},
     upstream::{Head, INSTANCE_HEADER},
     xmlrpc::Reply,
 };
@@ -24,6 +25,11 @@ use crate::{
 const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
                          computer only; send XML-RPC in UTF-8, without a document type";
 
+/// Other large answers wait, and this one cannot be made again.
+const NO_ROOM: Closed = Closed("too many large answers at the same time");
+/// How often an answer is made that is larger each time.
+const ATTEMPTS: u32 = 4;
+
 /// Answers one request.
 pub(crate) async fn serve(
     server: Arc<Server>,
@@ -32,7 +38,7 @@ pub(crate) async fn serve(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     deadlines.serving();
-    let reply = route(server, peer, request).await;
+    let reply = route(server, peer, &deadlines, request).await;
     deadlines.replying();
     reply
 }
@@ -40,16 +46,18 @@ pub(crate) async fn serve(
 async fn route(
     server: Arc<Server>,
     peer: SocketAddr,
+    deadlines: &Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
-        Method::GET => Ok(
-            match admission::check_host(request.headers(), &server.names) {
-                Ok(()) => server.pages.page(request.uri().path()),
-                Err(refusal) => refuse(&server, peer, &refusal),
-            },
-        ),
-        Method::POST => post(server, peer, request).await,
+        Method::GET => match admission::check_host(request.headers(), &server.names) {
+            Ok(()) => {
+                let made = server.pages.page(request.uri().path());
+                page(&server, made, deadlines).await
+            }
+            Err(refusal) => Ok(refuse(&server, peer, &refusal)),
+        },
+        Method::POST => post(server, peer, deadlines, request).await,
         ref method => Ok(text(
             StatusCode::NOT_IMPLEMENTED,
             format!("method {method} is not supported; XML-RPC is POST, the status page GET\n"),
@@ -60,6 +68,7 @@ async fn route(
 async fn post(
     server: Arc<Server>,
     peer: SocketAddr,
+    deadlines: &Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     if request
@@ -125,7 +134,54 @@ async fn post(
         }
         server.stats.undecoded.count();
     }
-    server.calls.answer(peer, head, body, call).await
+    answer(&server, peer, deadlines, head, body, call).await
+}
+
+/// Answers a call. A large answer that finds no room is made again when there is some, so that few wait in
+/// memory.
+async fn answer(
+    server: &Server,
+    peer: SocketAddr,
+    deadlines: &Deadlines,
+    head: Head,
+    body: Bytes,
+    mut call: Option<master::Request>,
+) -> Result<HttpReply, Closed> {
+    let mut room = server.answers.expected(&body).await;
+    for _ in 0..ATTEMPTS {
+        let (again, calls) = (head.clone(), &server.calls);
+        let reply = calls.answer(peer, again, body.clone(), call).await?;
+        let Some(size) = answers::size(&reply) else {
+            return Ok(reply);
+        };
+        server.answers.remember(&body, size);
+        if let Some(room) = server.answers.enough(room.take(), size).await {
+            return Ok(server.answers.count(reply, room, &deadlines.reader).await);
+        }
+        call = match body.len() <= body::SMALL {
+            true => master::Request::decode(&body).ok(),
+            false => None,
+        };
+        if call.as_ref().map(master::Request::kind) != Some(Kind::Read) {
+            return Err(NO_ROOM);
+        }
+        drop(reply);
+        room = Some(server.answers.reserve(size).await);
+    }
+    Err(Closed("its answer keeps growing"))
+}
+
+/// A page, in the room for large answers if it is one.
+async fn page(
+    server: &Server,
+    page: HttpReply,
+    deadlines: &Deadlines,
+) -> Result<HttpReply, Closed> {
+    let Some(size) = answers::size(&page) else {
+        return Ok(page);
+    };
+    let room = server.answers.enough(None, size).await.ok_or(NO_ROOM)?;
+    Ok(server.answers.count(page, room, &deadlines.reader).await)
 }
 
 fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {

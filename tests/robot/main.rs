@@ -68,6 +68,7 @@ mod clients {
 
 /// Memory, connections, files and turns of writes.
 mod limits {
+    mod answers;
     mod connections;
     mod memory;
     mod visits;

@@ -1,0 +1,366 @@
+//! Large answers under way: how much memory they take in all, and who gives way when there is none left.
+
+use std::{
+    collections::HashMap,
+    hash::{DefaultHasher, Hash, Hasher},
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use http_body_util::{BodyExt, Full};
+use hyper::body::Body;
+use tokio::sync::{Mutex as Turn, Notify, OwnedSemaphorePermit, Semaphore};
+
+use super::{body::SMALL, replies::HttpReply};
+
+/// A client that takes its answer more slowly, in bytes a second, gives way when there is no room left for
+/// others.
+const RATE: u32 = 256 << 10;
+/// How far ahead of [`RATE`] a client can get: after a longer pause it may have to give way.
+const AHEAD: Duration = Duration::from_millis(250);
+/// Answers that may wait for room although they are in memory already. They go before those that are not, so
+/// that few answers are made twice.
+const WAITING: usize = 4;
+/// Calls remembered for their large answers.
+const CALLS: usize = 256;
+
+/// How one connection takes its large answers.
+#[derive(Debug)]
+pub(crate) struct Reader {
+    /// Until then it is fast enough.
+    fast_until: Mutex<Instant>,
+    /// It has had a large answer.
+    counts: AtomicBool,
+    close: Notify,
+    /// It has been told to close, and has not answered yet.
+    told: AtomicBool,
+}
+
+impl Default for Reader {
+    fn default() -> Self {
+        Self {
+            fast_until: Mutex::new(Instant::now()),
+            counts: AtomicBool::new(false),
+            close: Notify::new(),
+            told: AtomicBool::new(false),
+        }
+    }
+}
+
+impl Reader {
+    fn fast_until(&self) -> MutexGuard<'_, Instant> {
+        self.fast_until
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// It has taken so many bytes.
+    pub(crate) fn took(&self, bytes: usize) {
+        if self.counts.load(Ordering::Relaxed) {
+            let mut until = self.fast_until();
+            *until = fast_until(*until, Instant::now(), bytes);
+        }
+    }
+
+    /// Completes when it is to give way, if it [is still slow](Self::is_slow).
+    pub(crate) async fn is_to_close(&self) {
+        self.close.notified().await;
+        self.told.store(false, Ordering::Relaxed);
+    }
+
+    /// Whether it is too slow. Asked after one more attempt to write: it may have been rosrescue that was busy.
+    pub(crate) fn is_slow(&self) -> bool {
+        *self.fast_until() <= Instant::now()
+    }
+}
+
+/// Until when a reader is fast enough that takes `bytes` at `now` and was so until `before`.
+fn fast_until(before: Instant, now: Instant, bytes: usize) -> Instant {
+    let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
+    let earned = Duration::from_secs(1) * bytes / RATE;
+    // Debts are kept, so that a byte now and then does not do.
+    (before + earned).min(now + AHEAD)
+}
+
+/// Memory for large answers.
+#[derive(Debug)]
+pub struct Answers {
+    /// In KiB.
+    size: u32,
+    room: Arc<Semaphore>,
+    /// Who waits for room with no answer yet, in order.
+    turn: Turn<()>,
+    waiting: Semaphore,
+    under_way: Mutex<HashMap<u64, Arc<Reader>>>,
+    next: AtomicUsize,
+    /// Sizes of large answers, by the call.
+    known: Mutex<HashMap<u64, usize>>,
+    known_count: AtomicUsize,
+}
+
+/// Room for one answer; released on drop.
+#[derive(Debug)]
+pub(crate) struct Room(OwnedSemaphorePermit);
+
+/// An answer's bytes, which hold their room until they have been written.
+struct Counted {
+    bytes: Bytes,
+    number: u64,
+    answers: Arc<Answers>,
+    _room: Room,
+}
+
+impl AsRef<[u8]> for Counted {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        lock(&self.answers.under_way).remove(&self.number);
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn key(call: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    call.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// The bytes of an answer, if it is a large one.
+pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
+    let size = reply.body().size_hint().exact()?;
+    let size = usize::try_from(size).unwrap_or(usize::MAX);
+    (size > SMALL).then_some(size)
+}
+
+impl Answers {
+    /// Room for large answers of `bytes` in all. A larger one takes all of it.
+    pub(crate) fn within(bytes: usize) -> Arc<Self> {
+        let size = u32::try_from(bytes >> 10).unwrap_or(u32::MAX);
+        Arc::new(Self {
+            size,
+            room: Arc::new(Semaphore::new(size as usize)),
+            turn: Turn::default(),
+            waiting: Semaphore::new(WAITING),
+            under_way: Mutex::default(),
+            next: AtomicUsize::new(0),
+            known: Mutex::default(),
+            known_count: AtomicUsize::new(0),
+        })
+    }
+
+    fn kib(&self, bytes: usize) -> u32 {
+        let kib = u32::try_from(bytes.div_ceil(1 << 10)).unwrap_or(u32::MAX);
+        kib.min(self.size)
+    }
+
+    /// Room for the answer to `call`, if it is known to be large. Waits for it.
+    pub(crate) async fn expected(&self, call: &[u8]) -> Option<Room> {
+        if self.known_count.load(Ordering::Relaxed) == 0 || call.len() > SMALL {
+            return None;
+        }
+        let size = lock(&self.known).get(&key(call)).copied()?;
+        Some(self.reserve(size).await)
+    }
+
+    /// Notes the size of a large answer to a small call.
+    pub(crate) fn remember(&self, call: &[u8], bytes: usize) {
+        if call.len() > SMALL {
+            return;
+        }
+        let mut known = lock(&self.known);
+        if known.len() >= CALLS {
+            known.clear();
+        }
+        known.insert(key(call), bytes);
+        self.known_count.store(known.len(), Ordering::Relaxed);
+    }
+
+    /// `room` if it is enough for `bytes`, or new room if there is some soon.
+    pub(crate) async fn enough(&self, room: Option<Room>, bytes: usize) -> Option<Room> {
+        let kib = self.kib(bytes);
+        if let Some(room) = room
+            && room.0.num_permits() >= kib as usize
+        {
+            return Some(room);
+        }
+        let room = self.room.clone().try_acquire_many_owned(kib);
+        match room {
+            Ok(room) => Some(Room(room)),
+            Err(_) => self.reserve_now(bytes).await,
+        }
+    }
+
+    /// Waits for room for an answer that is not made yet.
+    pub(crate) async fn reserve(&self, bytes: usize) -> Room {
+        let _turn = self.turn.lock().await;
+        self.acquire(bytes).await
+    }
+
+    /// Waits for room for an answer that is in memory already; none if too many wait like that.
+    async fn reserve_now(&self, bytes: usize) -> Option<Room> {
+        let _waiting = self.waiting.try_acquire().ok()?;
+        Some(self.acquire(bytes).await)
+    }
+
+    /// Waits for room. Clients that read too slowly give way.
+    async fn acquire(&self, bytes: usize) -> Room {
+        let mut room = std::pin::pin!(self.room.clone().acquire_many_owned(self.kib(bytes)));
+        loop {
+            let next = self.close_slowest(Instant::now());
+            tokio::select! {
+                biased;
+                room = &mut room => match room {
+                    Ok(room) => return Room(room),
+                    // Never closed.
+                    Err(_) => std::future::pending().await,
+                },
+                () = tokio::time::sleep_until(next.into()) => {}
+            }
+        }
+    }
+
+    /// Closes the connection that has been too slow for longest, if any is. Returns when to look again.
+    fn close_slowest(&self, now: Instant) -> Instant {
+        let under_way = lock(&self.under_way);
+        let readers = under_way
+            .iter()
+            .filter(|(_, reader)| !reader.told.load(Ordering::Relaxed))
+            .map(|(number, reader)| (*reader.fast_until(), *number));
+        let Some((until, number)) = readers.min() else {
+            return now + AHEAD;
+        };
+        if until > now {
+            return until;
+        }
+        if let Some(reader) = under_way.get(&number) {
+            reader.told.store(true, Ordering::Relaxed);
+            reader.close.notify_one();
+        }
+        // The next one, if that was not enough.
+        now + Duration::from_millis(1)
+    }
+
+    /// `reply`, which holds `room` until `reader` has taken all of it.
+    pub(crate) async fn count(
+        self: &Arc<Self>,
+        reply: HttpReply,
+        room: Room,
+        reader: &Arc<Reader>,
+    ) -> HttpReply {
+        let (head, body) = reply.into_parts();
+        let Ok(whole) = body.collect().await;
+        let bytes = whole.to_bytes();
+        let number = self.next.fetch_add(1, Ordering::Relaxed) as u64;
+        *reader.fast_until() = Instant::now() + AHEAD;
+        reader.counts.store(true, Ordering::Relaxed);
+        lock(&self.under_way).insert(number, reader.clone());
+        let counted = Counted {
+            bytes,
+            number,
+            answers: self.clone(),
+            _room: room,
+        };
+        HttpReply::from_parts(head, Full::new(Bytes::from_owner(counted)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use hyper::StatusCode;
+
+    use super::*;
+    use crate::server::replies::text;
+
+    const LARGE: usize = 100 << 10;
+
+    async fn sent(answers: &Arc<Answers>, reader: &Arc<Reader>) -> HttpReply {
+        let reply = text(StatusCode::OK, "x".repeat(LARGE));
+        assert_eq!(size(&reply), Some(LARGE));
+        let room = answers.reserve(LARGE).await;
+        answers.count(reply, room, reader).await
+    }
+
+    #[test]
+    fn who_reads_steadily_is_fast_enough_and_who_dribbles_is_not() {
+        let start = Instant::now();
+        let step = Duration::from_millis(125);
+        let slack = |bytes, steps: u32| {
+            let until = (1..=steps).fold(start + AHEAD, |until, number| {
+                fast_until(until, start + step * number, bytes)
+            });
+            until.checked_duration_since(start + step * steps)
+        };
+        let enough = RATE as usize / 8;
+        assert_eq!(slack(enough, 100), Some(AHEAD));
+        assert_eq!(slack(10 * enough, 100), Some(AHEAD), "no more than that");
+        assert_eq!(slack(enough / 10, 3), None);
+        assert_eq!(slack(0, 2), Some(AHEAD - 2 * step));
+    }
+
+    #[tokio::test]
+    async fn room_is_held_until_the_bytes_are_gone() {
+        let answers = Answers::within(2 * LARGE);
+        let reader = Arc::default();
+        let first = sent(&answers, &reader).await;
+        let Ok(bytes) = first.into_body().collect().await;
+        let _second = sent(&answers, &reader).await;
+        assert_eq!(answers.room.available_permits(), 0);
+        drop(bytes);
+        let room = answers.enough(None, LARGE).await.unwrap();
+        // Room that is there already does, if it is enough.
+        assert!(answers.enough(Some(room), LARGE).await.is_some());
+        assert_eq!(lock(&answers.under_way).len(), 1);
+    }
+
+    #[tokio::test]
+    async fn the_slowest_gives_way_when_there_is_no_room() {
+        let answers = Answers::within(2 * LARGE);
+        let readers = [(); 2].map(|()| Arc::<Reader>::default());
+        let mut held = Vec::new();
+        for reader in &readers {
+            held.push(sent(&answers, reader).await);
+        }
+        // The first one has just read something.
+        let slow = async {
+            readers[1].is_to_close().await;
+            held.pop();
+        };
+        let reading = async {
+            loop {
+                readers[0].took(LARGE);
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        let waiting = async { tokio::join!(answers.reserve(LARGE), slow) };
+        tokio::select! {
+            _ = waiting => {}
+            () = reading => {}
+            () = readers[0].is_to_close() => panic!("it is fast enough"),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_call_whose_answer_was_large_gets_its_room_first() {
+        let answers = Answers::within(2 * LARGE);
+        assert!(answers.expected(b"call").await.is_none());
+        answers.remember(b"call", LARGE);
+        assert!(answers.expected(b"another").await.is_none());
+        let room = answers.expected(b"call").await.unwrap();
+        assert_eq!(answers.room.available_permits(), LARGE >> 10);
+        // However large it is, there is room for it.
+        answers.remember(b"call", 100 * LARGE);
+        drop(room);
+        assert!(answers.expected(b"call").await.is_some());
+    }
+}

@@ -1,0 +1,68 @@
+//! Large answers that nobody reads take a bounded part of the memory, and keep nobody else from theirs.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Mode, Robot, Wire, encode_call, eventually_some, http_request, in_both_modes, params,
+};
+
+/// Bytes of the answer.
+const LARGE: usize = 5_000_000;
+const CLIENTS: usize = 400;
+
+in_both_modes!(large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way);
+
+fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
+    let robot = Robot::start(mode);
+    let client = robot.client();
+    client.set_param("/large", "x".repeat(LARGE));
+    client.set_param("/small", 1);
+    let memory = |name| robot.rescue.kib(name) / 1000;
+    let before = memory("VmRSS");
+    let question = http_request(&encode_call("getParam", params!["/hostile", "/large"]));
+    let ask = |_| {
+        let mut wire = client.connect().unwrap();
+        wire.send(&question).unwrap();
+        wire
+    };
+    let start = Instant::now();
+    let wires: Vec<Wire> = (0..CLIENTS).map(ask).collect();
+    // Beside them: a small call, and the same answer for somebody who reads it.
+    let read = || {
+        let start = Instant::now();
+        assert_eq!(client.param("/small"), Some(1.into()));
+        let small = start.elapsed();
+        // Called again after a lost connection, as ROS clients do.
+        let answer = eventually_some("a large answer", || client.param("/large"));
+        assert_eq!(answer.as_str().map(str::len), Some(LARGE));
+        (small, start.elapsed())
+    };
+    let at_once = read();
+    thread::sleep(Duration::from_secs(10).saturating_sub(start.elapsed()));
+    let later = read();
+    let (peak, now) = (memory("VmHWM"), memory("VmRSS"));
+    println!(
+        "{mode:?}: {before} MB before, {now} MB while {CLIENTS} do not read, {peak} MB at most; \
+         others have got their answers (a small one, then a large one) after {at_once:?} and {later:?}"
+    );
+    assert!(peak < 500, "{peak} MB");
+    // A debug build may still be making answers for the others.
+    assert!(later.1 < Duration::from_secs(20), "{later:?}");
+    drop(wires);
+}
+
+/// Who reads slowly is not cut off while there is room.
+#[test]
+fn a_slow_reader_gets_all_of_its_answer() {
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    client.set_param("/large", "x".repeat(LARGE));
+    let mut wire = client.connect().unwrap();
+    let question = http_request(&encode_call("getParam", params!["/slow", "/large"]));
+    wire.send(&question).unwrap();
+    thread::sleep(Duration::from_secs(2));
+    let answer = wire.response().unwrap();
+    assert_eq!(answer.code, 200);
+    assert!(answer.text().len() > LARGE);
+}
