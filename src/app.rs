@@ -16,7 +16,7 @@ use crate::{
     config::{Config, MasterConfig},
     gate::{self, State},
     guardian::handover::Sockets,
-    ledger::{Ledger, checkpointer},
+    ledger::{Ledger, checkpointer::Checkpointer},
     lifecycle::Supervision,
     master::Master,
     nodes::{self, Nodes},
@@ -157,7 +157,7 @@ pub async fn run(
         Some(_) => Supervision::Ours,
         None => Supervision::Theirs,
     };
-    let driver = Driver::new(
+    let mut driver = Driver::new(
         Examiner {
             ledger: ledger.clone(),
             upstream: upstream.clone(),
@@ -259,13 +259,12 @@ pub async fn run(
         ));
     }
     drop(server);
+    // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
+    let first = driver.start(restored);
+    let checkpointer =
+        Checkpointer::begin(ledger.clone(), config.checkpoint, config.sync_interval).await;
+    tasks.spawn(checkpointer.run(halt.clone()));
     tasks.spawn(drain.run());
-    tasks.spawn(checkpointer::run(
-        ledger.clone(),
-        config.checkpoint,
-        config.sync_interval,
-        halt.clone(),
-    ));
     tasks.spawn(nodes::watch(nodes, config.reap_interval));
     let announce = async {
         gate.clone().wait_for(State::is_open).await;
@@ -273,7 +272,7 @@ pub async fn run(
         say("ROS Rescue enabled. Master is now fault tolerant!!");
         std::future::pending().await
     };
-    let mut driver = tokio::spawn(driver.run(restored, halt));
+    let mut driver = tokio::spawn(driver.run(first, halt));
     let process = tokio::select! {
         process = &mut driver => match process {
             Ok(process) => process?,

@@ -100,29 +100,33 @@ impl Driver {
         }
     }
 
-    /// Watches the master until `stop`. `restored`: the mirror is from a checkpoint whose session continues.
+    /// Lets the mirror stand in, if it may, and returns what is to be done first. `restored`: the mirror is
+    /// from a checkpoint whose session continues.
+    pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
+        let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
+        let actions = self
+            .lifecycle
+            .on(Instant::now(), Input::Start { left, restored });
+        self.keep_shut();
+        actions
+    }
+
+    /// Watches the master until `stop`, after the actions that [`Self::start`] has returned.
     ///
     /// # Errors
     ///
     /// If no master can be started.
     pub(crate) async fn run(
         mut self,
-        restored: bool,
+        mut actions: Vec<Action>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, ProcessError> {
-        let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
-        let mut input = Input::Start { left, restored };
+        // None for the first actions.
+        let mut input = None;
         loop {
-            self.end_contact(input);
-            let actions = self.lifecycle.on(Instant::now(), input);
-            let deaths = self.lifecycle.deaths();
-            self.board.update(|facts| facts.deaths = deaths);
-            if matches!(input, Input::Start { .. }) {
-                self.keep_shut();
-            }
             let mut next = None;
             for action in actions {
-                if (input, action) == (Input::Wake, Action::Connect) {
+                if (input, action) == (Some(Input::Wake), Action::Connect) {
                     tracing::trace!(?input, ?action, "lifecycle");
                 } else {
                     tracing::debug!(?input, ?action, "lifecycle");
@@ -134,18 +138,23 @@ impl Driver {
                 }
                 next = self.carry_out(action).or(next);
             }
-            if matches!(input, Input::SpawnFailed { .. })
+            if matches!(input, Some(Input::SpawnFailed { .. }))
                 && let Some(error) = self.spawn_error.take()
             {
                 self.log_once(format!("cannot start a master: {error}"));
             }
-            if input == Input::Stop {
+            if input == Some(Input::Stop) {
                 return Ok(self.process);
             }
-            input = match next {
+            let now = match next {
                 Some(input) => input,
                 None => self.next_input(&stop).await,
             };
+            self.end_contact(now);
+            actions = self.lifecycle.on(Instant::now(), now);
+            let deaths = self.lifecycle.deaths();
+            self.board.update(|facts| facts.deaths = deaths);
+            input = Some(now);
         }
     }
 

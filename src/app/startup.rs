@@ -5,7 +5,7 @@ use std::path::Path;
 use super::{RunError, life};
 use crate::{
     checkpoint::{
-        format::{Checkpoint, Session},
+        format::Session,
         session::{self, Decision, Evidence, Rebuilt},
         store::{self, OpenError, Store},
     },
@@ -20,6 +20,7 @@ pub(super) struct Beginning {
     pub(super) session: Session,
     /// Writes that the session's last master may not have run.
     pub(super) pending: Vec<Request>,
+    /// Not begun yet.
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
     /// In words, for the operator.
@@ -104,21 +105,6 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     }
     session.boot_id = boot_id;
     session.closed = false;
-    if let Some(open) = &mut store {
-        let checkpoint = Checkpoint {
-            seq: open.seq(),
-            session: session.clone(),
-            snapshot: mirror.snapshot(),
-            pending: pending.iter().cloned().map(Into::into).collect(),
-        };
-        if let Err(error) = open.begin(&checkpoint) {
-            tracing::error!(
-                %error,
-                "unprotected: the checkpoint cannot be written; calls are forwarded, and it is \
-                 tried again every second"
-            );
-        }
-    }
     Ok(Beginning {
         mirror,
         session,

@@ -25,43 +25,7 @@ const QUIET: Duration = Duration::from_secs(2);
 /// but not more often than this: a memory card wears out.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// Keeps the checkpoint of `ledger` at `path` until `stop`. Syncs it every `sync_interval`, unless the
-/// ledger's policy differs.
-pub(crate) async fn run(
-    ledger: Arc<Ledger>,
-    path: PathBuf,
-    sync_interval: Duration,
-    stop: CancellationToken,
-) {
-    let mut checkpointer = Checkpointer {
-        seq: 0,
-        recorded_at: Instant::now(),
-        compacted_at: None,
-        failed_at: None,
-        // Logged when the checkpoint was opened.
-        said: ledger.unprotected(),
-        sync: ledger.sync,
-        ledger,
-        path,
-        sync_interval,
-    };
-    loop {
-        tokio::select! {
-            () = stop.cancelled() => return,
-            () = checkpointer.ledger.work.notified() => {}
-            () = tokio::time::sleep(LOOK) => {}
-        }
-        checkpointer.round(true).await;
-        if checkpointer.sync != SyncPolicy::Always {
-            tokio::select! {
-                () = stop.cancelled() => return,
-                () = checkpointer.pause() => {}
-            }
-        }
-    }
-}
-
-struct Checkpointer {
+pub(crate) struct Checkpointer {
     ledger: Arc<Ledger>,
     path: PathBuf,
     sync: SyncPolicy,
@@ -76,6 +40,46 @@ struct Checkpointer {
 }
 
 impl Checkpointer {
+    /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be answered before:
+    /// it would be in no journal. Later it is synced every `sync_interval`, unless the ledger's policy
+    /// differs.
+    pub(crate) async fn begin(ledger: Arc<Ledger>, path: PathBuf, sync_interval: Duration) -> Self {
+        let opened = ledger.with_store(|_, _| ()).is_some();
+        let mut checkpointer = Self {
+            seq: 0,
+            recorded_at: Instant::now(),
+            compacted_at: None,
+            failed_at: None,
+            // Logged when the checkpoint was opened.
+            said: ledger.unprotected().filter(|_| !opened),
+            sync: ledger.sync,
+            ledger,
+            path,
+            sync_interval,
+        };
+        checkpointer.compact().await;
+        checkpointer.say_protection();
+        checkpointer
+    }
+
+    /// Keeps the checkpoint until `stop`.
+    pub(crate) async fn run(mut self, stop: CancellationToken) {
+        loop {
+            tokio::select! {
+                () = stop.cancelled() => return,
+                () = self.ledger.work.notified() => {}
+                () = tokio::time::sleep(LOOK) => {}
+            }
+            self.round(true).await;
+            if self.sync != SyncPolicy::Always {
+                tokio::select! {
+                    () = stop.cancelled() => return,
+                    () = self.pause() => {}
+                }
+            }
+        }
+    }
+
     /// Until the next sync. In between, however long that is, the file is still checked.
     async fn pause(&mut self) {
         let end = Instant::now() + self.sync_interval;

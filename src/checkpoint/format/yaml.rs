@@ -85,11 +85,13 @@ pub(super) fn read(text: &str) -> Result<Value, String> {
             Some(Open::Array { elements, .. }) => elements.push(done),
             Some(Open::Struct { members, key }) => match key.take() {
                 None => match done {
-                    Value::String(name) if !members.contains_key(&name) => *key = Some(name),
-                    _ => return Err(at("a key that is no text or is there twice")),
+                    Value::String(name) => *key = Some(name),
+                    _ => return Err(at("a key that is no text")),
                 },
                 Some(name) => {
-                    members.insert(name, done);
+                    if members.insert(name, done).is_some() {
+                        return Err(at("the value of a key that is there twice"));
+                    }
                 }
             },
             None if whole.is_none() => whole = Some(done),
