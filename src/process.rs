@@ -20,8 +20,10 @@ use crate::{config::SupervisedConfig, guardian::handover};
 mod orphan;
 pub(crate) mod pidfd;
 mod rosout;
+mod spare;
 
 pub(crate) use rosout::Rosout;
+pub(crate) use spare::Spare;
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
@@ -142,8 +144,47 @@ impl Rosmaster {
     /// Starts a rosmaster on `port` of loopback. It outlives rosrescue: dropping the child does not end it.
     pub(crate) fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
-        command.arg("--core").arg("-p").arg(port.to_string());
-        command.arg("-w").arg(self.config.numworkers.to_string());
+        command.arg("-p").arg(port.to_string());
+        command.stdin(Stdio::null());
+        self.spawn_as(command, create(&self.output))
+    }
+
+    /// Starts a spare, if one is wanted and the program is ROS's own.
+    pub(crate) fn spawn_spare(&self) -> Option<Spare> {
+        if !self.config.spare {
+            return None;
+        }
+        let own = self.config.rosmaster.is_none();
+        let interpreter = own.then(|| spare::interpreter(&self.program)).flatten();
+        let Some(interpreter) = interpreter else {
+            tracing::warn!("no spare rosmaster: only ROS's own program can have one");
+            return None;
+        };
+        let mut words = interpreter.iter();
+        let mut command = command(Path::new(words.next()?));
+        command.args(words).arg("-c").arg(spare::PROGRAM);
+        command.arg(&self.program).stdin(Stdio::piped());
+        // The last words of the present master stay.
+        let output = OpenOptions::new().append(true).open(&self.output);
+        match self.spawn_as(command, output) {
+            Ok(child) => Spare::new(child),
+            Err(error) => {
+                tracing::warn!(%error, "no spare rosmaster");
+                None
+            }
+        }
+    }
+
+    /// Runs `command` with rosmaster's further arguments, its environment and `output`.
+    fn spawn_as(
+        &self,
+        mut command: Command,
+        output: io::Result<File>,
+    ) -> Result<Child, ProcessError> {
+        command
+            .arg("--core")
+            .arg("-w")
+            .arg(self.config.numworkers.to_string());
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
@@ -157,7 +198,7 @@ impl Rosmaster {
         if !own && self.write_log_config().is_ok() {
             command.env("ROS_PYTHON_LOG_CONFIG_FILE", &self.log_config);
         }
-        let (stdout, stderr) = match create(&self.output) {
+        let (stdout, stderr) = match output {
             Ok(file) => (
                 file.try_clone().map_or_else(|_| Stdio::null(), Stdio::from),
                 file.into(),
@@ -165,11 +206,7 @@ impl Rosmaster {
             Err(_) => (Stdio::null(), Stdio::null()),
         };
         // In a group of its own: rosrescue handles Ctrl-C in the terminal.
-        command
-            .stdin(Stdio::null())
-            .stdout(stdout)
-            .stderr(stderr)
-            .process_group(0);
+        command.stdout(stdout).stderr(stderr).process_group(0);
         command.spawn().map_err(|source| ProcessError::Spawn {
             program: self.program.clone(),
             source,

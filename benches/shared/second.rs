@@ -21,8 +21,15 @@ impl SecondMaster {
             words.collect::<Vec<_>>()
         };
         let (mut arguments, environment) = (read("cmdline"), read("environ"));
-        let place = arguments.iter().position(|word| word == "-p").expect("-p") + 1;
-        arguments[place] = port.to_string();
+        if arguments[1] == "-c" {
+            // It was a spare: interpreter, program text, and only then the rosmaster.
+            arguments.drain(..3);
+        }
+        let place = arguments.iter().position(|word| word == "-p");
+        if let Some(place) = place {
+            arguments.drain(place..place + 2);
+        }
+        arguments.extend(["-p".to_owned(), port.to_string()]);
         let mut command = Command::new(&arguments[0]);
         command
             .args(&arguments[1..])

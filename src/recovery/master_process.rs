@@ -1,13 +1,19 @@
 //! The supervised rosmaster: our child, or one that an earlier rosrescue left running.
 
-use tokio::sync::mpsc;
+use std::time::Duration;
+
+use tokio::{sync::mpsc, time::Instant};
 
 use crate::{
     ledger::Ledger,
-    process::{self, ProcessError, Rosmaster},
+    process::{self, ProcessError, Rosmaster, Spare},
     ros_env::MasterUri,
     upstream::Upstream,
+    wait,
 };
+
+/// A spare is started so long after a master: a recovery and the health check need the processor.
+const SPARE_AFTER: Duration = Duration::from_secs(2);
 
 /// A child's process id, and how it ended.
 type End = (u32, String);
@@ -23,6 +29,9 @@ pub(crate) struct MasterProcess {
     /// Our child, until it is called for the first time.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
+    spare: Option<Spare>,
+    /// When to start one.
+    spare_at: Option<Instant>,
 }
 
 impl MasterProcess {
@@ -35,6 +44,8 @@ impl MasterProcess {
             current: left,
             new: None,
             ends: mpsc::channel(4),
+            spare: None,
+            spare_at: left.map(|_| Instant::now() + SPARE_AFTER),
         };
         if let (Some(pid), Some(port)) = (left, port) {
             tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
@@ -77,7 +88,11 @@ impl MasterProcess {
             // Recorded before it runs: if rosrescue dies now, the next one can find the master.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
-        let mut child = self.rosmaster.spawn(port)?;
+        let mut child = match self.spare.take().and_then(|spare| spare.go(port)) {
+            Some(child) => child,
+            None => self.rosmaster.spawn(port)?,
+        };
+        self.spare_at = Some(Instant::now() + SPARE_AFTER);
         let pid = child.id().unwrap_or_default();
         tracing::info!(pid, port, "started rosmaster");
         self.watch(pid, async move {
@@ -99,7 +114,16 @@ impl MasterProcess {
 
     /// Returns when the master has ended. Cancel safe.
     pub(crate) async fn exited(&mut self) {
-        let how = self.gone().await;
+        let how = loop {
+            let spare_at = self.spare_at;
+            tokio::select! {
+                how = self.gone() => break how,
+                () = wait::until(spare_at) => {
+                    self.spare_at = None;
+                    self.spare = self.rosmaster.spawn_spare();
+                }
+            }
+        };
         tracing::warn!(pid = self.current, how, "rosmaster has ended");
         self.current = None;
         self.new = None;
@@ -128,6 +152,7 @@ impl MasterProcess {
 
     /// Stops the master in order.
     pub(crate) async fn stop(mut self) {
+        self.spare = None;
         if let Some(pid) = self.current {
             process::stop(pid, self.gone()).await;
         }

@@ -49,6 +49,7 @@ mod recovery {
     mod injection;
     mod no_shutdown;
     mod reconciliation;
+    mod spare_master;
     mod unreachable;
 }
 
