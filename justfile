@@ -16,7 +16,7 @@ test:
 bench:
     cargo bench --bench pauses
     cargo bench --bench table1
-    cargo bench --bench throughput
+    cargo bench --bench compare
 
 # A rescue to look at, with a real rosmaster and nodes
 quickstart:

@@ -1,0 +1,164 @@
+//! rosrescue side by side with a bare rosmaster, HAProxy and nginx, all in one run: `cargo bench --bench compare`.
+//!
+//! Four parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
+//! what grows with the state; and the first again on a stand-in for a small computer. Prints tables as Markdown,
+//! draws a picture, and writes every number as JSON. What a number means is said below each table.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a bench ends at the first thing that goes wrong"
+)]
+
+mod calls;
+mod cpu;
+mod load;
+mod party;
+mod picture;
+mod relays;
+mod report;
+mod robots;
+mod scale;
+#[path = "../shared/mod.rs"]
+mod shared;
+mod small;
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+use clap::{Args, ValueEnum};
+use serde::Serialize;
+
+use crate::{party::Kind, shared::machine, small::SmallComputer};
+
+const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/benchmarks.md");
+const PICTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/compare.svg");
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Part {
+    /// One kind of call at a time, by 1 to 512 connections.
+    Calls,
+    /// A storm of 100 nodes, and `roslaunch`.
+    Robots,
+    /// What grows with the state.
+    Scale,
+    /// The calls on one core at a quarter of its speed.
+    Small,
+}
+
+/// Compares rosrescue with a bare rosmaster, HAProxy and nginx.
+#[derive(Debug, Args)]
+struct Options {
+    /// What to measure
+    #[arg(long, value_name = "PART,…", value_delimiter = ',', value_enum)]
+    #[arg(default_values_t = [Part::Calls, Part::Robots, Part::Scale, Part::Small])]
+    parts: Vec<Part>,
+    /// Length of each measurement of one party in seconds; there are some 200
+    #[arg(
+        long,
+        env = "ROSRESCUE_BENCH_SECONDS",
+        value_name = "SECONDS",
+        default_value_t = 0.8
+    )]
+    seconds: f64,
+    /// Turns among which that time is divided, the parties alternating
+    #[arg(long, value_name = "COUNT", default_value_t = 3)]
+    turns: usize,
+    /// Storms of 100 nodes for each party
+    #[arg(long, value_name = "COUNT", default_value_t = 5)]
+    storms: usize,
+    /// Launches of 40 nodes for each party
+    #[arg(long, value_name = "COUNT", default_value_t = 3)]
+    launches: usize,
+    /// Where all numbers go as JSON, and the picture beside it as SVG [default: compare.json in Cargo's target
+    /// folder]
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Also put the tables of all parts and the picture into docs/
+    #[arg(long, conflicts_with = "parts")]
+    write_docs: bool,
+}
+
+/// Everything that was measured.
+#[derive(Debug, Default, Serialize)]
+struct Measured {
+    machine: String,
+    seconds: f64,
+    turns: usize,
+    calls: Option<Vec<calls::Cell>>,
+    robots: Option<Vec<robots::Times>>,
+    scale: Option<Vec<scale::Row>>,
+    small: Option<Small>,
+}
+
+#[derive(Debug, Serialize)]
+enum Small {
+    /// The share of a core that there really was.
+    Measured(f64, Vec<calls::Cell>),
+    /// Why nothing was measured.
+    Impossible(String),
+}
+
+fn main() -> ExitCode {
+    let Some(options) = shared::options::<Options>("compare") else {
+        return ExitCode::SUCCESS;
+    };
+    let needs = |part| options.parts.contains(&part);
+    let missing = relays::missing();
+    if (needs(Part::Calls) || needs(Part::Small)) && !missing.is_empty() {
+        eprintln!(
+            "compare: not everything to compare with is installed; apt-get install {}",
+            missing.join(" ")
+        );
+        return ExitCode::FAILURE;
+    }
+    let measured = measure(&options);
+    let text = report::markdown(&measured);
+    println!("{text}");
+    let json = options.json.unwrap_or_else(|| {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+        folder.with_file_name("compare.json")
+    });
+    let picture = measured.calls.as_deref().map(picture::svg);
+    let numbers = serde_json::to_string_pretty(&measured).expect("JSON");
+    write(&json, &numbers);
+    if let Some(picture) = &picture {
+        write(&json.with_extension("svg"), picture);
+    }
+    if options.write_docs {
+        let document = fs::read_to_string(DOCUMENT).expect("the document");
+        let document = report::put(&document, &text).expect("marks for the tables");
+        write(Path::new(DOCUMENT), &document);
+        if let Some(picture) = &picture {
+            write(Path::new(PICTURE), picture);
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+fn write(path: &Path, text: &str) {
+    fs::write(path, text).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    eprintln!("written: {}", path.display());
+}
+
+fn measure(options: &Options) -> Measured {
+    let (seconds, turns) = (options.seconds, options.turns.max(1));
+    let calls = |plan| calls::measure(&party::start(&Kind::ALL), plan, seconds, turns);
+    let needs = |part| options.parts.contains(&part);
+    Measured {
+        machine: machine::describe(),
+        seconds,
+        turns,
+        calls: needs(Part::Calls).then(|| calls(calls::WHOLE)),
+        robots: needs(Part::Robots).then(|| robots::measure(options.storms, options.launches)),
+        scale: needs(Part::Scale).then(|| scale::measure(seconds)),
+        small: needs(Part::Small).then(|| match SmallComputer::enter() {
+            Ok(computer) => Small::Measured(computer.share(), calls(calls::SMALLER)),
+            Err(reason) => Small::Impossible(reason),
+        }),
+    }
+}

@@ -1,0 +1,152 @@
+//! Who is compared: each with a rosmaster of its own, all started alike.
+
+use std::fmt;
+
+use serde::{Serialize, Serializer};
+
+use crate::{
+    cpu::family,
+    relays,
+    shared::{
+        second::SecondMaster,
+        support::{Client, Process, Rescue, Scratch, Setup, eventually, free_port},
+    },
+};
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// A rosmaster, nothing before it.
+    Bare,
+    /// `rosrescue core`.
+    Core,
+    /// `rosrescue proxy`.
+    Proxy,
+    Haproxy,
+    Nginx,
+}
+
+impl Kind {
+    pub(crate) const ALL: [Self; 5] = [
+        Self::Bare,
+        Self::Core,
+        Self::Proxy,
+        Self::Haproxy,
+        Self::Nginx,
+    ];
+    /// Those that are compared by real clients.
+    pub(crate) const OURS: [Self; 3] = [Self::Bare, Self::Core, Self::Proxy];
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Bare => "bare rosmaster",
+            Self::Core => "rosrescue core",
+            Self::Proxy => "rosrescue proxy",
+            Self::Haproxy => "HAProxy",
+            Self::Nginx => "nginx",
+        })
+    }
+}
+
+impl Serialize for Kind {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+#[derive(Debug)]
+enum Before {
+    Nothing,
+    Rescue(Box<Rescue>),
+    Relay(Process),
+}
+
+/// A rosmaster, and what is before it.
+#[derive(Debug)]
+pub(crate) struct Party {
+    pub(crate) kind: Kind,
+    /// What nodes use.
+    pub(crate) client: Client,
+    pub(crate) master_pid: u32,
+    // In the order of the drops.
+    before: Before,
+    _master: Option<SecondMaster>,
+    _scratch: Scratch,
+}
+
+impl Party {
+    fn core() -> Self {
+        let scratch = Scratch::new();
+        let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
+        let rescue = setup.guarded().start();
+        let client = rescue.client();
+        eventually("`rosversion` has been asked", || {
+            client.param("/rosdistro").is_some()
+        });
+        Self {
+            kind: Kind::Core,
+            master_pid: client.master_pid().expect("the master's process id"),
+            client,
+            before: Before::Rescue(Box::new(rescue)),
+            _master: None,
+            _scratch: scratch,
+        }
+    }
+
+    /// One whose master is started as the one with process id `like` was.
+    fn start(kind: Kind, like: u32) -> Self {
+        let scratch = Scratch::new();
+        let master_port = free_port();
+        let mut command = SecondMaster::command(like, master_port, &scratch.log_dir());
+        let master = SecondMaster::spawn(&mut command);
+        let client = Client::new(master_port);
+        eventually("the master answers", || client.master_pid().is_some());
+        let master_pid = client.master_pid().expect("the master's process id");
+        let (client, before) = match kind {
+            Kind::Core => panic!("`core` starts its own master"),
+            Kind::Bare => (client, Before::Nothing),
+            Kind::Proxy => {
+                let rescue = Setup::proxy(&scratch, master_port).guarded().start();
+                (rescue.client(), Before::Rescue(Box::new(rescue)))
+            }
+            Kind::Haproxy | Kind::Nginx => {
+                let port = free_port();
+                let relay = relays::start(kind, &scratch, port, master_port);
+                (Client::new(port), Before::Relay(relay))
+            }
+        };
+        eventually("calls pass", || client.master_pid() == Some(master_pid));
+        // As roscore does: roslaunch waits for it.
+        client.set_param("/run_id", "3b1f2f3e-c77e-11f0-8b0e-000000000000");
+        Self {
+            kind,
+            client,
+            master_pid,
+            before,
+            _master: Some(master),
+            _scratch: scratch,
+        }
+    }
+
+    /// The processes between client and master.
+    pub(crate) fn own(&self) -> Vec<u32> {
+        match &self.before {
+            Before::Nothing => Vec::new(),
+            Before::Rescue(rescue) => family(rescue.pid()),
+            Before::Relay(relay) => family(relay.pid()),
+        }
+    }
+}
+
+/// One of each of `kinds`, in that order; `core` must be one of them.
+pub(crate) fn start(kinds: &[Kind]) -> Vec<Party> {
+    let core = Party::core();
+    let like = core.master_pid;
+    let mut core = Some(core);
+    let of = |kind: &Kind| match kind {
+        Kind::Core => core.take().expect("one `core`"),
+        kind => Party::start(*kind, like),
+    };
+    kinds.iter().map(of).collect()
+}

@@ -1,0 +1,188 @@
+//! What was measured, as Markdown.
+
+use crate::{
+    Measured, Small,
+    calls::{Cell, Seen},
+    party::Kind,
+    robots::Times,
+    scale::Row,
+};
+
+const BEGIN: &str = "<!-- compare:begin -->";
+const END: &str = "<!-- compare:end -->";
+
+/// `document` with `text` in place of what is between its marks, which `text` has too.
+pub(crate) fn put(document: &str, text: &str) -> Option<String> {
+    let (before, rest) = document.split_once(BEGIN)?;
+    let (_, after) = rest.split_once(END)?;
+    Some(format!("{before}{text}{after}"))
+}
+
+/// All tables, between the marks that `docs/benchmarks.md` has for them.
+pub(crate) fn markdown(measured: &Measured) -> String {
+    let mut parts = vec![format!(
+        "{BEGIN}\n{}; {} s for each number, in {} turns.",
+        measured.machine, measured.seconds, measured.turns
+    )];
+    if let Some(cells) = &measured.calls {
+        parts.push(calls(cells) + CALLS.trim_end());
+    }
+    if let Some(times) = &measured.robots {
+        parts.push(robots(times) + ROBOTS.trim_end());
+    }
+    if let Some(rows) = &measured.scale {
+        parts.push(scale(rows) + SCALE.trim_end());
+    }
+    match &measured.small {
+        Some(Small::Measured(share, cells)) => parts.push(format!(
+            "### A small computer\n\nAll that is measured, and what measures, on one core with {:.0} % of its time \
+             (a bandwidth quota of 2.5 ms in each 10 ms for their cgroup).\n\n{}",
+            share * 1e2,
+            calls(cells).trim_start_matches("### Calls\n\n").trim_end()
+        )),
+        Some(Small::Impossible(reason)) => parts.push(format!(
+            "### A small computer\n\nNot measured: {reason}."
+        )),
+        None => {}
+    }
+    parts.join("\n\n") + "\n" + END
+}
+
+const CALLS: &str = "
+* Each party has a rosmaster of its own, started in the same way, and the parties take turns. Each connection is kept alive and calls as soon as it is answered; one thread
+  makes all the load, on the same cores. A connection that was closed is made anew and the call repeated, as Python's client does; the JSON counts that.
+  HAProxy runs in http mode with one thread, nginx with one worker and kept-alive connections to its master.
+* *Times*: from just before a call is sent until its whole answer is there.
+* *Calls a second*: of all connections together.
+* *Processor time*: user and system time of what is before the master (guardian and worker of rosrescue) + that of its master, over the calls.
+* *registerPublisher*: and `unregisterPublisher`, in turn. *multicall of 101*: 100 times `setParam` and a `deleteParam`, as `roslaunch` does. *KB*, *MB*: of the answer. Writes
+  change something: each sets another value.
+* Left out is what takes seconds a call: 5 MB, 10,000 parameters and multicalls by 64 or 512 connections.
+";
+
+const ROBOTS: &str = "
+* *A storm of 100 nodes*: all connect at once and make 15 calls each, one after the other, as a node does that starts: publishers, subscribers, services, parameters. Until
+  the last answer, median (largest).
+* *`roslaunch`*: 30 rospy and 10 roscpp nodes and 500 parameters, from its start until the last has registered. Most of it is Python's start.
+";
+
+const SCALE: &str = "
+* *A write*, *a read*: `setParam` and `getParam` of one parameter by one client, medians. A node has ten registrations.
+* *Compaction*: while one client sets a value of 8 KB and another one reads, without pause; from the first sight of the new file until it is the checkpoint.
+  *Longest call*: read, write; from 200 ms before that on, and in brackets all the rest of the time.
+* *Restart*: guardian and worker are killed and started again; from the start to the first answer to a read. *Recovery*: the master is killed; from the shut gate to the open
+  one, the start of a rosmaster included. *Recovery alone*: from the new rosmaster's open port on.
+* *Memory*: resident, guardian and worker together; at first, and after all that.
+";
+
+fn calls(cells: &[Cell]) -> String {
+    let tables = [
+        (
+            "Times of a call in ms, median (99th percentile):",
+            (|seen, _| format!("{} ({})", short(seen.median_ms), short(seen.p99_ms)))
+                as fn(&Seen, &Seen) -> String,
+        ),
+        (
+            "Calls a second (ratio to the bare rosmaster):",
+            |seen, bare| {
+                let ratio = seen.calls_per_second / bare.calls_per_second;
+                format!("{} ({ratio:.2})", short(seen.calls_per_second))
+            },
+        ),
+        (
+            "Processor time a call in µs, before the master + the master:",
+            |seen, _| format!("{:.0} + {:.0}", seen.own_cpu_us, seen.master_cpu_us),
+        ),
+    ];
+    let names = Kind::ALL.map(|kind| kind.to_string()).join(" | ");
+    let mut text = "### Calls\n".to_owned();
+    for (title, cell_text) in tables {
+        text += &format!(
+            "\n{title}\n\n| call | connections | {names} |\n|---|--:|--:|--:|--:|--:|--:|\n"
+        );
+        for cell in cells {
+            let bare = cell.of(Kind::Bare);
+            let texts = Kind::ALL.map(|kind| cell_text(cell.of(kind), bare));
+            let texts = texts.join(" | ");
+            text += &format!("| {} | {} | {texts} |\n", cell.call, cell.connections);
+        }
+    }
+    text
+}
+
+/// Three digits that count.
+fn short(number: f64) -> String {
+    match number {
+        0.0..1.0 => format!("{number:.2}"),
+        1.0..100.0 => format!("{number:.1}"),
+        _ => format!("{number:.0}"),
+    }
+}
+
+fn robots(times: &[Times]) -> String {
+    let names = Kind::OURS.map(|kind| kind.to_string()).join(" | ");
+    let mut text = format!("### Real clients\n\nIn ms:\n\n| | {names} |\n|---|--:|--:|--:|\n");
+    let lines = [
+        (
+            "a storm of 100 nodes",
+            (|times| &times.storm_ms) as fn(&Times) -> &Vec<f64>,
+        ),
+        ("`roslaunch`", |times| &times.launch_ms),
+    ];
+    for (what, of) in lines {
+        if of(&times[0]).is_empty() {
+            continue;
+        }
+        let bare = spread(of(&times[0])).0;
+        let cells = times.iter().map(|times| {
+            let (median, largest) = spread(of(times));
+            format!("{median:.0} ({largest:.0}), {:.2}", median / bare)
+        });
+        let cells: Vec<_> = cells.collect();
+        text += &format!("| {what} | {} |\n", cells.join(" | "));
+    }
+    text
+}
+
+/// Median and largest.
+fn spread(numbers: &[f64]) -> (f64, f64) {
+    let mut sorted = numbers.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let largest = sorted.last().copied().unwrap_or(f64::NAN);
+    let median = sorted.get(sorted.len() / 2).copied();
+    (median.unwrap_or(f64::NAN), largest)
+}
+
+fn scale(rows: &[Row]) -> String {
+    let mut text = "### Scale\n\n`rosrescue core`, in ms, median (largest):\n\n\
+        | parameters | nodes | a write | a read | compaction | longest call | restart | recovery | recovery alone | memory in MB |\n\
+        |--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n"
+        .to_owned();
+    let cell = |numbers: &[f64]| {
+        let (median, largest) = spread(numbers);
+        format!("{} ({})", short(median), short(largest))
+    };
+    for row in rows {
+        let mb = |kib: u64| format!("{:.1}", kib as f64 / 1024.0);
+        let cells = [
+            row.params.to_string(),
+            row.nodes.to_string(),
+            short(row.write_ms),
+            short(row.read_ms),
+            cell(&row.compactions_ms),
+            format!(
+                "{}, {} ({}, {})",
+                short(row.longest_ms[0]),
+                short(row.longest_ms[1]),
+                short(row.otherwise_ms[0]),
+                short(row.otherwise_ms[1])
+            ),
+            cell(&row.restarts_ms),
+            cell(&row.recoveries_ms),
+            cell(&row.injections_ms),
+            format!("{}, {}", mb(row.memory_kib), mb(row.memory_after_kib)),
+        ];
+        text += &format!("| {} |\n", cells.join(" | "));
+    }
+    text
+}
