@@ -144,7 +144,7 @@ impl Rosmaster {
     /// Starts a rosmaster on `port` of loopback. It outlives rosrescue: dropping the child does not end it.
     pub(crate) fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
-        command.arg("-p").arg(port.to_string());
+        command.arg("--core").arg("-p").arg(port.to_string());
         command.stdin(Stdio::null());
         self.spawn_as(command, create(&self.output))
     }
@@ -163,7 +163,8 @@ impl Rosmaster {
         let mut words = interpreter.iter();
         let mut command = command(Path::new(words.next()?));
         command.args(words).arg("-c").arg(spare::PROGRAM);
-        command.arg(&self.program).stdin(Stdio::piped());
+        command.arg(&self.program).arg("--core");
+        command.stdin(Stdio::piped());
         // The last words of the present master stay.
         let output = OpenOptions::new().append(true).open(&self.output);
         match self.spawn_as(command, output) {
@@ -181,10 +182,7 @@ impl Rosmaster {
         mut command: Command,
         output: io::Result<File>,
     ) -> Result<Child, ProcessError> {
-        command
-            .arg("--core")
-            .arg("-w")
-            .arg(self.config.numworkers.to_string());
+        command.arg("-w").arg(self.config.numworkers.to_string());
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
         }
