@@ -227,6 +227,7 @@ pub async fn run(
             gate: gate.clone(),
             ledger: ledger.clone(),
             reads: config.reads,
+            last_large: Default::default(),
             pool: Arc::new(pool),
             write_queue,
             slow,

@@ -2,7 +2,6 @@
 
 use std::{
     collections::HashMap,
-    hash::{DefaultHasher, Hash, Hasher},
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
@@ -25,8 +24,6 @@ const AHEAD: Duration = Duration::from_millis(250);
 /// Answers that may wait for room although they are in memory already. They go before those that are not, so
 /// that few answers are made twice.
 const WAITING: usize = 4;
-/// Calls remembered for their large answers.
-const CALLS: usize = 256;
 
 /// How one connection takes its large answers.
 #[derive(Debug)]
@@ -97,9 +94,6 @@ pub struct Answers {
     waiting: Semaphore,
     under_way: Mutex<HashMap<u64, Arc<Reader>>>,
     next: AtomicUsize,
-    /// Sizes of large answers, by the call.
-    known: Mutex<HashMap<u64, usize>>,
-    known_count: AtomicUsize,
 }
 
 /// Room for one answer; released on drop.
@@ -130,12 +124,6 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn key(call: &[u8]) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    call.hash(&mut hasher);
-    hasher.finish()
-}
-
 /// The bytes of an answer, if it is a large one.
 pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
     let size = reply.body().size_hint().exact()?;
@@ -154,36 +142,12 @@ impl Answers {
             waiting: Semaphore::new(WAITING),
             under_way: Mutex::default(),
             next: AtomicUsize::new(0),
-            known: Mutex::default(),
-            known_count: AtomicUsize::new(0),
         })
     }
 
     fn kib(&self, bytes: usize) -> u32 {
         let kib = u32::try_from(bytes.div_ceil(1 << 10)).unwrap_or(u32::MAX);
         kib.min(self.size)
-    }
-
-    /// Room for the answer to `call`, if it is known to be large. Waits for it.
-    pub(crate) async fn expected(&self, call: &[u8]) -> Option<Room> {
-        if self.known_count.load(Ordering::Relaxed) == 0 || call.len() > SMALL {
-            return None;
-        }
-        let size = lock(&self.known).get(&key(call)).copied()?;
-        Some(self.reserve(size).await)
-    }
-
-    /// Notes the size of a large answer to a small call.
-    pub(crate) fn remember(&self, call: &[u8], bytes: usize) {
-        if call.len() > SMALL {
-            return;
-        }
-        let mut known = lock(&self.known);
-        if known.len() >= CALLS {
-            known.clear();
-        }
-        known.insert(key(call), bytes);
-        self.known_count.store(known.len(), Ordering::Relaxed);
     }
 
     /// `room` if it is enough for `bytes`, or new room if there is some soon.
@@ -351,16 +315,8 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_call_whose_answer_was_large_gets_its_room_first() {
+    async fn there_is_room_for_an_answer_however_large_it_is() {
         let answers = Answers::within(2 * LARGE);
-        assert!(answers.expected(b"call").await.is_none());
-        answers.remember(b"call", LARGE);
-        assert!(answers.expected(b"another").await.is_none());
-        let room = answers.expected(b"call").await.unwrap();
-        assert_eq!(answers.room.available_permits(), LARGE >> 10);
-        // However large it is, there is room for it.
-        answers.remember(b"call", 100 * LARGE);
-        drop(room);
-        assert!(answers.expected(b"call").await.is_some());
+        assert!(answers.enough(None, 100 * LARGE).await.is_some());
     }
 }

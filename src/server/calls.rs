@@ -8,11 +8,11 @@ use std::{
 
 use bytes::Bytes;
 use thiserror::Error;
-use tokio::sync::{Notify, oneshot};
+use tokio::sync::{Mutex, Notify, oneshot};
 
 use super::{
     admission,
-    replies::{self, HttpReply, encoded, forwarded, made, no_shutdown, xml},
+    replies::{HttpReply, encoded, forwarded, made, no_shutdown, xml},
 };
 use crate::{
     cli::Reads,
@@ -38,6 +38,10 @@ pub struct Closed(pub(super) &'static str);
 /// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
 /// millisecond, and within some ten behind a call that keeps its interpreter busy.
 const PATIENCE: Duration = Duration::from_millis(100);
+/// Values that take a millisecond to encode, in bytes of memory.
+const LARGE: usize = 64 << 10;
+/// Largest answer that is kept, in bytes.
+const KEPT_MOST: usize = 16 << 20;
 /// Why a write is not answered.
 const UNANSWERED: &str = "the master gave no answer";
 /// Why a multicall of reads is not answered while the master is away.
@@ -49,6 +53,8 @@ pub struct Calls {
     pub ledger: Arc<Ledger>,
     /// Who answers reads while there is a master.
     pub reads: Reads,
+    /// The last large answer of the mirror.
+    pub last_large: Mutex<Option<LargeAnswer>>,
     /// Connections for reads.
     pub pool: Arc<Pool>,
     pub write_queue: WriteQueue,
@@ -59,6 +65,14 @@ pub struct Calls {
     pub uri: String,
     /// How long a call waits if only a master can answer it.
     pub hold: Duration,
+}
+
+/// An answer of the mirror at this version.
+pub struct LargeAnswer {
+    version: u64,
+    /// The call's bytes.
+    call: Bytes,
+    text: Bytes,
 }
 
 impl Calls {
@@ -75,7 +89,7 @@ impl Calls {
             (Some(call), Kind::Identity)
                 if *call.method() == Method::GetUri || !self.gate.is_open() =>
             {
-                let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
+                let (reply, _) = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
                 Ok(xml(&reply))
             }
             (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
@@ -97,12 +111,63 @@ impl Calls {
         }
     }
 
-    /// The mirror's answer to a read while there is a master; none if the master's may differ.
-    async fn exact_answer(&self, call: Option<&Request>) -> Option<HttpReply> {
+    /// The mirror's answer to a read while there is a master; none if the master's may differ. `body`: the
+    /// call's bytes.
+    async fn exact_answer(&self, body: &Bytes, call: Option<&Request>) -> Option<HttpReply> {
         let read = call.filter(|_| self.reads == Reads::Mirror)?;
-        let reply = replies::result(self.ledger.exact_answer(read)?).await?;
+        let answer = || {
+            let (value, version) = self.ledger.exact_answer(read)?;
+            Some((Reply::Value(value), version))
+        };
+        let reply = self.encode(body, answer).await?;
         self.stats.mirrored.count();
         Some(reply)
+    }
+
+    /// The mirror's answer to a read instead of the master's.
+    async fn stand_in(&self, body: &Bytes, call: Option<&Request>) -> Option<HttpReply> {
+        let read = call?;
+        let reply = self.encode(body, || self.ledger.answer(read)).await?;
+        self.stats.stood_in.count();
+        Some(reply)
+    }
+
+    /// Encodes what `answer` gives, and the mirror's version. None if a master cannot marshal it.
+    ///
+    /// What takes milliseconds is encoded away from the runtime, one answer at a time, and those who ask for
+    /// the same share one.
+    async fn encode(
+        &self,
+        body: &Bytes,
+        answer: impl Fn() -> Option<(Reply, u64)>,
+    ) -> Option<HttpReply> {
+        let (reply, _) = answer()?;
+        let Reply::Value(value) = reply else {
+            return Some(xml(&reply));
+        };
+        if !value.is_larger_than(LARGE) {
+            return Some(encoded(xmlrpc::encode_result(&value).ok()?));
+        }
+        // Whoever waits needs no memory for it.
+        drop(value);
+        let mut last = self.last_large.lock().await;
+        let (reply, version) = answer()?;
+        if let Some(last) = last.as_ref()
+            && (last.version, &last.call) == (version, body)
+        {
+            return Some(encoded(last.text.clone()));
+        }
+        let encode = move || match reply {
+            Reply::Value(value) => xmlrpc::encode_result(&value).ok(),
+            fault @ Reply::Fault { .. } => Some(xmlrpc::encode_reply(&fault)),
+        };
+        let text = Bytes::from(tokio::task::spawn_blocking(encode).await.ok()??);
+        *last = (text.len() <= KEPT_MOST).then(|| LargeAnswer {
+            version,
+            call: body.clone(),
+            text: text.clone(),
+        });
+        Some(encoded(text))
     }
 
     /// Answers a read from the mirror, or forwards it. The mirror answers while the master is away, fails or
@@ -114,23 +179,18 @@ impl Calls {
         call: Option<&Request>,
         kind: Kind,
     ) -> Result<HttpReply, Closed> {
-        let from_mirror = || {
-            let call = call.filter(|_| kind != Kind::Unknown)?;
-            let reply = self.ledger.answer(call)?;
-            self.stats.stood_in.count();
-            Some(xml(&reply))
-        };
+        let known = call.filter(|_| kind != Kind::Unknown);
         let mut gate = self.gate.clone();
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
         loop {
             match gate.look() {
                 State::Open { incarnation } => {
-                    if let Some(reply) = self.exact_answer(call).await {
+                    if let Some(reply) = self.exact_answer(&body, call).await {
                         return Ok(reply);
                     }
                     let patience = self.patience();
                     if patience <= tokio::time::Instant::now()
-                        && let Some(reply) = from_mirror()
+                        && let Some(reply) = self.stand_in(&body, known).await
                     {
                         return Ok(reply);
                     }
@@ -142,7 +202,7 @@ impl Calls {
                         Ok(reply) => reply,
                         Err(_) => {
                             self.slow.notify_one();
-                            if let Some(reply) = from_mirror() {
+                            if let Some(reply) = self.stand_in(&body, known).await {
                                 // When this read ends, the master answers again.
                                 let pool = self.pool.clone();
                                 tokio::spawn(async move {
@@ -158,12 +218,12 @@ impl Calls {
                         Ok(raw) => return Ok(forwarded(&self.uri, call, raw)),
                         Err(error) => tracing::debug!(%error, "read"),
                     }
-                    if let Some(reply) = from_mirror() {
+                    if let Some(reply) = self.stand_in(&body, known).await {
                         return Ok(reply);
                     }
                 }
                 State::StandingIn | State::Injecting => {
-                    if let Some(reply) = from_mirror() {
+                    if let Some(reply) = self.stand_in(&body, known).await {
                         return Ok(reply);
                     }
                 }

@@ -14,9 +14,6 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Values that are encoded outside of the runtime, in bytes of memory.
-const LARGE: usize = 64 << 10;
-
 /// What hyper sends.
 pub(crate) type HttpReply = Response<Full<Bytes>>;
 
@@ -56,21 +53,9 @@ pub(super) fn xml(reply: &Reply) -> HttpReply {
     encoded(xmlrpc::encode_reply(reply))
 }
 
-/// A method's result; none if rosmaster cannot marshal it. A long one takes milliseconds to encode, and must
-/// not hold up a thread of the runtime.
-pub(super) async fn result(value: Value) -> Option<HttpReply> {
-    let is_large = value.is_larger_than(LARGE);
-    let encode = move || xmlrpc::encode_result(&value).ok();
-    let text = match is_large {
-        true => tokio::task::spawn_blocking(encode).await.ok()?,
-        false => encode(),
-    };
-    text.map(encoded)
-}
-
 /// A reply of our own that is encoded already.
-pub(super) fn encoded(reply: Vec<u8>) -> HttpReply {
-    let mut http = Response::new(Full::new(Bytes::from(reply)));
+pub(super) fn encoded(reply: impl Into<Bytes>) -> HttpReply {
+    let mut http = Response::new(Full::new(reply.into()));
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http

@@ -147,14 +147,13 @@ async fn answer(
     body: Bytes,
     mut call: Option<master::Request>,
 ) -> Result<HttpReply, Closed> {
-    let mut room = server.answers.expected(&body).await;
+    let mut room = None;
     for _ in 0..ATTEMPTS {
         let (again, calls) = (head.clone(), &server.calls);
         let reply = calls.answer(peer, again, body.clone(), call).await?;
         let Some(size) = answers::size(&reply) else {
             return Ok(reply);
         };
-        server.answers.remember(&body, size);
         if let Some(room) = server.answers.enough(room.take(), size).await {
             return Ok(server.answers.count(reply, room, &deadlines.reader).await);
         }

@@ -3,16 +3,27 @@
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::thread;
 
-use crate::support::{Mode, Robot};
+use crate::support::{Mode, Robot, tree};
 use rosrescue::xmlrpc::Value;
 
 const WRITERS: usize = 6;
 const READERS: usize = 4;
 const ROUNDS: i32 = 300;
 
-/// Whichever connection it came on.
+/// Whichever connection it came on, and however large the answer is.
 fn a_read_shows_every_write_that_was_acknowledged(mode: Mode) {
     let robot = Robot::start_with(mode, &["--reads", "mirror"]);
+    for bytes in [10, 200_000] {
+        robot
+            .client()
+            .set_param("/writer", tree! {"filler" => "x".repeat(bytes)});
+        write_and_read(&robot);
+    }
+    assert!(robot.counter("mirrored") > 100);
+    assert_eq!(robot.counter("stood_in"), 0);
+}
+
+fn write_and_read(robot: &Robot) {
     let acknowledged = [const { AtomicI32::new(0) }; WRITERS];
     let is_over = || {
         acknowledged
@@ -49,8 +60,6 @@ fn a_read_shows_every_write_that_was_acknowledged(mode: Mode) {
             });
         }
     });
-    assert!(robot.counter("mirrored") > 100);
-    assert_eq!(robot.counter("stood_in"), 0);
 }
 
 #[test]
