@@ -110,14 +110,8 @@ pub(crate) fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
 }
 
 fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
-    let repeated = match &notification {
-        // For another name at the port.
-        Notification::Call(call) => queue.iter().any(
-            |waiting| matches!(waiting, Notification::Call(waiting) if Arc::ptr_eq(waiting, call)),
-        ),
-        _ => queue.contains(&notification),
-    };
-    if repeated {
+    let repeated = !matches!(notification, Notification::Call(_));
+    if repeated && queue.contains(&notification) {
         return;
     }
     queue.push_back(notification);
