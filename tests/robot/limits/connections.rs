@@ -115,7 +115,12 @@ fn core_with_files(scratch: &Scratch, limit: usize) -> Rescue {
         shell.args(["-c", &format!("ulimit -n {limit}; exec \"$0\" \"$@\"")]);
         behind(shell, own)
     });
-    setup.start()
+    let rescue = setup.start();
+    eventually("rosout is at work", || {
+        let node = params!["/c", "/rosout"];
+        rescue.client().ask("lookupNode", node).is_some()
+    });
+    rescue
 }
 
 #[test]
@@ -125,10 +130,6 @@ fn with_few_files_calls_are_served_recorded_and_recovered_under_idle_connections
         let mut rescue = core_with_files(&scratch, limit);
         let client = rescue.client();
         client.set_param("/x", 1);
-        eventually("rosout is at work", || {
-            let nodes = client.ask("lookupNode", params!["/c", "/rosout"]);
-            nodes.is_some()
-        });
         let before = files(&rescue);
         let wires = idle(&client, limit + 100);
         let start = Instant::now();
