@@ -59,13 +59,23 @@ impl Ledger {
     ) -> Option<(Reply, Option<u64>)> {
         let mut inner = self.lock();
         // An unregistration may concern a registration that is still on its way to the master.
-        let idle = !write.calls().into_iter().any(is_unregistration)
+        let idle = !inner.doubted
+            && !write.calls().into_iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
-        idle.then(|| {
-            let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
-            (reply, inner.last_seq())
-        })
+        if !idle {
+            return None;
+        }
+        let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
+        // A refusal is the master's, in its own words.
+        let refused = match &reply {
+            Reply::Value(value) => {
+                let code = value.as_array().and_then(<[Value]>::first);
+                code.and_then(Value::as_int).is_some_and(|code| code != 1)
+            }
+            Reply::Fault { .. } => true,
+        };
+        (!refused).then(|| (reply, inner.last_seq()))
     }
 
     /// The master's predicted answer to this call.

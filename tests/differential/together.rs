@@ -280,7 +280,10 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
     let (shared, alone): (Vec<_>, Vec<_>) =
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
     let batches = usize::try_from(counter("batches")).unwrap() - alone.len();
-    assert_eq!(counter("mirrored") > 100, reads == "mirror");
+    if !unreturnable {
+        // Such values leave the mirror in doubt most of the time.
+        assert_eq!(counter("mirrored") > 100, reads == "mirror");
+    }
     println!(
         "seed {seed}, unreturnable {unreturnable}, reads by the {reads}: {} calls, of which {} went alone and {} in {batches} batches",
         CALLERS * CALLS,
