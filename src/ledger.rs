@@ -150,8 +150,6 @@ impl Ledger {
         let mut inner = self.lock();
         let (_, uri) = inner.identity.clone();
         inner.set_identity((pid, uri));
-        // Answers with the old one are not given again.
-        inner.version += 1;
     }
 
     pub fn session(&self) -> Session {

@@ -149,33 +149,6 @@ impl Rosmaster {
         self.spawn_as(command, create(&self.output))
     }
 
-    /// Starts a spare, if one is wanted and the program is ROS's own.
-    pub(crate) fn spawn_spare(&self) -> Option<Spare> {
-        if !self.config.spare {
-            return None;
-        }
-        let own = self.config.rosmaster.is_none();
-        let interpreter = own.then(|| spare::interpreter(&self.program)).flatten();
-        let Some(interpreter) = interpreter else {
-            tracing::warn!("no spare rosmaster: only ROS's own program can have one");
-            return None;
-        };
-        let mut words = interpreter.iter();
-        let mut command = command(Path::new(words.next()?));
-        command.args(words).arg("-c").arg(spare::PROGRAM);
-        command.arg(&self.program).arg("--core");
-        command.stdin(Stdio::piped());
-        // The last words of the present master stay.
-        let output = OpenOptions::new().append(true).open(&self.output);
-        match self.spawn_as(command, output) {
-            Ok(child) => Spare::new(child),
-            Err(error) => {
-                tracing::warn!(%error, "no spare rosmaster");
-                None
-            }
-        }
-    }
-
     /// Runs `command` with rosmaster's further arguments, its environment and `output`.
     fn spawn_as(
         &self,

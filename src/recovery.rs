@@ -281,8 +281,8 @@ impl Driver {
                     ),
                     None => tracing::error!(
                         deaths,
-                        "crash loop: the master has died {deaths} times within a minute; whoever \
-                         starts it has its last words"
+                        "crash loop: the master has died {deaths} times within a minute; its \
+                         output is in the log of what starts it"
                     ),
                 }
             }

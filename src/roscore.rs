@@ -52,7 +52,7 @@ fn set(key: &str, value: &str) -> Request {
 fn has(roscore: &Roscore, key: &str) -> bool {
     let call = Request::new(Method::HasParam, [CALLER_ID, key]);
     let yes = Value::Bool(true);
-    matches!(roscore.ledger.answer(&call), Some((Reply::Value(Value::Array(answer)), _)) if answer.get(2) == Some(&yes))
+    matches!(roscore.ledger.answer(&call), Some(Reply::Value(Value::Array(answer))) if answer.get(2) == Some(&yes))
 }
 
 fn run_id(roscore: &Roscore) -> Request {

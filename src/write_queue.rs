@@ -6,6 +6,7 @@ pub(crate) mod batch;
 mod drain;
 mod outdated;
 pub(crate) mod parts;
+mod resync;
 mod round_trip;
 
 use std::{sync::Arc, time::Duration};

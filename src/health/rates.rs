@@ -1,4 +1,4 @@
-//! How often the nodes of one host are asked: whoever registers names cannot direct a flood at a host.
+//! How often the nodes of one host are asked, so that registered names cannot direct a flood at a host.
 
 use std::{
     collections::BTreeMap,

@@ -21,32 +21,27 @@ const ANSWER_MOST: usize = 64 << 20;
 const EXACT_ANSWER_MOST: usize = 1 << 20;
 
 impl Ledger {
-    /// The master's predicted answer to a read, and the mirror's version; none if it is a multicall that asks
-    /// for too much.
-    pub fn answer(&self, read: &Request) -> Option<(Reply, u64)> {
-        let mut inner = self.lock();
-        let version = inner.version;
-        let mirror = &mut inner.mirror;
+    /// The master's predicted answer to a read; none if it is a multicall that asks for too much.
+    pub fn answer(&self, read: &Request) -> Option<Reply> {
+        let mirror = &mut self.lock().mirror;
         let fits = mirror.fits(read, ANSWER_MOST);
-        fits.then(|| (mirror.apply_telling(read, &mut ()), version))
+        fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
-    /// The result of a read, if the present master's is the same to the byte, and the mirror's version. It
-    /// shows every write that was acknowledged.
-    pub fn exact_answer(&self, read: &Request) -> Option<(Value, u64)> {
-        let mut guard = self.lock();
-        let inner = &mut *guard;
-        let version = inner.version;
+    /// The result of a read, if the present master's is the same to the byte. It shows every write that was
+    /// acknowledged.
+    pub fn exact_answer(&self, read: &Request) -> Option<Value> {
+        let mut inner = self.lock();
         if inner.doubted || !inner.mirror.fits(read, EXACT_ANSWER_MOST) {
             return None;
         }
         if *read.method() == Method::GetParamNames {
             // Walks the whole tree, of which there is a copy at no cost.
             let mut params = inner.mirror.with_params_only();
-            drop(guard);
-            return Some((params.exact_answer(read)?, version));
+            drop(inner);
+            return params.exact_answer(read);
         }
-        Some((inner.mirror.exact_answer(read)?, version))
+        inner.mirror.exact_answer(read)
     }
 
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.

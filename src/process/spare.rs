@@ -1,7 +1,12 @@
 //! A spare rosmaster: a process that has loaded the program and waits to be told its port. It needs a tenth of
 //! the time of a new one.
 
-use std::{fs, path::Path, time::Duration};
+use std::{
+    fs::{self, OpenOptions},
+    path::Path,
+    process::Stdio,
+    time::Duration,
+};
 
 use rustix::process::Signal;
 use tokio::{
@@ -9,14 +14,14 @@ use tokio::{
     process::{Child, ChildStdin},
 };
 
-use super::{orphan, signal_process};
+use super::{Rosmaster, command, orphan, signal_process};
 
 /// A spare that does not listen after this time hangs: another master is started.
 const LIMIT: Duration = Duration::from_secs(3);
 
 /// What Python runs: it loads what rosmaster needs, waits for the port, and then runs the installed program as
 /// it is. The end of the input means that rosrescue has ended.
-pub(super) const PROGRAM: &str = "\
+const PROGRAM: &str = "\
 import runpy, sys
 import rosmaster.main, rosgraph.roslogging, rosgraph.xmlrpc, logging.config, logging.handlers, xmlrpc.client
 port = sys.stdin.readline().strip()
@@ -28,7 +33,7 @@ runpy.run_path(sys.argv[0], run_name='__main__')
 ";
 
 /// The interpreter and its arguments in the first line of `program`, if it is a Python script.
-pub(super) fn interpreter(program: &Path) -> Option<Vec<String>> {
+fn interpreter(program: &Path) -> Option<Vec<String>> {
     let text = fs::read(program).ok()?;
     let line = text.split(|byte| *byte == b'\n').next()?;
     let words = std::str::from_utf8(line).ok()?.strip_prefix("#!")?;
@@ -37,13 +42,42 @@ pub(super) fn interpreter(program: &Path) -> Option<Vec<String>> {
     words.last().and_then(is_python).map(|()| words)
 }
 
+impl Rosmaster {
+    /// Starts a spare, if one is wanted and the program is ROS's own.
+    pub(crate) fn spawn_spare(&self) -> Option<Spare> {
+        if !self.config.spare {
+            return None;
+        }
+        let own = self.config.rosmaster.is_none();
+        let interpreter = own.then(|| interpreter(&self.program)).flatten();
+        let Some(interpreter) = interpreter else {
+            tracing::warn!("no spare rosmaster: only ROS's own program can have one");
+            return None;
+        };
+        let mut words = interpreter.iter();
+        let mut command = command(Path::new(words.next()?));
+        command.args(words).arg("-c").arg(PROGRAM);
+        command.arg(&self.program).arg("--core");
+        command.stdin(Stdio::piped());
+        // The last words of the present master stay.
+        let output = OpenOptions::new().append(true).open(&self.output);
+        match self.spawn_as(command, output) {
+            Ok(child) => Spare::new(child),
+            Err(error) => {
+                tracing::warn!(%error, "no spare rosmaster");
+                None
+            }
+        }
+    }
+}
+
 /// The waiting process. Ends when it is dropped.
 #[derive(Debug)]
 pub(crate) struct Spare(Option<(Child, ChildStdin)>);
 
 impl Spare {
     /// None if `child` has no input.
-    pub(super) fn new(mut child: Child) -> Option<Self> {
+    fn new(mut child: Child) -> Option<Self> {
         let input = child.stdin.take()?;
         Some(Self(Some((child, input))))
     }

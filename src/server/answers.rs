@@ -4,7 +4,7 @@ use std::{
     collections::HashMap,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::{Duration, Instant},
 };
@@ -93,7 +93,7 @@ pub struct Answers {
     turn: Turn<()>,
     waiting: Semaphore,
     under_way: Mutex<HashMap<u64, Arc<Reader>>>,
-    next: AtomicUsize,
+    next: AtomicU64,
 }
 
 /// Room for one answer; released on drop.
@@ -141,7 +141,7 @@ impl Answers {
             turn: Turn::default(),
             waiting: Semaphore::new(WAITING),
             under_way: Mutex::default(),
-            next: AtomicUsize::new(0),
+            next: AtomicU64::new(0),
         })
     }
 
@@ -225,7 +225,7 @@ impl Answers {
         let (head, body) = reply.into_parts();
         let Ok(whole) = body.collect().await;
         let bytes = whole.to_bytes();
-        let number = self.next.fetch_add(1, Ordering::Relaxed) as u64;
+        let number = self.next.fetch_add(1, Ordering::Relaxed);
         *reader.fast_until() = Instant::now() + AHEAD;
         reader.counts.store(true, Ordering::Relaxed);
         lock(&self.under_way).insert(number, reader.clone());

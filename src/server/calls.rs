@@ -67,11 +67,9 @@ pub struct Calls {
     pub hold: Duration,
 }
 
-/// An answer of the mirror at this version.
+/// An answer of the mirror, and its encoding.
 pub struct LargeAnswer {
-    version: u64,
-    /// The call's bytes.
-    call: Bytes,
+    value: Value,
     text: Bytes,
 }
 
@@ -89,7 +87,7 @@ impl Calls {
             (Some(call), Kind::Identity)
                 if *call.method() == Method::GetUri || !self.gate.is_open() =>
             {
-                let (reply, _) = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
+                let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
                 Ok(xml(&reply))
             }
             (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
@@ -111,62 +109,54 @@ impl Calls {
         }
     }
 
-    /// The mirror's answer to a read while there is a master; none if the master's may differ. `body`: the
-    /// call's bytes.
-    async fn exact_answer(&self, body: &Bytes, call: Option<&Request>) -> Option<HttpReply> {
+    /// The mirror's answer to a read while there is a master; none if the master's may differ.
+    async fn exact_answer(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call.filter(|_| self.reads == Reads::Mirror)?;
-        let answer = || {
-            let (value, version) = self.ledger.exact_answer(read)?;
-            Some((Reply::Value(value), version))
-        };
-        let reply = self.encode(body, answer).await?;
+        let answer = || self.ledger.exact_answer(read).map(Reply::Value);
+        let reply = self.encode(answer).await?;
         self.stats.mirrored.count();
         Some(reply)
     }
 
-    /// The mirror's answer to a read instead of the master's.
-    async fn stand_in(&self, body: &Bytes, call: Option<&Request>) -> Option<HttpReply> {
+    /// The mirror's answer to a read instead of that of a master that is away, or late.
+    async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call?;
-        let reply = self.encode(body, || self.ledger.answer(read)).await?;
+        let reply = self.encode(|| self.ledger.answer(read)).await?;
         self.stats.stood_in.count();
         Some(reply)
     }
 
-    /// Encodes what `answer` gives, and the mirror's version. None if a master cannot marshal it.
+    /// Encodes what `answer` gives. None if a master cannot marshal it.
     ///
-    /// What takes milliseconds is encoded away from the runtime, one answer at a time, and those who ask for
-    /// the same share one.
-    async fn encode(
-        &self,
-        body: &Bytes,
-        answer: impl Fn() -> Option<(Reply, u64)>,
-    ) -> Option<HttpReply> {
-        let (reply, _) = answer()?;
-        let Reply::Value(value) = reply else {
-            return Some(xml(&reply));
+    /// What takes milliseconds is encoded outside of the runtime, one answer at a time. Equal answers in a row
+    /// share one encoding; values are shared, so comparing them is quick.
+    async fn encode(&self, answer: impl Fn() -> Option<Reply>) -> Option<HttpReply> {
+        let value = match answer()? {
+            Reply::Value(value) => value,
+            fault @ Reply::Fault { .. } => return Some(xml(&fault)),
         };
         if !value.is_larger_than(LARGE) {
             return Some(encoded(xmlrpc::encode_result(&value).ok()?));
         }
-        // Whoever waits needs no memory for it.
+        // A call that waits holds no copy.
         drop(value);
         let mut last = self.last_large.lock().await;
-        let (reply, version) = answer()?;
-        if let Some(last) = last.as_ref()
-            && (last.version, &last.call) == (version, body)
-        {
-            return Some(encoded(last.text.clone()));
-        }
-        let encode = move || match reply {
-            Reply::Value(value) => xmlrpc::encode_result(&value).ok(),
-            fault @ Reply::Fault { .. } => Some(xmlrpc::encode_reply(&fault)),
+        let value = match answer()? {
+            Reply::Value(value) => value,
+            fault @ Reply::Fault { .. } => return Some(xml(&fault)),
         };
-        let text = Bytes::from(tokio::task::spawn_blocking(encode).await.ok()??);
-        *last = (text.len() <= KEPT_MOST).then(|| LargeAnswer {
-            version,
-            call: body.clone(),
-            text: text.clone(),
-        });
+        let encode = move |last: Option<LargeAnswer>| match last {
+            Some(last) if last.value == value => Some(last),
+            _ => {
+                let text = xmlrpc::encode_result(&value).ok()?.into();
+                Some(LargeAnswer { value, text })
+            }
+        };
+        let before = last.take();
+        let encoding = tokio::task::spawn_blocking(move || encode(before));
+        let answer = encoding.await.ok()??;
+        let text = answer.text.clone();
+        *last = Some(answer).filter(|answer| answer.text.len() <= KEPT_MOST);
         Some(encoded(text))
     }
 
@@ -185,12 +175,14 @@ impl Calls {
         loop {
             match gate.look() {
                 State::Open { incarnation } => {
-                    if let Some(reply) = self.exact_answer(&body, call).await {
+                    if let Some(reply) = self.exact_answer(call).await {
                         return Ok(reply);
                     }
                     let patience = self.patience();
+                    // A mirror in doubt waits for the probes' verdict on the master.
+                    let known_now = known.filter(|_| !self.ledger.is_doubted());
                     if patience <= tokio::time::Instant::now()
-                        && let Some(reply) = self.stand_in(&body, known).await
+                        && let Some(reply) = self.stand_in(known_now).await
                     {
                         return Ok(reply);
                     }
@@ -202,7 +194,7 @@ impl Calls {
                         Ok(reply) => reply,
                         Err(_) => {
                             self.slow.notify_one();
-                            if let Some(reply) = self.stand_in(&body, known).await {
+                            if let Some(reply) = self.stand_in(known_now).await {
                                 // When this read ends, the master answers again.
                                 let pool = self.pool.clone();
                                 tokio::spawn(async move {
@@ -218,12 +210,12 @@ impl Calls {
                         Ok(raw) => return Ok(forwarded(&self.uri, call, raw)),
                         Err(error) => tracing::debug!(%error, "read"),
                     }
-                    if let Some(reply) = self.stand_in(&body, known).await {
+                    if let Some(reply) = self.stand_in(known).await {
                         return Ok(reply);
                     }
                 }
                 State::StandingIn | State::Injecting => {
-                    if let Some(reply) = self.stand_in(&body, known).await {
+                    if let Some(reply) = self.stand_in(known).await {
                         return Ok(reply);
                     }
                 }

@@ -32,7 +32,7 @@ type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A keep-alive connection to the master, for one call at a time.
 ///
-/// It is driven by whoever makes a call, in the same task: a task of its own would have to be woken twice for
+/// The caller drives it, in its own task: another task would have to be woken twice for
 /// each call. So nobody notices its end between two calls; [`Self::is_closed`] looks.
 #[derive(Debug)]
 pub struct Connection {

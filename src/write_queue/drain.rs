@@ -14,6 +14,7 @@ use super::batch::{self, Answer, Item};
 use super::{
     Link,
     outdated::is_outdated,
+    resync::ResyncSchedule,
     round_trip::{Done, Received, RoundTripError, round_trip},
 };
 use crate::{
@@ -27,13 +28,6 @@ use crate::{
 
 /// Pause before an unsent batch is tried again while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// Pause before reading the master's state again after a failure.
-const LOOK_PAUSE: Duration = Duration::from_secs(1);
-/// Reading the master's state keeps writes waiting, the longer the larger it is. After each time they pass for
-/// this many times as long; whoever needs a reading meanwhile shares the next one.
-const REST_TIMES: u32 = 10;
-/// But not for longer: answers may wait for it.
-const REST_MOST: Duration = Duration::from_secs(30);
 /// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master
 /// closes its connections within milliseconds; one that only closed an idle connection answers.
 const GRACE: Duration = Duration::from_millis(5);
@@ -65,11 +59,7 @@ pub(crate) struct Drain {
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     /// The incarnation for which the gate was open last.
     incarnation: u64,
-    resync_due: bool,
-    /// When to try a resync that failed, or has to wait, again.
-    resync_at: Option<tokio::time::Instant>,
-    /// Before this time there is no resync.
-    rest_until: Option<tokio::time::Instant>,
+    resync: ResyncSchedule,
     retry_at: Option<tokio::time::Instant>,
     /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
     /// read from the master again and holds their effects.
@@ -107,9 +97,7 @@ impl Drain {
             tell_lost,
             tell_sent,
             incarnation: 0,
-            resync_due: false,
-            resync_at: None,
-            rest_until: None,
+            resync: ResyncSchedule::default(),
             retry_at: None,
             opaque: Opaque::default(),
         }
@@ -118,7 +106,7 @@ impl Drain {
     /// Runs until every [`WriteQueue`](super::WriteQueue) is gone.
     pub(crate) async fn run(mut self) {
         let mut gate = self.gate.clone();
-        let mut resync = self.resync_interval.map(tokio::time::interval);
+        let mut interval = self.resync_interval.map(tokio::time::interval);
         loop {
             let mut changed = false;
             tokio::select! {
@@ -129,20 +117,19 @@ impl Drain {
                 () = gate.changed() => changed = true,
                 done = wait::for_some(self.in_flight.as_mut().map(|batch| &mut batch.done)) => {
                     // A read that takes longer than the interval must leave time for calls.
-                    if matches!(done.result, Ok(Received::Held(_))) && let Some(resync) = &mut resync {
-                        resync.reset();
+                    if matches!(done.result, Ok(Received::Held(_))) && let Some(interval) = &mut interval {
+                        interval.reset();
                     }
                     self.done(done);
                 }
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = wait::until(self.grace) => {}
-                () = wait::tick(&mut resync) => {
-                    self.resync_due |= self.in_flight.as_ref().is_none_or(|batch| !batch.items.is_empty());
+                () = wait::tick(&mut interval) => {
+                    if self.in_flight.as_ref().is_none_or(|batch| !batch.items.is_empty()) {
+                        self.resync.request();
+                    }
                 }
-                () = wait::until(self.resync_at) => {
-                    self.resync_at = None;
-                    self.resync_due = true;
-                }
+                () = wait::until(self.resync.wake_at()) => self.resync.wake(),
             }
             while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
@@ -179,10 +166,11 @@ impl Drain {
             self.take_back(opaque.into_iter().map(|(item, _)| item).collect());
         }
         if std::mem::replace(&mut self.incarnation, incarnation) != incarnation {
-            // The doubt concerned the previous master.
-            (self.resync_due, self.resync_at) = (false, None);
+            self.resync.reset();
         }
-        self.resync_due |= self.resync_at.is_none() && self.link.ledger.is_doubted();
+        if self.link.ledger.is_doubted() {
+            self.resync.doubted();
+        }
         if self.in_flight.is_some() || self.retry_at.is_some() || self.lost {
             return;
         }
@@ -192,22 +180,14 @@ impl Drain {
         {
             let _ = own.answer.send(Answer::Close);
         }
-        let rests = self
-            .rest_until
-            .filter(|end| tokio::time::Instant::now() < *end);
-        if self.resync_due {
-            self.resync_at = rests;
-        }
-        let items = if self.resync_due && rests.is_none() {
-            self.resync_due = false;
-            Vec::new()
-        } else {
-            let items = batch::pack(&mut self.queue);
-            if items.is_empty() {
-                return;
-            }
-            items
+        let inspects = self.resync.begin(tokio::time::Instant::now());
+        let items = match inspects {
+            true => Vec::new(),
+            false => batch::pack(&mut self.queue),
         };
+        if items.is_empty() && !inspects {
+            return;
+        }
         let mut connection = self.connection.take();
         connection.take_if(|(of, connection)| *of != incarnation || connection.is_closed());
         self.stats.batches.count();
@@ -237,7 +217,8 @@ impl Drain {
         self.connection = done.connection;
         let connected = !matches!(done.result, Err(RoundTripError::Connect(_)));
         if items.is_empty() && connected {
-            self.rest_until = Some(tokio::time::Instant::now() + rest_after(sent.elapsed()));
+            self.resync
+                .ended(tokio::time::Instant::now(), sent.elapsed());
         }
         match done.result {
             Ok(Received::Held(state)) => self.resync(incarnation, version, *state),
@@ -249,7 +230,7 @@ impl Drain {
     fn resync(&mut self, incarnation: u64, version: u64, state: Master) {
         let Ok(difference) = self.link.ledger.adopt_if(incarnation, version, state) else {
             // The gate was shut meanwhile, or the mirror has changed since.
-            self.resync_due = true;
+            self.resync.request();
             return;
         };
         if !difference.is_empty() {
@@ -272,8 +253,8 @@ impl Drain {
         if items.is_empty() {
             self.retry_at = Some(now + RETRY_PAUSE);
             match error {
-                RoundTripError::Connect(_) => self.resync_due = true,
-                _ => self.resync_at = Some(now + LOOK_PAUSE),
+                RoundTripError::Connect(_) => self.resync.request(),
+                _ => self.resync.failed(now),
             }
             if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
                 // The master lives but cannot be read: clients need not wait for that.
@@ -439,11 +420,6 @@ impl Drain {
             send();
         });
     }
-}
-
-/// How long writes pass after a reading of the master's state that took `time`.
-fn rest_after(time: Duration) -> Duration {
-    (time * REST_TIMES).min(REST_MOST)
 }
 
 /// Whether `call`, or an entry of it, subscribes a parameter. The reply holds the parameter's value.

@@ -80,6 +80,19 @@ impl Client {
         wire.response()
     }
 
+    /// Makes all of `calls`, in multicalls that rosrescue does not take apart.
+    #[track_caller]
+    pub(crate) fn call_all(&self, calls: &[Call]) {
+        for some in calls.chunks(200) {
+            let Call { method, params } = Call::multicall(some.iter().cloned());
+            let reply = self.call(&method, params).unwrap();
+            let Reply::Value(Value::Array(results)) = reply else {
+                panic!("{reply:?}");
+            };
+            assert_eq!(results.len(), some.len());
+        }
+    }
+
     /// The decoded answer, or why there is none.
     pub(crate) fn call(&self, method: &str, params: Vec<Value>) -> io::Result<Reply> {
         let response = self.exchange(&http_request(&encode_call(method, params)))?;

@@ -31,14 +31,7 @@ fn register(client: &Client, port: u16) {
     let subscribers =
         (0..2 * NODES).map(|i| call("registerSubscriber", i / 2, topic(i / 2 + 1, i % 2)));
     let calls: Vec<_> = publishers.chain(subscribers).collect();
-    for some in calls.chunks(200) {
-        let Call { method, params } = Call::multicall(some.iter().cloned());
-        let reply = client.call(&method, params).unwrap();
-        let Reply::Value(Value::Array(results)) = reply else {
-            panic!("{reply:?}");
-        };
-        assert_eq!(results.len(), some.len());
-    }
+    client.call_all(&calls);
     let text = |number| Value::from(format!("the value of parameter {number}"));
     let params = (0..PARAMS).map(|number| (format!("param_{number:04}"), text(number)));
     client.set_param("/robot", Value::Struct(Struct::from_iter(params)));

@@ -7,7 +7,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::support::{Client, Mode, Robot, eventually, names, params};
-use rosrescue::xmlrpc::{Call, Reply, Value};
+use rosrescue::xmlrpc::Call;
 
 /// A host that counts connections and closes them without an answer.
 struct Host {
@@ -66,14 +66,7 @@ impl Host {
             .zip(self.ports.iter().cycle())
             .map(call)
             .collect();
-        for some in calls.chunks(200) {
-            let Call { method, params } = Call::multicall(some.iter().cloned());
-            let reply = client.call(&method, params).unwrap();
-            let Reply::Value(Value::Array(results)) = reply else {
-                panic!("{reply:?}");
-            };
-            assert_eq!(results.len(), some.len());
-        }
+        client.call_all(&calls);
     }
 }
 
