@@ -297,7 +297,10 @@ fn the_old_port_of_the_master_may_become_our_own() {
     let (master, _) = master_of(&rescue);
     rescue.kill();
     signal(master, Signal::KILL);
-    eventually("the master is dead", || !alive(master));
+    // Its last thread closes the port, after the process counts as dead.
+    eventually("the master's port is free", || {
+        !alive(master) && TcpListener::bind(("0.0.0.0", port)).is_ok()
+    });
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
     let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
