@@ -359,7 +359,7 @@ mod tests {
         match cli.command {
             Some(Command::Proxy(args)) => Config::proxy(&args, &env, "robot", None),
             Some(Command::Core(args)) => Config::core(&args, &env, "robot", None),
-            None => Config::core(&cli.core, &env, "robot", None),
+            _ => Config::core(&cli.core, &env, "robot", None),
         }
     }
 

@@ -31,6 +31,7 @@
 //! * `server`: the side that clients talk to.
 //! * [`guardian`]: the parent process that keeps the sockets and restarts the worker.
 //! * [`app`]: assembles the program.
+//! * [`commands`]: the commands that do not serve nodes.
 //!
 //! `docs/architecture.md` follows a call, and a record, through these modules by function names.
 
@@ -38,6 +39,7 @@ pub mod app;
 pub mod checkpoint;
 pub mod cli;
 pub mod clock;
+pub mod commands;
 pub mod config;
 pub(crate) mod gate;
 pub mod guardian;

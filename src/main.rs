@@ -11,6 +11,7 @@ use clap::{CommandFactory, error::ErrorKind};
 use rosrescue::{
     app,
     cli::{Cli, Command, CommonArgs, LogFormat},
+    commands,
     config::Config,
     guardian::{
         self,
@@ -49,6 +50,7 @@ fn main() -> ExitCode {
         .into_owned();
     let local = listener::local_address();
     let (config, common, verbose) = match &cli.command {
+        Some(Command::Tool(tool)) => return commands::run(tool),
         Some(Command::Proxy(args)) => (
             Config::proxy(args, &env, &hostname, local),
             &args.common,

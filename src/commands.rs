@@ -1,0 +1,88 @@
+//! The commands that do not serve nodes: each asks a running rosrescue, reads a checkpoint or looks at this
+//! computer, prints what it has found, and ends with an [`Exit`] that a script can use.
+
+mod running;
+mod status;
+
+use std::{
+    fmt::Display,
+    io::{self, Write},
+    process::ExitCode,
+};
+
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::cli::{OutputArgs, Tool};
+
+/// How a command ends. A usage error of the command line has 2, too.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Exit {
+    /// It is done, and what was asked for is so.
+    Good = 0,
+    /// It is not so: unprotected, different, not in time, …
+    Bad = 1,
+}
+
+/// Why a command has no result.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub(crate) enum Failure {
+    /// What was given makes no sense. Exit status 2.
+    #[error("{0}")]
+    Usage(String),
+    /// No rosrescue answers. Exit status 3.
+    #[error("no rosrescue at {uri}: {why}. Start `rosrescue core`, or give its address with --uri")]
+    Nobody { uri: String, why: String },
+    /// It began and could not be finished. Exit status 1.
+    #[error("{0}")]
+    Failed(String),
+}
+
+impl Failure {
+    fn status(&self) -> u8 {
+        match self {
+            Self::Usage(_) => 2,
+            Self::Nobody { .. } => 3,
+            Self::Failed(_) => 1,
+        }
+    }
+}
+
+/// Runs `tool` and says what it has found.
+pub fn run(tool: &Tool) -> ExitCode {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let ended = match runtime {
+        Ok(runtime) => runtime.block_on(async {
+            match tool {
+                Tool::Status(args) => status::run(args).await,
+            }
+        }),
+        Err(error) => Err(Failure::Failed(format!("no runtime: {error}"))),
+    };
+    match ended {
+        Ok(exit) => ExitCode::from(exit as u8),
+        Err(failure) => {
+            eprintln!("rosrescue: {failure}");
+            ExitCode::from(failure.status())
+        }
+    }
+}
+
+/// Prints `result`, as text or JSON. A reader that has gone, as `head` does, is no failure.
+fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), Failure> {
+    let text = if output.json {
+        serde_json::to_string_pretty(result)
+            .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?
+    } else {
+        result.to_string()
+    };
+    match writeln!(io::stdout(), "{}", text.trim_end()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            Err(Failure::Failed(format!("cannot print: {error}")))
+        }
+        _ => Ok(()),
+    }
+}

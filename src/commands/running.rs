@@ -1,0 +1,79 @@
+//! Finding and asking the running rosrescue.
+
+use std::time::Duration;
+
+use http_body_util::{BodyExt, Empty, Limited};
+use hyper::{
+    Request, StatusCode,
+    body::Bytes,
+    client::conn::http1,
+    header::{ACCEPT, HOST},
+};
+use hyper_util::rt::TokioIo;
+use tokio::{net::TcpStream, time::timeout};
+
+use super::Failure;
+use crate::{
+    cli::TargetArgs,
+    resolver,
+    ros_env::{DEFAULT_MASTER_PORT, MasterUri},
+};
+
+/// How long it may take to answer. It answers in milliseconds, and waits for nobody.
+const ANSWER_LIMIT: Duration = Duration::from_secs(5);
+/// Largest page that is read, in bytes.
+const MAX_PAGE: usize = 64 << 20;
+
+/// A rosrescue that has been found by its address, and may or may not answer.
+#[derive(Clone, Debug)]
+pub(super) struct Running {
+    pub(super) address: MasterUri,
+}
+
+impl Running {
+    /// The one that `target` means.
+    pub(super) fn find(target: &TargetArgs) -> Result<Self, Failure> {
+        let of = |variable: &str, uri: &str| {
+            MasterUri::parse(uri).map_err(|error| Failure::Usage(format!("{variable}: {error}")))
+        };
+        let address = match (&target.uri, std::env::var("ROS_MASTER_URI")) {
+            (Some(uri), _) => of("--uri", uri)?,
+            (None, Ok(uri)) if !uri.is_empty() => of("ROS_MASTER_URI", &uri)?,
+            _ => MasterUri {
+                host: "localhost".to_owned(),
+                port: DEFAULT_MASTER_PORT,
+            },
+        };
+        Ok(Self { address })
+    }
+
+    /// The page at `path`, as a program gets it.
+    pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), Failure> {
+        let nobody = |why: String| Failure::Nobody {
+            uri: self.address.to_string(),
+            why,
+        };
+        match timeout(ANSWER_LIMIT, self.try_get(path)).await {
+            Ok(Ok(page)) => Ok(page),
+            Ok(Err(error)) => Err(nobody(error.to_string())),
+            Err(_) => Err(nobody(format!("no answer in {} s", ANSWER_LIMIT.as_secs()))),
+        }
+    }
+
+    async fn try_get(
+        &self,
+        path: &str,
+    ) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
+        let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
+        let stream = TcpStream::connect(&*addresses).await?;
+        let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
+        tokio::spawn(connection);
+        let request = Request::get(path)
+            .header(HOST, self.address.authority())
+            .header(ACCEPT, "text/plain, application/json")
+            .body(Empty::<Bytes>::new())?;
+        let (head, body) = sender.send_request(request).await?.into_parts();
+        let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
+        Ok((head.status, body))
+    }
+}
