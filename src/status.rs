@@ -1,7 +1,9 @@
 //! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
 
+pub(crate) mod metrics;
 pub(crate) mod report;
 pub(crate) mod stats;
+pub(crate) mod summary;
 
 use std::{
     fmt,

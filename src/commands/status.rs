@@ -16,6 +16,6 @@ pub(super) async fn run(args: &StatusArgs) -> Result<Exit, Failure> {
         let (_, text) = running.get("/").await?;
         print(&String::from_utf8_lossy(&text), &args.output)?;
     }
-    let unprotected = status["unprotected"].is_string();
+    let unprotected = status.get("unprotected").is_some_and(Value::is_string);
     Ok(if unprotected { Exit::Bad } else { Exit::Good })
 }

@@ -3,7 +3,8 @@
 use std::net::SocketAddr;
 
 use dashmap::DashMap;
-use serde::Serialize;
+
+use crate::status::summary::Client;
 
 /// Clients listed on the status page; there may be thousands.
 const LISTED: usize = 1000;
@@ -18,16 +19,6 @@ pub struct Clients(DashMap<SocketAddr, Seen>);
 struct Seen {
     caller_id: String,
     calls: u64,
-}
-
-/// One connection.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Client {
-    pub peer: String,
-    /// The caller id of its last call, cut if it is long.
-    pub caller_id: String,
-    /// Calls on this connection.
-    pub calls: u64,
 }
 
 impl Clients {
@@ -56,7 +47,7 @@ impl Clients {
     }
 
     /// The connections, by caller id, at most a thousand.
-    pub fn list(&self) -> Vec<Client> {
+    pub(crate) fn list(&self) -> Vec<Client> {
         let clients = self.0.iter().take(LISTED).map(|entry| Client {
             peer: entry.key().to_string(),
             caller_id: entry.caller_id.clone(),

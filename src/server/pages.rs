@@ -8,22 +8,21 @@
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master or by the mirror, else 503 |
 
-use std::{fmt, sync::Arc};
+use std::sync::Arc;
 
 use hyper::StatusCode;
-use serde::Serialize;
 
 use super::{
-    clients::{Client, Clients},
+    clients::Clients,
     replies::{HttpReply, page, text},
 };
 use crate::{
     clock,
     gate::{self, State},
     ledger::Ledger,
-    master::{Counts, Master},
+    master::Master,
     nodes::Nodes,
-    status::{Board, report::Report, stats::Stats},
+    status::{Board, metrics::metrics, stats::Stats, summary::Status},
     upstream::Upstream,
 };
 
@@ -97,184 +96,4 @@ impl Pages {
             counters: counters.collect(),
         }
     }
-}
-
-/// The status at one moment.
-#[derive(Clone, Debug, Serialize)]
-struct Status {
-    version: &'static str,
-    /// What nodes use as `ROS_MASTER_URI`.
-    uri: String,
-    master: String,
-    /// Whether calls pass to the master.
-    open: bool,
-    /// Whether calls are answered, by the master or the mirror.
-    ready: bool,
-    /// Since when the mirror stands in: seconds since 1970, by the wall clock.
-    standing_in_since: Option<f64>,
-    /// Writes that the mirror has answered and the master has not run yet.
-    pending_writes: usize,
-    /// Whether the master keeps dying.
-    crash_loop: bool,
-    /// Masters that have died since the start.
-    deaths: u64,
-    checkpoint: String,
-    /// Why the state is not recorded; none if it is.
-    unprotected: Option<String>,
-    /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
-    guarded: bool,
-    guarded_by: String,
-    /// Contents of the mirror.
-    state: Counts,
-    /// Nodes that do not answer and are not known to be dead.
-    unreachable: Vec<String>,
-    /// Masters examined since the start.
-    recoveries: u64,
-    last_recovery: Option<Report>,
-    /// Connections of clients, at most a thousand.
-    clients: Vec<Client>,
-    /// Counters since the start.
-    counters: serde_json::Map<String, serde_json::Value>,
-}
-
-impl fmt::Display for Status {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "rosrescue {}", self.version)?;
-        writeln!(f, "ROS_MASTER_URI  {}", self.uri)?;
-        let gate = match (self.standing_in_since, self.ready) {
-            (Some(since), _) => format!(
-                "away, standing in since {}, {} pending writes",
-                clock::wall_text(since),
-                self.pending_writes
-            ),
-            (None, true) => "calls pass".to_owned(),
-            (None, false) => "not seen yet, calls wait".to_owned(),
-        };
-        writeln!(f, "master          {} ({gate})", self.master)?;
-        if self.crash_loop {
-            writeln!(
-                f,
-                "                crash loop: the master dies again and again"
-            )?;
-        }
-        let protection = self.unprotected.as_deref().map_or_else(
-            || "protected".to_owned(),
-            |reason| format!("UNPROTECTED: {reason}"),
-        );
-        writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
-        writeln!(f, "guarded by      {}", self.guarded_by)?;
-        writeln!(f, "state           {}", self.state)?;
-        if !self.unreachable.is_empty() {
-            writeln!(f, "unreachable     {}", self.unreachable.join(", "))?;
-        }
-        if let Some(report) = &self.last_recovery {
-            writeln!(
-                f,
-                "last recovery   {} ms after {}",
-                report.phases.total_ms.round(),
-                report.cause
-            )?;
-            for (what, names) in [
-                ("not injected", &report.skipped),
-                ("differs", &report.mismatches),
-                ("removed", &report.removed),
-                ("reconciled", &report.reconciled),
-                ("unreachable", &report.unreachable),
-                ("notified", &report.notified),
-            ] {
-                if !names.is_empty() {
-                    writeln!(f, "  {what:<14}{}", names.join(", "))?;
-                }
-            }
-        }
-        for (name, value) in &self.counters {
-            writeln!(f, "{name:<16}{value}")?;
-        }
-        Ok(())
-    }
-}
-
-fn metrics(stats: &Stats, status: &Status) -> String {
-    use std::fmt::Write;
-
-    let mut text = String::new();
-    let mut add = |name: &str, kind: &str, help: &str, value: f64| {
-        // Writing to a string does not fail.
-        let _ = write!(
-            text,
-            "# HELP rosrescue_{name} {help}\n# TYPE rosrescue_{name} {kind}\nrosrescue_{name} {value}\n"
-        );
-    };
-    for (name, help, value) in stats.list() {
-        add(&format!("{name}_total"), "counter", help, value as f64);
-    }
-    let flag = |truth: bool| f64::from(u8::from(truth));
-    add(
-        "gate_open",
-        "gauge",
-        "whether calls pass to the master",
-        flag(status.open),
-    );
-    add(
-        "standing_in",
-        "gauge",
-        "whether the mirror answers, because the master is away",
-        flag(status.standing_in_since.is_some()),
-    );
-    add(
-        "pending_writes",
-        "gauge",
-        "writes answered by the mirror that the master has not run yet",
-        status.pending_writes as f64,
-    );
-    add(
-        "protected",
-        "gauge",
-        "whether the state is recorded",
-        flag(status.unprotected.is_none()),
-    );
-    add(
-        "crash_loop",
-        "gauge",
-        "whether the master dies again and again",
-        flag(status.crash_loop),
-    );
-    add(
-        "guarded",
-        "gauge",
-        "whether another process keeps the port when rosrescue dies",
-        flag(status.guarded),
-    );
-    add(
-        "recoveries_total",
-        "counter",
-        "masters examined",
-        status.recoveries as f64,
-    );
-    add(
-        "master_deaths_total",
-        "counter",
-        "masters that have died",
-        status.deaths as f64,
-    );
-    let counts = status.state;
-    add("nodes", "gauge", "nodes registered", counts.nodes as f64);
-    add("params", "gauge", "parameters set", counts.params as f64);
-    let unreachable = status.unreachable.len();
-    add(
-        "unreachable_nodes",
-        "gauge",
-        "nodes that do not answer and are not known to be dead",
-        unreachable as f64,
-    );
-    if let Some(report) = &status.last_recovery {
-        let seconds = report.phases.total_ms / 1e3;
-        add(
-            "last_recovery_seconds",
-            "gauge",
-            "from the shut gate to the open one",
-            seconds,
-        );
-    }
-    text
 }
