@@ -7,7 +7,7 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
-    tools::{OutputArgs, StatusArgs, TargetArgs, Tool},
+    tools::{HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool},
 };
 
 /// Keeps a ROS 1 robot running when its master dies.

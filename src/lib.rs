@@ -8,6 +8,7 @@
 //!
 //! * [`xmlrpc`]: XML-RPC text to values and back; independent of ROS.
 //! * [`master`]: the Master API as a state machine.
+//! * [`hide`]: which values of parameters are not shown.
 //! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
 //! * `health`: judging what a node reports; which nodes are unreachable.
@@ -44,6 +45,7 @@ pub mod config;
 pub(crate) mod gate;
 pub mod guardian;
 pub(crate) mod health;
+pub mod hide;
 pub(crate) mod ledger;
 pub mod lifecycle;
 pub mod master;

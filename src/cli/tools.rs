@@ -2,6 +2,8 @@
 
 use clap::{Args, Subcommand, builder::FalseyValueParser};
 
+use crate::hide::{self, Hide};
+
 /// A command that looks at a rosrescue, a checkpoint or this computer.
 #[derive(Debug, Subcommand)]
 pub enum Tool {
@@ -24,6 +26,15 @@ pub struct OutputArgs {
     #[arg(long, env = "ROSRESCUE_JSON")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub json: bool,
+}
+
+/// Which values of parameters are not shown.
+#[derive(Args, Clone, Debug)]
+pub struct HideArgs {
+    /// Hide the values of parameters whose full name matches this regular expression, which ignores case;
+    /// an empty one hides nothing
+    #[arg(long, env = "ROSRESCUE_HIDE_VALUES", value_name = "REGEX", default_value = hide::DEFAULT)]
+    pub hide_values: Hide,
 }
 
 /// Options of `rosrescue status`.

@@ -19,9 +19,10 @@ use std::{
 const LINES_MOST: usize = 500;
 
 /// The modules that do no IO, as `src/lib.rs` has them: a file or a folder each.
-const CORE: [&str; 7] = [
+const CORE: [&str; 8] = [
     "xmlrpc",
     "master",
+    "hide",
     "replay",
     "lifecycle",
     "health",
@@ -37,12 +38,13 @@ const STD: [&str; 14] = [
 ];
 
 /// The packages that the core may name: they work on values and bytes.
-const PURE: [&str; 8] = [
+const PURE: [&str; 9] = [
     "base64",
     "bytes",
     "crc32c",
     "indexmap",
     "quick_xml",
+    "regex",
     "serde",
     "serde_saphyr",
     "thiserror",
@@ -219,8 +221,8 @@ fn the_core_does_no_io() {
 
 /// The modules, each above all that it may import: `docs/decisions/0020`.
 #[rustfmt::skip]
-const LAYERS: [&str; 26] = [
-    "clock", "wait", "xmlrpc", "master", "replay", "lifecycle", "health", "checkpoint", "cli", "ros_env",
+const LAYERS: [&str; 27] = [
+    "clock", "wait", "xmlrpc", "master", "hide", "replay", "lifecycle", "health", "checkpoint", "cli", "ros_env",
     "config", "resolver", "gate", "status", "ledger", "upstream", "write_queue", "guardian", "process", "nodes",
     "recovery", "roscore", "server", "app", "commands", "main",
 ];
