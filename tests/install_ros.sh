@@ -26,13 +26,15 @@ has_libfaketime() {
     return 1
 }
 
+# PACKAGES, unless CHECK succeeds.
+need() { # PACKAGES CHECK...
+    packages=$1
+    shift
+    "$@" >/dev/null 2>&1 || echo "$packages"
+}
+
 # The packages of what does not work here. `python3` may be another one than ROS was made for.
 ros_missing() {
-    need() { # PACKAGES CHECK...
-        packages=$1
-        shift
-        "$@" >/dev/null 2>&1 || echo "$packages"
-    }
     for tool in rosmaster roslaunch rosnode rostopic rosservice rosparam; do
         need "python3-$tool" command -v "$tool"
     done
@@ -50,10 +52,10 @@ ros_missing() {
     need libfaketime has_libfaketime
 }
 
-ros_packages=$(ros_missing | tr '\n' ' ')
-if [ -n "$ros_packages" ]; then
+install_missing() { # PACKAGES...
+    [ $# -gt 0 ] || return 0
     if ! command -v apt-get >/dev/null; then
-        echo "ROS 1 is not complete here and there is no apt-get to install: $ros_packages" >&2
+        echo "ROS 1 is not complete here and there is no apt-get to install: $*" >&2
         exit 1
     fi
     if [ "$(id -u)" = 0 ]; then
@@ -61,17 +63,19 @@ if [ -n "$ros_packages" ]; then
     elif command -v sudo >/dev/null; then
         as_root=sudo
     else
-        echo "neither root nor sudo; let somebody run: apt-get install $ros_packages" >&2
+        echo "neither root nor sudo; let somebody run: apt-get install $*" >&2
         exit 1
     fi
-    echo "installing: $ros_packages"
+    echo "installing: $*"
     $as_root apt-get update -qq
-    # shellcheck disable=SC2086 # words are what is wanted
     if ! $as_root env DEBIAN_FRONTEND=noninteractive \
-        apt-get install -y -qq --no-install-recommends $ros_packages; then
-        echo "apt-get cannot install all of: $ros_packages" >&2
+        apt-get install -y -qq --no-install-recommends "$@"; then
+        echo "apt-get cannot install all of: $*" >&2
         echo "This needs a Debian or Ubuntu that carries ROS 1, as Debian 12 does, or a ROS Noetic in" >&2
         echo "/opt/ros." >&2
         exit 1
     fi
-fi
+}
+
+# shellcheck disable=SC2046 # words are what is wanted
+install_missing $(ros_missing)

@@ -14,6 +14,7 @@ if ! command -v cargo >/dev/null; then
 fi
 
 . tests/install_ros.sh
+. tests/install_robot.sh
 
 cargo fmt --all --check
 cargo clippy --locked --all-targets -- -D warnings

@@ -1,0 +1,34 @@
+#!/usr/bin/env bash
+# A whole robot (README.md) under `rosrescue core`, until Ctrl-C: run.sh [PORT]
+#
+# It uses a free port and a scratch folder. ROSRESCUE=/path/to/rosrescue takes a binary that is there already.
+
+cd "$(dirname "$0")/../.." || exit
+. examples/common.sh
+need_ros
+. tests/install_robot.sh
+need_rosrescue
+need_scratch
+
+step "rosrescue core"
+if [ $# -gt 0 ]; then
+    start_rosrescue core -p "$1" ||
+        give_up "rosrescue did not start: $(tail -n 3 "$scratch/rosrescue.log")"
+else
+    start_core
+fi
+took "the page: $ROS_MASTER_URI"
+
+step "the robot: examples/robot/launch.sh, which compiles the C++ nodes and runs roslaunch"
+start_node robot examples/robot/launch.sh "$scratch"
+within 180 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot does not come up"
+took "$(rosnode list | wc -l) nodes; it has reached the first place"
+
+step "the master is yours to kill:"
+read -r master < <(status last_recovery.master_pid)
+say "kill -9 $master" "export ROS_MASTER_URI=$ROS_MASTER_URI"
+say "Ctrl-C ends everything."
+while kill -0 "$rosrescue_pid" 2>/dev/null; do
+    sleep 1
+done
+give_up "rosrescue has ended"
