@@ -3,7 +3,7 @@
 use std::{
     io,
     sync::{Arc, atomic::AtomicU32},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use hyper::header::{HeaderValue, InvalidHeaderValue};
@@ -25,10 +25,16 @@ use crate::{
     ros_env::MasterUri,
     roscore::{self, Roscore},
     server::{
-        Server, answers::Answers, body, calls::Calls, clients::Clients, idle::Idle, listener,
-        pages::Pages,
+        Server,
+        answers::Answers,
+        body,
+        calls::Calls,
+        clients::Clients,
+        idle::Idle,
+        listener,
+        pages::{Pages, Rate},
     },
-    status::{Board, stats::Stats},
+    status::{Board, Mode, stats::Stats},
     upstream::{Upstream, pool::Pool},
     write_queue,
 };
@@ -122,7 +128,11 @@ pub async fn run(
     // Lives as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
     let (gate_tx, gate) = gate::gate();
-    let (board, slow, looped) = (Arc::new(Board::default()), Arc::default(), Arc::default());
+    let mode = match process {
+        Some(_) => Mode::Core,
+        None => Mode::Proxy,
+    };
+    let (board, slow, looped) = (Arc::new(Board::new(mode)), Arc::default(), Arc::default());
     let ledger = Arc::new(Ledger::new(
         mirror,
         session,
@@ -177,6 +187,7 @@ pub async fn run(
         board: board.clone(),
         ledger: ledger.clone(),
         gate: gate.clone(),
+        upstream: upstream.clone(),
     };
     let notified = notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
@@ -242,9 +253,10 @@ pub async fn run(
             gate: gate.clone(),
             ledger: ledger.clone(),
             nodes: nodes.clone(),
-            board,
+            board: board.clone(),
             clients,
             stats,
+            rate: Rate::new(Instant::now()),
         },
     });
     let permits = Arc::new(Semaphore::new(config.max_connections));
@@ -262,8 +274,13 @@ pub async fn run(
     drop(server);
     // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
     let first = driver.start(restored);
-    let checkpointer =
-        Checkpointer::begin(ledger.clone(), config.checkpoint, config.sync_interval).await;
+    let checkpointer = Checkpointer::begin(
+        ledger.clone(),
+        board,
+        config.checkpoint,
+        config.sync_interval,
+    )
+    .await;
     tasks.spawn(checkpointer.run(halt.clone()));
     tasks.spawn(drain.run());
     tasks.spawn(nodes::watch(nodes, config.reap_interval));

@@ -1,7 +1,7 @@
 //! The wall clock, only for display. No decision may depend on it: robots start without a battery-backed
 //! clock, and it jumps by years when the network comes up.
 
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 /// Seconds since 1970, with microseconds; 0 before that.
 #[allow(
@@ -12,6 +12,11 @@ pub fn wall_time() -> f64 {
     SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0.0, |since| since.as_secs_f64())
+}
+
+/// The wall time at `moment`, by the clock as it is set now.
+pub fn wall_time_of(moment: Instant) -> f64 {
+    (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)
 }
 
 /// A wall time as text in UTC, such as `2026-11-21T09:26:53Z`.
@@ -37,6 +42,19 @@ pub fn wall_text(seconds: f64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
+/// A time span for people, such as `2 h 5 min`.
+pub fn span(seconds: f64) -> String {
+    let whole = seconds.max(0.0) as u64;
+    let (days, hours, minutes) = (whole / 86_400, whole / 3_600 % 24, whole / 60 % 60);
+    match (days, hours, minutes) {
+        (0, 0, 0) if whole < 10 => format!("{:.1} s", seconds.max(0.0)),
+        (0, 0, 0) => format!("{whole} s"),
+        (0, 0, _) => format!("{minutes} min {} s", whole % 60),
+        (0, ..) => format!("{hours} h {minutes} min"),
+        _ => format!("{days} d {hours} h"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -50,6 +68,20 @@ mod tests {
             (4_102_444_799.0, "2099-12-31T23:59:59Z"),
         ] {
             assert_eq!(wall_text(seconds), text);
+        }
+    }
+
+    #[test]
+    fn spans() {
+        for (seconds, text) in [
+            (-1.0, "0.0 s"),
+            (0.25, "0.2 s"),
+            (59.9, "59 s"),
+            (125.0, "2 min 5 s"),
+            (7_500.0, "2 h 5 min"),
+            (180_000.0, "2 d 2 h"),
+        ] {
+            assert_eq!(span(seconds), text);
         }
     }
 }

@@ -34,15 +34,15 @@ impl State {
 #[derive(Clone, Copy, Debug)]
 struct Gate {
     state: State,
-    /// None while it is open.
-    shut_since: Option<Instant>,
+    /// Since when it has been open, or shut.
+    since: Instant,
 }
 
 /// A shut gate, as its two halves.
 pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
-        shut_since: Some(Instant::now()),
+        since: Instant::now(),
     });
     (Tx(tx), Rx(rx))
 }
@@ -59,11 +59,10 @@ impl Tx {
                 return false;
             }
             tracing::debug!("gate: {:?} => {state:?}", gate.state);
+            if gate.state.is_open() != state.is_open() {
+                gate.since = Instant::now();
+            }
             gate.state = state;
-            gate.shut_since = match state.is_open() {
-                true => None,
-                false => gate.shut_since.or_else(|| Some(Instant::now())),
-            };
             true
         });
     }
@@ -87,9 +86,9 @@ impl Rx {
         self.state().is_open()
     }
 
-    /// When calls stopped passing; none while they pass.
-    pub fn shut_since(&self) -> Option<Instant> {
-        self.0.borrow().shut_since
+    /// Since when calls have been passing, or not.
+    pub fn since(&self) -> Instant {
+        self.0.borrow().since
     }
 
     /// Returns when the state has changed since the last [`Self::look`] or the last return of this method.

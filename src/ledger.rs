@@ -211,7 +211,7 @@ impl Ledger {
         }
         inner.doubted |= recorded.doubtful;
         if !entries.is_empty() {
-            self.stats.recorded.add(entries.len() as u64);
+            self.stats.writes_recorded.add(entries.len() as u64);
             recorded.seq = inner.append(&entries);
             drop(inner);
             self.work.notify_one();

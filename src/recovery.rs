@@ -22,7 +22,10 @@ use crate::{
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
     nodes::Nodes,
     process::{self, ProcessError},
-    status::{Board, report::Outcome},
+    status::{
+        Board,
+        report::{Outcome, STARTED},
+    },
     upstream::{
         ConnectError, Connection,
         pool::{VerifyError, connect_verified},
@@ -82,6 +85,7 @@ impl Driver {
         };
         Self {
             lifecycle: Lifecycle::new(supervision, examiner.probing),
+            outage: Outage::begin(Instant::now(), STARTED, examiner.stats),
             examiner,
             write_queue,
             slow,
@@ -95,7 +99,6 @@ impl Driver {
             step: None,
             probe_deadline: None,
             prepared: None,
-            outage: Outage::begin(Instant::now(), "start"),
             said: None,
         }
     }
@@ -271,7 +274,9 @@ impl Driver {
                 }
             }
             Action::ReportCrashLoop(deaths) => {
-                self.board.update(|facts| facts.crash_loop = true);
+                self.board.update(|facts| {
+                    facts.crash_loop.get_or_insert_with(Instant::now);
+                });
                 match self.process.as_ref().map(MasterProcess::last_words) {
                     Some(last_words) => tracing::error!(
                         deaths,
@@ -287,7 +292,10 @@ impl Driver {
                 }
             }
             Action::ReportCalm => {
-                self.board.update(|facts| facts.crash_loop = false);
+                self.board.update(|facts| {
+                    facts.crash_loop = None;
+                    facts.calm_since = Some(Instant::now());
+                });
                 tracing::info!("the crash loop is over: the master lives");
             }
         }
@@ -378,7 +386,7 @@ impl Driver {
 
     fn shut_gate(&mut self, cause: Cause) {
         self.keep_shut();
-        self.outage = Outage::begin(Instant::now(), cause.as_str());
+        self.outage = Outage::begin(Instant::now(), cause.as_str(), self.examiner.stats);
         if cause == Cause::Stopping {
             return;
         }

@@ -1,28 +1,76 @@
 //! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
 
+pub(crate) mod condition;
 pub(crate) mod metrics;
 pub(crate) mod report;
 pub(crate) mod stats;
 pub(crate) mod summary;
 
 use std::{
+    collections::VecDeque,
     fmt,
     sync::{Mutex, MutexGuard, PoisonError},
+    time::Instant,
 };
 
-use self::report::Report;
+use serde::{Deserialize, Serialize};
+
+use self::report::{HealthCheck, Report};
+
+/// Reports that are kept.
+const REPORTS: usize = 20;
+
+/// Who starts masters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// rosrescue.
+    Core,
+    /// Somebody else.
+    Proxy,
+}
+
+/// What the checkpointer knows.
+#[derive(Clone, Copy, Debug)]
+pub struct Disk {
+    /// Whether changes are recorded, and since when it is so.
+    pub protected: bool,
+    pub since: Instant,
+    /// When the checkpoint was written as a whole, and the journal's last record then.
+    pub compacted: Option<(Instant, u64)>,
+    /// Bytes that are free for the checkpoint.
+    pub free: Option<u64>,
+}
+
+impl Disk {
+    /// Since when changes are not recorded. It is noticed a little later than it is so.
+    fn unprotected_since(&self) -> Instant {
+        match self.protected {
+            true => Instant::now(),
+            false => self.since,
+        }
+    }
+}
 
 /// The health of the master and of rosrescue.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Facts {
-    /// The master keeps dying.
-    pub crash_loop: bool,
+    pub mode: Mode,
+    pub started: Instant,
+    /// Since when the master keeps dying.
+    pub crash_loop: Option<Instant>,
+    /// When it no longer did.
+    pub calm_since: Option<Instant>,
     /// Masters that have died since the start.
     pub deaths: u64,
+    /// The latest reports, the oldest first.
+    pub reports: VecDeque<Report>,
     /// Masters examined since the start.
     pub recoveries: u64,
-    pub last_recovery: Option<Report>,
+    /// Reports among them that were rescues.
+    pub rescues: u64,
     pub guarded: Guarded,
+    pub disk: Disk,
 }
 
 /// Who keeps the port and restarts rosrescue when it dies.
@@ -61,27 +109,63 @@ impl fmt::Display for Guarded {
 }
 
 impl Facts {
-    /// The state in a line. `open`: whether calls pass to the master. `unprotected`: why it is not recorded.
-    pub fn line(&self, open: bool, unprotected: Option<String>) -> String {
-        let mut line = match (unprotected, open) {
-            (Some(reason), _) => format!("unprotected: {reason}"),
-            (None, false) if self.crash_loop => "the master dies again and again".to_owned(),
-            (None, false) => "the master is away".to_owned(),
-            (None, true) => "protected".to_owned(),
-        };
-        if let Guarded::NoLonger(pid) = self.guarded {
-            line += &format!("; unguarded: the guardian, process {pid}, has ended");
+    /// What is known at the start.
+    pub fn new(mode: Mode) -> Self {
+        let started = Instant::now();
+        Self {
+            mode,
+            started,
+            crash_loop: None,
+            calm_since: None,
+            deaths: 0,
+            reports: VecDeque::new(),
+            recoveries: 0,
+            rescues: 0,
+            guarded: Guarded::Nobody,
+            disk: Disk {
+                protected: true,
+                since: started,
+                compacted: None,
+                free: None,
+            },
         }
-        // A newline would start another assignment.
-        line.replace('\n', " ")
+    }
+
+    /// Since when there is nothing to complain of, if there is nothing now and calls pass.
+    fn settled_since(&self) -> Instant {
+        self.disk.since.max(self.calm_since.unwrap_or(self.started))
+    }
+
+    /// Adds a report and returns it with its number.
+    pub fn add(&mut self, mut report: Report) -> Report {
+        self.recoveries += 1;
+        self.rescues += u64::from(report.is_rescue());
+        report.number = self.recoveries;
+        if self.reports.len() == REPORTS {
+            self.reports.pop_front();
+        }
+        self.reports.push_back(report.clone());
+        report
+    }
+
+    /// Adds the health check after the recovery of that number, and returns the whole report.
+    pub(crate) fn add_check(&mut self, number: u64, check: HealthCheck) -> Option<Report> {
+        let mut reports = self.reports.iter_mut();
+        let report = reports.find(|report| report.number == number)?;
+        report.add(check);
+        Some(report.clone())
     }
 }
 
 /// Holds the present [`Facts`].
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Board(Mutex<Facts>);
 
 impl Board {
+    pub fn new(mode: Mode) -> Self {
+        Self(Mutex::new(Facts::new(mode)))
+    }
+
     fn lock(&self) -> MutexGuard<'_, Facts> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -92,27 +176,5 @@ impl Board {
 
     pub fn update<T>(&self, change: impl FnOnce(&mut Facts) -> T) -> T {
         change(&mut self.lock())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_line_says_the_worst() {
-        let mut facts = Facts::default();
-        assert_eq!(facts.line(false, None), "the master is away");
-        facts.crash_loop = true;
-        assert_eq!(facts.line(false, None), "the master dies again and again");
-        assert_eq!(facts.line(true, None), "protected");
-        let line = facts.line(true, Some("the disk\nis full".to_owned()));
-        assert_eq!(line, "unprotected: the disk is full");
-        assert_eq!(
-            facts.line(false, Some("why".to_owned())),
-            "unprotected: why"
-        );
-        facts.guarded = Guarded::NoLonger(7);
-        assert!(facts.line(true, None).contains("unguarded"));
     }
 }

@@ -15,7 +15,11 @@ use crate::{
     gate::{self, State},
     guardian::handover::{self, Guard},
     ledger::Ledger,
-    status::{Board, Guarded},
+    status::{
+        Board, Guarded,
+        condition::{Situation, condition},
+    },
+    upstream::Upstream,
 };
 
 /// Shortest time between two status messages to systemd.
@@ -52,12 +56,20 @@ pub(super) struct Source {
     pub(super) board: Arc<Board>,
     pub(super) ledger: Arc<Ledger>,
     pub(super) gate: gate::Rx,
+    pub(super) upstream: Arc<Upstream>,
 }
 
 impl Source {
     fn line(&self) -> String {
-        let unprotected = self.ledger.unprotected();
-        self.board.read().line(self.gate.is_open(), unprotected)
+        let situation = Situation {
+            gate: self.gate.state(),
+            gate_since: self.gate.since().into_std(),
+            unprotected: self.ledger.unprotected(),
+            master: self.upstream.address().to_string(),
+        };
+        self.board
+            .update(|facts| condition(&situation, facts))
+            .line()
     }
 
     /// Returns when calls are answered, by the master or the mirror.

@@ -10,6 +10,7 @@ use hyper::{
     header::{ACCEPT, HOST},
 };
 use hyper_util::rt::TokioIo;
+use serde::Deserialize;
 use tokio::{net::TcpStream, time::timeout};
 
 use super::Failure;
@@ -17,6 +18,7 @@ use crate::{
     cli::TargetArgs,
     resolver,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
+    status::summary::{SCHEMA, Status},
 };
 
 /// How long it may take to answer. It answers in milliseconds, and waits for nobody.
@@ -58,6 +60,33 @@ impl Running {
             Ok(Err(error)) => Err(nobody(error.to_string())),
             Err(_) => Err(nobody(format!("no answer in {} s", ANSWER_LIMIT.as_secs()))),
         }
+    }
+
+    /// How it is.
+    pub(super) async fn status(&self) -> Result<Status, Failure> {
+        /// What every version has.
+        #[derive(Deserialize)]
+        struct Versioned {
+            schema: u32,
+            version: String,
+        }
+        let (_, json) = self.get("/status.json").await?;
+        let at = &self.address;
+        let versioned = serde_json::from_slice(&json).map_err(|_| Failure::Nobody {
+            uri: at.to_string(),
+            why: "something else answers there, a bare rosmaster perhaps".to_owned(),
+        })?;
+        let Versioned { schema, version } = versioned;
+        if schema > SCHEMA {
+            return Err(Failure::Failed(format!(
+                "the rosrescue at {at} is version {version}, newer than this one ({}): use its own \
+                 command",
+                env!("CARGO_PKG_VERSION")
+            )));
+        }
+        serde_json::from_slice(&json).map_err(|error| {
+            Failure::Failed(format!("the status of {at} is not understood: {error}"))
+        })
     }
 
     async fn try_get(

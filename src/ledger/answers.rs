@@ -114,7 +114,7 @@ impl Ledger {
         }
         // Makes an inspection under way outdated: it could bring back what this call takes away.
         inner.version += u64::from(!changes);
-        self.stats.recorded.add(writes.len() as u64);
+        self.stats.writes_recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| Entry::Call {
             call: call.clone().into(),
             pending: true,

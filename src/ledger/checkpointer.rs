@@ -3,7 +3,7 @@
 //! beside traffic. A call waits for it with `--sync always`, and if its effect is in no journal.
 
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -14,6 +14,7 @@ use super::Ledger;
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
     cli::SyncPolicy,
+    status::Board,
 };
 
 /// Longest time between two checks of the file: tampering is noticed well within a second.
@@ -27,6 +28,7 @@ const BETWEEN: Duration = Duration::from_secs(10);
 
 pub(crate) struct Checkpointer {
     ledger: Arc<Ledger>,
+    board: Arc<Board>,
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
@@ -43,7 +45,12 @@ impl Checkpointer {
     /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be answered before:
     /// it would be in no journal. Later it is synced every `sync_interval`, unless the ledger's policy
     /// differs.
-    pub(crate) async fn begin(ledger: Arc<Ledger>, path: PathBuf, sync_interval: Duration) -> Self {
+    pub(crate) async fn begin(
+        ledger: Arc<Ledger>,
+        board: Arc<Board>,
+        path: PathBuf,
+        sync_interval: Duration,
+    ) -> Self {
         let opened = ledger.with_store(|_, _| ()).is_some();
         let mut checkpointer = Self {
             seq: 0,
@@ -54,6 +61,7 @@ impl Checkpointer {
             said: ledger.unprotected().filter(|_| !opened),
             sync: ledger.sync,
             ledger,
+            board,
             path,
             sync_interval,
         };
@@ -114,8 +122,13 @@ impl Checkpointer {
             (check, syncs.then(|| store.sync_job()).flatten())
         });
         let (check, sync) = jobs.unwrap_or_default();
-        let work = move || (check.map(CheckJob::run), sync.map(SyncJob::run));
-        if let Ok((checked, synced)) = tokio::task::spawn_blocking(work).await {
+        let folder = self.path.parent().map(PathBuf::from).unwrap_or_default();
+        let work = move || {
+            let free = free_bytes(&folder);
+            (check.map(CheckJob::run), sync.map(SyncJob::run), free)
+        };
+        if let Ok((checked, synced, free)) = tokio::task::spawn_blocking(work).await {
+            self.board.update(|facts| facts.disk.free = free);
             // The store keeps a failure; `say_protection` logs it.
             ledger.with_store(|store, _| {
                 let _ = checked.map(|done| store.checked(done));
@@ -167,7 +180,11 @@ impl Checkpointer {
 
     async fn compact(&mut self) {
         let ledger = &self.ledger;
-        let begun = ledger.with_store(|store, checkpoint| store.begin_compaction(checkpoint()));
+        let mut seq = 0;
+        let begun = ledger.with_store(|store, checkpoint| {
+            seq = store.seq();
+            store.begin_compaction(checkpoint())
+        });
         let finished = match begun {
             None => return,
             Some(Err(error)) => Some(Err(error)),
@@ -183,7 +200,10 @@ impl Checkpointer {
                 tracing::debug!(%error, "compaction");
             }
             _ => {
-                self.compacted_at = Some(Instant::now());
+                let now = Instant::now();
+                self.compacted_at = Some(now);
+                self.board
+                    .update(|facts| facts.disk.compacted = Some((now, seq)));
                 if self.sync == SyncPolicy::Always {
                     // The new file's name is not on the disk yet.
                     self.sync(true).await;
@@ -223,6 +243,22 @@ impl Checkpointer {
             (None, Some(_)) => tracing::info!(checkpoint = %path, "protected again"),
             _ => {}
         }
+        let protected = unprotected.is_none();
+        self.board.update(|facts| {
+            if facts.disk.protected != protected {
+                (facts.disk.protected, facts.disk.since) = (protected, Instant::now());
+            }
+        });
         self.said = unprotected;
     }
+}
+
+/// Bytes that are free in `folder`.
+fn free_bytes(folder: &Path) -> Option<u64> {
+    let folder = match folder.as_os_str().is_empty() {
+        true => Path::new("."),
+        false => folder,
+    };
+    let disk = rustix::fs::statvfs(folder).ok()?;
+    Some(disk.f_bavail.saturating_mul(disk.f_frsize))
 }

@@ -158,7 +158,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
         let Some(call) = compose() else { continue };
-        nodes.stats.notifications.count();
+        nodes.stats.notifications_sent.count();
         let mut asked = pin!(client::ask(&port, &call, nodes.timeout));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
@@ -228,7 +228,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                     api,
                     "telling a node to shut down: another has its name"
                 );
-                nodes.stats.notifications.count();
+                nodes.stats.notifications_sent.count();
                 client::ask(api, &master::shutdown(node), nodes.timeout).await;
             }
             return;

@@ -342,7 +342,7 @@ impl Examiner {
                 }
                 self.ledger.delivered();
                 tracing::debug!(skipped = plan.skipped().len(), "injected");
-                self.stats.injections.count();
+                self.stats.masters_restored.count();
                 // Thousands of small allocations: freed in another thread.
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());

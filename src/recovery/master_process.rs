@@ -32,6 +32,8 @@ pub(crate) struct MasterProcess {
     spare: Option<Spare>,
     /// When to start one.
     spare_at: Option<Instant>,
+    /// How the last master ended, until it is reported.
+    end: Option<String>,
 }
 
 impl MasterProcess {
@@ -46,6 +48,7 @@ impl MasterProcess {
             ends: mpsc::channel(4),
             spare: None,
             spare_at: left.map(|_| Instant::now() + SPARE_AFTER),
+            end: None,
         };
         if let (Some(pid), Some(port)) = (left, port) {
             tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
@@ -112,6 +115,11 @@ impl MasterProcess {
         self.new.take()
     }
 
+    /// How the last master ended, once.
+    pub(crate) fn take_end(&mut self) -> Option<String> {
+        self.end.take()
+    }
+
     /// Returns when the master has ended. Cancel safe.
     pub(crate) async fn exited(&mut self) {
         let how = loop {
@@ -125,6 +133,7 @@ impl MasterProcess {
             }
         };
         tracing::warn!(pid = self.current, how, "rosmaster has ended");
+        self.end = Some(how);
         self.current = None;
         self.new = None;
     }

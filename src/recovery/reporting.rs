@@ -4,30 +4,46 @@ use std::time::{Duration, Instant};
 
 use tracing::Instrument;
 
-use super::{Driver, examine::Examination};
+use super::{Driver, examine::Examination, master_process::MasterProcess};
 use crate::lifecycle::Cause;
 use crate::{
     clock,
     nodes::health_check,
-    status::report::{Outcome, Phases, Report, ms},
+    status::{
+        report::{Outcome, Phases, Report, ms},
+        stats::Stats,
+    },
 };
 
 /// A message about a lasting state is repeated after this time.
 const REPEAT: Duration = Duration::from_secs(10);
 
 /// The time during which calls have not passed.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Outage {
     pub cause: &'static str,
     pub since: Instant,
     wall: f64,
     port_open: Option<Instant>,
+    stats: &'static Stats,
+    /// At its begin, as [`counted`].
+    before: (u64, u64),
+}
+
+/// Calls that the mirror has answered, and those that waited in vain.
+fn counted(stats: &Stats) -> (u64, u64) {
+    (
+        stats.calls_without_master.value(),
+        stats.calls_unanswered.value(),
+    )
 }
 
 impl Outage {
     /// An outage that begins now.
-    pub(super) fn begin(now: Instant, cause: &'static str) -> Self {
+    pub(super) fn begin(now: Instant, cause: &'static str, stats: &'static Stats) -> Self {
         Self {
+            stats,
+            before: counted(stats),
             cause,
             since: now,
             wall: clock::wall_time(),
@@ -46,25 +62,30 @@ impl Outage {
         let absence = self
             .port_open
             .map_or(total, |open| open.duration_since(self.since));
+        let (answered, unanswered) = counted(self.stats);
         Report {
-            cause: self.cause,
+            number: 0,
+            cause: self.cause.to_owned(),
+            ended: None,
+            answered: answered - self.before.0,
+            unanswered: unanswered - self.before.1,
             detected_at: self.wall,
             outcome: examination.outcome,
             master_pid: examination.pid,
             phases: Phases {
                 absence_ms: ms(absence),
-                look_ms: ms(examination.look),
+                inspection_ms: ms(examination.look),
                 injection_ms: ms(examination.injection),
                 total_ms: ms(total),
             },
             health_check_ms: None,
             restored: examination.counts,
-            skipped: examination.skipped,
+            not_restored: examination.skipped,
             mismatches: examination.mismatches,
             removed: Vec::new(),
             reconciled: Vec::new(),
             unreachable: Vec::new(),
-            notified: Vec::new(),
+            told_again: Vec::new(),
         }
     }
 }
@@ -76,8 +97,9 @@ impl Driver {
             // It holds only the session's initial state.
             examination.outcome = Outcome::Begun;
         }
-        let Outage { cause, since, .. } = self.outage;
-        let report = self.outage.report(Instant::now(), examination);
+        let (cause, since) = (self.outage.cause, self.outage.since);
+        let mut report = self.outage.report(Instant::now(), examination);
+        report.ended = self.process.as_mut().and_then(MasterProcess::take_end);
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
@@ -86,29 +108,25 @@ impl Driver {
             tracing::debug!("the same master goes on");
             return;
         }
-        report.log(&report.outcome.to_string());
-        let outcome = report.outcome;
-        self.board.update(|facts| {
-            facts.recoveries += 1;
-            facts.last_recovery = Some(report);
-        });
+        let report = self.board.update(|facts| facts.add(report));
+        report.log();
         if !self.lifecycle.has_served() {
             // After a restart of rosrescue it is unknown what changed just before.
             self.examiner.ledger.with_activity(|mirror, activity| {
                 activity.notice_all(mirror, Instant::now());
             });
         }
+        let Report {
+            number, outcome, ..
+        } = report;
         if outcome != Outcome::Resumed {
             let (nodes, board) = (self.nodes.clone(), self.board.clone());
             let check = async move {
                 let check = health_check::after_recovery(nodes, since, outcome).await;
                 let Some(check) = check else { return };
-                board.update(|facts| {
-                    if let Some(report) = &mut facts.last_recovery {
-                        report.add(check);
-                        report.log("recovery is complete");
-                    }
-                });
+                if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
+                    report.log_check();
+                }
             };
             tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
         }

@@ -114,7 +114,7 @@ impl Calls {
         let read = call.filter(|_| self.reads == Reads::Mirror)?;
         let answer = || self.ledger.exact_answer(read).map(Reply::Value);
         let reply = self.encode(answer).await?;
-        self.stats.mirrored.count();
+        self.stats.calls_from_mirror.count();
         Some(reply)
     }
 
@@ -122,7 +122,7 @@ impl Calls {
     async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call?;
         let reply = self.encode(|| self.ledger.answer(read)).await?;
-        self.stats.stood_in.count();
+        self.stats.calls_without_master.count();
         Some(reply)
     }
 
@@ -224,7 +224,7 @@ impl Calls {
             tokio::select! {
                 () = gate.changed() => {}
                 () = &mut hold => {
-                    self.stats.hold_expired.count();
+                    self.stats.calls_unanswered.count();
                     return Err(Closed("the master did not come back in time, see --hold"));
                 }
             }
@@ -320,7 +320,7 @@ impl Calls {
             tokio::select! {
                 answer = &mut answered => return answer.map_err(|_| Closed(UNANSWERED)),
                 () = &mut held => {
-                    self.stats.hold_expired.count();
+                    self.stats.calls_unanswered.count();
                     return Err(Closed("the master did not come back in time, see --hold"));
                 }
                 () = &mut patience, if patient => {
@@ -357,7 +357,7 @@ impl Calls {
         if let Some(seq) = self.ledger.to_await(seq) {
             self.ledger.durable(seq).await;
         }
-        self.stats.stood_in.count();
+        self.stats.calls_without_master.count();
         Some(reply)
     }
 }

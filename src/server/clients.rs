@@ -1,30 +1,79 @@
 //! Connected clients: a table for the status page.
 
-use std::net::SocketAddr;
+use std::{
+    collections::HashMap,
+    net::SocketAddr,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
 
 use dashmap::DashMap;
 
-use crate::status::summary::Client;
+use crate::{
+    clock,
+    status::{
+        report::ms,
+        summary::{Caller, Client},
+    },
+};
 
 /// Clients listed on the status page; there may be thousands.
 const LISTED: usize = 1000;
 /// Kept length of a caller id, in characters: a client may send any, and be idle for hours.
 const CALLER_ID: usize = 200;
 
-/// The connections of clients.
+/// Callers of ended connections whose times are kept. Tools have a new name each time.
+const CALLERS: usize = 256;
+
+/// The connections of clients, and how long their calls have taken.
 #[derive(Debug, Default)]
-pub struct Clients(DashMap<SocketAddr, Seen>);
+pub struct Clients {
+    present: DashMap<SocketAddr, Seen>,
+    /// Of connections that have ended, or are used by another caller now.
+    past: Mutex<HashMap<String, Times>>,
+}
 
 #[derive(Debug, Default)]
 struct Seen {
     caller_id: String,
     calls: u64,
+    /// Of this caller.
+    times: Times,
+}
+
+impl Seen {
+    /// The caller id, or the address of a client that says none.
+    fn caller(&self, peer: &SocketAddr) -> String {
+        match self.caller_id.as_str() {
+            "" => peer.ip().to_string(),
+            id => id.to_owned(),
+        }
+    }
+}
+
+/// How long calls have taken.
+#[derive(Clone, Copy, Debug, Default)]
+struct Times {
+    calls: u64,
+    all: Duration,
+    longest: Duration,
+    longest_at: Option<Instant>,
+}
+
+impl Times {
+    fn add(&mut self, other: Self) {
+        self.calls += other.calls;
+        self.all += other.all;
+        if other.longest > self.longest {
+            (self.longest, self.longest_at) = (other.longest, other.longest_at);
+        }
+    }
 }
 
 impl Clients {
     /// Lists a connection from `peer` until the result is dropped.
     pub fn enter(&self, peer: SocketAddr) -> Present<'_> {
-        self.0.insert(peer, Seen::default());
+        self.present.insert(peer, Seen::default());
         Present {
             clients: self,
             peer,
@@ -34,21 +83,77 @@ impl Clients {
     pub fn called(&self, peer: SocketAddr, caller_id: &str) {
         let end = caller_id.char_indices().nth(CALLER_ID);
         let caller_id = end.map_or(caller_id, |(end, _)| caller_id.split_at(end).0);
-        if let Some(mut seen) = self.0.get_mut(&peer) {
+        if let Some(mut seen) = self.present.get_mut(&peer) {
             seen.calls += 1;
             if seen.caller_id != caller_id {
+                self.keep(seen.caller(&peer), std::mem::take(&mut seen.times));
                 caller_id.clone_into(&mut seen.caller_id);
             }
         }
     }
 
+    /// The call of `peer` that began at `start` has been answered, or closed.
+    pub fn answered(&self, peer: SocketAddr, start: Instant) {
+        let now = Instant::now();
+        let longest = now.duration_since(start);
+        if let Some(mut seen) = self.present.get_mut(&peer) {
+            seen.times.add(Times {
+                calls: 1,
+                all: longest,
+                longest,
+                longest_at: Some(now),
+            });
+        }
+    }
+
+    fn past(&self) -> MutexGuard<'_, HashMap<String, Times>> {
+        self.past.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Keeps the times of a caller. When there are too many, those without a long call go.
+    fn keep(&self, caller: String, times: Times) {
+        if times.calls == 0 {
+            return;
+        }
+        let mut past = self.past();
+        past.entry(caller).or_default().add(times);
+        if past.len() > CALLERS {
+            let quickest = past.iter().min_by_key(|(_, times)| times.longest);
+            if let Some(caller) = quickest.map(|(caller, _)| caller.clone()) {
+                past.remove(&caller);
+            }
+        }
+    }
+
     pub fn count(&self) -> usize {
-        self.0.len()
+        self.present.len()
+    }
+
+    /// The callers whose longest call took longest, at most `most`.
+    pub(crate) fn slowest(&self, most: usize) -> Vec<Caller> {
+        let mut all = self.past().clone();
+        for entry in &self.present {
+            if entry.times.calls > 0 {
+                all.entry(entry.caller(entry.key()))
+                    .or_default()
+                    .add(entry.times);
+            }
+        }
+        let mut all: Vec<_> = all.into_iter().collect();
+        all.sort_by(|(a, one), (b, other)| (other.longest, a).cmp(&(one.longest, b)));
+        let callers = all.into_iter().take(most).map(|(caller, times)| Caller {
+            caller,
+            calls: times.calls,
+            mean_ms: ms(times.all / u32::try_from(times.calls).unwrap_or(u32::MAX)),
+            longest_ms: ms(times.longest),
+            longest_at: times.longest_at.map_or(0.0, clock::wall_time_of),
+        });
+        callers.collect()
     }
 
     /// The connections, by caller id, at most a thousand.
     pub(crate) fn list(&self) -> Vec<Client> {
-        let clients = self.0.iter().take(LISTED).map(|entry| Client {
+        let clients = self.present.iter().take(LISTED).map(|entry| Client {
             peer: entry.key().to_string(),
             caller_id: entry.caller_id.clone(),
             calls: entry.calls,
@@ -68,7 +173,9 @@ pub struct Present<'a> {
 
 impl Drop for Present<'_> {
     fn drop(&mut self) {
-        self.clients.0.remove(&self.peer);
+        if let Some((peer, seen)) = self.clients.present.remove(&self.peer) {
+            self.clients.keep(seen.caller(&peer), seen.times);
+        }
     }
 }
 
@@ -93,5 +200,46 @@ mod tests {
         assert_eq!(clients.list()[0].caller_id, "ü".repeat(CALLER_ID));
         drop(present);
         assert_eq!(clients.count(), 0);
+    }
+
+    #[test]
+    fn the_slowest_callers_are_known_after_they_have_gone() {
+        let clients = Clients::default();
+        let now = Instant::now();
+        let ago = |ms| now.checked_sub(Duration::from_millis(ms)).unwrap();
+        let call = |peer: &str, caller_id: &str, ms| {
+            let peer = peer.parse().unwrap();
+            let present = clients.enter(peer);
+            clients.called(peer, caller_id);
+            clients.answered(peer, ago(ms));
+            present
+        };
+        let stays = call("127.0.0.1:1", "/slow", 1_000);
+        drop(call("127.0.0.1:2", "/slow", 3_000));
+        drop(call("127.0.0.1:3", "", 2_000));
+        for number in 0..2 * CALLERS {
+            drop(call("127.0.0.1:4", &format!("/tool_{number}"), 1));
+        }
+        assert_eq!(clients.past().len(), CALLERS);
+        let slowest = clients.slowest(2);
+        let names: Vec<_> = slowest.iter().map(|caller| &*caller.caller).collect();
+        assert_eq!(names, ["/slow", "127.0.0.1"]);
+        assert_eq!(slowest[0].calls, 2);
+        assert!((2_999.0..4_000.0).contains(&slowest[0].longest_ms));
+        assert!((1_999.0..3_000.0).contains(&slowest[0].mean_ms));
+        drop(stays);
+    }
+
+    #[test]
+    fn a_connection_that_another_caller_uses_counts_for_both() {
+        let clients = Clients::default();
+        let peer = "127.0.0.1:4000".parse().unwrap();
+        let _present = clients.enter(peer);
+        for caller_id in ["/a", "/b"] {
+            clients.called(peer, caller_id);
+            clients.answered(peer, Instant::now());
+        }
+        assert_eq!(clients.slowest(5).len(), 2);
+        assert_eq!(clients.list()[0].calls, 2);
     }
 }

@@ -1,6 +1,6 @@
 //! One request from its head to its answer.
 
-use std::{net::SocketAddr, sync::Arc};
+use std::{net::SocketAddr, sync::Arc, time::Instant};
 
 use bytes::Bytes;
 use hyper::{Method, Request, StatusCode, body::Incoming, header::CONTENT_ENCODING};
@@ -108,7 +108,7 @@ async fn post(
     let (body, call) = match read.await {
         Ok(read) => read,
         Err(BodyError::TooLarge { limit }) => {
-            server.stats.refused.count();
+            server.stats.requests_refused.count();
             tracing::warn!(%peer, limit, "refused a request body beyond the limit (--max-body)");
             let reason = format!("the body is larger than {limit} bytes, see --max-body\n");
             return Ok(text(StatusCode::PAYLOAD_TOO_LARGE, reason));
@@ -125,16 +125,19 @@ async fn post(
     } else {
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
-            server.stats.refused.count();
+            server.stats.requests_refused.count();
             tracing::warn!(%peer, "refused a request of another computer that cannot be decoded");
             return Ok(xml(&Reply::Fault {
                 code: 1,
                 text: UNDECODED.to_owned(),
             }));
         }
-        server.stats.undecoded.count();
+        server.stats.requests_not_understood.count();
     }
-    answer(&server, peer, deadlines, head, body, call).await
+    let start = Instant::now();
+    let answered = answer(&server, peer, deadlines, head, body, call).await;
+    server.clients.answered(peer, start);
+    answered
 }
 
 /// Answers a call. A large answer that finds no room is made again when there is some, so that few wait in
@@ -184,7 +187,7 @@ async fn page(
 }
 
 fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
-    server.stats.refused.count();
+    server.stats.requests_refused.count();
     tracing::warn!(%peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
     text(refusal.status, format!("{}\n", refusal.reason))
 }

@@ -1,89 +1,76 @@
 //! The metrics, in Prometheus' text format.
+//!
+//! Written by hand: every value is one of a [`Status`], which a library would want in registers of its own.
 
-use super::{stats::Stats, summary::Status};
+use std::fmt::{Display, Write};
+
+use super::{condition::Name, stats::Stats, summary::Status};
 
 /// What `/metrics` answers.
 pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
-    use std::fmt::Write;
-
     let mut text = String::new();
-    let mut add = |name: &str, kind: &str, help: &str, value: f64| {
-        // Writing to a string does not fail.
-        let _ = write!(
-            text,
-            "# HELP rosrescue_{name} {help}\n# TYPE rosrescue_{name} {kind}\nrosrescue_{name} {value}\n"
-        );
-    };
     for (name, help, value) in stats.list() {
-        add(&format!("{name}_total"), "counter", help, value as f64);
+        add(&mut text, &format!("{name}_total"), help, value);
     }
-    let flag = |truth: bool| f64::from(u8::from(truth));
-    add(
-        "gate_open",
+    let flag = u8::from;
+    let journal = &status.journal;
+    #[rustfmt::skip]
+    let values: [(&str, &str, Option<f64>); 22] = [
+        ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
+        ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
+        ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
+        ("crash_loop", "whether the master dies again and again", Some(flag(status.crash_loop).into())),
+        ("guarded", "whether another process keeps the port when rosrescue dies", Some(flag(status.guarded).into())),
+        ("action_needed", "whether somebody should look: the status says what to do", Some(flag(status.condition.action.is_some()).into())),
+        ("master_deaths_total", "masters that have died", Some(status.deaths as f64)),
+        ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),
+        ("rescues_total", "rescues: recoveries but for an ordinary start", Some(status.rescues as f64)),
+        ("pending_writes", "writes answered by the mirror that the master has not run yet", Some(status.pending_writes as f64)),
+        ("nodes", "nodes registered", Some(status.state.nodes as f64)),
+        ("publishers", "publishers of topics, each topic counted", Some(status.state.publishers as f64)),
+        ("subscribers", "subscribers of topics, each topic counted", Some(status.state.subscribers as f64)),
+        ("services", "services registered", Some(status.state.services as f64)),
+        ("params", "parameters set", Some(status.state.params as f64)),
+        ("unreachable_nodes", "nodes that do not answer and are not known to be dead", Some(status.unreachable.len() as f64)),
+        ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
+        ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),
+        ("journal_bytes", "size of the checkpoint's journal", Some(journal.bytes as f64)),
+        ("snapshot_bytes", "size of the checkpoint before its journal", Some(journal.snapshot_bytes as f64)),
+        ("disk_free_bytes", "bytes free on the checkpoint's disk", journal.disk_free_bytes.map(|bytes| bytes as f64)),
+        ("last_recovery_seconds", "how long calls did not pass to the master the last time", status.last_recovery.as_ref().map(|report| report.phases.total_ms / 1e3)),
+    ];
+    for (name, help, value) in values {
+        if let Some(value) = value {
+            add(&mut text, name, help, value);
+        }
+    }
+    head(
+        &mut text,
+        "condition",
+        "1 for what is so, as in /status.json",
         "gauge",
-        "whether calls pass to the master",
-        flag(status.open),
     );
-    add(
-        "standing_in",
-        "gauge",
-        "whether the mirror answers, because the master is away",
-        flag(status.standing_in_since.is_some()),
-    );
-    add(
-        "pending_writes",
-        "gauge",
-        "writes answered by the mirror that the master has not run yet",
-        status.pending_writes as f64,
-    );
-    add(
-        "protected",
-        "gauge",
-        "whether the state is recorded",
-        flag(status.unprotected.is_none()),
-    );
-    add(
-        "crash_loop",
-        "gauge",
-        "whether the master dies again and again",
-        flag(status.crash_loop),
-    );
-    add(
-        "guarded",
-        "gauge",
-        "whether another process keeps the port when rosrescue dies",
-        flag(status.guarded),
-    );
-    add(
-        "recoveries_total",
-        "counter",
-        "masters examined",
-        status.recoveries as f64,
-    );
-    add(
-        "master_deaths_total",
-        "counter",
-        "masters that have died",
-        status.deaths as f64,
-    );
-    let counts = status.state;
-    add("nodes", "gauge", "nodes registered", counts.nodes as f64);
-    add("params", "gauge", "parameters set", counts.params as f64);
-    let unreachable = status.unreachable.len();
-    add(
-        "unreachable_nodes",
-        "gauge",
-        "nodes that do not answer and are not known to be dead",
-        unreachable as f64,
-    );
-    if let Some(report) = &status.last_recovery {
-        let seconds = report.phases.total_ms / 1e3;
-        add(
-            "last_recovery_seconds",
-            "gauge",
-            "from the shut gate to the open one",
-            seconds,
-        );
+    for name in Name::ALL {
+        let value = u8::from(status.condition.name == name);
+        let name = name.as_str();
+        // Writing to a string does not fail.
+        let _ = writeln!(text, "rosrescue_condition{{name=\"{name}\"}} {value}");
     }
     text
+}
+
+fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
+    let kind = match name.ends_with("_total") {
+        true => "counter",
+        false => "gauge",
+    };
+    head(text, name, help, kind);
+    let _ = writeln!(text, "rosrescue_{name} {value}");
+}
+
+fn head(text: &mut String, name: &str, help: &str, kind: &str) {
+    let _ = write!(
+        text,
+        "# HELP rosrescue_{name} {help}\n# TYPE rosrescue_{name} {kind}\n"
+    );
 }

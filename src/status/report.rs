@@ -1,14 +1,16 @@
-//! What a recovery did, and how long each part of it took.
+//! What a rescue did, and how long each part of it took.
 
 use std::{fmt, time::Duration};
 
-use serde::Serialize;
-use tracing::field::debug;
+use serde::{Deserialize, Serialize};
 
-use crate::master::Counts;
+use crate::{clock, master::Counts};
+
+/// The cause of a report when rosrescue itself was started.
+pub(crate) const STARTED: &str = "rosrescue was started";
 
 /// How the present master got its state.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// An empty master and an empty mirror: a new session.
@@ -33,46 +35,56 @@ impl Outcome {
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Begun => "a new master is served",
-            Self::Injected => "the master has been restored",
-            Self::Adopted => "a running master has been taken over",
-            Self::Reconciled => "the same master goes on, and knows what was written meanwhile",
-            Self::Resumed => "the same master goes on",
+            Self::Begun => "a new session is served by a new master",
+            Self::Injected => "a new master was given the whole state",
+            Self::Adopted => "a running master was taken over with all that it holds",
+            Self::Reconciled => "the same master goes on, and was told what changed meanwhile",
+            Self::Resumed => "the same master goes on, unchanged",
         })
     }
 }
 
 /// Durations in milliseconds.
-#[derive(Clone, Debug, Default, Serialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Phases {
-    /// From the shut gate to the master's open port.
+    /// From the moment when calls stopped passing to the master's open port.
     pub absence_ms: f64,
     /// Reading what the master holds.
-    pub look_ms: f64,
-    /// Injecting and reading back.
+    pub inspection_ms: f64,
+    /// Giving it the state and reading that back.
     pub injection_ms: f64,
-    /// From the shut gate to the open gate.
+    /// From the moment when calls stopped passing to the one when they passed again.
     pub total_ms: f64,
 }
 
-#[derive(Clone, Debug, Serialize)]
+/// What was done for one master. One that comes after an outage, or after a restart of rosrescue, is a
+/// rescue.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// Why the gate was shut.
-    pub cause: &'static str,
-    /// When the gate was shut: seconds since 1970 by the wall clock, to compare with logs.
+    /// Counts reports since the start of rosrescue, from 1.
+    pub number: u64,
+    /// Why calls no longer passed.
+    pub cause: String,
+    /// How the process of the master before ended, if rosrescue has seen it.
+    pub ended: Option<String>,
+    /// When calls stopped passing: seconds since 1970 by the wall clock, to compare with logs.
     pub detected_at: f64,
     /// How the master got its state.
     pub outcome: Outcome,
     /// The process id that the master reports.
     pub master_pid: i32,
     pub phases: Phases,
-    /// From the open gate to the end of the health check, in milliseconds; none until then.
+    /// Calls that the mirror answered meanwhile.
+    pub answered: u64,
+    /// Calls that waited in vain meanwhile, because only a master could answer them.
+    pub unanswered: u64,
+    /// From then to the end of the health check, in milliseconds; none until then.
     pub health_check_ms: Option<f64>,
     /// What the master holds now.
     pub restored: Counts,
-    /// What was not injected, and why.
-    pub skipped: Vec<String>,
-    /// Differences between the master, read back, and what was injected. Should be empty.
+    /// What could not be given to the master, and why.
+    pub not_restored: Vec<String>,
+    /// Differences between the master, read back, and what it was given. Should be empty.
     pub mismatches: Vec<String>,
     /// Nodes that were found dead and unregistered.
     pub removed: Vec<String>,
@@ -80,46 +92,111 @@ pub struct Report {
     pub reconciled: Vec<String>,
     /// Nodes that did not answer and were kept.
     pub unreachable: Vec<String>,
-    /// Topics whose subscribers were sent the full list of publishers.
-    pub notified: Vec<String>,
+    /// Topics whose subscribers were sent the list of publishers once more, in case the master died before it
+    /// could. Nothing is wrong with them.
+    pub told_again: Vec<String>,
 }
 
 impl Report {
+    /// Whether it was worth a report to a person: not the ordinary start.
+    pub(crate) fn is_rescue(&self) -> bool {
+        !(self.cause == STARTED && matches!(self.outcome, Outcome::Begun | Outcome::Adopted))
+    }
+
     /// Adds the results of the health check.
     pub(crate) fn add(&mut self, check: HealthCheck) {
         self.health_check_ms = Some(ms(check.duration));
         self.removed = check.removed;
         self.reconciled = check.reconciled;
         self.unreachable = check.unreachable;
-        self.notified = check.notified;
+        self.told_again = check.notified;
     }
 
-    /// Logs the non-empty parts in one line.
-    pub(crate) fn log(&self, message: &str) {
-        let some = |list: &Vec<String>| (!list.is_empty()).then(|| debug(list.clone()));
+    /// The lists that are not empty, each with what it means.
+    fn lists(&self) -> impl Iterator<Item = (&'static str, &[String])> {
+        let lists: [(_, &[String]); 6] = [
+            ("could not be restored", &self.not_restored),
+            ("differs from what was restored", &self.mismatches),
+            ("dead nodes taken out", &self.removed),
+            ("corrected, as the nodes say", &self.reconciled),
+            ("nodes that do not answer", &self.unreachable),
+            ("topics told once more", &self.told_again),
+        ];
+        lists.into_iter().filter(|(_, list)| !list.is_empty())
+    }
+
+    /// What nodes noticed.
+    fn felt(&self) -> String {
+        match (self.answered, self.unanswered) {
+            (0, 0) => "no call came meanwhile".to_owned(),
+            (answered, 0) => format!("{answered} calls were answered meanwhile, none was lost"),
+            (answered, lost) => {
+                format!("{answered} calls were answered meanwhile, {lost} waited in vain")
+            }
+        }
+    }
+
+    /// Logs that calls pass again.
+    pub(crate) fn log(&self) {
+        let phases = &self.phases;
+        tracing::info!(
+            cause = self.cause,
+            ended = self.ended,
+            absence_ms = phases.absence_ms,
+            inspection_ms = phases.inspection_ms,
+            injection_ms = phases.injection_ms,
+            total_ms = phases.total_ms,
+            master_pid = self.master_pid,
+            "calls pass to the master: {} ({})",
+            self.outcome,
+            self.restored
+        );
+        for (what, list) in self.lists().take(2) {
+            tracing::warn!(?list, "{what}");
+        }
+    }
+
+    /// Logs what the health check has found.
+    pub(crate) fn log_check(&self) {
+        let some =
+            |list: &Vec<String>| (!list.is_empty()).then(|| tracing::field::debug(list.clone()));
+        tracing::info!(
+            total_ms = self.phases.total_ms,
+            health_check_ms = self.health_check_ms,
+            removed = some(&self.removed),
+            reconciled = some(&self.reconciled),
+            told_again = some(&self.told_again),
+            unreachable = some(&self.unreachable),
+            "all nodes were asked whether they live: the rescue is complete"
+        );
+    }
+}
+
+/// A few lines for people.
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Phases {
             absence_ms,
-            look_ms,
+            inspection_ms,
             injection_ms,
             total_ms,
         } = self.phases;
-        tracing::info!(
-            cause = self.cause,
-            absence_ms,
-            look_ms,
-            injection_ms,
-            total_ms,
-            health_check_ms = self.health_check_ms,
-            master_pid = self.master_pid,
-            skipped = some(&self.skipped),
-            mismatches = some(&self.mismatches),
-            removed = some(&self.removed),
-            reconciled = some(&self.reconciled),
-            notified = some(&self.notified),
-            unreachable = some(&self.unreachable),
-            "{message}: {}",
-            self.restored
-        );
+        write!(f, "{}  {}", clock::wall_text(self.detected_at), self.cause)?;
+        if let Some(ended) = &self.ended {
+            write!(f, " ({ended})")?;
+        }
+        writeln!(f, "; after {total_ms:.0} ms {}", self.outcome)?;
+        writeln!(
+            f,
+            "  {absence_ms:.0} ms until a master listened, {inspection_ms:.0} ms to read it, \
+             {injection_ms:.0} ms to restore it; {}",
+            self.felt()
+        )?;
+        writeln!(f, "  master process {}: {}", self.master_pid, self.restored)?;
+        for (what, list) in self.lists() {
+            writeln!(f, "  {what}: {}", list.join(", "))?;
+        }
+        Ok(())
     }
 }
 

@@ -1,14 +1,18 @@
-//! The status at one moment, as `/status.json` and `rosrescue status` have it.
+//! The status at one moment, as `/status.json` has it and `rosrescue status` reads it.
 
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
-use super::report::Report;
+use super::{Mode, condition::Condition, report::Report};
 use crate::{clock, master::Counts};
 
+/// The version of the format. It changes when a field goes away or gets another meaning; new fields do not
+/// change it.
+pub(crate) const SCHEMA: u32 = 1;
+
 /// A connection of a client.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Client {
     pub(crate) peer: String,
     /// The caller id of its last call, cut if it is long.
@@ -17,18 +21,58 @@ pub(crate) struct Client {
     pub(crate) calls: u64,
 }
 
-/// The status at one moment.
-#[derive(Clone, Debug, Serialize)]
+/// All calls of one caller since the start.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Caller {
+    /// Its caller id, or the address of a client that says none.
+    pub(crate) caller: String,
+    pub(crate) calls: u64,
+    /// Until the answer was ready, in milliseconds.
+    pub(crate) mean_ms: f64,
+    pub(crate) longest_ms: f64,
+    /// When the longest call ended: seconds since 1970.
+    pub(crate) longest_at: f64,
+}
+
+/// The checkpoint's journal.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Journal {
+    /// Since the checkpoint was last written as a whole.
+    pub(crate) records: u64,
+    pub(crate) bytes: u64,
+    /// The part of the file before the journal.
+    pub(crate) snapshot_bytes: u64,
+    /// When the checkpoint was last written as a whole: seconds since 1970.
+    pub(crate) last_compaction: Option<f64>,
+    /// What is free on its disk.
+    pub(crate) disk_free_bytes: Option<u64>,
+}
+
+/// The status at one moment. All times of day are seconds since 1970 by the wall clock.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Status {
-    pub(crate) version: &'static str,
+    /// [`SCHEMA`].
+    pub(crate) schema: u32,
+    pub(crate) version: String,
+    pub(crate) mode: Mode,
+    /// The process that serves nodes.
+    pub(crate) pid: u32,
+    /// When it was started.
+    pub(crate) started: f64,
+    /// The same, in seconds until now.
+    pub(crate) uptime: f64,
     /// What nodes use as `ROS_MASTER_URI`.
     pub(crate) uri: String,
+    pub(crate) condition: Condition,
+    /// The real master's address.
     pub(crate) master: String,
+    /// Its process id, or the last one's; none if there was none.
+    pub(crate) master_pid: Option<i32>,
     /// Whether calls pass to the master.
     pub(crate) open: bool,
     /// Whether calls are answered, by the master or the mirror.
     pub(crate) ready: bool,
-    /// Since when the mirror stands in: seconds since 1970, by the wall clock.
+    /// Since when the mirror stands in; none while calls pass.
     pub(crate) standing_in_since: Option<f64>,
     /// Writes that the mirror has answered and the master has not run yet.
     pub(crate) pending_writes: usize,
@@ -39,6 +83,7 @@ pub(crate) struct Status {
     pub(crate) checkpoint: String,
     /// Why the state is not recorded; none if it is.
     pub(crate) unprotected: Option<String>,
+    pub(crate) journal: Journal,
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
     pub(crate) guarded: bool,
     pub(crate) guarded_by: String,
@@ -46,68 +91,142 @@ pub(crate) struct Status {
     pub(crate) state: Counts,
     /// Nodes that do not answer and are not known to be dead.
     pub(crate) unreachable: Vec<String>,
-    /// Masters examined since the start.
+    /// Masters examined since the start, the first one included.
     pub(crate) recoveries: u64,
+    /// The report of the last one.
     pub(crate) last_recovery: Option<Report>,
+    /// Rescues since the start, and the reports of the last 20, the oldest first.
+    pub(crate) rescues: u64,
+    pub(crate) last_rescues: Vec<Report>,
+    /// Between the last two times when somebody asked, at least a second apart.
+    pub(crate) calls_per_second: f64,
+    /// The callers whose longest call took longest, at most 20.
+    pub(crate) slowest_callers: Vec<Caller>,
     /// Connections of clients, at most a thousand.
     pub(crate) clients: Vec<Client>,
     /// Counters since the start.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
 }
 
+impl Status {
+    /// A counter's value; 0 if an older rosrescue does not know it.
+    pub(crate) fn counter(&self, name: &str) -> u64 {
+        let value = self.counters.get(name);
+        value.and_then(serde_json::Value::as_u64).unwrap_or(0)
+    }
+}
+
+/// Ten lines for a tired person, and what is wrong in more.
 impl fmt::Display for Status {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "rosrescue {}", self.version)?;
-        writeln!(f, "ROS_MASTER_URI  {}", self.uri)?;
-        let gate = match (self.standing_in_since, self.ready) {
-            (Some(since), _) => format!(
-                "away, standing in since {}, {} pending writes",
-                clock::wall_text(since),
-                self.pending_writes
-            ),
-            (None, true) => "calls pass".to_owned(),
-            (None, false) => "not seen yet, calls wait".to_owned(),
+        let Condition {
+            since,
+            text,
+            action,
+            ..
+        } = &self.condition;
+        let until = self.started + self.uptime;
+        writeln!(
+            f,
+            "{}, since {} ({})",
+            self.condition.title(),
+            clock::wall_text(*since),
+            clock::span(until - since)
+        )?;
+        writeln!(f, "            {text}")?;
+        if let Some(action) = action {
+            writeln!(f, "to do       {action}")?;
+        }
+        let mode = match self.mode {
+            Mode::Core => "core",
+            Mode::Proxy => "proxy",
         };
-        writeln!(f, "master          {} ({gate})", self.master)?;
-        if self.crash_loop {
+        writeln!(
+            f,
+            "rosrescue   {} {mode}, process {}, up {}, guarded by {}",
+            self.version,
+            self.pid,
+            clock::span(self.uptime),
+            self.guarded_by
+        )?;
+        writeln!(f, "serves      {}", self.uri)?;
+        write!(f, "master      {}", self.master)?;
+        if let Some(pid) = self.master_pid {
+            write!(f, ", process {pid}")?;
+        }
+        match self.deaths {
+            0 => writeln!(f)?,
+            1 => writeln!(f, ", died once")?,
+            deaths => writeln!(f, ", died {deaths} times")?,
+        }
+        writeln!(f, "state       {}", self.state)?;
+        writeln!(
+            f,
+            "calls       {}, {:.1} a second; {} answered without the master, {} in vain",
+            self.counter("calls"),
+            self.calls_per_second,
+            self.counter("calls_without_master"),
+            self.counter("calls_unanswered")
+        )?;
+        let journal = &self.journal;
+        writeln!(
+            f,
+            "checkpoint  {}, {}, {} free",
+            self.checkpoint,
+            size(journal.bytes + journal.snapshot_bytes),
+            journal
+                .disk_free_bytes
+                .map_or_else(|| "unknown".to_owned(), size)
+        )?;
+        if self.pending_writes > 0 {
             writeln!(
                 f,
-                "                crash loop: the master dies again and again"
+                "pending     {} changes that the next master will be told",
+                self.pending_writes
             )?;
         }
-        let protection = self.unprotected.as_deref().map_or_else(
-            || "protected".to_owned(),
-            |reason| format!("UNPROTECTED: {reason}"),
-        );
-        writeln!(f, "checkpoint      {} ({protection})", self.checkpoint)?;
-        writeln!(f, "guarded by      {}", self.guarded_by)?;
-        writeln!(f, "state           {}", self.state)?;
         if !self.unreachable.is_empty() {
-            writeln!(f, "unreachable     {}", self.unreachable.join(", "))?;
-        }
-        if let Some(report) = &self.last_recovery {
             writeln!(
                 f,
-                "last recovery   {} ms after {}",
-                report.phases.total_ms.round(),
-                report.cause
+                "no answer   from {} (kept, and asked again)",
+                self.unreachable.join(", ")
             )?;
-            for (what, names) in [
-                ("not injected", &report.skipped),
-                ("differs", &report.mismatches),
-                ("removed", &report.removed),
-                ("reconciled", &report.reconciled),
-                ("unreachable", &report.unreachable),
-                ("notified", &report.notified),
-            ] {
-                if !names.is_empty() {
-                    writeln!(f, "  {what:<14}{}", names.join(", "))?;
-                }
-            }
         }
-        for (name, value) in &self.counters {
-            writeln!(f, "{name:<16}{value}")?;
+        match self.last_rescues.last() {
+            Some(report) => write!(f, "rescues     {}, the last:\n{report}", self.rescues),
+            None => writeln!(f, "rescues     none needed so far"),
         }
-        Ok(())
+    }
+}
+
+/// Bytes for people.
+pub(crate) fn size(bytes: u64) -> String {
+    let mut value = bytes as f64;
+    for unit in ["B", "kB", "MB", "GB"] {
+        if value < 1000.0 {
+            let digits = usize::from(unit != "B" && value < 10.0);
+            return format!("{value:.digits$} {unit}");
+        }
+        value /= 1000.0;
+    }
+    format!("{value:.1} TB")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes() {
+        for (bytes, text) in [
+            (0, "0 B"),
+            (999, "999 B"),
+            (1_234, "1.2 kB"),
+            (12_345, "12 kB"),
+            (64_000_000_000, "64 GB"),
+            (2_000_000_000_000, "2.0 TB"),
+        ] {
+            assert_eq!(size(bytes), text);
+        }
     }
 }

@@ -190,7 +190,7 @@ impl Drain {
         }
         let mut connection = self.connection.take();
         connection.take_if(|(of, connection)| *of != incarnation || connection.is_closed());
-        self.stats.batches.count();
+        self.stats.write_batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
@@ -386,7 +386,7 @@ impl Drain {
             let call = item.call.as_deref().filter(|call| call.is_answerable());
             match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
                 Some((reply, seq)) => {
-                    self.stats.stood_in.count();
+                    self.stats.calls_without_master.count();
                     last = last.max(seq);
                     answers.push((item, Answer::Made(reply)));
                 }

@@ -279,10 +279,10 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
         .filter(|call| Request::from((*call).clone()).kind().mutates());
     let (shared, alone): (Vec<_>, Vec<_>) =
         mutating.partition(|call| SHARE.contains(&call.method.as_str()));
-    let batches = usize::try_from(counter("batches")).unwrap() - alone.len();
+    let batches = usize::try_from(counter("write_batches")).unwrap() - alone.len();
     if !unreturnable {
         // Such values leave the mirror in doubt most of the time.
-        assert_eq!(counter("mirrored") > 100, reads == "mirror");
+        assert_eq!(counter("calls_from_mirror") > 100, reads == "mirror");
     }
     println!(
         "seed {seed}, unreturnable {unreturnable}, reads by the {reads}: {} calls, of which {} went alone and {} in {batches} batches",
@@ -317,7 +317,8 @@ fn play(seed: u64, unreturnable: bool, reads: &str) {
         drop(behind.ready());
         eventually("the state is back", || {
             let status = status(&rescue.client());
-            status["open"] == true && status["counters"]["injections"] != counters["injections"]
+            status["open"] == true
+                && status["counters"]["masters_restored"] != counters["masters_restored"]
         });
         states(rescue.port(), port, "after a crash");
     }

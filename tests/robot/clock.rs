@@ -127,7 +127,7 @@ fn recovery_does_not_depend_on_it() {
         );
         let took = start.elapsed().as_secs_f64();
         let report = &status(&client)["last_recovery"];
-        for phase in ["absence_ms", "look_ms", "injection_ms", "total_ms"] {
+        for phase in ["absence_ms", "inspection_ms", "injection_ms", "total_ms"] {
             let ms = report["phases"][phase].as_f64().unwrap();
             assert!(
                 (0.0..=took * 1e3).contains(&ms),

@@ -19,8 +19,8 @@ fn a_read_shows_every_write_that_was_acknowledged(mode: Mode) {
             .set_param("/writer", tree! {"filler" => "x".repeat(bytes)});
         write_and_read(&robot);
     }
-    assert!(robot.counter("mirrored") > 100);
-    assert_eq!(robot.counter("stood_in"), 0);
+    assert!(robot.counter("calls_from_mirror") > 100);
+    assert_eq!(robot.counter("calls_without_master"), 0);
 }
 
 fn write_and_read(robot: &Robot) {
@@ -67,10 +67,10 @@ fn a_core_answers_reads_though_its_master_hangs() {
     let robot = Robot::start(Mode::Core);
     let client = robot.client();
     client.set_param("/gain", 7);
-    let before = robot.counter("mirrored");
+    let before = robot.counter("calls_from_mirror");
     crate::support::stop(robot.master_pid());
     assert_eq!(client.param("/gain"), Some(7.into()));
-    assert_eq!(robot.counter("mirrored"), before + 1);
+    assert_eq!(robot.counter("calls_from_mirror"), before + 1);
 }
 
 /// As for a proxy, where somebody may write past it.
@@ -82,7 +82,7 @@ fn a_core_forwards_reads_if_it_is_told_to() {
     let past = robot.bare();
     past.set_param("/gain", 8);
     assert_eq!(client.param("/gain"), Some(8.into()));
-    assert_eq!(robot.counter("mirrored"), 0);
+    assert_eq!(robot.counter("calls_from_mirror"), 0);
 }
 
 crate::support::in_both_modes!(a_read_shows_every_write_that_was_acknowledged);

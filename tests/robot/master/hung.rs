@@ -54,7 +54,7 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     let before = State::read(&client);
     let pid = robot.master_pid();
-    let injections = robot.counter("injections");
+    let injections = robot.counter("masters_restored");
 
     crate::support::stop(pid);
     // It is under way in the master, which has not run it.
@@ -103,7 +103,7 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     crate::support::signal(pid, Signal::CONT);
     robot.await_gate();
     assert_eq!(robot.master_pid(), pid, "the same master goes on");
-    assert_eq!(robot.counter("injections"), injections + 1);
+    assert_eq!(robot.counter("masters_restored"), injections + 1);
     after.assert_same(&robot.state(), "in the master that goes on");
     after.assert_same(&State::read(&client), "through rosrescue");
     // Never of an older value, and never of a part of the publishers.
@@ -134,7 +134,7 @@ fn ten_hangs_under_writes_lose_nothing() {
     let robot = Robot::start_with(Mode::Proxy, &PROBES);
     let client = robot.client();
     let pid = robot.master_pid();
-    let injections = robot.counter("injections");
+    let injections = robot.counter("masters_restored");
     let watcher = FakeNode::start("/watcher");
     let keys = ["/first", "/second"];
     for key in keys {
@@ -186,7 +186,7 @@ fn ten_hangs_under_writes_lose_nothing() {
     });
     assert_eq!(robot.master_pid(), pid, "the same master goes on");
     // Once after each hang that was noticed, however often the gate was found shut besides.
-    assert!(robot.counter("injections") >= injections + shut);
+    assert!(robot.counter("masters_restored") >= injections + shut);
     for (key, written) in keys.into_iter().zip(written) {
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
         eventually("the node is told of the last value", || {

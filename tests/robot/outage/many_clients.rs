@@ -145,7 +145,7 @@ fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
     robot.revive_master();
     robot.await_recovery(dead);
     // No call was closed without an answer.
-    assert_eq!(robot.counter("hold_expired"), 0);
+    assert_eq!(robot.counter("calls_unanswered"), 0);
     let (bare, state) = (robot.bare(), robot.state());
     for number in 0..CLIENTS {
         let name = format!("/client{number}");

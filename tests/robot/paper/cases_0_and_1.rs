@@ -122,16 +122,14 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
     robot.await_state(&after, "when the nodes that ended have been found");
     if how == Signal::KILL {
         let rescue = &mut robot.rescue;
-        rescue.wait_line("all of the recovery in one line", |line| {
-            let parts = [
-                "cause=\"",
-                "absence_ms=",
-                "look_ms=",
-                "injection_ms=",
-                "health_check_ms=",
-                "removed=[",
-            ];
-            line.contains("recovery is complete: ") && parts.iter().all(|part| line.contains(part))
+        rescue.wait_line("each phase of the recovery", |line| {
+            let parts = ["cause=\"", "absence_ms=", "inspection_ms=", "injection_ms="];
+            line.contains("calls pass to the master: ")
+                && parts.iter().all(|part| line.contains(part))
+        });
+        rescue.wait_line("what the health check has found", |line| {
+            let parts = ["health_check_ms=", "removed=["];
+            line.contains("the rescue is complete") && parts.iter().all(|part| line.contains(part))
         });
         // On a busy computer one of them may be found out a little later.
         for name in ["/gone_listener", "/gone_server", "/gone_talker"] {

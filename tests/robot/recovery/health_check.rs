@@ -25,12 +25,12 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
         "outcome",
         "phases",
         "restored",
-        "skipped",
+        "not_restored",
         "mismatches",
         "removed",
         "reconciled",
         "unreachable",
-        "notified",
+        "told_again",
     ] {
         assert!(!last[field].is_null(), "no `{field}` in {last:#}");
     }

@@ -42,7 +42,7 @@ impl Manager {
         Self { socket, heard }
     }
 
-    /// Waits until `assignment` is said.
+    /// Waits until a line begins with `assignment`.
     #[track_caller]
     fn wait(&mut self, assignment: &str) {
         let mut buffer = [0; 4096];
@@ -51,7 +51,7 @@ impl Manager {
             let length = length.unwrap_or_else(|_| panic!("no {assignment}: {:?}", self.heard));
             let message = String::from_utf8(buffer[..length].to_vec()).unwrap();
             let lines: Vec<_> = message.lines().map(str::to_owned).collect();
-            let found = lines.iter().any(|line| line == assignment);
+            let found = lines.iter().any(|line| line.starts_with(assignment));
             self.heard.extend(lines);
             if found {
                 return;
@@ -81,7 +81,7 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
         .wrapped(|own| activated(own, socket.into()))
         .at_port(port)
         .spawn();
-    manager.wait("STATUS=the master is away");
+    manager.wait("STATUS=waiting for a first master: Nodes wait");
     manager.wait("WATCHDOG=1");
     assert!(!manager.has_heard("READY=1"));
     let mut master = Rosmaster::start_at(&scratch, master_port);
@@ -95,7 +95,7 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
     assert_eq!(page["guarded"], true);
     assert_eq!(page["guarded_by"], "systemd");
     master.kill();
-    manager.wait("STATUS=the master is away");
+    manager.wait("STATUS=standing in for the master: Nodes go on");
 
     // A crash, and what systemd does then: the socket is the same.
     rescue.kill();

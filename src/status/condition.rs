@@ -1,0 +1,264 @@
+//! How the robot is, in words for a tired person: one name, what nodes notice now, and what to do.
+
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Facts, Guarded, Mode};
+use crate::{clock, gate::State};
+
+/// The conditions, from the best to the worst.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Name {
+    /// Calls pass to the master and every change is recorded.
+    Protected,
+    /// The master is away, and the mirror answers in its place.
+    StandingIn,
+    /// The master dies again and again. Between two deaths calls may pass.
+    CrashLoop,
+    /// Calls are answered, but changes are not recorded.
+    Unprotected,
+    /// Nobody knows the state: no master was ever seen, and calls wait for one.
+    Waiting,
+}
+
+impl Name {
+    pub(crate) const ALL: [Self; 5] = [
+        Self::Protected,
+        Self::StandingIn,
+        Self::CrashLoop,
+        Self::Unprotected,
+        Self::Waiting,
+    ];
+
+    /// As in JSON and in metrics.
+    pub(crate) fn as_str(self) -> &'static str {
+        match self {
+            Self::Protected => "protected",
+            Self::StandingIn => "standing_in",
+            Self::CrashLoop => "crash_loop",
+            Self::Unprotected => "unprotected",
+            Self::Waiting => "waiting",
+        }
+    }
+
+    fn title(self) -> &'static str {
+        match self {
+            Self::Protected => "protected",
+            Self::StandingIn => "standing in for the master",
+            Self::CrashLoop => "crash loop of the master",
+            Self::Unprotected => "UNPROTECTED",
+            Self::Waiting => "waiting for a first master",
+        }
+    }
+}
+
+/// How the robot is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Condition {
+    /// The worst that is so.
+    pub(crate) name: Name,
+    /// Since when, in seconds since 1970 by the wall clock.
+    pub(crate) since: f64,
+    /// What nodes notice now.
+    pub(crate) text: String,
+    /// What to do; none if nothing is.
+    pub(crate) action: Option<String>,
+}
+
+impl Condition {
+    /// Whether nobody needs to look.
+    pub(crate) fn is_good(&self) -> bool {
+        self.name == Name::Protected && self.action.is_none()
+    }
+
+    /// In a line, as systemd shows it.
+    pub(crate) fn line(&self) -> String {
+        let action = self.action.iter().map(|action| format!(" To do: {action}"));
+        let text = format!(
+            "{}: {}{}",
+            self.title(),
+            self.text,
+            action.collect::<String>()
+        );
+        // A newline would start another assignment.
+        text.replace('\n', " ")
+    }
+
+    pub(crate) fn title(&self) -> &'static str {
+        self.name.title()
+    }
+}
+
+/// What the condition follows from, besides the [`Facts`].
+#[derive(Debug)]
+pub(crate) struct Situation {
+    pub(crate) gate: State,
+    /// Since when calls pass, or do not.
+    pub(crate) gate_since: Instant,
+    /// Why changes are not recorded.
+    pub(crate) unprotected: Option<String>,
+    pub(crate) master: String,
+}
+
+/// The condition of `now`.
+pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
+    let (mut text, mut action) = nodes_notice(now, facts);
+    let (mut name, mut since) = match now.gate {
+        State::Unknown => (Name::Waiting, now.gate_since),
+        State::StandingIn | State::Injecting => (Name::StandingIn, now.gate_since),
+        State::Open { .. } => (Name::Protected, now.gate_since.max(facts.settled_since())),
+    };
+    if let Some(since_loop) = facts.crash_loop
+        && name < Name::CrashLoop
+    {
+        (name, since) = (Name::CrashLoop, since_loop);
+    }
+    if let Some(reason) = &now.unprotected {
+        if name < Name::Unprotected {
+            (name, since) = (Name::Unprotected, facts.disk.unprotected_since());
+        }
+        text += &format!(
+            " Changes are not recorded, so a crash of rosrescue itself would lose them: {reason}."
+        );
+        action.get_or_insert_with(|| {
+            "free or repair the disk; recording begins again by itself.".to_owned()
+        });
+    }
+    if let Guarded::NoLonger(pid) = facts.guarded {
+        text += &format!(
+            " The guardian, process {pid}, has ended: if rosrescue dies now, nobody starts it again."
+        );
+        action.get_or_insert_with(|| "start rosrescue anew when the robot is at rest.".to_owned());
+    }
+    if name == Name::Protected {
+        text += " Every change is recorded.";
+    }
+    Condition {
+        name,
+        since: clock::wall_time_of(since),
+        text,
+        action,
+    }
+}
+
+fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
+    let master = &now.master;
+    let open = now.gate.is_open();
+    let starts_it = format!("start the master at {master}, if nothing else does.");
+    match (now.gate, facts.mode) {
+        (State::Unknown, Mode::Core) => (
+            "Nodes wait: their calls are held until the first master is known.".to_owned(),
+            None,
+        ),
+        (State::Unknown, Mode::Proxy) => (
+            format!(
+                "Nodes wait: their calls are held, because no master was ever seen at {master}."
+            ),
+            Some(format!(
+                "start the master at {master}, or correct --master."
+            )),
+        ),
+        _ if facts.crash_loop.is_some() => {
+            let text = match open {
+                true => "Nodes run as usual: the master answers, but it keeps dying",
+                false => {
+                    "Nodes go on: rosrescue answers in the place of the master, which keeps dying"
+                }
+            };
+            let output = match facts.mode {
+                Mode::Core => "read why in ….rosmaster-output.log beside the checkpoint",
+                Mode::Proxy => "read why in the log of what starts it",
+            };
+            let text = format!(
+                "{text}, {} times so far; this is over when one lives for 10 s.",
+                facts.deaths
+            );
+            (text, Some(format!("{output}.")))
+        }
+        (State::Open { .. }, _) => ("Nodes run as usual: the master answers.".to_owned(), None),
+        (_, Mode::Core) => (
+            "Nodes go on: rosrescue answers in the master's place and starts a new one.".to_owned(),
+            None,
+        ),
+        (_, Mode::Proxy) => (
+            format!(
+                "Nodes go on: rosrescue answers in the place of the master at {master}, which is away."
+            ),
+            Some(starts_it),
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OPEN: State = State::Open { incarnation: 1 };
+
+    fn of(gate: State, unprotected: Option<&str>, facts: &Facts) -> Condition {
+        let situation = Situation {
+            gate,
+            gate_since: facts.started,
+            unprotected: unprotected.map(str::to_owned),
+            master: "http://robot:11312/".to_owned(),
+        };
+        condition(&situation, facts)
+    }
+
+    #[test]
+    fn the_worst_has_the_name_and_all_of_it_is_said() {
+        let mut facts = Facts::new(Mode::Proxy);
+        let good = of(OPEN, None, &facts);
+        assert!(good.is_good(), "{good:?}");
+        assert_eq!(
+            good.line(),
+            "protected: Nodes run as usual: the master answers. Every change is recorded."
+        );
+        assert_eq!(of(State::Unknown, None, &facts).name, Name::Waiting);
+        let away = of(State::StandingIn, None, &facts);
+        assert_eq!(away.name, Name::StandingIn);
+        assert!(away.text.starts_with("Nodes go on"), "{away:?}");
+        assert!(away.action.unwrap().contains("http://robot:11312/"));
+
+        facts.crash_loop = Some(Instant::now());
+        facts.deaths = 7;
+        assert_eq!(of(State::StandingIn, None, &facts).name, Name::CrashLoop);
+        let between = of(OPEN, None, &facts);
+        assert_eq!(between.name, Name::CrashLoop);
+        assert!(
+            between.text.starts_with("Nodes run as usual"),
+            "{between:?}"
+        );
+        assert!(between.text.contains("7 times"), "{between:?}");
+
+        let line = of(OPEN, Some("the disk\nis full"), &facts).line();
+        assert!(
+            line.starts_with("UNPROTECTED: Nodes run as usual"),
+            "{line}"
+        );
+        assert!(line.contains("the disk is full") && line.contains("7 times"));
+    }
+
+    #[test]
+    fn an_unguarded_rosrescue_is_protected_and_asks_for_something() {
+        let mut facts = Facts::new(Mode::Core);
+        facts.guarded = Guarded::NoLonger(7);
+        let condition = of(OPEN, None, &facts);
+        assert_eq!(condition.name, Name::Protected);
+        assert!(!condition.is_good());
+        assert!(condition.text.contains("process 7"), "{condition:?}");
+    }
+
+    #[test]
+    fn it_is_good_since_the_last_trouble() {
+        let minute = std::time::Duration::from_secs(60);
+        let mut facts = Facts::new(Mode::Core);
+        facts.started = facts.started.checked_sub(minute).unwrap();
+        facts.disk.since = facts.started;
+        let before = of(OPEN, None, &facts).since;
+        facts.calm_since = Some(facts.started + minute / 2);
+        assert!(of(OPEN, None, &facts).since > before + 29.0);
+    }
+}
