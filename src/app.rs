@@ -18,7 +18,6 @@ use crate::{
     guardian::handover::Sockets,
     ledger::{Ledger, checkpointer::Checkpointer},
     lifecycle::Supervision,
-    master::Master,
     nodes::{self, Nodes},
     process::{ProcessError, Rosmaster},
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},
@@ -99,6 +98,7 @@ pub async fn run(
     let uri = config.advertised.to_string();
     say(&format!("ROS_MASTER_URI={uri}"));
     say(&format!("checkpoint: {}", config.checkpoint.display()));
+    say(&beginning.story);
     let last = beginning.session.master_uri.as_deref();
     let last = last.and_then(|uri| MasterUri::parse(uri).ok());
     // No master can be at our own port.
@@ -123,7 +123,7 @@ pub async fn run(
         pending,
         store,
         restored,
-        story,
+        ..
     } = beginning;
     // Lives as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
@@ -286,7 +286,6 @@ pub async fn run(
     tasks.spawn(nodes::watch(nodes, config.reap_interval));
     let announce = async {
         gate.clone().wait_for(State::is_open).await;
-        say(&format!("{story}: {}", ledger.with_mirror(Master::counts)));
         say("ROS Rescue enabled. Master is now fault tolerant!!");
         std::future::pending().await
     };
@@ -319,8 +318,14 @@ async fn close(ledger: Arc<Ledger>) {
         ledger.with_store(|store, checkpoint| store.close(&checkpoint()))
     });
     match closed.await {
-        Ok(Some(Err(error))) => tracing::error!(%error, "no closing checkpoint"),
+        Ok(Some(Err(error))) => tracing::error!(
+            %error,
+            "stopped, but the closing checkpoint could not be written: the next start takes this for \
+             a crash; free or repair the disk"
+        ),
         Ok(_) => tracing::info!("closed in order"),
-        Err(error) => tracing::error!(%error, "no closing checkpoint"),
+        Err(error) => {
+            tracing::error!(%error, "stopped without a closing checkpoint; please report this")
+        }
     }
 }

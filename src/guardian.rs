@@ -31,6 +31,7 @@ use thiserror::Error;
 pub mod handover;
 pub mod restart;
 
+use crate::limit::rarely;
 use restart::{End, Next, Restarts};
 
 /// The running program, even after its file has been replaced by another version.
@@ -68,11 +69,12 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         };
         let pid = worker.pid;
         if pause.is_zero() {
-            tracing::warn!(pid, how = %end, "the worker has ended; starting it again");
+            rarely!(warn, pid, how = %end, "the worker has ended; another one is started at once, and the port stays open");
         } else {
-            tracing::error!(
-                pid, how = %end, ?pause,
-                "the worker dies again and again; the port stays open, and it is started again after a pause"
+            rarely!(
+                error, pid, how = %end, ?pause,
+                "the worker dies again and again; it is started after a pause, and the port stays open. \
+                 Its lines above say why; please report them"
             );
         }
         let stop;
@@ -96,7 +98,9 @@ fn start_again(
         match Worker::start(listeners) {
             Ok(worker) => return Ok((worker, stop)),
             Err(error) if stop.is_some() => return Err(error),
-            Err(error) => tracing::error!(%error, "retrying"),
+            Err(error) => {
+                rarely!(error, %error, "no worker can be started, and calls wait; it is tried again")
+            }
         }
         pause = restart::PAUSE_MOST;
     }

@@ -19,6 +19,7 @@
 //!
 //! * [`cli`], [`config`], [`ros_env`]: command line, configuration, and ROS's environment variables.
 //! * `clock`, `resolver`, `wait`: the wall clock; addresses of hosts; waiting for optional events.
+//! * `limit`, [`log`]: how often a line is logged; where the log goes.
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
 //! * [`checkpoint::store`]: the checkpoint on the disk.
@@ -48,6 +49,8 @@ pub(crate) mod health;
 pub mod hide;
 pub(crate) mod ledger;
 pub mod lifecycle;
+pub(crate) mod limit;
+pub mod log;
 pub mod master;
 pub(crate) mod nodes;
 pub(crate) mod process;

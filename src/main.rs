@@ -18,6 +18,7 @@ use rosrescue::{
         handover::{Guard, Sockets},
     },
     listener,
+    log::Stderr,
 };
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
@@ -196,7 +197,7 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
     let ansi = std::io::stderr().is_terminal() && colour_is_welcome();
     let log = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr)
+        .with_writer(Stderr::of(std::env::var("JOURNAL_STREAM").ok().as_deref()))
         .with_target(false)
         // They would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)

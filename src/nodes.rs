@@ -32,6 +32,7 @@ use crate::{
         Ledger,
         activity::{Change, Notification, Owed},
     },
+    limit::rarely,
     status::{report::HealthCheck, stats::Stats},
     wait,
     write_queue::WriteQueue,
@@ -285,7 +286,7 @@ fn say(outcome: &CheckResult, what: &str) {
         ..
     } = outcome;
     let names = &outcome.names;
-    tracing::info!(?names, ?removed, ?reconciled, "{what}");
+    rarely!(info, ?names, ?removed, ?reconciled, "{what}");
 }
 
 /// The regular health check.
@@ -296,6 +297,11 @@ async fn reap(nodes: Arc<Nodes>) {
         ..
     } = health_check::check_all(&nodes).await;
     if !removed.is_empty() || !reconciled.is_empty() {
-        tracing::info!(?removed, ?reconciled, "health check");
+        rarely!(
+            info,
+            ?removed,
+            ?reconciled,
+            "the regular health check has put the master right"
+        );
     }
 }

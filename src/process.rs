@@ -263,7 +263,11 @@ pub(crate) async fn stop(pid: u32, ended: impl Future) {
         if tokio::time::timeout(STOP_TIME, &mut ended).await.is_ok() {
             return;
         }
-        tracing::warn!(pid, ?signal, "a process did not end in time");
+        tracing::warn!(
+            pid,
+            ?signal,
+            "a process did not end in time after this signal; it gets the next one"
+        );
     }
 }
 

@@ -2,6 +2,7 @@
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
+mod report_file;
 mod reporting;
 mod stall_probe;
 mod thread_exit;
@@ -15,11 +16,12 @@ use tracing::Instrument;
 use self::{
     examine::{Examination, ExamineError, Examiner, Manner, Prepared},
     master_process::MasterProcess,
-    reporting::Outage,
+    reporting::{Outage, Said},
 };
 use crate::{
     gate::State,
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
+    limit::rarely,
     nodes::Nodes,
     process::{self, ProcessError},
     status::{
@@ -65,7 +67,7 @@ pub(crate) struct Driver {
     probe_deadline: Option<tokio::time::Instant>,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
-    said: Option<(String, Instant)>,
+    said: Option<Said>,
 }
 
 impl Driver {
@@ -144,7 +146,7 @@ impl Driver {
             if matches!(input, Some(Input::SpawnFailed { .. }))
                 && let Some(error) = self.spawn_error.take()
             {
-                self.log_once(format!("cannot start a master: {error}"));
+                self.log_once(format!("cannot start a master, and tries again: {error}"));
             }
             if input == Some(Input::Stop) {
                 return Ok(self.process);
@@ -171,7 +173,10 @@ impl Driver {
             return;
         }
         if self.examiner.gate.state() == State::Injecting && input != Input::NotAMaster {
-            tracing::warn!("the master died while it was brought to the mirror's state");
+            rarely!(
+                warn,
+                "the new master died while it was given the state; the next one is given it"
+            );
             self.lifecycle.on(Instant::now(), Input::Answered);
         }
         self.disconnect();
@@ -278,16 +283,17 @@ impl Driver {
                     facts.crash_loop.get_or_insert_with(Instant::now);
                 });
                 match self.process.as_ref().map(MasterProcess::last_words) {
-                    Some(last_words) => tracing::error!(
-                        deaths,
+                    Some(last_words) => rarely!(
+                        error,
                         last_words,
-                        "crash loop: the master has died {deaths} times within a minute; it is \
-                         restarted with growing pauses"
+                        "crash loop: the master has died {deaths} times within a minute; nodes go on, \
+                         rosrescue answers in its place and starts the next one after growing pauses. \
+                         Its last words and master.log say why"
                     ),
-                    None => tracing::error!(
-                        deaths,
-                        "crash loop: the master has died {deaths} times within a minute; its \
-                         output is in the log of what starts it"
+                    None => rarely!(
+                        error,
+                        "crash loop: the master has died {deaths} times within a minute; nodes go on, \
+                         rosrescue answers in its place. The log of what starts it says why"
                     ),
                 }
             }
@@ -296,7 +302,7 @@ impl Driver {
                     facts.crash_loop = None;
                     facts.calm_since = Some(Instant::now());
                 });
-                tracing::info!("the crash loop is over: the master lives");
+                rarely!(info, "the crash loop is over: the master lives");
             }
         }
         None
@@ -335,11 +341,11 @@ impl Driver {
                 let input = error.as_input();
                 if input == Input::NotAMaster {
                     self.log_once(format!(
-                        "what answers at {master} is not a ROS master: {error}"
+                        "what answers at {master} is not a ROS master: {error}. Look at --master"
                     ));
                 } else {
                     self.log_once(format!(
-                        "the master at {master} could not be examined: {error}"
+                        "the master at {master} could not be read or restored, and it is tried again: {error}"
                     ));
                 }
                 Some(input)
@@ -393,7 +399,20 @@ impl Driver {
         if cause == Cause::Hung {
             self.disconnect();
         }
-        tracing::warn!(cause = cause.as_str(), "standing in for the master");
+        let cause = cause.as_str();
+        match self.process {
+            Some(_) => rarely!(
+                warn,
+                cause,
+                "the master is away: nodes go on, rosrescue answers in its place and starts a new one"
+            ),
+            None => rarely!(
+                warn,
+                cause,
+                "the master is away: nodes go on, rosrescue answers in its place. Start the master, if \
+                 nothing else does"
+            ),
+        }
         // The prepared injection is outdated.
         self.prepared = None;
     }

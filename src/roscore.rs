@@ -15,6 +15,7 @@ use crate::nodes::client::{self, Sign};
 use crate::{
     gate,
     ledger::Ledger,
+    limit::rarely,
     master::{self, CALLER_ID, Method, Request},
     process::{self, Rosout},
     write_queue::WriteQueue,
@@ -112,7 +113,9 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     }
     let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
     if version.is_none() {
-        tracing::warn!(key, "not set: `rosversion {argument}` gave no answer");
+        tracing::warn!(
+            "the parameter {key} is not set: `rosversion {argument}` gave no answer; set it, if a node needs it"
+        );
     }
     version.map(|version| set(key, &version))
 }
@@ -120,7 +123,9 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
 /// Keeps a rosout running: ours, or an existing one.
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
-        tracing::warn!("no rosout is installed (apt-get install rosout): /rosout is not collected");
+        tracing::warn!(
+            "no rosout is installed, so /rosout is not collected: apt-get install rosout, or --no-rosout"
+        );
         return;
     };
     let mut pause = RESPAWN;
@@ -138,12 +143,20 @@ async fn keep_rosout(roscore: &Roscore) {
                 Ok(mut child) => {
                     let pid = child.id().unwrap_or_default();
                     roscore.rosout.store(pid, Ordering::Relaxed);
-                    tracing::info!(pid, "started rosout");
+                    rarely!(info, pid, "started rosout");
                     let how = child.wait().await.map(process::describe);
                     let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
-                    tracing::warn!(pid, how, last_words, "rosout has ended");
+                    rarely!(
+                        warn,
+                        pid,
+                        how,
+                        last_words,
+                        "rosout has ended, and is started again"
+                    );
                 }
-                Err(error) => tracing::warn!(%error, "cannot start rosout"),
+                Err(error) => {
+                    rarely!(warn, %error, "cannot start rosout, and tries again; /rosout is not collected meanwhile")
+                }
             },
         }
         roscore.rosout.store(0, Ordering::Relaxed);

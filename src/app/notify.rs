@@ -103,7 +103,7 @@ async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
         .update(|facts| facts.guarded = Guarded::NoLonger(pid));
     tracing::warn!(
         pid,
-        "unguarded: the guardian process has ended; all goes on, but if rosrescue dies now, \
+        "unguarded: the guardian process has ended; nodes run as usual, but if rosrescue dies now, \
          connections are refused and nobody starts it again. Stop it and start it anew when the robot \
          is at rest"
     );

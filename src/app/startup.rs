@@ -35,8 +35,9 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             // A robot without a working disk still needs its master.
             tracing::error!(
                 %error,
-                "unprotected: the checkpoint cannot be used; calls are forwarded, but a crash of \
-                 rosrescue itself would lose the state. Choose a place with --checkpoint"
+                "unprotected: the checkpoint cannot be used; nodes run as usual, but a crash of \
+                 rosrescue itself would lose the state. Choose another place with --checkpoint, or \
+                 repair this one"
             );
             (None, store::read(&config.checkpoint).ok().flatten())
         }
@@ -51,7 +52,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             tracing::info!("checkpoint: {sentence}");
         }
         for sentence in &loaded.damage {
-            tracing::error!("checkpoint: {sentence}");
+            tracing::error!("the checkpoint is damaged: {sentence}");
         }
         let Rebuilt {
             mirror,
@@ -60,7 +61,9 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             trouble,
         } = session::rebuild(loaded.checkpoint, loaded.records);
         if let Some(trouble) = trouble {
-            tracing::error!("checkpoint: its snapshot is no state of a master: {trouble}");
+            tracing::error!(
+                "the checkpoint is damaged: its snapshot is no state of a master: {trouble}"
+            );
         }
         let session = session.unwrap_or_default();
         let same_boot = session.boot_id == boot_id;
@@ -74,7 +77,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
-                story = format!("restored ({why})");
+                story = format!("the session goes on ({why}): {}", mirror.counts());
                 beginning = Some((mirror, session, pending));
             }
             Decision::Fresh(why) => {
@@ -83,10 +86,10 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 let kept = store.as_mut().map(|store| store.set_aside("session"));
                 let kept = match kept {
                     Some(Ok(Some(path))) => {
-                        format!("; the old checkpoint is kept as {}", path.display())
+                        format!("; the checkpoint before is kept as {}", path.display())
                     }
                     Some(Err(error)) => {
-                        tracing::error!(%error, "the old checkpoint is not kept");
+                        tracing::error!(%error, "the checkpoint of the session before could not be kept under another name");
                         String::new()
                     }
                     _ => String::new(),

@@ -14,6 +14,7 @@ use super::Ledger;
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
     cli::SyncPolicy,
+    limit::rarely,
     status::Board,
 };
 
@@ -228,19 +229,24 @@ impl Checkpointer {
         let path = self.path.display();
         let kept = self.ledger.with_store(|store, _| store.take_kept());
         if let Some(kept) = kept.flatten() {
-            tracing::warn!(
+            rarely!(
+                warn,
                 checkpoint = %path, kept = %kept.display(),
-                "what was at the checkpoint's path is kept under another name"
+                "somebody replaced or changed the checkpoint; what was there is kept under another name, \
+                 and a whole one is written"
             );
         }
         let unprotected = self.ledger.unprotected();
         match (&unprotected, &self.said) {
-            (Some(reason), None) => tracing::error!(
+            (Some(reason), None) => rarely!(
+                error,
                 checkpoint = %path, reason,
-                "unprotected: calls are forwarded, but a crash of rosrescue itself would lose the \
-                 state; free or repair the disk, and rosrescue re-arms by itself"
+                "unprotected: nodes run as usual, but a crash of rosrescue itself would lose the state; \
+                 free or repair the disk, and recording begins again by itself"
             ),
-            (None, Some(_)) => tracing::info!(checkpoint = %path, "protected again"),
+            (None, Some(_)) => {
+                rarely!(info, checkpoint = %path, "protected again: a whole checkpoint is written")
+            }
             _ => {}
         }
         let protected = unprotected.is_none();

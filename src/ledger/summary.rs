@@ -39,8 +39,8 @@ impl Inner {
                 method = method.name(),
                 mirror,
                 master,
-                "the mirror's reply differs from the master's; the mirror is made anew from the \
-                 master (said once for each method)"
+                "the mirror's reply differs from the master's, whose reply counts; the mirror is made \
+                 anew. Please report this line (it comes once for each method)"
             );
         }
     }

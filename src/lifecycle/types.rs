@@ -92,8 +92,8 @@ impl Cause {
     /// The cause in words, for reports.
     pub fn as_str(self) -> &'static str {
         match self {
-            Self::ConnectionLost => "the master's connection ended",
-            Self::ThreadEnded => "a thread of the master ended",
+            Self::ConnectionLost => "the connection to the master ended",
+            Self::ThreadEnded => "the master began to end",
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
             Self::Stopping => "rosrescue stops",

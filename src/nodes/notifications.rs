@@ -21,6 +21,7 @@ use super::{
 use crate::{
     health::{Claims, port_of},
     ledger::activity::{Displaced, Notification},
+    limit::rarely,
     master::{self, Master},
     xmlrpc::{Call, Value},
 };
@@ -223,7 +224,8 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             if is_itself(&displaced, interview.pid, interview.claims.as_ref())
                 && !is_taken(&nodes, api)
             {
-                tracing::info!(
+                rarely!(
+                    info,
                     node,
                     api,
                     "telling a node to shut down: another has its name"

@@ -15,6 +15,7 @@ use tokio::{
 };
 
 use super::{Rosmaster, command, orphan, signal_process};
+use crate::limit::rarely;
 
 /// A spare that does not listen after this time hangs: another master is started.
 const LIMIT: Duration = Duration::from_secs(3);
@@ -51,7 +52,10 @@ impl Rosmaster {
         let own = self.config.rosmaster.is_none();
         let interpreter = own.then(|| interpreter(&self.program)).flatten();
         let Some(interpreter) = interpreter else {
-            tracing::warn!("no spare rosmaster: only ROS's own program can have one");
+            rarely!(
+                info,
+                "no spare rosmaster: only ROS's own program can have one"
+            );
             return None;
         };
         let mut words = interpreter.iter();
@@ -64,7 +68,7 @@ impl Rosmaster {
         match self.spawn_as(command, output) {
             Ok(child) => Spare::new(child),
             Err(error) => {
-                tracing::warn!(%error, "no spare rosmaster");
+                rarely!(warn, %error, "no spare rosmaster: the next one takes longer to start");
                 None
             }
         }
@@ -95,7 +99,11 @@ impl Spare {
             drop(input);
             tokio::time::sleep(LIMIT).await;
             if is_spare(pid) && !orphan::listens(pid, port) {
-                tracing::warn!(pid, "the spare rosmaster does not listen: ending it");
+                rarely!(
+                    warn,
+                    pid,
+                    "the spare rosmaster does not listen, and is ended; another one is started"
+                );
                 signal_process(pid, Signal::KILL);
             }
         });

@@ -14,6 +14,7 @@ use crate::{
     gate::{State, Tx},
     ledger::{Basis, Ledger},
     lifecycle::{Input, Probing, Supervision},
+    limit::rarely,
     master::{Counts, Master, Method, Request},
     replay::{self, Authority, Bears, Inspection, Known, Plan, Token, Treatment},
     status::stats::Stats,
@@ -209,9 +210,11 @@ impl Examiner {
                 limit: SETTLE_LIMIT,
             }),
             Supervision::Theirs => {
-                tracing::warn!(
+                rarely!(
+                    warn,
                     "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or \
-                     it does not close them; what they do from now on may be lost"
+                     it does not close them; what they do from now on may be lost. Restart the master, if \
+                     this comes again"
                 );
                 Ok(())
             }
@@ -348,10 +351,11 @@ impl Examiner {
                 return Ok(());
             };
             examination.mismatches = mismatches;
-            tracing::error!(
+            rarely!(
+                error,
                 round,
                 mismatches = ?examination.mismatches,
-                "the master differs from what was injected"
+                "the master differs from what it was given, and is given it once more; please report this line"
             );
             // What the master holds wins over what was expected; the rest is tried again.
             let first = self.first_look(connection).await?;
@@ -396,9 +400,11 @@ async fn may_run_a_call(master: SocketAddr) -> bool {
 /// Logs where the master differed from the mirror.
 fn say_difference(difference: &[String]) {
     if !difference.is_empty() {
-        tracing::warn!(
+        rarely!(
+            warn,
             ?difference,
-            "the master was changed past rosrescue; the mirror follows it"
+            "the master was changed past rosrescue, and the mirror follows it; let everybody use \
+             rosrescue's address"
         );
     }
 }

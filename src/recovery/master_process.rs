@@ -6,6 +6,7 @@ use tokio::{sync::mpsc, time::Instant};
 
 use crate::{
     ledger::Ledger,
+    limit::rarely,
     process::{self, ProcessError, Rosmaster, Spare},
     ros_env::MasterUri,
     upstream::Upstream,
@@ -97,7 +98,7 @@ impl MasterProcess {
         };
         self.spare_at = Some(Instant::now() + SPARE_AFTER);
         let pid = child.id().unwrap_or_default();
-        tracing::info!(pid, port, "started rosmaster");
+        rarely!(info, pid, port, "started rosmaster");
         self.watch(pid, async move {
             match child.wait().await {
                 Ok(status) => process::describe(status),
@@ -132,7 +133,7 @@ impl MasterProcess {
                 }
             }
         };
-        tracing::warn!(pid = self.current, how, "rosmaster has ended");
+        rarely!(warn, pid = self.current, how, "rosmaster has ended");
         self.end = Some(how);
         self.current = None;
         self.new = None;
@@ -154,7 +155,11 @@ impl MasterProcess {
         // A child's process id cannot be reused before its end is reported. For a master that was left
         // running this holds except for a moment between its end and the report.
         if let Some(pid) = self.current {
-            tracing::warn!(pid, "killing the master");
+            rarely!(
+                warn,
+                pid,
+                "the master does not answer, and is killed; a new one is started"
+            );
             process::signal_process(pid, rustix::process::Signal::KILL);
         }
     }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use tracing::Instrument;
 
-use super::{Driver, examine::Examination, master_process::MasterProcess};
+use super::{Driver, examine::Examination, master_process::MasterProcess, report_file};
 use crate::lifecycle::Cause;
 use crate::{
     clock,
@@ -15,8 +15,10 @@ use crate::{
     },
 };
 
-/// A message about a lasting state is repeated after this time.
+/// A message about a lasting state is repeated after this time, then after twice that, and so on
 const REPEAT: Duration = Duration::from_secs(10);
+/// up to this.
+const LONGEST_REPEAT: Duration = Duration::from_secs(600);
 
 /// The time during which calls have not passed.
 #[derive(Clone, Debug)]
@@ -90,6 +92,14 @@ impl Outage {
     }
 }
 
+/// The last message about a lasting state.
+pub(super) struct Said {
+    text: String,
+    pause: Duration,
+    /// When it may be logged again.
+    next: Instant,
+}
+
 impl Driver {
     /// Reports an examination. Health check and reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
@@ -110,6 +120,14 @@ impl Driver {
         }
         let report = self.board.update(|facts| facts.add(report));
         report.log();
+        let store = self.examiner.ledger.with_store(|store, _| {
+            let works = store.unprotected().is_none();
+            works.then(|| store.path().to_owned())
+        });
+        let checkpoint = store.flatten().filter(|_| report.is_rescue());
+        if let (Some(checkpoint), Outcome::Resumed) = (&checkpoint, report.outcome) {
+            report_file::keep(checkpoint.clone(), report.clone());
+        }
         if !self.lifecycle.has_served() {
             // After a restart of rosrescue it is unknown what changed just before.
             self.examiner.ledger.with_activity(|mirror, activity| {
@@ -126,6 +144,9 @@ impl Driver {
                 let Some(check) = check else { return };
                 if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
                     report.log_check();
+                    if let Some(checkpoint) = checkpoint {
+                        report_file::keep(checkpoint, report);
+                    }
                 }
             };
             tokio::spawn(check.instrument(tracing::debug_span!("health_check")));
@@ -137,20 +158,25 @@ impl Driver {
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
-            self.log_once(format!("waiting for the master: {what}"));
+            match self.process {
+                Some(_) => self.log_once(format!("waiting for the master: {what}")),
+                None => self.log_once(format!(
+                    "waiting for the master, which somebody has to start: {what}"
+                )),
+            }
         }
     }
 
-    /// Warns. The same text is logged at most once in [`REPEAT`].
+    /// Warns. The same text is logged again after growing pauses.
     pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
-        let again = self
-            .said
-            .as_ref()
-            .is_none_or(|(said, at)| *said != text || now.duration_since(*at) >= REPEAT);
-        if again {
-            tracing::warn!("{text}");
-            self.said = Some((text, now));
-        }
+        let pause = match &self.said {
+            Some(said) if said.text == text && now < said.next => return,
+            Some(said) if said.text == text => (said.pause * 2).min(LONGEST_REPEAT),
+            _ => REPEAT,
+        };
+        tracing::warn!("{text}");
+        let next = now + pause;
+        self.said = Some(Said { text, pause, next });
     }
 }

@@ -18,6 +18,7 @@ use crate::{
     cli::Reads,
     gate::{self, State},
     ledger::Ledger,
+    limit::rarely,
     master::{Kind, Method, Request},
     status::stats::Stats,
     upstream::{Head, pool::Pool},
@@ -91,13 +92,13 @@ impl Calls {
                 Ok(xml(&reply))
             }
             (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
-                tracing::warn!(%peer, "refused to shut the master down for another computer");
+                rarely!(warn, %peer, "refused to shut the master down for another computer");
                 Ok(no_shutdown(
                     "shutdown is taken from the master's own computer only",
                 ))
             }
             (Some(call), Kind::Shutdown) if admission::is_for_a_node(call) => {
-                tracing::warn!(%peer, "refused to shut down for a node that is registered at our address");
+                rarely!(warn, %peer, "refused to shut down for a node that is registered at our address");
                 Ok(no_shutdown("this is the master, and no node"))
             }
             (_, Kind::Read | Kind::Identity | Kind::Unknown) => {

@@ -23,6 +23,7 @@ use super::{
     deadlines::{Deadlines, Timed},
     service,
 };
+use crate::limit::rarely;
 
 /// Connections that the kernel holds while rosrescue is busy, or briefly away.
 const BACKLOG: i32 = 1024;
@@ -146,7 +147,7 @@ pub async fn run(
             }
             Err(error) => {
                 if !std::mem::replace(&mut failed, true) {
-                    tracing::warn!(%error, "cannot accept connections; retrying");
+                    rarely!(warn, %error, "cannot accept connections, and tries again; raise the limit on open files, if that is the reason");
                 }
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }

@@ -15,6 +15,7 @@ use super::{
     replies::{HttpReply, text, xml},
 };
 use crate::{
+    limit::rarely,
     master::{self, Kind},
     upstream::{Head, INSTANCE_HEADER},
     xmlrpc::Reply,
@@ -109,7 +110,7 @@ async fn post(
         Ok(read) => read,
         Err(BodyError::TooLarge { limit }) => {
             server.stats.requests_refused.count();
-            tracing::warn!(%peer, limit, "refused a request body beyond the limit (--max-body)");
+            rarely!(warn, %peer, limit, "refused a request body beyond the limit (--max-body)");
             let reason = format!("the body is larger than {limit} bytes, see --max-body\n");
             return Ok(text(StatusCode::PAYLOAD_TOO_LARGE, reason));
         }
@@ -126,7 +127,7 @@ async fn post(
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
             server.stats.requests_refused.count();
-            tracing::warn!(%peer, "refused a request of another computer that cannot be decoded");
+            rarely!(warn, %peer, "refused a request of another computer that cannot be decoded");
             return Ok(xml(&Reply::Fault {
                 code: 1,
                 text: UNDECODED.to_owned(),
@@ -188,7 +189,7 @@ async fn page(
 
 fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     server.stats.requests_refused.count();
-    tracing::warn!(%peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
+    rarely!(warn, %peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 

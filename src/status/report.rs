@@ -4,6 +4,7 @@ use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
+use crate::limit::rarely;
 use crate::{clock, master::Counts};
 
 /// The cause of a report when rosrescue itself was started.
@@ -139,7 +140,8 @@ impl Report {
     /// Logs that calls pass again.
     pub(crate) fn log(&self) {
         let phases = &self.phases;
-        tracing::info!(
+        rarely!(
+            info,
             cause = self.cause,
             ended = self.ended,
             absence_ms = phases.absence_ms,
@@ -151,16 +153,25 @@ impl Report {
             self.outcome,
             self.restored
         );
-        for (what, list) in self.lists().take(2) {
-            tracing::warn!(?list, "{what}");
+        if !self.not_restored.is_empty() {
+            let list = &self.not_restored;
+            rarely!(
+                warn,
+                ?list,
+                "the new master cannot hold these, or could not return them; set them anew"
+            );
         }
     }
 
     /// Logs what the health check has found.
     pub(crate) fn log_check(&self) {
+        if !self.is_rescue() && self.lists().next().is_none() {
+            return;
+        }
         let some =
             |list: &Vec<String>| (!list.is_empty()).then(|| tracing::field::debug(list.clone()));
-        tracing::info!(
+        rarely!(
+            info,
             total_ms = self.phases.total_ms,
             health_check_ms = self.health_check_ms,
             removed = some(&self.removed),

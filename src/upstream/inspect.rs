@@ -4,6 +4,7 @@ use thiserror::Error;
 
 use super::{CallError, Connection};
 use crate::{
+    limit::rarely,
     master::{Master, Request},
     replay::{Inspection, NotAMaster, Token},
 };
@@ -54,9 +55,10 @@ pub(crate) async fn second(
     previous: &Master,
 ) -> Result<Master, InspectError> {
     if !first.has_params() {
-        tracing::warn!(
-            "the master holds a parameter that it can never return, and with it none of the others: \
-             the mirror keeps what it knows of them. Delete it, or set it to numbers of 32 bits and \
+        rarely!(
+            warn,
+            "the master holds a parameter that it can never return, so getParam of it and of each \
+             namespace around it fails for everybody; delete it, or set it to numbers of 32 bits and \
              dates without markup"
         );
     }

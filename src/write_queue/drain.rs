@@ -19,6 +19,7 @@ use super::{
 };
 use crate::{
     gate::{self, State},
+    limit::rarely,
     master::{Master, Method, Request},
     status::stats::Stats,
     upstream::{Connection, RawReply, inspect::InspectError},
@@ -234,9 +235,11 @@ impl Drain {
             return;
         };
         if !difference.is_empty() {
-            tracing::warn!(
+            rarely!(
+                warn,
                 ?difference,
-                "the master differed from the mirror, which was made anew from it"
+                "the master held something else than the mirror, which follows it now; if it was \
+                 changed past rosrescue, let everybody use rosrescue's address"
             );
         }
         self.answer_opaque();
@@ -344,9 +347,11 @@ impl Drain {
 
     /// A batch got one answer as a whole instead of its results.
     fn undeliverable(&mut self, items: Vec<Item>) {
-        tracing::warn!(
+        rarely!(
+            warn,
             calls = items.len(),
-            "the master did not answer each call of a multicall"
+            "the master did not answer each call of a multicall; callers try again, and its state \
+             is read anew"
         );
         self.link.ledger.doubt();
         for item in items {
@@ -373,7 +378,11 @@ impl Drain {
             .filter(|batch| !batch.items.is_empty())
         {
             let calls: Vec<_> = batch.items.iter().map(Item::describe).collect();
-            tracing::info!(?calls, "in flight when the master went away");
+            rarely!(
+                info,
+                ?calls,
+                "in flight when the master went away; the mirror answers them"
+            );
             self.take_back(batch.items);
         }
         let (mut last, mut answers) = (None, Vec::new());

@@ -80,6 +80,7 @@ mod limits {
 mod cli {
     mod addresses;
     mod as_roscore;
+    mod log;
     mod options;
     mod secrets;
     mod start;

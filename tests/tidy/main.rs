@@ -9,6 +9,7 @@
 )]
 
 mod documents;
+mod lines;
 
 use std::{
     fs,
@@ -221,8 +222,8 @@ fn the_core_does_no_io() {
 
 /// The modules, each above all that it may import: `docs/decisions/0020`.
 #[rustfmt::skip]
-const LAYERS: [&str; 27] = [
-    "clock", "wait", "xmlrpc", "master", "hide", "replay", "lifecycle", "health", "checkpoint", "cli", "ros_env",
+const LAYERS: [&str; 29] = [
+    "clock", "limit", "log", "wait", "xmlrpc", "master", "hide", "replay", "lifecycle", "health", "checkpoint", "cli", "ros_env",
     "config", "resolver", "gate", "status", "ledger", "upstream", "write_queue", "guardian", "process", "nodes",
     "recovery", "roscore", "server", "app", "commands", "main",
 ];

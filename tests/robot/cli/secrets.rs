@@ -1,6 +1,10 @@
 //! What the log and the status page are silent about: the values of parameters, which may be passwords.
 
-use crate::support::{Mode, Robot, encode_call, eventually, http_request, params, request, tree};
+use std::fs;
+
+use crate::support::{
+    Mode, Robot, encode_call, eventually, eventually_some, http_request, params, request, tree,
+};
 use rosrescue::xmlrpc::{Call, Value};
 
 const SECRET: &str = "hunter2";
@@ -55,6 +59,16 @@ fn values_are_never_logged() {
         let page = client.exchange(&page).unwrap().text();
         assert!(!page.contains(SECRET), "{path}: {page}");
     }
+    let checkpoint = robot.rescue.checkpoint();
+    let report = eventually_some("a report is written", || {
+        let files = fs::read_dir(checkpoint.parent().unwrap()).unwrap();
+        let paths = files.map(|file| file.unwrap().path());
+        let mut reports = paths.filter(|path| path.to_str().unwrap().contains(".report-"));
+        fs::read_to_string(reports.next()?)
+            .ok()
+            .filter(|report| report.contains("/large"))
+    });
+    assert!(!report.contains(SECRET), "{report}");
     let log = robot.rescue.output();
     assert!(
         log.iter().any(|line| line.contains("setParam")),

@@ -228,7 +228,11 @@ fn workers_that_die_again_and_again_are_started_after_a_pause() {
     kill_until_paused(&scratch, &rescue);
     let said = rescue.stderr().join("\n");
     assert!(said.contains("500ms"), "{said}");
-    assert_eq!(said.matches("starting it again").count(), 5, "{said}");
+    assert_eq!(
+        said.matches("another one is started at once").count(),
+        5,
+        "{said}"
+    );
     // Whoever calls in the pause waits for its end.
     assert!(rescue.client().master_pid().is_some());
     assert_eq!(rescue.terminate().code(), Some(0));

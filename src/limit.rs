@@ -1,0 +1,104 @@
+//! Lines of the log that could come by the thousand: so many at once, then one from time to time. The rest is
+//! logged at level debug and counted.
+
+use std::{
+    sync::{Mutex, PoisonError},
+    time::{Duration, Instant},
+};
+
+/// Lines at once.
+const BURST: u32 = 10;
+/// Afterwards one more for each of these: some 300 a day.
+const REFILL: Duration = Duration::from_secs(300);
+
+/// How often one line is logged.
+#[derive(Debug)]
+pub(crate) struct Limit(Mutex<Bucket>);
+
+#[derive(Debug)]
+struct Bucket {
+    left: u32,
+    /// When the last one was added.
+    filled: Option<Instant>,
+    left_out: u64,
+}
+
+impl Limit {
+    pub(crate) const fn new() -> Self {
+        Self(Mutex::new(Bucket {
+            left: BURST,
+            filled: None,
+            left_out: 0,
+        }))
+    }
+
+    /// Whether it is logged now. If so, the number of those left out before it; none if there are none.
+    pub(crate) fn pass(&self, now: Instant) -> Option<Option<u64>> {
+        let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        bucket.pass(now)
+    }
+}
+
+impl Bucket {
+    fn pass(&mut self, now: Instant) -> Option<Option<u64>> {
+        let mut filled = *self.filled.get_or_insert(now);
+        while self.left < BURST && now.duration_since(filled) >= REFILL {
+            filled += REFILL;
+            self.left += 1;
+        }
+        if self.left == BURST {
+            filled = now;
+        }
+        self.filled = Some(filled);
+        let Some(left) = self.left.checked_sub(1) else {
+            self.left_out += 1;
+            return None;
+        };
+        self.left = left;
+        let left_out = std::mem::take(&mut self.left_out);
+        Some((left_out > 0).then_some(left_out))
+    }
+}
+
+/// As the macro of `tracing` of that level, but [rate-limited](self).
+macro_rules! rarely {
+    ($level:ident, $($line:tt)+) => {{
+        static LIMIT: $crate::limit::Limit = $crate::limit::Limit::new();
+        match LIMIT.pass(std::time::Instant::now()) {
+            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            None => tracing::debug!($($line)+),
+        }
+    }};
+}
+pub(crate) use rarely;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_that_comes_every_second_is_logged_some_300_times_a_day() {
+        let limit = Limit::new();
+        let start = Instant::now();
+        let mut logged = 0;
+        let mut left_out = 0;
+        for second in 0..86_400 {
+            if let Some(before) = limit.pass(start + Duration::from_secs(second)) {
+                logged += 1;
+                left_out += before.unwrap_or(0);
+            }
+        }
+        assert_eq!(logged, 10 + 86_400 / 300 - 1);
+        assert!(left_out > 85_000);
+    }
+
+    #[test]
+    fn after_a_long_rest_it_is_as_at_first() {
+        let limit = Limit::new();
+        let start = Instant::now();
+        let burst = |at: Instant| (0..20).filter(|_| limit.pass(at).is_some()).count();
+        assert_eq!(burst(start), 10);
+        assert_eq!(burst(start + Duration::from_secs(3_600)), 10);
+        assert_eq!(burst(start + Duration::from_secs(3_900)), 1);
+    }
+}

@@ -1,0 +1,97 @@
+//! The log: priorities for journald, a limit on what could come by the thousand, and reports as files.
+
+use std::fs::{self, File};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+
+use crate::support::{Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, request};
+
+/// Standard error is a file, as it may be a socket of journald: it is known by device and inode.
+#[test]
+fn journald_is_told_the_priority_of_each_line_and_nobody_else_is() {
+    let scratch = Scratch::new();
+    let mut master = Rosmaster::start(&scratch);
+    let path = scratch.path("journal");
+    let file = File::create(&path).unwrap().metadata().unwrap();
+    let stream = format!("{}:{}", file.dev(), file.ino());
+    for (stream, is_journald) in [(stream, true), ("1:2".to_owned(), false)] {
+        let checkpoint = scratch.path(format!("{is_journald}")).join("checkpoint");
+        let rescue = Setup::proxy(&scratch, master.client().port())
+            .at_checkpoint(checkpoint)
+            .env("JOURNAL_STREAM", stream)
+            .env("JOURNAL", &path)
+            .wrapped(|own| {
+                let mut shell = std::process::Command::new("sh");
+                shell.args(["-c", r#"exec "$0" "$@" 2>>"$JOURNAL""#]);
+                behind(shell, own)
+            });
+        let mut rescue = rescue.start();
+        if is_journald {
+            let port = master.client().port();
+            master.kill();
+            let has = |start: &str, words: &str| {
+                let journal = fs::read_to_string(&path).unwrap();
+                let found = |line: &str| line.starts_with(start) && line.contains(words);
+                journal.lines().any(found)
+            };
+            eventually("a warning", || has("<4>", "the master is away"));
+            assert!(has("<6>", "calls pass to the master"));
+            let journal = fs::read_to_string(&path).unwrap();
+            assert!(
+                journal.lines().all(|line| line.starts_with('<')),
+                "{journal}"
+            );
+            master = Rosmaster::start_at(&scratch, port);
+        }
+        rescue.terminate();
+        let journal = fs::read_to_string(&path).unwrap();
+        assert_eq!(journal.contains('<'), is_journald, "{journal}");
+        File::create(&path).unwrap();
+    }
+}
+
+#[test]
+fn what_comes_by_the_hundred_is_logged_ten_times() {
+    let robot = Robot::start_with(Mode::Core, &[]);
+    let client = robot.client();
+    let foreign = request("POST / HTTP/1.1", &["Origin: http://elsewhere"], b"x");
+    for _ in 0..200 {
+        client.exchange(&foreign).unwrap();
+    }
+    assert_eq!(robot.counter("requests_refused"), 200);
+    // Lines are written before the answer.
+    let log = robot.rescue.stderr();
+    let said = log
+        .iter()
+        .filter(|line| line.contains("refused a request"))
+        .count();
+    assert_eq!(said, 10, "{log:?}");
+}
+
+#[test]
+fn each_rescue_leaves_a_report_beside_the_checkpoint() {
+    let mut robot = Robot::start(Mode::Core);
+    let reports = |robot: &Robot| {
+        let folder = robot.rescue.checkpoint();
+        let entries = fs::read_dir(folder.parent().unwrap()).unwrap();
+        let paths = entries.map(|entry| entry.unwrap().path());
+        let is_report =
+            |path: &std::path::PathBuf| path.to_str().unwrap().contains(".yaml.report-");
+        let mut reports: Vec<_> = paths.filter(is_report).collect();
+        reports.sort();
+        reports
+    };
+    assert!(reports(&robot).is_empty(), "an ordinary start is no rescue");
+    for count in 1..=2 {
+        robot.crash_master();
+        eventually("a report is written", || reports(&robot).len() == count);
+    }
+    let path = reports(&robot).pop().unwrap();
+    eventually("it is whole", || {
+        let text = fs::read_to_string(&path).unwrap();
+        text.contains("signal 9") && text.contains("a new master was given the whole state")
+    });
+    assert_eq!(
+        fs::metadata(&path).unwrap().permissions().mode() & 0o777,
+        0o600
+    );
+}
