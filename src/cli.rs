@@ -1,11 +1,13 @@
 //! The command line. Every option has an environment variable, a default and a unit in its help.
 
+mod live;
 mod serve;
 mod tools;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
+    live::{For, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
     tools::{HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool},
 };

@@ -3,6 +3,9 @@
 
 mod running;
 mod status;
+mod terminal;
+mod top;
+mod wait;
 
 use std::{
     fmt::Display,
@@ -58,6 +61,8 @@ pub fn run(tool: &Tool) -> ExitCode {
         Ok(runtime) => runtime.block_on(async {
             match tool {
                 Tool::Status(args) => status::run(args).await,
+                Tool::Top(args) => top::run(args).await,
+                Tool::Wait(args) => wait::run(args).await,
             }
         }),
         Err(error) => Err(Failure::Failed(format!("no runtime: {error}"))),
@@ -77,12 +82,22 @@ fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(),
         serde_json::to_string_pretty(result)
             .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?
     } else {
-        result.to_string()
+        plain(&result.to_string())
     };
-    match writeln!(io::stdout(), "{}", text.trim_end()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-            Err(Failure::Failed(format!("cannot print: {error}")))
-        }
-        _ => Ok(()),
+    print_line(text.trim_end()).map(drop)
+}
+
+/// Prints `text`. Returns whether anybody reads it.
+fn print_line(text: &str) -> Result<bool, Failure> {
+    match writeln!(io::stdout(), "{text}") {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(Failure::Failed(format!("cannot print: {error}"))),
     }
+}
+
+/// `text` without what a terminal would take for commands: names come from whoever calls.
+fn plain(text: &str) -> String {
+    let safe = |c: char| if c.is_control() && c != '\n' { '?' } else { c };
+    text.chars().map(safe).collect()
 }

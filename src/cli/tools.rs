@@ -2,6 +2,7 @@
 
 use clap::{Args, Subcommand, builder::FalseyValueParser};
 
+use super::{TopArgs, WaitArgs};
 use crate::hide::{self, Hide};
 
 /// A command that looks at a rosrescue, a checkpoint or this computer.
@@ -9,6 +10,10 @@ use crate::hide::{self, Hide};
 pub enum Tool {
     /// Say how the running rosrescue is, in ten lines
     Status(StatusArgs),
+    /// Show live what goes on: calls a second, slowest callers, nodes, rescues
+    Top(TopArgs),
+    /// Wait until calls are answered, for start scripts
+    Wait(WaitArgs),
 }
 
 /// Which running rosrescue is meant.

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use http_body_util::{BodyExt, Empty, Limited};
+use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
     Request, StatusCode,
     body::Bytes,
     client::conn::http1,
-    header::{ACCEPT, HOST},
+    header::{ACCEPT, CONTENT_TYPE, HOST},
 };
 use hyper_util::rt::TokioIo;
 use serde::Deserialize;
@@ -16,9 +16,11 @@ use tokio::{net::TcpStream, time::timeout};
 use super::Failure;
 use crate::{
     cli::TargetArgs,
+    master::Method,
     resolver,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
     status::summary::{SCHEMA, Status},
+    xmlrpc::{self, Call, Reply, Value},
 };
 
 /// How long it may take to answer. It answers in milliseconds, and waits for nobody.
@@ -51,15 +53,10 @@ impl Running {
 
     /// The page at `path`, as a program gets it.
     pub(super) async fn get(&self, path: &str) -> Result<(StatusCode, Bytes), Failure> {
-        let nobody = |why: String| Failure::Nobody {
-            uri: self.address.to_string(),
-            why,
-        };
-        match timeout(ANSWER_LIMIT, self.try_get(path)).await {
-            Ok(Ok(page)) => Ok(page),
-            Ok(Err(error)) => Err(nobody(error.to_string())),
-            Err(_) => Err(nobody(format!("no answer in {} s", ANSWER_LIMIT.as_secs()))),
-        }
+        let request = Request::get(path)
+            .header(HOST, self.address.authority())
+            .header(ACCEPT, "text/plain, application/json");
+        self.exchange(request.body(Full::default())).await
     }
 
     /// How it is.
@@ -89,19 +86,44 @@ impl Running {
         })
     }
 
-    async fn try_get(
+    /// Its answer to a call of the Master API.
+    pub(super) async fn call(&self, method: Method, params: Vec<Value>) -> Result<Reply, Failure> {
+        let body = xmlrpc::encode_call(&Call::new(method.name(), params));
+        let request = Request::post("/RPC2")
+            .header(CONTENT_TYPE, "text/xml")
+            .header(HOST, self.address.authority());
+        let answer = self.exchange(request.body(Full::new(body.into()))).await?;
+        xmlrpc::decode_reply(&answer.1)
+            .map_err(|error| self.nobody(format!("it gives no answer to calls: {error}")))
+    }
+
+    fn nobody(&self, why: String) -> Failure {
+        Failure::Nobody {
+            uri: self.address.to_string(),
+            why,
+        }
+    }
+
+    async fn exchange(
         &self,
-        path: &str,
+        request: hyper::http::Result<Request<Full<Bytes>>>,
+    ) -> Result<(StatusCode, Bytes), Failure> {
+        match timeout(ANSWER_LIMIT, self.try_exchange(request)).await {
+            Ok(Ok(answer)) => Ok(answer),
+            Ok(Err(error)) => Err(self.nobody(error.to_string())),
+            Err(_) => Err(self.nobody(format!("no answer in {} s", ANSWER_LIMIT.as_secs()))),
+        }
+    }
+
+    async fn try_exchange(
+        &self,
+        request: hyper::http::Result<Request<Full<Bytes>>>,
     ) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
         let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
         let stream = TcpStream::connect(&*addresses).await?;
         let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
         tokio::spawn(connection);
-        let request = Request::get(path)
-            .header(HOST, self.address.authority())
-            .header(ACCEPT, "text/plain, application/json")
-            .body(Empty::<Bytes>::new())?;
-        let (head, body) = sender.send_request(request).await?.into_parts();
+        let (head, body) = sender.send_request(request?).await?.into_parts();
         let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
         Ok((head.status, body))
     }

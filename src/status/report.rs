@@ -183,6 +183,15 @@ impl Report {
     }
 }
 
+impl Report {
+    /// One line for people.
+    pub(crate) fn line(&self) -> String {
+        let at = clock::wall_text(self.detected_at);
+        let Self { cause, outcome, .. } = self;
+        format!("{at}  {:.0} ms: {outcome} ({cause})", self.phases.total_ms)
+    }
+}
+
 /// A few lines for people.
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

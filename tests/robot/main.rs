@@ -87,6 +87,13 @@ mod cli {
     mod stop;
 }
 
+/// Commands that ask a running rosrescue.
+mod commands {
+    mod status;
+    mod top;
+    mod wait;
+}
+
 /// The checkpoint as the whole program keeps it.
 mod checkpoint {
     mod at_the_start;

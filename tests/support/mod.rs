@@ -16,6 +16,7 @@
     reason = "a test"
 )]
 
+mod command;
 mod disk;
 mod failing;
 mod fake;
@@ -37,6 +38,7 @@ mod status;
 mod streams;
 mod twins;
 
+pub(crate) use command::{Ran, command, run};
 pub(crate) use disk::SmallDisk;
 pub(crate) use failing::{Failing, Failures, Forkserver, page};
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};

@@ -33,7 +33,7 @@ fn block<'a>(text: &'a str, first: &str) -> &'a str {
 #[test]
 fn the_documents_have_the_help_as_the_program_prints_it() {
     let document = read("docs/cli.md");
-    for command in ["core", "proxy"] {
+    for command in ["core", "proxy", "status", "top", "wait"] {
         assert_eq!(
             block(&document, &format!("$ rosrescue {command} --help")),
             printed(&[command, "--help"]),

@@ -1,0 +1,95 @@
+//! Options of the commands that watch a running rosrescue.
+
+use std::{fmt, str::FromStr};
+
+use clap::{Args, builder::FalseyValueParser};
+
+use super::{OutputArgs, TargetArgs};
+
+/// Options of `rosrescue top`.
+#[derive(Args, Clone, Debug)]
+pub struct TopArgs {
+    /// Which one.
+    #[command(flatten)]
+    pub target: TargetArgs,
+    /// End after so many rounds, one a second [default: until q, Ctrl-C or a signal]
+    #[arg(long, env = "ROSRESCUE_TOP_COUNT", value_name = "COUNT")]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..))]
+    pub count: Option<u64>,
+    /// Print one JSON object a line, once a second
+    #[arg(long, env = "ROSRESCUE_JSON")]
+    #[arg(value_parser = FalseyValueParser::new())]
+    pub json: bool,
+}
+
+/// Options of `rosrescue wait`.
+#[derive(Args, Clone, Debug)]
+pub struct WaitArgs {
+    /// Which one.
+    #[command(flatten)]
+    pub target: TargetArgs,
+    /// What to wait for: `answered` (calls are answered, by the master or in its place), `master` (they pass
+    /// to a master), `protected` (that, and changes are recorded), or a node's /NAME. Several: all of them
+    #[arg(long = "for", env = "ROSRESCUE_WAIT_FOR", value_name = "WHAT")]
+    #[arg(value_delimiter = ',', num_args = 1.., default_value = "answered")]
+    pub wanted: Vec<For>,
+    /// How long, in seconds; 0 for ever
+    #[arg(
+        long,
+        env = "ROSRESCUE_WAIT_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "60"
+    )]
+    #[arg(value_parser = seconds)]
+    pub timeout: f64,
+    /// In which form.
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse::<f64>().ok();
+    let seconds = seconds.filter(|seconds| (0.0..=1e9).contains(seconds));
+    seconds.ok_or_else(|| "give a number of seconds, such as 30 or 0.5".to_owned())
+}
+
+/// What `rosrescue wait` waits for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum For {
+    /// Calls are answered.
+    Answered,
+    /// They pass to a master.
+    Master,
+    /// They do, and changes are recorded.
+    Protected,
+    /// The node of this name is registered.
+    Node(String),
+}
+
+impl FromStr for For {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "answered" => Ok(Self::Answered),
+            "master" => Ok(Self::Master),
+            "protected" => Ok(Self::Protected),
+            name if name.starts_with('/') && name.len() > 1 => Ok(Self::Node(name.to_owned())),
+            _ => Err(
+                "give answered, master, protected, or a node's whole name, such as /talker"
+                    .to_owned(),
+            ),
+        }
+    }
+}
+
+impl fmt::Display for For {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Answered => f.write_str("answers to calls"),
+            Self::Master => f.write_str("a master"),
+            Self::Protected => f.write_str("protection"),
+            Self::Node(name) => write!(f, "the node {name}"),
+        }
+    }
+}

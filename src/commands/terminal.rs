@@ -1,0 +1,101 @@
+//! The terminal as a picture that is drawn again and again.
+
+use std::{
+    io::{self, IsTerminal, Read, Write, stdout},
+    sync::Mutex,
+    thread,
+};
+
+use rustix::termios::{
+    LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcgetwinsize, tcsetattr,
+};
+use tokio::sync::mpsc;
+
+/// The other screen, without a cursor; and back.
+const ENTER: &str = "\x1b[?1049h\x1b[?25l";
+const LEAVE: &str = "\x1b[?25h\x1b[?1049l";
+/// The size of a terminal that does not say.
+const USUAL: (usize, usize) = (80, 24);
+
+/// The terminal's settings before, until they are restored.
+static BEFORE: Mutex<Option<Termios>> = Mutex::new(None);
+
+/// Is restored on drop, and before a panic's message.
+pub(super) struct Terminal(());
+
+impl Terminal {
+    /// Takes over the terminal; none if standard output is none.
+    pub(super) fn enter() -> Option<Self> {
+        if !stdout().is_terminal() {
+            return None;
+        }
+        let before = tcgetattr(stdout()).ok()?;
+        let mut raw = before.clone();
+        // Ctrl-C stays a signal; to be stopped would leave the shell on the other screen.
+        raw.local_modes
+            .remove(LocalModes::ICANON | LocalModes::ECHO);
+        raw.special_codes[SpecialCodeIndex::VSUSP] = 0;
+        tcsetattr(stdout(), OptionalActions::Now, &raw).ok()?;
+        if let Ok(mut kept) = BEFORE.lock() {
+            *kept = Some(before);
+        }
+        let report = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            restore();
+            report(panic);
+        }));
+        put(ENTER);
+        Some(Self(()))
+    }
+
+    /// Shows `text`, cut to the terminal's size.
+    pub(super) fn draw(&self, text: &str) {
+        let (columns, rows) = size();
+        let lines = text.lines().take(rows);
+        let lines: Vec<String> = lines
+            .map(|line| line.chars().take(columns).collect())
+            .collect();
+        // Each line is cleared behind its end, and the rest below: that does not flicker.
+        put(&format!("\x1b[H{}\x1b[K\x1b[J", lines.join("\x1b[K\r\n")));
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        restore();
+    }
+}
+
+fn put(text: &str) {
+    let mut out = stdout();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+fn restore() {
+    let before = BEFORE.lock().ok().and_then(|mut before| before.take());
+    if let Some(before) = before {
+        put(LEAVE);
+        let _ = tcsetattr(stdout(), OptionalActions::Now, &before);
+    }
+}
+
+/// Columns and rows.
+pub(super) fn size() -> (usize, usize) {
+    match tcgetwinsize(stdout()) {
+        Ok(size) if size.ws_col > 0 && size.ws_row > 0 => (size.ws_col.into(), size.ws_row.into()),
+        _ => USUAL,
+    }
+}
+
+/// What is typed, byte by byte.
+pub(super) fn keys() -> mpsc::Receiver<u8> {
+    let (to, keys) = mpsc::channel(16);
+    thread::spawn(move || {
+        for byte in io::stdin().lock().bytes().map_while(Result::ok) {
+            if to.blocking_send(byte).is_err() {
+                return;
+            }
+        }
+    });
+    keys
+}

@@ -1,0 +1,322 @@
+//! `rosrescue top`: what goes on, once a second.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    fmt::{self, Write},
+    time::Duration,
+};
+
+use serde::Serialize;
+use tokio::{
+    signal::unix::{Signal, SignalKind, signal},
+    time::{Instant, MissedTickBehavior, interval},
+};
+
+use super::{
+    Exit, Failure, plain, print_line,
+    running::Running,
+    terminal::{self, Terminal},
+};
+use crate::{
+    cli::TopArgs,
+    clock,
+    master::Counts,
+    status::{
+        condition::Condition,
+        report::Report,
+        summary::{Caller, Status},
+    },
+};
+
+const SECOND: Duration = Duration::from_secs(1);
+/// Rescues shown.
+const RESCUES: usize = 5;
+
+/// One caller in the last second, and since the start.
+#[derive(Debug, Serialize)]
+struct Row {
+    caller: String,
+    calls_per_second: f64,
+    calls: u64,
+    mean_ms: Option<f64>,
+    longest_ms: Option<f64>,
+    longest_at: Option<f64>,
+}
+
+/// What is shown.
+#[derive(Debug, Serialize)]
+struct Top {
+    /// Seconds since 1970, by the clock of rosrescue's computer.
+    at: f64,
+    uri: String,
+    condition: Condition,
+    calls_per_second: f64,
+    calls: u64,
+    calls_without_master: u64,
+    calls_unanswered: u64,
+    state: Counts,
+    unreachable: Vec<String>,
+    /// The busiest first, then the slowest.
+    callers: Vec<Row>,
+    rescues: u64,
+    last_rescues: Vec<Report>,
+    /// Lines of the terminal.
+    #[serde(skip)]
+    height: usize,
+}
+
+/// Calls so far, to count those of a second.
+struct Sample {
+    at: Instant,
+    calls: u64,
+    by_peer: HashMap<String, u64>,
+}
+
+impl Sample {
+    fn of(status: &Status, at: Instant) -> Self {
+        let clients = status.clients.iter();
+        Self {
+            at,
+            calls: status.counter("calls"),
+            by_peer: clients.map(|of| (of.peer.clone(), of.calls)).collect(),
+        }
+    }
+}
+
+/// What to show of `status`, which was asked for at `now`.
+fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> Top {
+    let calls = status.counter("calls");
+    let seconds = before.map(|before| now.duration_since(before.at).as_secs_f64().max(0.1));
+    let rate = |calls: u64| seconds.map_or(0.0, |seconds| calls as f64 / seconds);
+    let calls_per_second = match before {
+        Some(before) => rate(calls.saturating_sub(before.calls)),
+        None => status.calls_per_second,
+    };
+    let mut rates: BTreeMap<String, (f64, u64)> = BTreeMap::new();
+    for client in &status.clients {
+        let earlier = before.and_then(|before| before.by_peer.get(&client.peer));
+        let new = client.calls.saturating_sub(earlier.copied().unwrap_or(0));
+        let name = match client.caller_id.is_empty() {
+            true => client.peer.rsplit_once(':').map_or("", |(host, _)| host),
+            false => &client.caller_id,
+        };
+        let (sum, all) = rates.entry(name.to_owned()).or_default();
+        *sum += rate(new);
+        *all += client.calls;
+    }
+    let mut times: HashMap<&str, &Caller> = HashMap::new();
+    for caller in &status.slowest_callers {
+        times.insert(&caller.caller, caller);
+        rates.entry(caller.caller.clone()).or_default();
+    }
+    let mut callers: Vec<_> = rates
+        .into_iter()
+        .map(|(caller, (calls_per_second, calls))| {
+            let times = times.get(&*caller);
+            Row {
+                calls_per_second,
+                calls: times.map_or(calls, |times| times.calls.max(calls)),
+                mean_ms: times.map(|times| times.mean_ms),
+                longest_ms: times.map(|times| times.longest_ms),
+                longest_at: times.map(|times| times.longest_at),
+                caller,
+            }
+        })
+        .filter(|row| row.calls > 0)
+        .collect();
+    callers.sort_by(|a, b| {
+        let key = |row: &Row| (row.calls_per_second, row.longest_ms.unwrap_or(0.0));
+        key(b)
+            .partial_cmp(&key(a))
+            .unwrap_or(std::cmp::Ordering::Equal)
+    });
+    Top {
+        at: status.started + status.uptime,
+        calls_per_second,
+        calls,
+        calls_without_master: status.counter("calls_without_master"),
+        calls_unanswered: status.counter("calls_unanswered"),
+        uri: status.uri,
+        condition: status.condition,
+        state: status.state,
+        unreachable: status.unreachable,
+        callers,
+        rescues: status.rescues,
+        last_rescues: status.last_rescues,
+        height,
+    }
+}
+
+impl fmt::Display for Top {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut head = String::new();
+        let Condition {
+            since,
+            text,
+            action,
+            ..
+        } = &self.condition;
+        writeln!(
+            head,
+            "rosrescue top   {}   {}",
+            clock::wall_text(self.at),
+            self.uri
+        )?;
+        writeln!(
+            head,
+            "{}, for {}",
+            self.condition.title(),
+            clock::span(self.at - since)
+        )?;
+        writeln!(head, "{text}")?;
+        if let Some(action) = action {
+            writeln!(head, "To do: {action}")?;
+        }
+        writeln!(
+            head,
+            "{:.1} calls a second, {} in all; {} answered without the master, {} in vain",
+            self.calls_per_second, self.calls, self.calls_without_master, self.calls_unanswered
+        )?;
+        let Counts {
+            nodes,
+            publishers,
+            subscribers,
+            services,
+            params,
+            ..
+        } = self.state;
+        writeln!(
+            head,
+            "nodes {nodes}, publishers {publishers}, subscribers {subscribers}, services {services}, \
+             parameters {params}"
+        )?;
+        if !self.unreachable.is_empty() {
+            writeln!(head, "no answer from {}", self.unreachable.join(", "))?;
+        }
+        let mut foot = format!("\nrescues so far: {}\n", self.rescues);
+        for report in self.last_rescues.iter().rev().take(RESCUES) {
+            writeln!(foot, "{}", report.line())?;
+        }
+        // An empty line and the table's own head.
+        let taken = head.lines().count() + foot.lines().count() + 2;
+        write!(f, "{head}\n{:<32}", "CALLER")?;
+        writeln!(
+            f,
+            "{:>9}{:>9}{:>9}{:>11}",
+            "CALLS/S", "CALLS", "MEAN ms", "LONGEST ms"
+        )?;
+        for row in self.callers.iter().take(self.height.saturating_sub(taken)) {
+            let ms = |ms: Option<f64>| ms.map_or_else(String::new, |ms| format!("{ms:.1}"));
+            let caller: String = row.caller.chars().take(31).collect();
+            write!(
+                f,
+                "{caller:<32}{:>9.1}{:>9}",
+                row.calls_per_second, row.calls
+            )?;
+            write!(f, "{:>9}{:>11}", ms(row.mean_ms), ms(row.longest_ms))?;
+            let at = row.longest_at.map(clock::wall_text).unwrap_or_default();
+            // The time of day.
+            writeln!(f, " {}", at.get(11..19).unwrap_or(""))?;
+        }
+        f.write_str(&foot)
+    }
+}
+
+/// What ends it.
+struct Ends(Vec<Signal>);
+
+impl Ends {
+    fn new() -> Result<Self, Failure> {
+        let kinds = [
+            SignalKind::interrupt(),
+            SignalKind::terminate(),
+            SignalKind::hangup(),
+        ];
+        let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>();
+        signals
+            .map(Self)
+            .map_err(|error| Failure::Failed(format!("no signals: {error}")))
+    }
+
+    async fn come(&mut self) {
+        std::future::poll_fn(|context| {
+            let come = |signal: &mut Signal| signal.poll_recv(context).is_ready();
+            match self.0.iter_mut().any(come) {
+                true => std::task::Poll::Ready(()),
+                false => std::task::Poll::Pending,
+            }
+        })
+        .await;
+    }
+}
+
+pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
+    let running = Running::find(&args.target)?;
+    // Before the terminal is taken over: if nobody is there, that is all there is to say.
+    let mut status = running.status().await;
+    if let Err(failure) = status {
+        return Err(failure);
+    }
+    let mut ends = Ends::new()?;
+    let mut resized = signal(SignalKind::window_change())
+        .map_err(|error| Failure::Failed(format!("no signals: {error}")))?;
+    let terminal = match args.json {
+        true => None,
+        false => Terminal::enter(),
+    };
+    let mut keys = terminal.is_some().then(terminal::keys);
+    let mut seconds = interval(SECOND);
+    seconds.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    seconds.tick().await;
+    let mut before: Option<Sample> = None;
+    let mut shown = String::new();
+    let mut rounds = 0;
+    loop {
+        let now = Instant::now();
+        let failed = match status {
+            Ok(status) => {
+                let sample = Sample::of(&status, now);
+                let height = match terminal {
+                    Some(_) => terminal::size().1,
+                    None => usize::MAX,
+                };
+                let top = top(status, before.as_ref(), now, height);
+                before = Some(sample);
+                shown = match args.json {
+                    true => serde_json::to_string(&top)
+                        .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?,
+                    false => plain(&top.to_string()),
+                };
+                None
+            }
+            // It may be started again this very moment.
+            Err(failure) => Some(failure),
+        };
+        match (&terminal, &failed) {
+            (Some(terminal), None) => terminal.draw(&shown),
+            (Some(terminal), Some(failure)) => terminal.draw(&format!("{failure}\n\n{shown}")),
+            (None, None) if !print_line(&shown)? => return Ok(Exit::Good),
+            (None, None) => {}
+            (None, Some(failure)) => eprintln!("rosrescue: {failure}"),
+        }
+        rounds += 1;
+        if args.count.is_some_and(|count| rounds >= count) {
+            return failed.map_or(Ok(Exit::Good), Err);
+        }
+        loop {
+            tokio::select! {
+                _ = seconds.tick() => break,
+                () = ends.come() => return Ok(Exit::Good),
+                _ = resized.recv() => if let Some(terminal) = &terminal {
+                    terminal.draw(&shown);
+                },
+                key = async { keys.as_mut()?.recv().await }, if keys.is_some() => match key {
+                    Some(b'q' | b'Q' | 3 | 4) => return Ok(Exit::Good),
+                    Some(_) => {}
+                    None => keys = None,
+                },
+            }
+        }
+        status = running.status().await;
+    }
+}

@@ -1,0 +1,119 @@
+//! `rosrescue wait`: until calls are answered, for start scripts.
+
+use std::{fmt, time::Duration};
+
+use serde::Serialize;
+use tokio::time::{Instant, sleep_until};
+
+use super::{Exit, Failure, print, running::Running};
+use crate::{
+    cli::{For, WaitArgs},
+    master::Method,
+    status::{condition::Name, summary::Status},
+    xmlrpc::{Reply, Value},
+};
+
+/// Pause between two tries.
+const PAUSE: Duration = Duration::from_millis(250);
+
+/// How the waiting ended.
+#[derive(Debug, Serialize)]
+struct Waited {
+    uri: String,
+    /// Whether all of it is so.
+    met: bool,
+    /// What is not so yet.
+    missing: Vec<String>,
+    /// Why, in a sentence.
+    why: Option<String>,
+    seconds: f64,
+}
+
+impl fmt::Display for Waited {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { uri, seconds, .. } = self;
+        match self.met {
+            true => write!(f, "{uri}: it is so, after {seconds:.1} s"),
+            false => write!(
+                f,
+                "{uri}: not so after {seconds:.1} s: {}{}",
+                self.missing.join(", "),
+                self.why
+                    .iter()
+                    .map(|why| format!(". {why}"))
+                    .collect::<String>()
+            ),
+        }
+    }
+}
+
+pub(super) async fn run(args: &WaitArgs) -> Result<Exit, Failure> {
+    let running = Running::find(&args.target)?;
+    let start = Instant::now();
+    let deadline = (args.timeout > 0.0)
+        .then(|| Duration::try_from_secs_f64(args.timeout).ok())
+        .flatten()
+        .and_then(|limit| start.checked_add(limit));
+    let mut said = false;
+    loop {
+        let (missing, why) = missing(&running, &args.wanted).await?;
+        let late = deadline.is_some_and(|deadline| Instant::now() >= deadline);
+        if missing.is_empty() || late {
+            let waited = Waited {
+                uri: running.address.to_string(),
+                met: missing.is_empty(),
+                missing,
+                why,
+                seconds: start.elapsed().as_secs_f64(),
+            };
+            print(&waited, &args.output)?;
+            return Ok(match waited.met {
+                true => Exit::Good,
+                false => Exit::Bad,
+            });
+        }
+        if !std::mem::replace(&mut said, true) {
+            eprintln!(
+                "rosrescue: waiting for {} at {}",
+                missing.join(", "),
+                running.address
+            );
+        }
+        let next = Instant::now() + PAUSE;
+        sleep_until(deadline.map_or(next, |deadline| deadline.min(next))).await;
+    }
+}
+
+/// What of `wanted` is not so, and why.
+async fn missing(
+    running: &Running,
+    wanted: &[For],
+) -> Result<(Vec<String>, Option<String>), Failure> {
+    let all = || wanted.iter().map(ToString::to_string).collect();
+    let status = match running.status().await {
+        Ok(status) => status,
+        Err(nobody @ Failure::Nobody { .. }) => return Ok((all(), Some(nobody.to_string()))),
+        Err(failure) => return Err(failure),
+    };
+    let mut missing = Vec::new();
+    for wanted in wanted {
+        if !is_so(running, wanted, &status).await {
+            missing.push(wanted.to_string());
+        }
+    }
+    let why = (!missing.is_empty()).then(|| status.condition.line());
+    Ok((missing, why))
+}
+
+async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
+    match wanted {
+        For::Answered => status.ready,
+        For::Master => status.open,
+        For::Protected => status.condition.name == Name::Protected,
+        For::Node(name) => {
+            let params = ["/rosrescue_wait", name].map(Value::from);
+            let reply = running.call(Method::LookupNode, params.into()).await;
+            matches!(reply, Ok(Reply::Value(Value::Array(answer))) if answer.first() == Some(&Value::Int(1)))
+        }
+    }
+}

@@ -1,0 +1,46 @@
+"""Runs a command on a terminal of its own: terminal.py SECONDS KEY COLUMNSxROWS PROGRAM ARGUMENT...
+
+Types KEY after so many seconds, or sends the signal of that number; prints the exit status, whether the terminal is as
+it was, and then what was shown.
+"""
+import fcntl
+import os
+import pty
+import select
+import struct
+import sys
+import termios
+import time
+
+seconds, key, size = float(sys.argv[1]), sys.argv[2], sys.argv[3]
+columns, rows = map(int, size.split("x"))
+parent, child = pty.openpty()
+fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+before = termios.tcgetattr(child)
+pid = os.fork()
+if pid == 0:
+    os.setsid()
+    fcntl.ioctl(child, termios.TIOCSCTTY, 0)
+    for number in range(3):
+        os.dup2(child, number)
+    os.execv(sys.argv[4], sys.argv[4:])
+shown, end, typed, status = b"", time.monotonic() + seconds, False, None
+while status is None:
+    if select.select([parent], [], [], 0.05)[0]:
+        shown += os.read(parent, 65536)
+    if not typed and time.monotonic() > end:
+        typed = True
+        if key.isdigit():
+            os.kill(pid, int(key))
+        elif key == "resize":
+            fcntl.ioctl(child, termios.TIOCSWINSZ, struct.pack("HHHH", 10, 40, 0, 0))
+            end, typed, key = time.monotonic() + seconds, False, "q"
+        else:
+            os.write(parent, key.encode())
+    ended, code = os.waitpid(pid, os.WNOHANG)
+    status = code if ended else None
+while select.select([parent], [], [], 0.2)[0]:
+    shown += os.read(parent, 65536)
+print(os.waitstatus_to_exitcode(status), termios.tcgetattr(child) == before)
+sys.stdout.flush()
+sys.stdout.buffer.write(shown)

@@ -1,0 +1,142 @@
+//! `rosrescue status`: how the running one is, for a tired person and for a script.
+
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::thread;
+
+use crate::support::{
+    FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, free_port, page, params, run,
+};
+
+#[test]
+fn it_says_what_nodes_notice_and_what_to_do() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let (scratch, port) = (&robot.scratch, robot.port());
+    let talker = FakeNode::start("/talker");
+    talker.publish(&robot.client(), "/topic", "std_msgs/String");
+    let good = run(scratch, port, &["status"]);
+    assert_eq!(good.exit, 0, "{good:?}");
+    assert!(good.stdout.starts_with("protected, since "), "{good:?}");
+    assert!(good.stdout.contains("Nodes run as usual"), "{good:?}");
+    assert!(good.stdout.lines().count() <= 10, "{good:?}");
+    // The page is the same.
+    let first = |text: &str| text.lines().nth(1).map(str::to_owned);
+    assert_eq!(first(&page(&robot.client(), "/")), first(&good.stdout));
+
+    let dead = robot.master_pid();
+    robot.kill_master_at_once(dead);
+    eventually("the mirror stands in", || !robot.is_open());
+    robot.client().set_param("/meanwhile", 1);
+    let away = run(&robot.scratch, port, &["status"]);
+    assert_eq!(away.exit, 1, "{away:?}");
+    assert!(
+        away.stdout
+            .starts_with("standing in for the master, since "),
+        "{away:?}"
+    );
+    assert!(away.stdout.contains("Nodes go on"), "{away:?}");
+    assert!(
+        away.stdout
+            .contains("\nto do       start the master at http://"),
+        "{away:?}"
+    );
+    let json = run(&robot.scratch, port, &["status", "--json"]);
+    assert_eq!((json.exit, &json.json()["schema"]), (1, &1.into()));
+    assert_eq!(json.json()["condition"]["name"], "standing_in");
+    assert_eq!(json.json()["pending_writes"], 1);
+
+    robot.revive_master();
+    robot.await_recovery(dead);
+    let after = run(&robot.scratch, port, &["status"]);
+    assert_eq!(after.exit, 0, "{after:?}");
+    assert!(
+        after.stdout.contains("rescues     1, the last:\n"),
+        "{after:?}"
+    );
+    assert!(
+        after
+            .stdout
+            .contains("a new master was given the whole state"),
+        "{after:?}"
+    );
+    let json = run(&robot.scratch, port, &["status", "--json"]).json();
+    let rescue = &json["last_rescues"][0];
+    assert_eq!(rescue["outcome"], "injected", "{rescue}");
+    assert_eq!(json["last_rescues"].as_array().unwrap().len(), 1);
+    let slowest = json["slowest_callers"].as_array().unwrap();
+    let longest = |row: &serde_json::Value| row["longest_ms"].as_f64().unwrap();
+    assert!(!slowest.is_empty(), "{json}");
+    assert!(
+        slowest.is_sorted_by(|a, b| longest(a) >= longest(b)),
+        "{slowest:?}"
+    );
+    assert!(
+        json["journal"]["disk_free_bytes"].as_u64() > Some(0),
+        "{json}"
+    );
+}
+
+/// Names come from whoever calls; one must not write to the terminal of whoever asks.
+#[test]
+fn it_prints_no_commands_for_a_terminal() {
+    let robot = Robot::start(Mode::Core);
+    let evil = "/evil\u{1b}[2J";
+    robot.client().call("getPid", params![evil]).unwrap();
+    for command in [&["status"][..], &["top", "--count", "1"]] {
+        let ran = run(&robot.scratch, robot.port(), command);
+        assert!(!ran.stdout.contains('\u{1b}'), "{ran:?}");
+    }
+}
+
+#[test]
+fn nobody_there_or_somebody_else_is_exit_status_3() {
+    let scratch = Scratch::new();
+    let nobody = run(&scratch, free_port(), &["status"]);
+    assert_eq!(nobody.exit, 3, "{nobody:?}");
+    assert!(
+        nobody.stderr.contains("no rosrescue at http://127.0.0.1:"),
+        "{nobody:?}"
+    );
+    let master = Rosmaster::start(&scratch);
+    let bare = run(&scratch, master.client().port(), &["status"]);
+    assert_eq!(bare.exit, 3, "{bare:?}");
+    assert!(bare.stderr.contains("a bare rosmaster perhaps"), "{bare:?}");
+    let nonsense = run(&scratch, 1, &["status", "--uri", "nonsense"]);
+    assert_eq!(nonsense.exit, 2, "{nonsense:?}");
+    assert_eq!(nonsense.stderr.lines().count(), 1, "{nonsense:?}");
+}
+
+#[test]
+fn a_newer_rosrescue_is_said_to_be_one() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.unwrap();
+            let _ = stream.read(&mut [0; 1024]);
+            let body = r#"{"schema": 2, "version": "9.9.9"}"#;
+            let length = body.len();
+            let _ = write!(
+                stream,
+                "HTTP/1.1 200 OK\r\nContent-Length: {length}\r\n\r\n{body}"
+            );
+        }
+    });
+    let ran = run(&Scratch::new(), port, &["status"]);
+    assert_eq!(ran.exit, 1, "{ran:?}");
+    assert!(
+        ran.stderr.contains("version 9.9.9, newer than this one"),
+        "{ran:?}"
+    );
+}
+
+/// A master that was never seen: nodes wait, and whoever asks is told what for.
+#[test]
+fn it_says_that_nodes_wait_for_a_first_master() {
+    let scratch = Scratch::new();
+    let rescue = Setup::proxy(&scratch, free_port()).spawn();
+    eventually("the status says so", || {
+        let ran = run(&scratch, rescue.port(), &["status"]);
+        ran.exit == 1 && ran.stdout.contains("Nodes wait") && ran.stdout.contains("\nto do ")
+    });
+}

@@ -1,0 +1,76 @@
+//! `rosrescue wait`: start scripts go on when there is something to go on with.
+
+use std::time::Instant;
+
+use crate::support::{
+    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, command, free_port, run,
+};
+
+#[test]
+fn it_waits_for_what_is_not_there_yet() {
+    let scratch = Scratch::new();
+    let (master_port, rescue) = {
+        let port = free_port();
+        (port, Setup::proxy(&scratch, port))
+    };
+    let port = rescue.port;
+    let wait = |name: &str, wanted: &[&str]| {
+        let mut arguments = vec!["wait", "--timeout", "0"];
+        arguments.extend(wanted.iter().flat_map(|what| ["--for", what]));
+        let mut process = Process::start(name, &mut command(&scratch, port, &arguments));
+        process.wait_line("what it waits for", |line| line.contains("waiting for "));
+        process
+    };
+    // Nothing listens yet.
+    let mut answered = wait("answered", &[]);
+    let mut all = wait("all", &["master", "protected", "/talker"]);
+    let rescue = rescue.spawn();
+    let _master = Rosmaster::start_at(&scratch, master_port);
+    assert_eq!(answered.wait().code(), Some(0));
+    let protected = run(&scratch, port, &["wait", "--for", "protected", "--json"]);
+    assert_eq!(protected.exit, 0, "{protected:?}");
+    assert_eq!(protected.json()["met"], true);
+    assert!(all.exited().is_none(), "there is no talker");
+    let talker = FakeNode::start("/talker");
+    talker.publish(&rescue.client(), "/topic", "std_msgs/String");
+    assert_eq!(all.wait_output().code(), Some(0));
+    let said = all.stderr();
+    assert_eq!(said.len(), 1, "once: {said:?}");
+    assert!(said[0].contains("the node /talker"), "{said:?}");
+}
+
+#[test]
+fn it_ends_in_time_and_says_what_is_missing() {
+    let robot = Robot::start(Mode::Core);
+    let start = Instant::now();
+    let arguments = ["wait", "--for", "master", "/nobody", "--timeout", "0.5"];
+    let ran = run(&robot.scratch, robot.port(), &arguments);
+    assert!(start.elapsed().as_secs_f64() >= 0.5);
+    assert_eq!(ran.exit, 1, "{ran:?}");
+    assert!(ran.stdout.contains("the node /nobody"), "{ran:?}");
+    assert!(!ran.stdout.contains("a master"), "{ran:?}");
+    let nobody = run(&robot.scratch, free_port(), &["wait", "--timeout", "0.1"]);
+    assert_eq!(nobody.exit, 1, "{nobody:?}");
+    for wrong in [["--for", "everything"], ["--timeout", "-1"]] {
+        let ran = run(
+            &robot.scratch,
+            robot.port(),
+            &[&["wait"], &wrong[..]].concat(),
+        );
+        assert_eq!(ran.exit, 2, "{ran:?}");
+    }
+}
+
+/// While the mirror stands in calls are answered, and there is no master.
+#[test]
+fn answers_are_not_a_master() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.take_master_away();
+    let exit = |what: &str| {
+        let arguments = ["wait", "--for", what, "--timeout", "0.1"];
+        run(&robot.scratch, robot.port(), &arguments).exit
+    };
+    assert_eq!(exit("answered"), 0);
+    assert_eq!(exit("master"), 1);
+    assert_eq!(exit("protected"), 1);
+}
