@@ -25,7 +25,7 @@ within 180 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot d
 took "$(rosnode list | wc -l) nodes; it has reached the first place"
 
 step "the master is yours to kill:"
-read -r master < <(status last_recovery.master_pid)
+read -r master < <(status master_pid)
 say "kill -9 $master" "export ROS_MASTER_URI=$ROS_MASTER_URI"
 say "Ctrl-C ends everything."
 while kill -0 "$rosrescue_pid" 2>/dev/null; do

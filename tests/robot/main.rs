@@ -56,6 +56,7 @@ mod recovery {
 /// Long lives of nodes, and the tools of ROS.
 mod nodes {
     mod streams;
+    mod example;
     mod tools;
 }
 

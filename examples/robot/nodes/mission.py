@@ -25,9 +25,12 @@ def main():
         ended = client.send_goal_and_wait(goal)
         if rospy.is_shutdown():
             return
-        arrived += ended == actionlib.GoalStatus.SUCCEEDED
-        rospy.set_param("~arrived", arrived)
-        state.publish("at %s" % place["name"])
+        if ended == actionlib.GoalStatus.SUCCEEDED:
+            arrived += 1
+            rospy.set_param("~arrived", arrived)
+            state.publish("at %s" % place["name"])
+        else:
+            state.publish("did not reach %s" % place["name"])
         rospy.sleep(rospy.get_param("~pause"))
 
 

@@ -1,0 +1,282 @@
+//! The example robot (`examples/robot`): ten deaths of its master and three of rosrescue's worker, and no node of
+//! it notices.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Instant, SystemTime};
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+use crate::support::{
+    Client, Library, NODES, Node, Process, Rescue, Scratch, Setup, State, eventually,
+    eventually_some, free_port, ros_command, signal, status,
+};
+
+const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/robot");
+/// Deaths of the master between two of the worker: a sixth within a minute would be a crash loop.
+const DEATHS: [usize; 4] = [3, 3, 2, 2];
+/// Sets a parameter as rqt_reconfigure does.
+const RECONFIGURE: &str = "
+import sys, rospy, dynamic_reconfigure.client
+rospy.init_node('operator', anonymous=True)
+node, key, value = sys.argv[1:4]
+print(dynamic_reconfigure.client.Client(node, timeout=30).update_configuration({key: value})[key])
+";
+
+struct Example {
+    scratch: Scratch,
+    rescue: Rescue,
+    master_port: u16,
+    witness: Node,
+    _launch: Process,
+}
+
+impl Example {
+    fn start() -> Self {
+        let scratch = Scratch::new();
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("example-robot");
+        let mut build = Command::new(format!("{EXAMPLE}/build.sh"));
+        let built = build
+            .arg(folder.join("robot_example_cpp"))
+            .status()
+            .unwrap();
+        assert!(built.success(), "`tests/run.sh` installs what is missing");
+        let master_port = free_port();
+        let rosmaster = Path::new(NODES).join("waiting_rosmaster.py");
+        let rescue = Setup::core(&scratch, master_port)
+            .guarded()
+            .args(["--rosmaster", rosmaster.to_str().unwrap()])
+            .start();
+        let mut launch = ros_command(&scratch, format!("{EXAMPLE}/launch.sh"), rescue.port());
+        launch.arg(&folder).arg("drive_seconds:=3");
+        launch.arg(format!("bag:={}", scratch.path("robot.bag").display()));
+        let launch = Process::start("roslaunch", &mut launch);
+        let mut witness = Library::Rospy.command(&scratch, rescue.port(), "witness");
+        let example = Self {
+            witness: Node::run(&mut witness),
+            scratch,
+            rescue,
+            master_port,
+            _launch: launch,
+        };
+        eventually("the robot has driven", || {
+            example.param("/mission/arrived").is_some()
+        });
+        example.at_work();
+        example
+    }
+
+    fn param(&self, key: &str) -> Option<Value> {
+        self.rescue.client().param(key)
+    }
+
+    fn master(&self) -> Client {
+        Client::new(self.master_port)
+    }
+
+    fn is_open(&self) -> bool {
+        status(&self.rescue.client())["open"] == true
+    }
+
+    fn kill_master(&self) -> u32 {
+        fs::write(self.scratch.path("away"), "").unwrap();
+        let dead = self.master().master_pid().expect("a living master");
+        signal(dead, Signal::KILL);
+        eventually("the mirror stands in", || !self.is_open());
+        dead
+    }
+
+    fn revive_master(&self, dead: u32) {
+        fs::remove_file(self.scratch.path("away")).unwrap();
+        eventually("there is another master", || {
+            self.master().master_pid().is_some_and(|pid| pid != dead) && self.is_open()
+        });
+    }
+
+    fn kill_worker(&self) {
+        let worker = |dead| {
+            eventually_some("there is a worker", || {
+                let mut pids = self.scratch.survivors().into_iter().map(|(pid, _)| pid);
+                pids.find(|&pid| {
+                    let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
+                    let text = String::from_utf8_lossy(&environment).into_owned();
+                    pid != dead && text.contains("ROSRESCUE_GUARDIAN=")
+                })
+            })
+        };
+        let dead = worker(0);
+        signal(dead, Signal::KILL);
+        worker(dead);
+        eventually("calls pass again", || self.is_open());
+    }
+
+    /// Waits until messages come on every topic that is watched, and transforms and diagnostics are fresh.
+    #[track_caller]
+    fn at_work(&self) {
+        let heard = || -> BTreeMap<String, u64> {
+            let said = self.witness.said("heard");
+            said.last()
+                .map_or_else(BTreeMap::new, |said| serde_json::from_str(said).unwrap())
+        };
+        let (before, diagnosed) = (heard(), self.witness.said("diagnostics").len());
+        eventually("messages come on every topic", || {
+            let now = heard();
+            now.len() == 8
+                && now
+                    .iter()
+                    .all(|(topic, count)| count > before.get(topic).unwrap_or(&0))
+        });
+        eventually("the whole tree of transforms is there and fresh", || {
+            let age = self.witness.said("transforms").pop();
+            age.is_some_and(|age| age.parse::<f64>().unwrap() < 3.0)
+        });
+        eventually("everything is diagnosed", || {
+            let said = self.witness.said("diagnostics").split_off(diagnosed);
+            said.last()
+                .is_some_and(|said| said == "/Base /Cameras /Computer /Power")
+        });
+    }
+
+    /// Who is registered, and the parameters without what the mission counts.
+    fn state(&self) -> State {
+        let mut state = State::read(&self.master());
+        if let Value::Struct(params) = &mut state.params
+            && let Some(Value::Struct(mission)) = params.get_mut("mission")
+        {
+            mission.swap_remove("arrived");
+        }
+        state
+    }
+
+    /// The process behind each name.
+    fn processes(&self) -> BTreeMap<String, u32> {
+        let nodes = self.state().nodes.into_iter().map(|(name, api)| {
+            let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
+            let node = Client::new(port.parse().unwrap());
+            (name, node.master_pid().expect("a living node"))
+        });
+        nodes.collect()
+    }
+
+    #[track_caller]
+    fn reconfigure(&self, node: &str, key: &str, value: &str) {
+        let mut command = ros_command(&self.scratch, "/usr/bin/python3", self.rescue.port());
+        let output = command
+            .args(["-c", RECONFIGURE, node, key, value])
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stdout);
+        assert!(said.trim().starts_with(value), "{said}{output:?}");
+    }
+
+    fn drives(&self) -> Vec<String> {
+        self.witness.said("drive")
+    }
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a bag has the times of the wall clock"
+)]
+fn wall() -> f64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.unwrap().as_secs_f64()
+}
+
+#[test]
+fn a_realistic_robot_notices_nothing() {
+    let robot = Example::start();
+    let (mut before, processes) = (robot.state(), robot.processes());
+    assert!(processes.len() >= 28, "{processes:?}");
+    let (first_death, start) = (wall(), Instant::now());
+    for (round, deaths) in DEATHS.into_iter().enumerate() {
+        for death in 0..deaths {
+            if death == 0 {
+                // A goal that is under way when the master dies.
+                eventually("it drives", || {
+                    robot
+                        .drives()
+                        .last()
+                        .is_some_and(|drive| drive.starts_with("driving"))
+                });
+            }
+            let dead = robot.kill_master();
+            match (round, death) {
+                (0, 0) => robot.reconfigure("/camera/rear/driver", "brightness", "200"),
+                (1, 0) => robot.reconfigure("/camera/front/preview", "update_rate", "3"),
+                _ => {}
+            }
+            robot.revive_master(dead);
+        }
+        if round < 3 {
+            robot.kill_worker();
+        }
+    }
+    println!("the deaths took {:?}", start.elapsed());
+    let drives = robot.drives().len();
+    eventually("it has arrived again", || {
+        robot
+            .drives()
+            .iter()
+            .skip(drives)
+            .any(|drive| drive.starts_with("at "))
+    });
+    let last_recovery = wall();
+    robot.at_work();
+
+    assert_eq!(robot.processes(), processes);
+    assert_eq!(robot.witness.said("gap"), Vec::<String>::new());
+    let lost = |drive: &String| !drive.starts_with("driving to ") && !drive.starts_with("at ");
+    assert!(!robot.drives().iter().any(lost), "{:?}", robot.drives());
+    // What was set during outages is kept, and nothing else has changed.
+    for (node, key, value) in [
+        ("camera/rear/driver", "brightness", Value::Int(200)),
+        ("camera/front/preview", "update_rate", Value::Double(3.0)),
+    ] {
+        let namespace = node
+            .split('/')
+            .try_fold(&mut before.params, |at, name| match at {
+                Value::Struct(members) => members.get_mut(name),
+                _ => None,
+            });
+        let Some(Value::Struct(namespace)) = namespace else {
+            panic!("no parameters of {node}");
+        };
+        namespace.insert(key.to_owned(), value);
+    }
+    before.assert_same(&robot.state(), "at the end");
+
+    let recorder = processes["/recorder"];
+    signal(recorder, Signal::INT);
+    let bag = robot.scratch.path("robot.bag");
+    eventually("the bag is closed", || bag.exists());
+    let mut read = Library::Rospy.command(&robot.scratch, robot.rescue.port(), "witness");
+    let mut read = Process::start("the bag's reader", read.arg("bag").arg(&bag));
+    assert!(read.wait_output().success(), "{}", read.log());
+    let said = read.stdout();
+    assert!(!said.iter().any(|line| line.starts_with("gap")), "{said:?}");
+    for topic in [
+        "/scan",
+        "/base/odom",
+        "/tf",
+        "/diagnostics_agg",
+        "/mission/state",
+    ] {
+        let line = said
+            .iter()
+            .find_map(|line| line.strip_prefix(&format!("bagged {topic} ")));
+        let times: Vec<f64> = line
+            .unwrap()
+            .split(' ')
+            .map(|text| text.parse().unwrap())
+            .collect();
+        assert!(
+            times[0] < first_death && times[1] > last_recovery - 5.0,
+            "{topic} {times:?}"
+        );
+    }
+    robot.rescue.assert_no_panic();
+}
