@@ -155,6 +155,7 @@ pub async fn run(
         gate.clone(),
         stats,
         config.resync_interval,
+        config.reap_interval.is_some(),
     );
     let nodes = Arc::new(Nodes::new(
         ledger.clone(),

@@ -84,7 +84,8 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well; none to disable them.
+    /// Pause between two health checks while all is well; none to disable them, and the eviction of nodes
+    /// whose ports other nodes register.
     pub reap_interval: Option<Duration>,
     /// Pause between two comparisons of the mirror with the master; none to disable them.
     pub resync_interval: Option<Duration>,

@@ -7,10 +7,12 @@
 mod backoff;
 mod rates;
 mod repeats;
+mod taken_port;
 mod unreachable;
 
 pub(crate) use rates::Rates;
 pub(crate) use repeats::Repeats;
+pub(crate) use taken_port::{Eviction, first_taking};
 pub(crate) use unreachable::Unreachable;
 
 use std::collections::BTreeMap;

@@ -8,6 +8,7 @@
 
 pub(crate) mod api;
 pub(crate) mod checks;
+mod forget;
 pub(crate) mod kind;
 mod methods;
 pub(crate) mod multicall;

@@ -4,6 +4,7 @@
 
 pub(crate) mod batch;
 mod drain;
+mod evict;
 mod outdated;
 pub(crate) mod parts;
 mod resync;
@@ -66,6 +67,7 @@ impl WriteQueue {
             call: Some(Arc::new(call)),
             answer,
             condition,
+            way_made: false,
         };
         self.items.send(item).await.ok()?;
         match answered.await.ok()? {
@@ -83,19 +85,20 @@ impl WriteQueue {
 }
 
 /// Makes a write queue and the worker to run. `resync_interval`: how often the master is compared with the
-/// mirror, if at all.
+/// mirror, if at all. `evicts`: whether a node whose port another one registers is taken out.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
     gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
+    evicts: bool,
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
     let lost = Arc::new(Notify::new());
     let (tell_sent, sent) = watch::channel(None);
     let link = Link { ledger, upstream };
-    let drain = Drain::new(
+    let mut drain = Drain::new(
         rx,
         link,
         gate,
@@ -104,6 +107,7 @@ pub(crate) fn write_queue(
         lost.clone(),
         tell_sent,
     );
+    drain.evicts = evicts;
     (WriteQueue { items, lost, sent }, drain)
 }
 

@@ -141,8 +141,9 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
-    /// How often every node is asked whether it lives, so that one that was killed does not stay
-    /// registered for ever, in seconds; 0 for only after a recovery, as ROS has it
+    /// Take out nodes that have died, so that they do not stay registered for ever: every node is asked so
+    /// often whether it lives, in seconds, and whoever is registered with the port of a node that registers
+    /// is taken out first. 0 for only after a recovery, as ROS has it
     #[arg(
         long,
         env = "ROSRESCUE_REAP_DEAD_NODES",

@@ -301,6 +301,7 @@ impl Calls {
             call: call.clone(),
             answer,
             condition: None,
+            way_made: false,
         };
         self.write_queue.submit(item).await;
         let call = call.as_deref();

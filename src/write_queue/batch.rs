@@ -39,6 +39,8 @@ pub(crate) struct Item {
     pub answer: oneshot::Sender<Answer>,
     /// For a call of our own: when it is still right.
     pub condition: Option<Condition>,
+    /// Whether those whose ports it takes have been dealt with.
+    pub way_made: bool,
 }
 
 /// A node and its last calls at the time of the decision to register or unregister something for it. The

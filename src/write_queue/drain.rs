@@ -12,7 +12,7 @@ use tracing::Instrument;
 
 use super::batch::{self, Answer, Item};
 use super::{
-    Link,
+    Link, evict,
     outdated::is_outdated,
     resync::ResyncSchedule,
     round_trip::{Done, Received, RoundTripError, round_trip},
@@ -44,12 +44,12 @@ struct InFlight {
 }
 
 pub(crate) struct Drain {
-    link: Link,
+    pub(super) link: Link,
     gate: gate::Rx,
     stats: &'static Stats,
     resync_interval: Option<Duration>,
     items: mpsc::Receiver<Item>,
-    queue: VecDeque<Item>,
+    pub(super) queue: VecDeque<Item>,
     connection: Option<(u64, Connection)>,
     in_flight: Option<InFlight>,
     /// How long the batch in flight may continue behind a shut gate.
@@ -65,6 +65,8 @@ pub(crate) struct Drain {
     /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
     /// read from the master again and holds their effects.
     opaque: Opaque,
+    /// Whether a node whose port another one registers is taken out.
+    pub(super) evicts: bool,
 }
 
 #[derive(Default)]
@@ -101,6 +103,7 @@ impl Drain {
             resync: ResyncSchedule::default(),
             retry_at: None,
             opaque: Opaque::default(),
+            evicts: false,
         }
     }
 
@@ -184,7 +187,7 @@ impl Drain {
         let inspects = self.resync.begin(tokio::time::Instant::now());
         let items = match inspects {
             true => Vec::new(),
-            false => batch::pack(&mut self.queue),
+            false => self.pack(),
         };
         if items.is_empty() && !inspects {
             return;
@@ -276,7 +279,7 @@ impl Drain {
         }
     }
 
-    fn take_back(&mut self, items: Vec<Item>) {
+    pub(super) fn take_back(&mut self, items: Vec<Item>) {
         for item in items.into_iter().rev() {
             self.queue.push_front(item);
         }
@@ -393,6 +396,9 @@ impl Drain {
                 continue;
             }
             let call = item.call.as_deref().filter(|call| call.is_answerable());
+            if let Some(call) = call.filter(|_| self.evicts && item.raw.is_some()) {
+                evict::while_standing_in(&self.link.ledger, call);
+            }
             match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
                 Some((reply, seq)) => {
                     self.stats.calls_without_master.count();

@@ -50,6 +50,7 @@ mod recovery {
     mod no_shutdown;
     mod reconciliation;
     mod spare_master;
+    mod taken_port;
     mod unreachable;
 }
 

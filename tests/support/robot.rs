@@ -83,7 +83,7 @@ impl Robot {
     #[track_caller]
     pub(crate) fn start_for_outages(mode: Mode) -> Self {
         let mut robot = Self::start_under(mode, "waiting_rosmaster.py", &[]);
-        robot.away = (mode == Mode::Core).then(|| robot.scratch.path("away"));
+        robot.stay_away();
         robot
     }
 
@@ -186,6 +186,12 @@ impl Robot {
         eventually_some("the master says its process id", || {
             self.bare().master_pid()
         })
+    }
+
+    /// From now on the master of one that was started under `waiting_rosmaster.py` stays away once it is
+    /// killed, until [`Self::revive_master`].
+    pub(crate) fn stay_away(&mut self) {
+        self.away = (self.mode == Mode::Core).then(|| self.scratch.path("away"));
     }
 
     /// SIGKILL to the real master.

@@ -8,6 +8,7 @@ fn item(call: Request) -> Item {
         call: Some(Arc::new(call)),
         answer: oneshot::channel().0,
         condition: None,
+        way_made: false,
     }
 }
 

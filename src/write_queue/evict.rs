@@ -1,0 +1,86 @@
+//! With `--reap-dead-nodes`, whoever is registered with a port that another node registers is taken out first.
+//! Nobody is asked: a node cannot answer before its registration is done.
+
+use std::{sync::Arc, time::Instant};
+
+use tokio::sync::oneshot;
+
+use super::{
+    batch::{self, Answer, Item},
+    drain::Drain,
+};
+use crate::{
+    health::{Eviction, first_taking},
+    ledger::Ledger,
+    master::Request,
+};
+
+impl Drain {
+    /// The next batch. A call that takes a port is the first of its batch, and the eviction goes before it.
+    pub(super) fn pack(&mut self) -> Vec<Item> {
+        let mut items = batch::pack(&mut self.queue);
+        if !self.evicts {
+            return items;
+        }
+        let Some(first) = items.first_mut() else {
+            return items;
+        };
+        let mut length = 1;
+        if first.raw.is_some() && !first.way_made {
+            let ledger = &self.link.ledger;
+            if let Some(call) = first.call.as_deref()
+                && let Some(eviction) = eviction(ledger, call)
+            {
+                first.way_made = true;
+                let by = call.caller().unwrap_or_default().to_owned();
+                self.take_back(items);
+                return vec![own(eviction, by)];
+            }
+            let taking = ledger.with_mirror(|mirror| {
+                first_taking(mirror, items.iter().map_while(|item| item.call.as_deref()))
+            });
+            length = taking.unwrap_or(items.len()).max(1);
+        }
+        let rest = items.split_off(length);
+        self.take_back(rest);
+        items
+    }
+}
+
+/// What goes before `call`, if anything.
+fn eviction(ledger: &Ledger, call: &Request) -> Option<Eviction> {
+    ledger.with_mirror(|mirror| Eviction::before(mirror, call))
+}
+
+/// The same while the mirror stands in, which does it at once.
+pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
+    if let Some(eviction) = eviction(ledger, call)
+        && ledger.stand_in(Instant::now(), &eviction.call).is_some()
+    {
+        say(&eviction.nodes, call.caller().unwrap_or_default());
+    }
+}
+
+fn own(eviction: Eviction, by: String) -> Item {
+    let (answer, answered) = oneshot::channel();
+    tokio::spawn(async move {
+        if let Ok(Answer::Raw(_) | Answer::Made(_)) = answered.await {
+            say(&eviction.nodes, &by);
+        }
+    });
+    Item {
+        raw: None,
+        call: Some(Arc::new(eviction.call)),
+        answer,
+        condition: None,
+        way_made: false,
+    }
+}
+
+fn say(nodes: &[String], by: &str) {
+    tracing::info!(
+        ?nodes,
+        by,
+        "taken out: dead, for another node has registered with their port"
+    );
+}

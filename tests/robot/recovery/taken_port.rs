@@ -1,0 +1,158 @@
+//! A dead node's port is another node's now: `--reap-dead-nodes` takes the dead one out before the master can
+//! mistake the other for it (ros_comm issue 2241).
+
+use std::time::Duration;
+
+use rosrescue::xmlrpc::{Call, Value};
+
+use crate::support::{
+    Client, FakeNode, Mode, Node, Robot, Rosmaster, Scratch, State, eventually, free_port, holds,
+    in_both_modes, params, ros_command,
+};
+
+/// A rospy node at a given port.
+const INNOCENT: &str = "
+import sys, rospy
+from std_msgs.msg import String
+rospy.init_node('innocent', xmlrpc_port=int(sys.argv[1]))
+publisher = rospy.Publisher('topic', String, queue_size=1)
+print('ready /innocent', flush=True)
+rospy.spin()
+";
+
+/// Longer than a master needs to tell a node to shut down.
+const A_WHILE: Duration = Duration::from_secs(2);
+
+fn innocent(scratch: &Scratch, master: u16, port: u16) -> Node {
+    let mut command = ros_command(scratch, "/usr/bin/python3", master);
+    Node::run(command.args(["-c", INNOCENT, &port.to_string()]))
+}
+
+/// A node with registrations of every kind, one of which another node has taken over, that dies. Returns its
+/// port.
+fn dead_node(master: &Client, heir: &FakeNode) -> u16 {
+    // One that no other program on this computer gets meanwhile.
+    let node = FakeNode::start_at("/killed", free_port());
+    node.publish(master, "/topic", "std_msgs/String");
+    node.subscribe(master, "/other", "std_msgs/String");
+    node.watch_param(master, "/gain");
+    node.offer(master, "/own");
+    node.offer(master, "/shared");
+    heir.offer(master, "/shared");
+    node.port()
+}
+
+/// The dead node is started again, at a port of its own.
+fn started_again(master: &Client) -> FakeNode {
+    let node = FakeNode::start("/killed");
+    node.publish(master, "/topic", "std_msgs/String");
+    node
+}
+
+fn options() -> [&'static str; 2] {
+    // The health check itself never comes to it.
+    ["--reap-dead-nodes", "3600"]
+}
+
+#[test]
+fn a_bare_master_shuts_the_innocent_node_down() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let client = master.client();
+    let port = dead_node(&client, &FakeNode::start("/heir"));
+    let mut innocent = innocent(&scratch, master.port, port);
+    assert!(State::read(&client).knows("/killed"));
+    let _again = started_again(&client);
+    innocent.wait();
+}
+
+in_both_modes!(the_innocent_node_lives_on);
+
+fn the_innocent_node_lives_on(mode: Mode) {
+    let mut robot = Robot::start_with(mode, &options());
+    let client = robot.client();
+    let [heir, watcher] = ["/heir", "/watcher"].map(FakeNode::start);
+    watcher.subscribe(&client, "/topic", "std_msgs/String");
+    let port = dead_node(&client, &heir);
+    let mut innocent = innocent(&robot.scratch, robot.port(), port);
+    // What is gone is gone before the new node is there, and those who subscribe have heard of both.
+    let state = robot.settled_state();
+    assert!(!state.knows("/killed"), "{state}");
+    assert_eq!(client.ask("lookupNode", params!["/test", "/killed"]), None);
+    assert_eq!(state.publishers_of("/topic"), ["/innocent"]);
+    let shared = state
+        .service_apis
+        .iter()
+        .find(|(name, _)| name == "/shared");
+    assert_eq!(shared.unwrap().1, heir.service_api());
+    eventually("the subscriber has heard of both", || {
+        let updates = watcher.updates("/topic");
+        updates.contains(&Vec::new()) && updates.last().is_some_and(|last| last.len() == 1)
+    });
+    // It is in the journal.
+    robot.rescue.kill();
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    robot.crash_master();
+    state.assert_same(&robot.settled_state(), "after everything was killed");
+
+    let _again = started_again(&client);
+    assert!(holds(A_WHILE, || innocent.exited().is_none()));
+    assert_eq!(watcher.heard("shutdown"), Vec::<Vec<_>>::new());
+    assert_eq!(robot.counter("divergences"), 0);
+}
+
+in_both_modes!(while_the_mirror_stands_in_it_is_the_same);
+
+fn while_the_mirror_stands_in_it_is_the_same(mode: Mode) {
+    let mut robot = Robot::start_under_with(mode, "waiting_rosmaster.py", &[], &options());
+    let client = robot.client();
+    let heir = FakeNode::start("/heir");
+    let port = dead_node(&client, &heir);
+    robot.settled_state();
+    robot.stay_away();
+    robot.take_master_away();
+    let mut innocent = innocent(&robot.scratch, robot.port(), port);
+    assert_eq!(client.ask("lookupNode", params!["/test", "/killed"]), None);
+    let again = started_again(&client);
+    assert!(holds(A_WHILE, || innocent.exited().is_none()));
+    assert!(!robot.is_open());
+    robot.revive_master();
+    robot.await_gate();
+    let api = client.ok("lookupNode", params!["/test", "/killed"]);
+    assert_eq!(api, Value::from(again.api.as_str()));
+    let state = robot.settled_state();
+    assert_eq!(state.publishers_of("/topic"), ["/innocent", "/killed"]);
+    assert!(innocent.exited().is_none());
+}
+
+/// Many at once, of which some take ports from others of the same batch, alone and in multicalls.
+#[test]
+fn of_many_registrations_the_last_at_a_port_stays() {
+    let robot = Robot::start_with(Mode::Core, &options());
+    let register = |node: String, port: usize| {
+        let api = format!("http://127.0.0.1:{}/", 1 + port);
+        let params = params![node, "/topic", "std_msgs/String", api];
+        Call::new("registerSubscriber", params)
+    };
+    std::thread::scope(|scope| {
+        for port in 0..20 {
+            let client = robot.client();
+            scope.spawn(move || {
+                for turn in 0..5 {
+                    let call = register(format!("/node{port}_{turn}"), port);
+                    match turn % 2 {
+                        0 => drop(client.ok(&call.method, call.params)),
+                        _ => client.call_all(&[call]),
+                    }
+                }
+            });
+        }
+    });
+    let mut left = robot.settled_state().subscribers_of("/topic");
+    left.sort();
+    let mut last: Vec<_> = (0..20).map(|port| format!("/node{port}_4")).collect();
+    last.sort();
+    assert_eq!(left, last);
+    assert_eq!(robot.counter("divergences"), 0);
+}
