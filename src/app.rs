@@ -25,6 +25,7 @@ use crate::{
     roscore::{self, Roscore},
     server::{
         Server,
+        access::Access,
         answers::Answers,
         body,
         calls::Calls,
@@ -225,8 +226,14 @@ pub async fn run(
         ledger.clone(),
         gate.clone(),
     );
+    let access = Access::new(config.allow.clone(), config.allow_write.clone());
+    if !config.allow.is_empty() || !config.allow_write.is_empty() {
+        tracing::info!("{access}");
+    }
     let server = Arc::new(Server {
         names,
+        access,
+        refused: Default::default(),
         instance,
         looped: Arc::clone(&looped),
         clients: clients.clone(),

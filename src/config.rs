@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use ipnet::IpNet;
 use thiserror::Error;
 
 use crate::{
@@ -87,6 +88,10 @@ pub struct Config {
     /// Pause between two health checks while all is well; none to disable them, and the eviction of nodes
     /// whose ports other nodes register.
     pub reap_interval: Option<Duration>,
+    /// Who may call; none: everybody.
+    pub allow: Vec<IpNet>,
+    /// Who may change anything; none: everybody who may call.
+    pub allow_write: Vec<IpNet>,
     /// Pause between two comparisons of the mirror with the master; none to disable them.
     pub resync_interval: Option<Duration>,
     /// Who answers reads while there is a master.
@@ -259,6 +264,8 @@ impl Config {
                 86_400.0,
             )?)
             .filter(|interval| !interval.is_zero()),
+            allow: args.allow.clone(),
+            allow_write: args.allow_write.clone(),
             resync_interval: Some(seconds(
                 "--resync-interval",
                 args.resync_interval,

@@ -1,5 +1,6 @@
 //! The side that clients talk to: listener, admission, calls and pages.
 
+pub(crate) mod access;
 pub(crate) mod admission;
 pub(crate) mod answers;
 pub(crate) mod body;
@@ -12,17 +13,28 @@ pub(crate) mod pages;
 pub(crate) mod replies;
 pub(crate) mod service;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use tokio::sync::{Notify, Semaphore};
 
-use self::{answers::Answers, calls::Calls, clients::Clients, idle::Idle, pages::Pages};
+use self::{
+    access::{Access, Said},
+    answers::Answers,
+    calls::Calls,
+    clients::Clients,
+    idle::Idle,
+    pages::Pages,
+};
 use crate::status::stats::Stats;
 
 /// What every request needs.
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
+    /// Who may call and change.
+    pub(crate) access: Access,
+    /// Which refused addresses the log has named lately.
+    pub(crate) refused: Mutex<Said>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
     /// Notified when a request of our own arrives here: the master's address is our own.

@@ -1,11 +1,13 @@
 //! Options of `core` and `proxy`.
 
-use std::path::PathBuf;
+use std::{net::IpAddr, path::PathBuf};
 
 use clap::{
     Args, ValueEnum,
     builder::{FalseyValueParser, PossibleValue},
 };
+
+use ipnet::IpNet;
 
 use crate::checkpoint::session::Restore;
 
@@ -152,6 +154,26 @@ pub struct CommonArgs {
     )]
     #[arg(allow_negative_numbers = true)]
     pub reap_dead_nodes: f64,
+    /// Networks and addresses that may call, as in 10.0.0.0/24 or fd00::/64; all others are refused but
+    /// this computer, which always may [default: everybody]
+    #[arg(
+        long,
+        env = "ROSRESCUE_ALLOW",
+        value_name = "NET",
+        value_delimiter = ','
+    )]
+    #[arg(value_parser = network)]
+    pub allow: Vec<IpNet>,
+    /// Networks and addresses that may change anything; of others that may call only reads are taken. Every
+    /// node changes something when it starts [default: everybody who may call]
+    #[arg(
+        long,
+        env = "ROSRESCUE_ALLOW_WRITE",
+        value_name = "NET",
+        value_delimiter = ','
+    )]
+    #[arg(value_parser = network)]
+    pub allow_write: Vec<IpNet>,
     /// How often the mirror is compared with the master, for writes that reached it past the proxy,
     /// in seconds; 0 for never (it is compared at each connect and after each doubt anyway)
     #[arg(
@@ -211,6 +233,24 @@ pub struct CommonArgs {
     pub log: Option<String>,
 }
 
+/// A network, or the one of a single address. An IPv4 network written as IPv6 (`::ffff:10.0.0.0/120`) is an
+/// IPv4 network.
+fn network(text: &str) -> Result<IpNet, &'static str> {
+    let net = text.parse::<IpNet>();
+    let net = net.or_else(|_| text.parse::<IpAddr>().map(IpNet::from));
+    let net =
+        net.map_err(|_| "write a network or an address, as in 10.0.0.0/24, 10.0.0.7 or fd00::/64")?;
+    let mapped = match net {
+        IpNet::V6(net) => net
+            .addr()
+            .to_ipv4_mapped()
+            .zip(net.prefix_len().checked_sub(96)),
+        IpNet::V4(_) => None,
+    };
+    let mapped = mapped.and_then(|(address, length)| IpNet::new(address.into(), length).ok());
+    Ok(mapped.unwrap_or(net))
+}
+
 impl ValueEnum for Restore {
     fn value_variants<'a>() -> &'a [Self] {
         &[Self::Auto, Self::Always, Self::Never]
@@ -256,4 +296,35 @@ pub enum LogFormat {
     Text,
     /// A JSON object a message
     Json,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::network;
+
+    #[test]
+    fn a_network_is_written_in_many_ways() {
+        for (text, is) in [
+            ("10.0.0.0/24", "10.0.0.0/24"),
+            ("10.0.0.7", "10.0.0.7/32"),
+            ("fd00::/64", "fd00::/64"),
+            ("::1", "::1/128"),
+            ("::ffff:10.0.0.0/120", "10.0.0.0/24"),
+            ("::ffff:10.0.0.7", "10.0.0.7/32"),
+            ("::/0", "::/0"),
+        ] {
+            assert_eq!(network(text).map(|net| net.to_string()), Ok(is.to_owned()));
+        }
+        for text in [
+            "",
+            "robot",
+            "10.0.0.0/33",
+            "10.0.0",
+            "10.0.0.1-9",
+            "fd00::/129",
+            "*",
+        ] {
+            assert!(network(text).is_err(), "{text}");
+        }
+    }
 }

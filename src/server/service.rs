@@ -1,12 +1,21 @@
 //! One request from its head to its answer.
 
-use std::{net::SocketAddr, sync::Arc, time::Instant};
+use std::{
+    net::SocketAddr,
+    sync::{Arc, PoisonError},
+    time::Instant,
+};
 
 use bytes::Bytes;
-use hyper::{Method, Request, StatusCode, body::Incoming, header::CONTENT_ENCODING};
+use hyper::{
+    Method, Request, StatusCode,
+    body::Incoming,
+    header::{CONNECTION, CONTENT_ENCODING, HeaderValue},
+};
 
 use super::{
     Server,
+    access::Grant,
     admission::{self, Refusal},
     answers,
     body::{self, BodyError, Room},
@@ -35,11 +44,21 @@ const ATTEMPTS: u32 = 4;
 pub(crate) async fn serve(
     server: Arc<Server>,
     peer: SocketAddr,
+    grant: Grant,
     deadlines: Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     deadlines.serving();
-    let reply = route(server, peer, &deadlines, request).await;
+    let reply = match grant.check(peer.ip()) {
+        Ok(()) => route(server, peer, grant, &deadlines, request).await,
+        Err(refusal) => {
+            let mut reply = keep_out(&server, peer, &refusal);
+            // Its connection is to leave room for others.
+            let close = HeaderValue::from_static("close");
+            reply.headers_mut().insert(CONNECTION, close);
+            Ok(reply)
+        }
+    };
     deadlines.replying();
     reply
 }
@@ -47,6 +66,7 @@ pub(crate) async fn serve(
 async fn route(
     server: Arc<Server>,
     peer: SocketAddr,
+    grant: Grant,
     deadlines: &Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
@@ -58,7 +78,7 @@ async fn route(
             }
             Err(refusal) => Ok(refuse(&server, peer, &refusal)),
         },
-        Method::POST => post(server, peer, deadlines, request).await,
+        Method::POST => post(server, peer, grant, deadlines, request).await,
         ref method => Ok(text(
             StatusCode::NOT_IMPLEMENTED,
             format!("method {method} is not supported; XML-RPC is POST, the status page GET\n"),
@@ -69,6 +89,7 @@ async fn route(
 async fn post(
     server: Arc<Server>,
     peer: SocketAddr,
+    grant: Grant,
     deadlines: &Deadlines,
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
@@ -118,6 +139,10 @@ async fn post(
         Err(BodyError::TooSlow) => return Err(Closed("the request came too slowly")),
         Err(BodyError::NoRoom) => return Err(Closed("too many large requests at the same time")),
     };
+    let kind = call.as_ref().map(master::Request::kind);
+    if let Err(refusal) = grant.check_call(peer.ip(), kind) {
+        return Ok(keep_out(&server, peer, &refusal));
+    }
     server.stats.calls.count();
     if let Some(call) = &call {
         let caller_id = call.caller().unwrap_or_default();
@@ -190,6 +215,19 @@ async fn page(
 fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     server.stats.requests_refused.count();
     rarely!(warn, %peer, status = refusal.status.as_u16(), reason = refusal.reason, "refused a request");
+    text(refusal.status, format!("{}\n", refusal.reason))
+}
+
+/// As [`refuse`], but the log names an address once a minute: nodes call again and again.
+fn keep_out(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
+    let mut said = server
+        .refused
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner);
+    if said.is_due(Instant::now(), peer.ip()) {
+        tracing::warn!("refused: {}", refusal.reason);
+    }
+    server.stats.requests_refused.count();
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 

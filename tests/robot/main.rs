@@ -56,8 +56,8 @@ mod recovery {
 
 /// Long lives of nodes, and the tools of ROS.
 mod nodes {
-    mod streams;
     mod example;
+    mod streams;
     mod tools;
 }
 
@@ -66,6 +66,7 @@ mod clients {
     mod connections;
     mod forwarding;
     mod hostile;
+    mod networks;
     mod reads;
 }
 

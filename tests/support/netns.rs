@@ -67,6 +67,31 @@ impl Netns {
         format!("{}.{host}", self.net)
     }
 
+    /// Gives both sides addresses of IPv6, too: [`Self::near6`], and those of [`Self::far6`] from 2 to 5.
+    pub(crate) fn add_ipv6(&self) {
+        let Self { name, near, .. } = self;
+        // At once, and not after a search for the same address elsewhere.
+        ip(&format!("addr add {}/64 dev {near} nodad", self.near6()));
+        let far = near.replacen('n', "f", 1);
+        for host in 2..6 {
+            ip(&format!(
+                "-n {name} addr add {}/64 dev {far} nodad",
+                self.far6(host)
+            ));
+        }
+    }
+
+    /// As [`Self::near`], of IPv6.
+    pub(crate) fn near6(&self) -> String {
+        self.far6(1)
+    }
+
+    /// As [`Self::far`], of IPv6.
+    pub(crate) fn far6(&self, host: u8) -> String {
+        let net = self.net.replace('.', ":");
+        format!("fd00:{net}::{host}")
+    }
+
     /// Packets to that address vanish from now on.
     pub(crate) fn cut(&self, host: u8) {
         let Self { near, net, .. } = self;

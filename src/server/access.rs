@@ -1,0 +1,231 @@
+//! Who may call, and who may change something: `--allow` and `--allow-write`, without IO.
+
+use std::{
+    collections::HashMap,
+    fmt,
+    net::IpAddr,
+    time::{Duration, Instant},
+};
+
+use hyper::StatusCode;
+use ipnet::IpNet;
+
+use super::admission::Refusal;
+use crate::master::Kind;
+
+/// A refused node calls again up to 20 times a second.
+const SAY_AGAIN: Duration = Duration::from_secs(60);
+/// Most addresses that are remembered for that. Others are counted and not spoken of.
+const REMEMBERED: usize = 1000;
+
+/// The networks of `--allow` and `--allow-write`. None given: everybody.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Access {
+    allow: Vec<IpNet>,
+    allow_write: Vec<IpNet>,
+}
+
+/// What a client may do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Grant {
+    Nothing,
+    Read,
+    Write,
+}
+
+impl Access {
+    pub(crate) fn new(allow: Vec<IpNet>, allow_write: Vec<IpNet>) -> Self {
+        Self { allow, allow_write }
+    }
+
+    /// Of a connection from `peer` to our address `own`. This computer may do everything: rosmaster,
+    /// rosout and the robot's own nodes live here. Who may change may call.
+    pub(crate) fn of(&self, peer: IpAddr, own: Option<IpAddr>) -> Grant {
+        let peer = peer.to_canonical();
+        let here = peer.is_loopback() || own.map(|own| own.to_canonical()) == Some(peer);
+        let is_in = |nets: &[IpNet]| nets.iter().any(|net| net.contains(&peer));
+        let writes = is_in(&self.allow_write);
+        match (here || writes, self.allow.is_empty() || is_in(&self.allow)) {
+            (true, _) => Grant::Write,
+            (_, true) if self.allow_write.is_empty() => Grant::Write,
+            (_, true) => Grant::Read,
+            (_, false) => Grant::Nothing,
+        }
+    }
+}
+
+impl Grant {
+    /// Whether any request is taken.
+    pub(crate) fn check(self, peer: IpAddr) -> Result<(), Refusal> {
+        match self {
+            Self::Nothing => Err(refusal(peer, "call", "--allow")),
+            Self::Read | Self::Write => Ok(()),
+        }
+    }
+
+    /// Whether a call of this kind is taken; none if it could not be decoded. What only the master
+    /// understands may change anything.
+    pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Refusal> {
+        match (self, kind) {
+            (Self::Write, _) | (Self::Read, Some(Kind::Read | Kind::Identity)) => Ok(()),
+            (Self::Read | Self::Nothing, _) => Err(refusal(peer, "change", "--allow-write")),
+        }
+    }
+}
+
+/// rospy and roscpp take this status for a master that is not there yet, and call again; an XML-RPC fault would
+/// end a node that starts.
+fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
+    let reason = match what {
+        "call" => format!("{peer} may not call this master: rosrescue's {option} does not name it"),
+        _ => format!("{peer} may only read here: rosrescue's {option} does not name it"),
+    };
+    Refusal {
+        status: StatusCode::FORBIDDEN,
+        reason,
+    }
+}
+
+/// For a person, at the start.
+impl fmt::Display for Access {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let list = |nets: &[IpNet]| {
+            let mut names: Vec<_> = nets.iter().map(|net| net.trunc().to_string()).collect();
+            names.insert(0, "this computer".to_owned());
+            names.join(", ")
+        };
+        let may_call: Vec<_> = [&self.allow[..], &self.allow_write].concat();
+        match (self.allow.is_empty(), self.allow_write.is_empty()) {
+            (true, true) => f.write_str("everybody may call and change"),
+            (false, true) => write!(f, "only these may call and change: {}", list(&self.allow)),
+            (true, false) => write!(
+                f,
+                "everybody may read, only these may change: {}",
+                list(&self.allow_write)
+            ),
+            (false, false) => write!(
+                f,
+                "only these may call: {}; only these may change: {}",
+                list(&may_call),
+                list(&self.allow_write)
+            ),
+        }
+    }
+}
+
+/// When each address was last spoken of.
+#[derive(Debug, Default)]
+pub(crate) struct Said(HashMap<IpAddr, Instant>);
+
+impl Said {
+    /// Whether to speak of `peer` now.
+    pub(crate) fn is_due(&mut self, now: Instant, peer: IpAddr) -> bool {
+        let is_recent = |said: &Instant| now.duration_since(*said) < SAY_AGAIN;
+        if self.0.get(&peer).is_some_and(is_recent) {
+            return false;
+        }
+        if self.0.len() >= REMEMBERED {
+            self.0.retain(|_, said| is_recent(said));
+        }
+        let due = self.0.len() < REMEMBERED;
+        if due {
+            self.0.insert(peer, now);
+        }
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn nets(list: &[&str]) -> Vec<IpNet> {
+        list.iter().map(|net| net.parse().unwrap()).collect()
+    }
+
+    fn grant(allow: &[&str], write: &[&str], peer: &str) -> Grant {
+        let own = "10.0.0.7".parse().unwrap();
+        Access::new(nets(allow), nets(write)).of(peer.parse().unwrap(), Some(own))
+    }
+
+    #[test]
+    fn networks_say_who_may_call_and_who_may_change() {
+        use Grant::{Nothing, Read, Write};
+        const LAN: [&str; 2] = ["10.0.0.0/24", "fd00::/64"];
+        for (allow, write, peer, may) in [
+            (&[][..], &[][..], "192.0.2.1", Write),
+            (&LAN, &[], "10.0.0.9", Write),
+            (&LAN, &[], "::ffff:10.0.0.9", Write),
+            (&LAN, &[], "fd00::9", Write),
+            (&LAN, &[], "10.0.1.9", Nothing),
+            (&LAN, &[], "fd00:0:0:1::9", Nothing),
+            (&[], &LAN, "10.0.0.9", Write),
+            (&[], &LAN, "192.0.2.1", Read),
+            (&LAN, &["10.0.0.8/32"], "10.0.0.8", Write),
+            (&LAN, &["10.0.0.8/32"], "10.0.0.9", Read),
+            (&LAN, &["10.0.0.8/32"], "192.0.2.1", Nothing),
+            // Who may change may call.
+            (&LAN, &["192.0.2.1/32"], "192.0.2.1", Write),
+            // An address of one family is in no network of the other.
+            (&["0.0.0.0/0"], &[], "fd00::9", Nothing),
+            (&["::/0"], &[], "10.0.0.9", Nothing),
+            // This computer.
+            (&["192.0.2.0/24"], &["192.0.2.1/32"], "127.0.0.1", Write),
+            (&["192.0.2.0/24"], &["192.0.2.1/32"], "::1", Write),
+            (&["192.0.2.0/24"], &["192.0.2.1/32"], "10.0.0.7", Write),
+        ] {
+            assert_eq!(grant(allow, write, peer), may, "{allow:?} {write:?} {peer}");
+        }
+    }
+
+    #[test]
+    fn what_may_change_something_is_a_change() {
+        let peer = "10.0.0.9".parse().unwrap();
+        let may = |grant: Grant, kind| grant.check_call(peer, kind).is_ok();
+        for kind in [Kind::Identity, Kind::Read] {
+            assert!(may(Grant::Read, Some(kind)), "{kind:?}");
+        }
+        for kind in [
+            Kind::Unregister,
+            Kind::Mutate,
+            Kind::Unknown,
+            Kind::Shutdown,
+        ] {
+            assert!(!may(Grant::Read, Some(kind)), "{kind:?}");
+            assert!(may(Grant::Write, Some(kind)), "{kind:?}");
+        }
+        assert!(!may(Grant::Read, None));
+        assert!(may(Grant::Write, None));
+        assert!(Grant::Read.check(peer).is_ok());
+        assert_eq!(Grant::Nothing.check(peer).unwrap_err().status.as_u16(), 403);
+    }
+
+    #[test]
+    fn the_start_says_who_may() {
+        let says =
+            |allow: &[&str], write: &[&str]| Access::new(nets(allow), nets(write)).to_string();
+        assert_eq!(
+            says(&["10.0.0.7/24"], &["fd00::/64"]),
+            "only these may call: this computer, 10.0.0.0/24, fd00::/64; only these may change: \
+             this computer, fd00::/64"
+        );
+        assert_eq!(
+            says(&[], &["10.0.0.8/32"]),
+            "everybody may read, only these may change: this computer, 10.0.0.8/32"
+        );
+    }
+
+    #[test]
+    fn an_address_is_spoken_of_once_a_minute() {
+        let (mut said, now) = (Said::default(), Instant::now());
+        let peer = |number: usize| IpAddr::from(u128::try_from(number).unwrap().to_be_bytes());
+        assert!(said.is_due(now, peer(0)));
+        assert!(!said.is_due(now, peer(0)));
+        assert!(said.is_due(now, peer(1)));
+        assert!(said.is_due(now + SAY_AGAIN, peer(0)));
+        let spoken =
+            (0..3 * REMEMBERED).filter(|&number| said.is_due(now + SAY_AGAIN, peer(number)));
+        assert_eq!(spoken.count(), REMEMBERED - 1);
+        assert!(said.is_due(now + 3 * SAY_AGAIN, peer(2 * REMEMBERED)));
+    }
+}
