@@ -16,7 +16,7 @@ use crate::{
     config::{Config, MasterConfig},
     gate::{self, State},
     guardian::handover::Sockets,
-    ledger::{Ledger, checkpointer::Checkpointer},
+    ledger::{Ledger, checkpointer::Checkpointer, history::Rescues},
     lifecycle::Supervision,
     nodes::{self, Nodes},
     process::{ProcessError, Rosmaster},
@@ -184,6 +184,7 @@ pub async fn run(
         nodes.clone(),
         board.clone(),
         process,
+        Rescues::new(ledger.clone(), config.history),
     );
     let told = Source {
         board: board.clone(),

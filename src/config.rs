@@ -2,7 +2,7 @@
 
 use std::{
     net::{IpAddr, SocketAddr},
-    path::PathBuf,
+    path::{Path, PathBuf},
     time::Duration,
 };
 
@@ -73,6 +73,8 @@ pub struct Config {
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
     pub restore: Restore,
+    /// Most space for the checkpoints that are kept, in bytes.
+    pub history: u64,
     /// When the journal is synced.
     pub sync: SyncPolicy,
     /// Pause between two syncs with [`SyncPolicy::Interval`].
@@ -232,7 +234,6 @@ impl Config {
         if let Some((variable, given)) = ros_env::bad_override(env) {
             return Err(UsageError::Host { variable, given });
         }
-        let checkpoint = args.checkpoint.clone();
         let interval = Duration::from_millis(args.probe_interval);
         let interval = master.idle_limit().map_or(interval, |limit| {
             interval.min((limit / 2).max(SHORTEST_INTERVAL))
@@ -247,8 +248,9 @@ impl Config {
             advertised,
             master,
             reads,
-            checkpoint: checkpoint.unwrap_or_else(|| ros_env::log_dir(env).join(CHECKPOINT_NAME)),
+            checkpoint: checkpoint_path(args.checkpoint.as_deref(), env),
             restore: args.restore,
+            history: args.history << 20,
             sync: args.sync,
             sync_interval: Duration::from_millis(args.sync_interval),
             hold: seconds("--hold", args.hold, 3600.0)?,
@@ -277,6 +279,14 @@ impl Config {
             max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),
         })
     }
+}
+
+/// The checkpoint that is meant if `given` is on the command line.
+pub(crate) fn checkpoint_path(given: Option<&Path>, env: Lookup<'_>) -> PathBuf {
+    given.map_or_else(
+        || ros_env::log_dir(env).join(CHECKPOINT_NAME),
+        Path::to_owned,
+    )
 }
 
 fn usize_of(number: u32) -> usize {

@@ -7,6 +7,7 @@ pub(crate) mod activity;
 mod answers;
 pub(crate) mod checkpointer;
 mod durability;
+pub(crate) mod history;
 mod injection;
 mod pending;
 mod summary;

@@ -20,6 +20,7 @@ use self::{
 };
 use crate::{
     gate::State,
+    ledger::history::Rescues,
     lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
     limit::rarely,
     nodes::Nodes,
@@ -56,6 +57,7 @@ pub(crate) struct Driver {
     board: Arc<Board>,
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
+    rescues: Rescues,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     connection: Option<Connection>,
@@ -80,6 +82,7 @@ impl Driver {
         nodes: Arc<Nodes>,
         board: Arc<Board>,
         process: Option<MasterProcess>,
+        rescues: Rescues,
     ) -> Self {
         let supervision = match process {
             Some(_) => Supervision::Ours,
@@ -94,6 +97,7 @@ impl Driver {
             nodes,
             board,
             process,
+            rescues,
             spawn_error: None,
             connection: None,
             ended: None,

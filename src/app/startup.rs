@@ -7,7 +7,7 @@ use crate::{
     checkpoint::{
         format::Session,
         session::{self, Decision, Evidence, Rebuilt},
-        store::{self, OpenError, Store},
+        store::{self, OpenError, Store, history},
     },
     clock,
     config::Config,
@@ -97,6 +97,11 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 story = format!("a new session begins ({why}{kept})");
             }
         }
+    }
+    if let Some(store) = &store
+        && let Err(error) = history::trim(store.path(), config.history)
+    {
+        tracing::debug!(%error, "the kept checkpoints cannot be listed");
     }
     let restored = beginning.is_some();
     let (mirror, mut session, pending) = beginning.unwrap_or_default();

@@ -14,6 +14,7 @@
 mod aside;
 mod error;
 mod generation;
+pub mod history;
 mod journal;
 mod load;
 mod lock;

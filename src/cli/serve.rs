@@ -84,6 +84,16 @@ pub struct CommonArgs {
     /// When to restore the state of the checkpoint at the start of rosrescue
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = Restore::Auto)]
     pub restore: Restore,
+    /// Most space for the checkpoints that are kept: of the last five sessions, and of the last twenty rescues,
+    /// in MiB; 0 for the last session alone. `rosrescue history` lists them
+    #[arg(
+        long,
+        env = "ROSRESCUE_HISTORY",
+        value_name = "MIB",
+        default_value_t = 16
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(..=1 << 20))]
+    pub history: u64,
     /// When the journal is forced to the disk; it survives kill -9 in any case
     #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = SyncPolicy::Interval)]
     pub sync: SyncPolicy,

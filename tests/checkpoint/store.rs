@@ -196,10 +196,7 @@ fn a_session_set_aside_has_no_part_in_the_next() {
     store.begin(&checkpoint(2)).unwrap();
     for nth in 1..=12 {
         let aside = store.set_aside("session").unwrap().unwrap();
-        assert_eq!(
-            aside,
-            folder.path().join(format!("c.yaml.session-{}", 2 * nth))
-        );
+        assert_eq!(aside, folder.path().join(format!("c.yaml.session-{nth}")));
         assert!(store.append(&[entry(0)]).is_err());
         store.begin(&checkpoint(store.seq())).unwrap();
         store.append(&[entry(nth)]).unwrap();

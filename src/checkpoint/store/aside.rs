@@ -4,12 +4,13 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::generation::{append_all, failed};
+use super::names::previous;
 use super::storage::FileId;
 use super::{BROKEN, Loaded, Names, Storage, Store, StoreError};
 
 impl<S: Storage> Store<S> {
-    /// Renames the present file to `PATH.REASON-NUMBER`, and its previous generation too, so that neither
-    /// affects the next one. Nothing can be recorded before the next [`begin`](Self::begin). Returns the
+    /// Renames the present file to `PATH.REASON-NUMBER`, so that it does not affect the next one. Its previous
+    /// generation is removed, or renamed too if the file lacks anything. Nothing can be recorded before the next [`begin`](Self::begin). Returns the
     /// file's new path, if there was a file.
     ///
     /// # Errors
@@ -19,7 +20,8 @@ impl<S: Storage> Store<S> {
         self.active = None;
         self.overtake();
         self.unprotected = Some("its file has been set aside".to_owned());
-        self.present = None;
+        // Then it has all that the previous generation has.
+        let whole = self.present.take().is_some_and(|present| present.usable);
         let kind: String = reason
             .chars()
             .map(|letter| {
@@ -30,12 +32,16 @@ impl<S: Storage> Store<S> {
                 }
             })
             .collect();
-        let path = &self.names.path;
-        // The previous generation first: if it stayed alone it could be restored.
-        let moved = set_aside_previous(&self.storage, &self.names, &kind).and_then(|()| {
-            let aside = self.names.aside(&self.storage, &kind)?;
-            let moved = rename_if_there(&self.storage, path, &aside)?;
-            self.storage.sync_dir(self.names.folder())?;
+        let (storage, path) = (&self.storage, &self.names.path);
+        let moved = self.names.aside(storage, &kind).and_then(|aside| {
+            // The previous generation first: if it stayed alone it could be restored.
+            let before = self.names.previous();
+            match whole {
+                true => if_there(storage.remove(&before))?,
+                false => if_there(storage.rename(&before, &previous(&aside)))?,
+            };
+            let moved = if_there(storage.rename(path, &aside))?;
+            storage.sync_dir(self.names.folder())?;
             Ok(moved.then_some(aside))
         });
         moved.map_err(failed("set aside", path))
@@ -91,11 +97,12 @@ pub(super) fn set_aside_previous(
 ) -> io::Result<()> {
     let previous = names.previous();
     let aside = names.aside(storage, kind)?;
-    rename_if_there(storage, &previous, &aside).map(|_| ())
+    if_there(storage.rename(&previous, &aside)).map(|_| ())
 }
 
-fn rename_if_there(storage: &impl Storage, from: &Path, to: &Path) -> io::Result<bool> {
-    match storage.rename(from, to) {
+/// Whether the file was there.
+fn if_there(done: io::Result<()>) -> io::Result<bool> {
+    match done {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(error) => Err(error),

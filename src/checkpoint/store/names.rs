@@ -16,9 +16,7 @@ pub(super) struct Names {
 
 impl Names {
     fn with(&self, suffix: &str) -> PathBuf {
-        let mut name = self.path.as_os_str().to_owned();
-        name.push(suffix);
-        PathBuf::from(name)
+        with(&self.path, suffix)
     }
 
     pub(super) fn lock(&self) -> PathBuf {
@@ -26,7 +24,7 @@ impl Names {
     }
 
     pub(super) fn previous(&self) -> PathBuf {
-        self.with(".previous")
+        previous(&self.path)
     }
 
     pub(super) fn fresh(&self, generation: u64) -> PathBuf {
@@ -52,7 +50,7 @@ impl Names {
     }
 
     /// The numbers of the files called `PATH.KIND-NUMBER`, lowest first.
-    fn numbers(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<u64>> {
+    pub(super) fn numbers(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<u64>> {
         let number = |ending: &String| {
             ending
                 .strip_prefix(kind)?
@@ -65,7 +63,7 @@ impl Names {
         Ok(numbers)
     }
 
-    fn numbered(&self, kind: &str, number: u64) -> PathBuf {
+    pub(super) fn numbered(&self, kind: &str, number: u64) -> PathBuf {
         self.with(&format!(".{kind}-{number}"))
     }
 
@@ -76,7 +74,9 @@ impl Names {
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
         for number in found.iter().take(surplus) {
             // A failed removal must not prevent the new file.
-            let _ = storage.remove(&self.numbered(kind, *number));
+            let path = self.numbered(kind, *number);
+            let _ = storage.remove(&path);
+            let _ = storage.remove(&previous(&path));
         }
         let number = found.last().copied().unwrap_or(0).saturating_add(1);
         Ok(self.numbered(kind, number))
@@ -96,4 +96,15 @@ impl Names {
         }
         Ok(())
     }
+}
+
+/// The name of the generation before the file at `path`.
+pub(super) fn previous(path: &Path) -> PathBuf {
+    with(path, ".previous")
+}
+
+pub(super) fn with(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
 }
