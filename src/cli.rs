@@ -1,5 +1,6 @@
 //! The command line. Every option has an environment variable, a default and a unit in its help.
 
+mod files;
 mod live;
 mod serve;
 mod tools;
@@ -7,6 +8,10 @@ mod tools;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
+    files::{
+        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, RestoreArgs,
+        VerifyArgs,
+    },
     live::{For, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
     tools::{HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool},
@@ -70,10 +75,9 @@ mod tests {
     fn every_option_has_an_environment_variable_and_a_help_text() {
         let cli = Cli::command();
         for command in std::iter::once(&cli).chain(cli.get_subcommands()) {
-            for option in command
-                .get_arguments()
-                .filter(|a| !["help", "version"].contains(&a.get_id().as_str()))
-            {
+            for option in command.get_arguments().filter(|a| {
+                !a.is_positional() && !["help", "version"].contains(&a.get_id().as_str())
+            }) {
                 let name = option.get_id();
                 let variable = option
                     .get_env()

@@ -1,10 +1,18 @@
 //! The commands that do not serve nodes: each asks a running rosrescue, reads a checkpoint or looks at this
 //! computer, prints what it has found, and ends with an [`Exit`] that a script can use.
 
+mod diff;
+mod files;
+mod history;
+mod inspect;
+mod live;
+mod params;
+mod restore;
 mod running;
 mod status;
 mod terminal;
 mod top;
+mod verify;
 mod wait;
 
 use std::{
@@ -54,14 +62,21 @@ impl Failure {
 
 /// Runs `tool` and says what it has found.
 pub fn run(tool: &Tool) -> ExitCode {
-    let runtime = tokio::runtime::Builder::new_current_thread()
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
         .enable_all()
         .build();
     let ended = match runtime {
         Ok(runtime) => runtime.block_on(async {
             match tool {
+                Tool::Diff(args) => diff::run(args).await,
+                Tool::History(args) => history::run(args).await,
+                Tool::Inspect(args) => inspect::run(args).await,
+                Tool::Params(args) => params::run(args).await,
+                Tool::Restore(args) => restore::run(args).await,
                 Tool::Status(args) => status::run(args).await,
                 Tool::Top(args) => top::run(args).await,
+                Tool::Verify(args) => verify::run(args).await,
                 Tool::Wait(args) => wait::run(args).await,
             }
         }),

@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use regex::{Regex, RegexBuilder};
 
-use crate::xmlrpc::Value;
+use crate::xmlrpc::{Struct, Value};
 
 /// The names whose values are hidden unless others are given.
 pub const DEFAULT: &str = "password|token|secret|key";
@@ -43,6 +43,15 @@ impl Hide {
     /// members of structs have names of their own, also in lists. The root is called ``.
     pub fn mask(&self, name: &str, value: &Value) -> Value {
         self.mask_below(name, value, self.hides(name))
+    }
+
+    /// [`mask`](Self::mask) for the whole tree of parameters.
+    pub fn mask_tree(&self, tree: &Struct) -> Struct {
+        let members = tree.iter().map(|(key, value)| {
+            let shown = self.mask(&format!("/{key}"), value);
+            (key.clone(), shown)
+        });
+        members.collect()
     }
 
     /// [`mask`](Self::mask), if it is known whether `name` is hidden.

@@ -29,8 +29,10 @@ pub use api::{Applied, Method, is_success};
 pub use kind::Kind;
 pub use multicall::entry_reply;
 pub use names::CALLER_ID;
+pub(crate) use names::{name_for, param_name_for};
 pub use notice::{Notice, NoticeSink};
 pub use request::{Entry, Request};
+pub(crate) use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{

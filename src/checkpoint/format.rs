@@ -12,6 +12,7 @@
 mod document;
 mod emit;
 mod frame;
+mod rosparam;
 #[cfg(test)]
 mod tests;
 mod yaml;
@@ -25,6 +26,7 @@ use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub(crate) use frame::{Framed, push_body, scan, seal};
+pub use rosparam::{for_rosparam, shown};
 
 /// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512)
 /// below a parameter path of half as many names. rosmaster itself cannot return a value deeper than 492

@@ -173,6 +173,22 @@ impl Master {
             .map(String::as_str)
     }
 
+    /// The services that a node provides, with their addresses.
+    pub fn services_of(&self, caller_id: &str) -> impl Iterator<Item = (&str, &str)> {
+        let node = self.registry.nodes.get(caller_id);
+        let services = node.into_iter().flat_map(|node| &node.services);
+        services.filter_map(move |service| {
+            let entry = self.registry.services.get(service)?;
+            (entry.node == caller_id).then_some((service.as_str(), entry.api.as_str()))
+        })
+    }
+
+    /// The node that provides a service.
+    pub fn provider_of(&self, service: &str) -> Option<&str> {
+        let entry = self.registry.services.get(service)?;
+        Some(entry.node.as_str())
+    }
+
     /// Sizes of the state. Walks everything.
     pub fn counts(&self) -> Counts {
         let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();

@@ -192,7 +192,7 @@ fn double(out: &mut Vec<u8>, number: f64) {
 }
 
 /// `20240131T12:00:00`, as Python writes it, converted to a YAML timestamp.
-fn timestamp(text: &str) -> Option<String> {
+pub(super) fn timestamp(text: &str) -> Option<String> {
     let number = |range: std::ops::Range<usize>| {
         let digits = text.get(range)?;
         digits

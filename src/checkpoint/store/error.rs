@@ -46,7 +46,7 @@ pub enum OpenError {
 
 impl OpenError {
     /// The operating system's error, without advice.
-    pub(super) fn without_advice(&self) -> String {
+    pub(crate) fn without_advice(&self) -> String {
         match self {
             Self::Io {
                 doing,

@@ -1,0 +1,297 @@
+//! How two masters' states differ, for people. The order of lists, which only a master's replies show, does not
+//! count.
+
+use std::collections::BTreeSet;
+
+use serde::Serialize;
+
+use crate::{
+    checkpoint::format::shown,
+    hide::Hide,
+    master::{Master, Snapshot},
+    xmlrpc::{Struct, Value},
+};
+
+/// What differs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum What {
+    Node,
+    Publisher,
+    Subscriber,
+    /// A subscription of a parameter.
+    ParamSubscriber,
+    Service,
+    TopicType,
+    Parameter,
+}
+
+/// One difference between two states, A and B.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Difference {
+    pub what: What,
+    /// Of the node, topic, service or parameter.
+    pub name: String,
+    /// The node that is registered, for publishers and subscribers.
+    pub node: Option<String>,
+    /// In A: an address, a type or a value; none if it is not there.
+    pub a: Option<String>,
+    /// The same in B.
+    pub b: Option<String>,
+    /// What a node that is in only one of them is registered for.
+    pub registrations: Vec<String>,
+}
+
+impl Difference {
+    /// The difference in words, for states with these names.
+    pub fn text(&self, [a, b]: [&str; 2]) -> String {
+        let (name, node) = (&self.name, self.node.as_deref().unwrap_or_default());
+        let (side, value) = match (&self.a, &self.b) {
+            (Some(in_a), Some(in_b)) => {
+                return match self.what {
+                    What::Node => format!("node {name} is at {in_a} in {a} and at {in_b} in {b}"),
+                    What::Service => {
+                        format!("service {name} is of {in_a} in {a} and of {in_b} in {b}")
+                    }
+                    What::TopicType => {
+                        format!("topic {name} has the type {in_a} in {a} and {in_b} in {b}")
+                    }
+                    _ => format!("parameter {name}: {in_a} -> {in_b}"),
+                };
+            }
+            (Some(value), None) => (a, value),
+            (None, Some(value)) => (b, value),
+            (None, None) => return format!("{name} differs"),
+        };
+        match self.what {
+            What::Node => {
+                let held = self.registrations.join(", ");
+                format!("node {name} at {value} only in {side}: {held}")
+            }
+            What::Publisher => format!("{node} publishes {name} only in {side}"),
+            What::Subscriber => format!("{node} subscribes {name} only in {side}"),
+            What::ParamSubscriber => format!("{node} watches the parameter {name} only in {side}"),
+            What::Service => format!("service {name} of {value} only in {side}"),
+            What::TopicType => format!("topic {name} has a type, {value}, only in {side}"),
+            What::Parameter => format!("parameter {name} only in {side}: {value}"),
+        }
+    }
+}
+
+/// Where `a` and `b` differ, without the values of parameters that are hidden.
+pub fn compare(a: &Master, b: &Master, hide: &Hide) -> Vec<Difference> {
+    let mut found = Comparison {
+        a: a.snapshot(),
+        b: b.snapshot(),
+        hide,
+        found: Vec::new(),
+    };
+    found.nodes(a, b);
+    found.registrations();
+    found.services();
+    found.types();
+    found.params("", a.params(), b.params());
+    found.found
+}
+
+/// What a node is registered for, in words.
+pub fn registrations(master: &Master, node: &str) -> Vec<String> {
+    let services = master
+        .services_of(node)
+        .map(|(name, _)| format!("provides {name}"));
+    let publishes = master
+        .publications(node)
+        .map(|topic| format!("publishes {topic}"));
+    let subscribes = master
+        .subscriptions(node)
+        .map(|topic| format!("subscribes {topic}"));
+    let watches = master.param_subscriptions(node);
+    let watches = watches.map(|key| format!("watches the parameter {}", plain(key)));
+    publishes
+        .chain(subscribes)
+        .chain(services)
+        .chain(watches)
+        .collect()
+}
+
+/// The name of a parameter from the key under which it is subscribed.
+pub fn plain(key: &str) -> &str {
+    match key {
+        "/" => key,
+        _ => key.trim_end_matches('/'),
+    }
+}
+
+struct Comparison<'h> {
+    a: Snapshot,
+    b: Snapshot,
+    hide: &'h Hide,
+    found: Vec<Difference>,
+}
+
+impl Comparison<'_> {
+    fn add(&mut self, what: What, name: &str, a: Option<String>, b: Option<String>) {
+        self.found.push(Difference {
+            what,
+            name: name.to_owned(),
+            node: None,
+            a,
+            b,
+            registrations: Vec::new(),
+        });
+    }
+
+    fn nodes(&mut self, a: &Master, b: &Master) {
+        let names: BTreeSet<&str> = a.nodes().chain(b.nodes()).map(|(name, _)| name).collect();
+        for name in names {
+            let apis = [a, b].map(|master| master.api_of(name).map(str::to_owned));
+            if apis[0] == apis[1] {
+                continue;
+            }
+            let only = match &apis {
+                [Some(_), None] => Some(a),
+                [None, Some(_)] => Some(b),
+                _ => None,
+            };
+            let [in_a, in_b] = apis;
+            self.add(What::Node, name, in_a, in_b);
+            if let (Some(only), Some(last)) = (only, self.found.last_mut()) {
+                last.registrations = registrations(only, name);
+            }
+        }
+    }
+
+    /// Of the nodes that are in both.
+    fn registrations(&mut self) {
+        let both =
+            |node: &String| self.a.nodes.contains_key(node) && self.b.nodes.contains_key(node);
+        let mut found = Vec::new();
+        for (what, a, b) in [
+            (What::Publisher, &self.a.publishers, &self.b.publishers),
+            (What::Subscriber, &self.a.subscribers, &self.b.subscribers),
+            (
+                What::ParamSubscriber,
+                &self.a.param_subscribers,
+                &self.b.param_subscribers,
+            ),
+        ] {
+            let keys: BTreeSet<_> = a.keys().chain(b.keys()).collect();
+            for key in keys {
+                let [in_a, in_b] =
+                    [a, b].map(|lists| lists.get(key).map_or(&[][..], Vec::as_slice));
+                let nodes: BTreeSet<_> =
+                    in_a.iter().chain(in_b).filter(|node| both(node)).collect();
+                for node in nodes {
+                    let [there, here] =
+                        [in_a, in_b].map(|list| list.contains(node).then(String::new));
+                    if there != here {
+                        found.push(Difference {
+                            what,
+                            name: plain(key).to_owned(),
+                            node: Some(node.clone()),
+                            a: there,
+                            b: here,
+                            registrations: Vec::new(),
+                        });
+                    }
+                }
+            }
+        }
+        self.found.extend(found);
+    }
+
+    fn services(&mut self) {
+        let (a, b) = (&self.a, &self.b);
+        let names: BTreeSet<_> = a
+            .services
+            .keys()
+            .chain(b.services.keys())
+            .cloned()
+            .collect();
+        for name in names {
+            let entries = [&self.a, &self.b].map(|state| state.services.get(&name));
+            if entries[0] == entries[1] {
+                continue;
+            }
+            // A node that is in only one of them has been named with its services.
+            let told = match entries {
+                [Some(entry), None] => !self.b.nodes.contains_key(&entry.node),
+                [None, Some(entry)] => !self.a.nodes.contains_key(&entry.node),
+                _ => false,
+            };
+            if !told {
+                let words = |entry: &crate::master::ServiceEntry| {
+                    format!("{} at {}", entry.node, entry.api)
+                };
+                let [in_a, in_b] = entries.map(|entry| entry.map(words));
+                self.add(What::Service, &name, in_a, in_b);
+            }
+        }
+    }
+
+    fn types(&mut self) {
+        let (a, b) = (&self.a, &self.b);
+        let topics: BTreeSet<_> = a
+            .topic_types
+            .keys()
+            .chain(b.topic_types.keys())
+            .cloned()
+            .collect();
+        for topic in topics {
+            let [in_a, in_b] =
+                [&self.a, &self.b].map(|state| state.topic_types.get(&topic).cloned());
+            // A topic that is in use in only one of them has been named with its nodes.
+            let used = |state: &Snapshot| {
+                state.publishers.contains_key(&topic) || state.subscribers.contains_key(&topic)
+            };
+            let told = (in_a.is_none() || in_b.is_none()) && used(&self.a) != used(&self.b);
+            if in_a != in_b && !told {
+                self.add(What::TopicType, &topic, in_a, in_b);
+            }
+        }
+    }
+
+    fn params(&mut self, path: &str, a: &Struct, b: &Struct) {
+        if a.iter().eq(b) {
+            return;
+        }
+        let keys: BTreeSet<_> = a.keys().chain(b.keys()).collect();
+        for key in keys {
+            self.param(&format!("{path}/{key}"), a.get(key), b.get(key));
+        }
+    }
+
+    fn param(&mut self, name: &str, a: Option<&Value>, b: Option<&Value>) {
+        let empty = Struct::new();
+        let members = |value: Option<&Value>| match value {
+            None => Some(empty.clone()),
+            Some(Value::Struct(members)) if !members.is_empty() => Some(members.clone()),
+            Some(_) => None,
+        };
+        match (a, b, members(a), members(b)) {
+            // A namespace, in one or both.
+            (.., Some(a), Some(b)) => self.params(name, &a, &b),
+            _ if a.is_some_and(|a| b.is_some_and(|b| same(a, b))) => {}
+            _ => {
+                let [in_a, in_b] =
+                    [a, b].map(|value| value.map(|value| shown(&self.hide.mask(name, value))));
+                self.add(What::Parameter, name, in_a, in_b);
+            }
+        }
+    }
+}
+
+/// Whether both are equal, in whatever order the members of their structs are.
+fn same(a: &Value, b: &Value) -> bool {
+    match (a, b) {
+        (Value::Struct(a), Value::Struct(b)) => {
+            a.len() == b.len()
+                && a.iter()
+                    .all(|(key, a)| b.get(key).is_some_and(|b| same(a, b)))
+        }
+        (Value::Array(a), Value::Array(b)) => {
+            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| same(a, b))
+        }
+        _ => a == b,
+    }
+}

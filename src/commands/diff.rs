@@ -1,0 +1,72 @@
+//! `rosrescue diff`: how two checkpoints differ, or a checkpoint and the running master.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::{Exit, Failure, files, live::Live, print, running::Running};
+use crate::{
+    checkpoint::compare::{Difference, compare},
+    cli::DiffArgs,
+};
+
+pub(super) async fn run(args: &DiffArgs) -> Result<Exit, Failure> {
+    let a = files::read(&args.a, &args.read)?;
+    let (b, state, names) = match &args.b {
+        Some(b) => {
+            let b = files::read(b, &args.read)?;
+            (b.path.display().to_string(), b.state, ["A", "B"])
+        }
+        None => {
+            let mut live = Live::connect(&Running::find(&args.target)?).await?;
+            let state = live.state(&a.state).await?;
+            (live.uri, state, ["the file", "the running master"])
+        }
+    };
+    let differences = compare(&a.state, &state, &args.hide.hide_values);
+    let differences = differences.into_iter().map(|difference| Line {
+        text: difference.text(names),
+        difference,
+    });
+    let diff = Diff {
+        names,
+        a: a.path.display().to_string(),
+        b,
+        differences: differences.collect(),
+    };
+    print(&diff, &args.output)?;
+    Ok(if diff.differences.is_empty() {
+        Exit::Good
+    } else {
+        Exit::Bad
+    })
+}
+
+#[derive(Serialize)]
+struct Diff {
+    #[serde(skip)]
+    names: [&'static str; 2],
+    a: String,
+    b: String,
+    differences: Vec<Line>,
+}
+
+#[derive(Serialize)]
+struct Line {
+    text: String,
+    #[serde(flatten)]
+    difference: Difference,
+}
+
+impl fmt::Display for Diff {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.differences.is_empty() {
+            return writeln!(f, "{} and {} do not differ", self.a, self.b);
+        }
+        let [a, b] = self.names;
+        writeln!(f, "{a} is {}\n{b} is {}", self.a, self.b)?;
+        self.differences
+            .iter()
+            .try_for_each(|line| writeln!(f, "{}", line.text))
+    }
+}

@@ -1,0 +1,174 @@
+//! Finding and reading checkpoints. Nothing is locked and nothing is written, so it works beside a running rosrescue.
+
+use std::{
+    fs,
+    os::unix::fs::MetadataExt,
+    path::{Path, PathBuf},
+};
+
+use super::Failure;
+use crate::{
+    checkpoint::{
+        format::{Entry, Session},
+        session,
+        store::{self, OpenError, history},
+    },
+    cli::{CheckpointArgs, ReadArgs},
+    config,
+    master::{Master, Request},
+};
+
+/// A checkpoint that was read.
+pub(super) struct Opened {
+    pub(super) path: PathBuf,
+    pub(super) bytes: u64,
+    /// When it was last written to, by the wall clock.
+    pub(super) written: i64,
+    /// The last record in the snapshot; none if there is no whole snapshot.
+    pub(super) snapshot_seq: Option<u64>,
+    /// The methods of the journal's calls; `session` for a change of the session.
+    pub(super) journal: Vec<String>,
+    pub(super) session: Session,
+    pub(super) state: Master,
+    pub(super) pending: Vec<Request>,
+    /// Whether `state` is all that was recorded.
+    pub(super) exact: bool,
+    pub(super) torn: Option<String>,
+    pub(super) damage: Vec<String>,
+}
+
+/// The checkpoint in use, links resolved.
+pub(super) fn present(place: &CheckpointArgs) -> PathBuf {
+    let env = |name: &str| std::env::var(name).ok();
+    let path = config::checkpoint_path(place.checkpoint.as_deref(), &env);
+    fs::canonicalize(&path).unwrap_or(path)
+}
+
+/// The checkpoint that `file` means: a path, or a name or number of the history.
+pub(super) fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
+    if let Ok(path) = fs::canonicalize(file) {
+        return Ok(path);
+    }
+    let present = present(place);
+    let listed = list(&present);
+    let wanted = file.to_string_lossy();
+    let named = |(number, kept): (usize, &Listed)| {
+        let is_meant = kept.name == wanted || (number + 1).to_string() == wanted;
+        is_meant.then(|| kept.path.clone())
+    };
+    listed.iter().enumerate().find_map(named).ok_or_else(|| {
+        Failure::Usage(format!(
+            "there is no file `{wanted}`, and no checkpoint of that name or number beside `{}`; `rosrescue history` \
+             lists them",
+            present.display()
+        ))
+    })
+}
+
+/// A line of the history.
+pub(super) struct Listed {
+    /// `present`, `session-3`, `rescue-7`.
+    pub(super) name: String,
+    pub(super) path: PathBuf,
+    pub(super) written: i64,
+}
+
+/// The checkpoint at `present`, and what is kept beside it, the last ones first.
+pub(super) fn list(present: &Path) -> Vec<Listed> {
+    let mut listed: Vec<_> = history::kept(present)
+        .unwrap_or_default()
+        .into_iter()
+        .map(|kept| Listed {
+            name: format!("{}-{}", kept.kind.name(), kept.number),
+            path: kept.path,
+            written: kept.written,
+        })
+        .collect();
+    listed.sort_by_key(|kept| std::cmp::Reverse(kept.written));
+    if let Ok(metadata) = fs::metadata(present) {
+        let first = Listed {
+            name: "present".to_owned(),
+            path: present.to_owned(),
+            written: metadata.mtime(),
+        };
+        listed.insert(0, first);
+    }
+    listed
+}
+
+/// Reads the checkpoint at `path`, damaged or not.
+pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
+    let shown = path.display();
+    let metadata = fs::metadata(path)
+        .map_err(|error| Failure::Usage(format!("cannot read `{shown}`: {error}")))?;
+    if metadata.is_dir() {
+        let why = format!("`{shown}` is a folder: give the checkpoint in it");
+        return Err(Failure::Usage(why));
+    }
+    let loaded = store::read(path).map_err(|error| {
+        Failure::Usage(match error {
+            OpenError::NotACheckpoint { .. } => format!("`{shown}` is not a rosrescue checkpoint"),
+            OpenError::NewerVersion { version, .. } => format!(
+                "`{shown}` was written in checkpoint format {version} by a newer rosrescue: use that one"
+            ),
+            other => other.without_advice(),
+        })
+    })?;
+    let gone = || Failure::Usage(format!("there is no file `{shown}` any more"));
+    let loaded = loaded.ok_or_else(gone)?;
+    let snapshot_seq = loaded.checkpoint.as_ref().map(|checkpoint| checkpoint.seq);
+    let entries = loaded.records.iter().map(|record| match &record.entry {
+        Entry::Call { call, .. } => call.method.clone(),
+        Entry::Session(_) => "session".to_owned(),
+    });
+    let journal = entries.collect();
+    let mut damage = loaded.damage;
+    let rebuilt = session::rebuild(loaded.checkpoint, loaded.records);
+    let exact = loaded.exact && rebuilt.trouble.is_none();
+    damage.extend(
+        rebuilt
+            .trouble
+            .map(|why| format!("the snapshot is no state of a master: {why}")),
+    );
+    Ok(Opened {
+        path: path.to_owned(),
+        bytes: metadata.len(),
+        written: metadata.mtime(),
+        snapshot_seq,
+        journal,
+        session: rebuilt.session.unwrap_or_default(),
+        state: rebuilt.mirror,
+        pending: rebuilt.pending,
+        exact,
+        torn: loaded.torn,
+        damage,
+    })
+}
+
+/// Reads the checkpoint that `file` means. Refuses a damaged one, unless that is asked for.
+pub(super) fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure> {
+    let opened = open(&find(file, &args.place)?)?;
+    let path = opened.path.display();
+    if !opened.exact && !args.damaged {
+        let why = opened
+            .damage
+            .first()
+            .map_or("records are missing", String::as_str);
+        return Err(Failure::Usage(format!(
+            "`{path}` is damaged: {why}. `rosrescue verify` says what is left of it, and --damaged uses that"
+        )));
+    }
+    for sentence in &opened.damage {
+        eprintln!("rosrescue: {sentence}");
+    }
+    Ok(opened)
+}
+
+/// A number of bytes for people.
+pub(super) fn size(bytes: u64) -> String {
+    match bytes {
+        0..1_024 => format!("{bytes} B"),
+        1_024..1_048_576 => format!("{:.1} KiB", bytes as f64 / 1024.0),
+        _ => format!("{:.1} MiB", bytes as f64 / 1_048_576.0),
+    }
+}

@@ -1,0 +1,104 @@
+//! `rosrescue history`: the checkpoints that are kept.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::{
+    Exit, Failure,
+    files::{self, size},
+    print,
+};
+use crate::{cli::HistoryArgs, clock};
+
+pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
+    let present = files::present(&args.place);
+    let rows = files::list(&present)
+        .into_iter()
+        .zip(1..)
+        .map(|(listed, number)| {
+            let opened = files::open(&listed.path);
+            let counts = opened.as_ref().ok().map(|opened| opened.state.counts());
+            Row {
+                number,
+                what: what(&listed.name),
+                name: listed.name,
+                written: clock::wall_text(listed.written as f64),
+                bytes: std::fs::metadata(&listed.path).map_or(0, |metadata| metadata.len()),
+                nodes: counts.map(|counts| counts.nodes),
+                parameters: counts.map(|counts| counts.params),
+                problem: match opened {
+                    Ok(opened) => opened.damage.first().cloned(),
+                    Err(error) => Some(error.to_string()),
+                },
+                path: listed.path.display().to_string(),
+            }
+        });
+    let history = History {
+        checkpoint: present.display().to_string(),
+        kept: rows.collect(),
+    };
+    print(&history, &args.output)?;
+    Ok(if history.kept.is_empty() {
+        Exit::Bad
+    } else {
+        Exit::Good
+    })
+}
+
+fn what(name: &str) -> &'static str {
+    match name.split('-').next() {
+        Some("rescue") => "what a new master was given",
+        Some("session") => "the end of an earlier session",
+        _ => "the checkpoint in use",
+    }
+}
+
+#[derive(Serialize)]
+struct History {
+    checkpoint: String,
+    kept: Vec<Row>,
+}
+
+#[derive(Serialize)]
+struct Row {
+    number: usize,
+    name: String,
+    what: &'static str,
+    /// Last written to, by the wall clock.
+    written: String,
+    bytes: u64,
+    /// None if it cannot be read.
+    nodes: Option<usize>,
+    parameters: Option<usize>,
+    problem: Option<String>,
+    path: String,
+}
+
+impl fmt::Display for History {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.kept.is_empty() {
+            return writeln!(
+                f,
+                "there is no checkpoint at {}, and none is kept beside it",
+                self.checkpoint
+            );
+        }
+        for row in &self.kept {
+            let (name, written, what) = (&row.name, &row.written, row.what);
+            let [nodes, params] = [row.nodes, row.parameters]
+                .map(|count| count.map_or_else(|| "?".to_owned(), |count| count.to_string()));
+            let size = size(row.bytes);
+            writeln!(
+                f,
+                "{:>3}  {name:<11} {written}  {nodes:>4} nodes {params:>5} parameters {size:>10}  {what}",
+                row.number
+            )?;
+            writeln!(f, "     {}", row.path)?;
+            if let Some(problem) = &row.problem {
+                writeln!(f, "     {problem}")?;
+            }
+        }
+        Ok(())
+    }
+}

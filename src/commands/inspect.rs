@@ -1,0 +1,257 @@
+//! `rosrescue inspect`: what a checkpoint holds.
+
+use std::{collections::BTreeMap, fmt};
+
+use serde::Serialize;
+
+use super::{
+    Exit, Failure,
+    files::{self, Opened, size},
+    print,
+};
+use crate::{
+    checkpoint::{compare::plain, format::shown},
+    cli::InspectArgs,
+    clock,
+    hide::Hide,
+    master::{Counts, Master},
+    xmlrpc::{Struct, Value},
+};
+
+pub(super) async fn run(args: &InspectArgs) -> Result<Exit, Failure> {
+    let present;
+    let file = match &args.file {
+        Some(file) => file,
+        None => {
+            present = files::present(&args.read.place);
+            &present
+        }
+    };
+    let opened = files::read(file, &args.read)?;
+    print(
+        &Inspected::new(&opened, &args.hide.hide_values),
+        &args.output,
+    )?;
+    Ok(Exit::Good)
+}
+
+/// What a checkpoint holds.
+#[derive(Serialize)]
+struct Inspected {
+    file: String,
+    bytes: u64,
+    /// Whether this is all that was recorded.
+    exact: bool,
+    damage: Vec<String>,
+    /// Of the last append, if it was cut short.
+    torn: Option<String>,
+    /// Last written to, by the wall clock.
+    written: String,
+    session: Session,
+    counts: Counts,
+    nodes: Vec<Node>,
+    topics: Vec<Topic>,
+    /// The values of some are hidden.
+    parameters: Struct,
+    journal: Journal,
+    /// Methods of the writes that no master has run yet.
+    pending: Vec<String>,
+}
+
+#[derive(Serialize)]
+struct Session {
+    id: String,
+    started: String,
+    /// Stopped in order.
+    closed: bool,
+    master_uri: Option<String>,
+}
+
+#[derive(Serialize)]
+struct Node {
+    name: String,
+    address: String,
+    publishes: Vec<String>,
+    subscribes: Vec<String>,
+    services: Vec<String>,
+    watches: Vec<String>,
+}
+
+#[derive(Serialize)]
+struct Topic {
+    name: String,
+    #[serde(rename = "type")]
+    kind: Option<String>,
+    publishers: usize,
+    subscribers: usize,
+}
+
+#[derive(Serialize)]
+struct Journal {
+    /// The last record in the snapshot.
+    snapshot: Option<u64>,
+    /// Records since then.
+    records: usize,
+    /// How many of them, by method.
+    calls: BTreeMap<String, usize>,
+}
+
+impl Inspected {
+    fn new(opened: &Opened, hide: &Hide) -> Self {
+        let state = &opened.state;
+        let texts = |names: Vec<&str>| names.into_iter().map(str::to_owned).collect::<Vec<_>>();
+        let mut nodes: Vec<_> = state
+            .nodes()
+            .map(|(name, address)| Node {
+                name: name.to_owned(),
+                address: address.to_owned(),
+                publishes: texts(state.publications(name).collect()),
+                subscribes: texts(state.subscriptions(name).collect()),
+                services: texts(state.services_of(name).map(|(name, _)| name).collect()),
+                watches: texts(state.param_subscriptions(name).map(plain).collect()),
+            })
+            .collect();
+        nodes.sort_by(|a, b| a.name.cmp(&b.name));
+        let mut calls = BTreeMap::new();
+        for method in &opened.journal {
+            *calls.entry(method.clone()).or_default() += 1;
+        }
+        let session = &opened.session;
+        let pending = opened.pending.iter();
+        Self {
+            file: opened.path.display().to_string(),
+            bytes: opened.bytes,
+            exact: opened.exact,
+            damage: opened.damage.clone(),
+            torn: opened.torn.clone(),
+            written: clock::wall_text(opened.written as f64),
+            session: Session {
+                id: session.id.clone(),
+                started: session.started.clone(),
+                closed: session.closed,
+                master_uri: session.master_uri.clone(),
+            },
+            counts: state.counts(),
+            nodes,
+            topics: topics(state),
+            parameters: hide.mask_tree(state.params()),
+            journal: Journal {
+                snapshot: opened.snapshot_seq,
+                records: opened.journal.len(),
+                calls,
+            },
+            pending: pending
+                .map(|call| call.method().name().to_owned())
+                .collect(),
+        }
+    }
+}
+
+/// The topics that are in use.
+fn topics(state: &Master) -> Vec<Topic> {
+    let mut used: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
+    for (node, _) in state.nodes() {
+        for topic in state.publications(node) {
+            used.entry(topic).or_default().0 += 1;
+        }
+        for topic in state.subscriptions(node) {
+            used.entry(topic).or_default().1 += 1;
+        }
+    }
+    let topics = used
+        .into_iter()
+        .map(|(name, (publishers, subscribers))| Topic {
+            name: name.to_owned(),
+            kind: state.type_of(name).map(str::to_owned),
+            publishers,
+            subscribers,
+        });
+    topics.collect()
+}
+
+impl fmt::Display for Inspected {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            session, journal, ..
+        } = self;
+        writeln!(f, "checkpoint  {} ({})", self.file, size(self.bytes))?;
+        for sentence in self.damage.iter().chain(&self.torn) {
+            writeln!(f, "            {sentence}")?;
+        }
+        let end = match session.closed {
+            true => "stopped in order",
+            false => "runs, or was not stopped in order",
+        };
+        writeln!(
+            f,
+            "session     {} of {}, {end}",
+            session.id, session.started
+        )?;
+        writeln!(f, "written     {}", self.written)?;
+        let master = session.master_uri.as_deref().unwrap_or("none yet");
+        writeln!(f, "master      {master}")?;
+        writeln!(f, "state       {}", self.counts)?;
+        let calls: Vec<_> = journal
+            .calls
+            .iter()
+            .map(|(name, count)| format!("{count} {name}"))
+            .collect();
+        let calls = if calls.is_empty() {
+            "nothing".to_owned()
+        } else {
+            calls.join(", ")
+        };
+        match journal.snapshot {
+            Some(seq) => writeln!(
+                f,
+                "journal     {calls} since the snapshot, which is of record {seq}"
+            )?,
+            None => writeln!(f, "journal     {calls}; there is no whole snapshot")?,
+        }
+        if !self.pending.is_empty() {
+            writeln!(
+                f,
+                "pending     {} writes that no master has run yet",
+                self.pending.len()
+            )?;
+        }
+        writeln!(f, "\nnodes")?;
+        for node in &self.nodes {
+            writeln!(f, "  {} at {}", node.name, node.address)?;
+            for (verb, names) in [
+                ("publishes", &node.publishes),
+                ("subscribes", &node.subscribes),
+                ("provides", &node.services),
+                ("watches", &node.watches),
+            ] {
+                if !names.is_empty() {
+                    writeln!(f, "    {verb:<11}{}", names.join(", "))?;
+                }
+            }
+        }
+        writeln!(f, "\ntopics")?;
+        for topic in &self.topics {
+            let kind = topic.kind.as_deref().unwrap_or("of unknown type");
+            let (publishers, subscribers) = (topic.publishers, topic.subscribers);
+            writeln!(
+                f,
+                "  {}  {kind}  {publishers} publishing, {subscribers} subscribing",
+                topic.name
+            )?;
+        }
+        writeln!(f, "\nparameters")?;
+        write_params(f, "", &self.parameters)
+    }
+}
+
+fn write_params(f: &mut fmt::Formatter<'_>, path: &str, members: &Struct) -> fmt::Result {
+    for (key, value) in members {
+        match value {
+            Value::Struct(inner) if !inner.is_empty() => {
+                write_params(f, &format!("{path}/{key}"), inner)?;
+            }
+            value => writeln!(f, "  {path}/{key}: {}", shown(value))?,
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,113 @@
+//! The running master, by the calls that every node may make.
+
+use std::{fmt::Display, time::Duration};
+
+use hyper::header::HeaderValue;
+use tokio::{net::TcpStream, time::timeout};
+
+use super::{Failure, running::Running};
+use crate::{
+    master::{Master, Request},
+    replay::Token,
+    resolver,
+    upstream::{Connection, inspect},
+    xmlrpc::{Reply, Value},
+};
+
+/// How long a connection may take.
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+/// How long an answer may take: `getParam('/')` of a million parameters takes rosmaster half a minute.
+const ANSWER_LIMIT: Duration = Duration::from_secs(120);
+/// Largest answer, in bytes.
+const MAX_REPLY: usize = 512 << 20;
+
+/// A connection to the running rosrescue.
+pub(super) struct Live {
+    connection: Connection,
+    pub(super) uri: String,
+}
+
+impl Live {
+    pub(super) async fn connect(running: &Running) -> Result<Self, Failure> {
+        let address = &running.address;
+        let uri = address.to_string();
+        let nobody = |why: String| Failure::Nobody {
+            uri: uri.clone(),
+            why,
+        };
+        let connect = async {
+            let addresses = resolver::addresses(&address.host, address.port).await?;
+            let stream = TcpStream::connect(&*addresses).await?;
+            let name = HeaderValue::from_static("a-command");
+            Connection::over(stream, address, name, MAX_REPLY).await
+        };
+        let connection = match timeout(CONNECT_LIMIT, connect).await {
+            Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,
+            Err(_) => {
+                return Err(nobody(format!(
+                    "no answer in {} s",
+                    CONNECT_LIMIT.as_secs()
+                )));
+            }
+        };
+        Ok(Self { connection, uri })
+    }
+
+    /// What the master holds. Who watches parameters cannot be read, and is taken from `previous` for nodes that are
+    /// where they were.
+    pub(super) async fn state(&mut self, previous: &Master) -> Result<Master, Failure> {
+        // No master bears it.
+        let token = Token::new("", 0);
+        let uri = self.uri.clone();
+        let failed =
+            |why: &dyn Display| Failure::Failed(format!("cannot read the master at {uri}: {why}"));
+        let read = async {
+            let first = inspect::first(&mut self.connection, &token).await;
+            let first = first.map_err(|error| failed(&error))?;
+            if !first.has_params() {
+                let why = "it holds a parameter that no master can return; delete that first";
+                return Err(failed(&why));
+            }
+            let state = inspect::second(first, &mut self.connection, previous).await;
+            state.map_err(|error| failed(&error))
+        };
+        let limit = format!("no answer in {} s", ANSWER_LIMIT.as_secs());
+        timeout(ANSWER_LIMIT, read)
+            .await
+            .unwrap_or_else(|_| Err(failed(&limit)))
+    }
+
+    /// Makes `calls` in one multicall. Returns the message of each that was refused; none for one that succeeded.
+    pub(super) async fn make(
+        &mut self,
+        calls: Vec<Request>,
+    ) -> Result<Vec<Option<String>>, Failure> {
+        let count = calls.len();
+        let failed =
+            |why: String| Failure::Failed(format!("the calls to {} failed: {why}", self.uri));
+        let call = Request::multicall(calls).into();
+        let reply = timeout(ANSWER_LIMIT, self.connection.call(&call)).await;
+        let reply =
+            reply.map_err(|_| failed(format!("no answer in {} s", ANSWER_LIMIT.as_secs())))?;
+        match reply.map_err(|error| failed(error.to_string()))? {
+            Reply::Value(Value::Array(results)) if results.len() == count => {
+                Ok(results.iter().map(refusal).collect())
+            }
+            Reply::Fault { text, .. } => Err(failed(text)),
+            Reply::Value(_) => Err(failed("this is no master's answer".to_owned())),
+        }
+    }
+}
+
+/// Why an entry of a multicall has failed.
+fn refusal(result: &Value) -> Option<String> {
+    let answer = match result {
+        Value::Array(one) => one.first().and_then(Value::as_array),
+        _ => None,
+    };
+    match answer {
+        Some([Value::Int(1), ..]) => None,
+        Some([_, message, ..]) => Some(message.as_str().unwrap_or("no reason given").to_owned()),
+        _ => Some(crate::checkpoint::format::shown(result)),
+    }
+}

@@ -1,0 +1,80 @@
+//! `rosrescue params`: the parameters of a checkpoint, for `rosparam load`.
+
+use std::{
+    fmt,
+    io::{self, Write},
+};
+
+use serde::Serialize;
+
+use super::{Exit, Failure, files, print};
+use crate::{
+    checkpoint::{format::for_rosparam, putback::OF_THE_SESSION},
+    cli::ParamsArgs,
+    hide::Hide,
+    xmlrpc::{Struct, Value},
+};
+
+pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
+    let opened = files::read(&args.file, &args.read)?;
+    let mut tree = opened.state.params().clone();
+    let mut left_out = Vec::new();
+    if let Some(hide) = &args.hide_values {
+        tree = without(&tree, "", hide, &mut left_out);
+    }
+    if args.output.json {
+        print(&Tree(tree), &args.output)?;
+    } else {
+        for name in OF_THE_SESSION {
+            if tree.shift_remove(name.trim_start_matches('/')).is_some() {
+                left_out.push(format!(
+                    "{name} is left out: it belongs to the session of then"
+                ));
+            }
+        }
+        let (yaml, not_carried) =
+            for_rosparam(&tree).map_err(|error| Failure::Failed(error.to_string()))?;
+        left_out.extend(not_carried);
+        match io::stdout().write_all(&yaml) {
+            Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+                return Err(Failure::Failed(format!("cannot print: {error}")));
+            }
+            _ => {}
+        }
+    }
+    for sentence in left_out {
+        eprintln!("rosrescue: {sentence}");
+    }
+    Ok(Exit::Good)
+}
+
+/// The tree without hidden parameters: a placeholder would be loaded.
+fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -> Struct {
+    let mut kept = Struct::new();
+    for (key, value) in tree {
+        let name = format!("{path}/{key}");
+        match value {
+            Value::Struct(members) if !members.is_empty() && !hide.hides(&name) => {
+                let members = without(members, &name, hide, left_out);
+                if !members.is_empty() {
+                    kept.insert(key.clone(), Value::Struct(members));
+                }
+            }
+            value if hide.mask(&name, value) == *value => {
+                drop(kept.insert(key.clone(), value.clone()))
+            }
+            _ => left_out.push(format!("{name} is left out: it is hidden")),
+        }
+    }
+    kept
+}
+
+#[derive(Serialize)]
+#[serde(transparent)]
+struct Tree(Struct);
+
+impl fmt::Display for Tree {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} parameters", self.0.len())
+    }
+}

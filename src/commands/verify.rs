@@ -1,0 +1,78 @@
+//! `rosrescue verify`: whether a checkpoint is whole, and what can be used of one that is not.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::{Exit, Failure, files, print};
+use crate::{cli::VerifyArgs, master::Counts};
+
+pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, Failure> {
+    let opened = files::open(&files::find(&args.file, &args.place)?)?;
+    let verified = Verified {
+        file: opened.path.display().to_string(),
+        whole: opened.damage.is_empty(),
+        exact: opened.exact,
+        snapshot: opened.snapshot_seq,
+        records: opened.journal.len(),
+        usable: opened.state.counts(),
+        torn: opened.torn,
+        damage: opened.damage,
+    };
+    print(&verified, &args.output)?;
+    Ok(if verified.whole {
+        Exit::Good
+    } else {
+        Exit::Bad
+    })
+}
+
+#[derive(Serialize)]
+struct Verified {
+    file: String,
+    /// Whether nothing is damaged.
+    whole: bool,
+    /// Whether all that was recorded can be used, if need be with the generation before.
+    exact: bool,
+    /// The last record in the snapshot that can be used; none if there is none.
+    snapshot: Option<u64>,
+    /// Records after it that can be used.
+    records: usize,
+    usable: Counts,
+    /// Of the last append, if it was cut short.
+    torn: Option<String>,
+    damage: Vec<String>,
+}
+
+impl fmt::Display for Verified {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let verdict = match (self.whole, self.exact) {
+            (true, _) => "is whole",
+            (false, true) => "is damaged, and nothing is lost",
+            (false, false) => "is damaged",
+        };
+        writeln!(f, "{} {verdict}", self.file)?;
+        for sentence in &self.damage {
+            writeln!(f, "damage   {sentence}")?;
+        }
+        let source = match (self.snapshot, self.records) {
+            (Some(_), records) => format!("the snapshot and {records} records"),
+            (None, 0) => "nothing".to_owned(),
+            (None, records) => format!("{records} records without a snapshot"),
+        };
+        writeln!(f, "usable   {source}: {}", self.usable)?;
+        if let Some(torn) = &self.torn {
+            writeln!(
+                f,
+                "torn     {torn}: normal after a crash, or while it is written; nothing that was confirmed is in it"
+            )?;
+        }
+        if !self.whole && (self.snapshot, self.records) != (None, 0) {
+            writeln!(
+                f,
+                "to do    the options --damaged of inspect, diff, params and restore use what is left"
+            )?;
+        }
+        Ok(())
+    }
+}
