@@ -113,6 +113,12 @@ fn print_line(text: &str) -> Result<bool, Failure> {
 
 /// `text` without what a terminal would take for commands: names come from whoever calls.
 fn plain(text: &str) -> String {
-    let safe = |c: char| if c.is_control() && c != '\n' { '?' } else { c };
+    let safe = |c: char| {
+        if c.is_control() && c != '\n' {
+            '\u{fffd}'
+        } else {
+            c
+        }
+    };
     text.chars().map(safe).collect()
 }

@@ -90,8 +90,12 @@ mod cli {
     mod stop;
 }
 
-/// Commands that ask a running rosrescue.
+/// The commands that do not serve.
 mod commands {
+    mod checkpoints;
+    mod history;
+    mod params;
+    mod restore;
     mod status;
     mod top;
     mod wait;

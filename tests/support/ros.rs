@@ -127,14 +127,41 @@ impl Tool {
     /// Runs `name` against the master at `port` until it ends by itself.
     #[track_caller]
     pub(crate) fn run(scratch: &Scratch, port: u16, name: &str, arguments: &[&str]) -> Self {
-        let mut command = ros_command(scratch, find_program(name), port);
-        let mut process = Process::start(format!("{name} {arguments:?}"), command.args(arguments));
+        Self::wait(
+            &mut ros_command(scratch, find_program(name), port),
+            arguments,
+        )
+    }
+
+    /// Runs a command of rosrescue for the one at `port`, until it ends by itself.
+    #[track_caller]
+    pub(crate) fn rosrescue(scratch: &Scratch, port: u16, arguments: &[&str]) -> Self {
+        let program = env!("CARGO_BIN_EXE_rosrescue");
+        Self::wait(&mut ros_command(scratch, program, port), arguments)
+    }
+
+    #[track_caller]
+    fn wait(command: &mut Command, arguments: &[&str]) -> Self {
+        let mut process = Process::start(format!("{command:?}"), command.args(arguments));
         let status = process.wait_output();
         Self {
             status,
             stdout: process.stdout().join("\n"),
             stderr: process.stderr().join("\n"),
         }
+    }
+
+    /// What it printed, after it has ended with `status`.
+    #[track_caller]
+    pub(crate) fn ended(self, status: i32) -> String {
+        assert_eq!(self.status.code(), Some(status), "{self:?}");
+        self.stdout
+    }
+
+    /// The JSON that it printed, after it has ended with `status`.
+    #[track_caller]
+    pub(crate) fn json(self, status: i32) -> serde_json::Value {
+        serde_json::from_str(&self.ended(status)).expect("JSON")
     }
 }
 

@@ -1,0 +1,116 @@
+//! The checkpoints that are kept, and `history`.
+
+use std::fs;
+
+use rosrescue::xmlrpc::Value;
+
+use crate::support::{Mode, Robot, Tool, eventually};
+
+fn history(robot: &Robot) -> Vec<serde_json::Value> {
+    let json = Tool::rosrescue(&robot.scratch, robot.port(), &["history", "--json"]).json(0);
+    json["kept"].as_array().unwrap().clone()
+}
+
+fn names(robot: &Robot) -> Vec<String> {
+    let rows = history(robot);
+    let names = rows
+        .iter()
+        .map(|row| row["name"].as_str().unwrap().to_owned());
+    let mut names: Vec<_> = names.collect();
+    names.sort();
+    names
+}
+
+/// An orderly stop and a start: with `--restore never` it begins another session.
+fn start_again(robot: &mut Robot) {
+    assert!(robot.rescue.terminate().success());
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+}
+
+#[test]
+fn the_last_five_sessions_and_each_rescue_are_kept() {
+    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--restore", "never"]);
+    for session in 1..=7 {
+        robot.client().set_param("/session", session);
+        start_again(&mut robot);
+    }
+    let kept = [3, 4, 5, 6, 7].map(|number| format!("session-{number}"));
+    assert_eq!(names(&robot), [&["present".to_owned()][..], &kept].concat());
+    // By name, and by number.
+    let run = |robot: &Robot, arguments: &[&str]| {
+        Tool::rosrescue(&robot.scratch, robot.port(), arguments).ended(0)
+    };
+    let params = run(&robot, &["params", "session-3"]);
+    assert!(params.contains("\"session\": 3"), "{params}");
+    let second = history(&robot)[1]["name"].as_str().unwrap().to_owned();
+    assert_eq!(
+        run(&robot, &["inspect", "2"]),
+        run(&robot, &["inspect", &second])
+    );
+
+    robot.client().set_param("/before", 1);
+    robot.crash_master();
+    eventually("the rescue is kept", || {
+        names(&robot).contains(&"rescue-1".to_owned())
+    });
+    robot.client().set_param("/before", 2);
+    let text = Tool::rosrescue(
+        &robot.scratch,
+        robot.port(),
+        &["diff", "rescue-1", "--live"],
+    );
+    let text = text.ended(1);
+    assert!(text.ends_with("parameter /before: 1 -> 2"), "{text}");
+    robot.crash_master();
+    eventually("the other one too", || {
+        names(&robot).contains(&"rescue-2".to_owned())
+    });
+    assert!(run(&robot, &["params", "rescue-2"]).contains("\"before\": 2"));
+    let text = run(&robot, &["history"]);
+    assert!(text.contains("what a new master was given"), "{text}");
+    assert_eq!(text.lines().count(), 2 * history(&robot).len());
+    // Only its owner may read them.
+    use std::os::unix::fs::PermissionsExt;
+    for row in history(&robot) {
+        let mode = fs::metadata(row["path"].as_str().unwrap())
+            .unwrap()
+            .permissions()
+            .mode();
+        assert_eq!(mode & 0o777, 0o600, "{row}");
+    }
+}
+
+#[test]
+fn a_history_of_no_space_is_the_last_session() {
+    let options = ["--no-rosout", "--restore", "never", "--history", "0"];
+    let mut robot = Robot::start_with(Mode::Core, &options);
+    for session in 1..=2 {
+        robot.client().set_param("/session", session);
+        robot.crash_master();
+        start_again(&mut robot);
+    }
+    // Were one kept it would be there before the stop has ended.
+    assert_eq!(names(&robot), ["present", "session-2"]);
+}
+
+/// A large state is not written beside itself again and again.
+#[test]
+fn a_rescue_that_would_not_fit_is_not_kept() {
+    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--history", "1"]);
+    robot.client().set_param("/large", "x".repeat(2 << 20));
+    // The next generation has it in its snapshot.
+    assert!(robot.rescue.terminate().success());
+    robot.rescue.start_again();
+    robot.rescue.wait_serving();
+    let large = Value::from("x".repeat(2 << 20));
+    robot.client().set_param("/large", large);
+    robot.client().set_param("/small", 1);
+    robot.crash_master();
+    assert!(robot.rescue.terminate().success());
+    let rescues: Vec<_> = names(&robot)
+        .into_iter()
+        .filter(|name| name.starts_with("rescue"))
+        .collect();
+    assert_eq!(rescues, [""; 0]);
+}
