@@ -14,6 +14,8 @@
 //! * `health`: judging what a node reports; which nodes are unreachable.
 //! * [`checkpoint::session`]: whether a checkpoint's session continues, and the state that it holds.
 //! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
+//! * [`checkpoint::compare`], [`checkpoint::putback`]: how two states differ, and what brings a running master
+//!   nearer to a checkpoint.
 //!
 //! The *shell* does IO and decides as little as possible. From the bottom to the top:
 //!

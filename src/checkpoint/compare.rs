@@ -65,7 +65,7 @@ impl Difference {
         };
         match self.what {
             What::Node => {
-                let held = self.registrations.join(", ");
+                let held = grouped(&self.registrations);
                 format!("node {name} at {value} only in {side}: {held}")
             }
             What::Publisher => format!("{node} publishes {name} only in {side}"),
@@ -76,6 +76,22 @@ impl Difference {
             What::Parameter => format!("parameter {name} only in {side}: {value}"),
         }
     }
+}
+
+/// `publishes /a, /b; subscribes /c` from a list of its parts.
+fn grouped(registrations: &[String]) -> String {
+    let (mut text, mut last) = (String::new(), "");
+    for registration in registrations {
+        let (verb, name) = registration.split_once(' ').unwrap_or_default();
+        text += match (last.is_empty(), verb == last) {
+            (true, _) => "",
+            (_, true) => ", ",
+            (_, false) => "; ",
+        };
+        text += if verb == last { name } else { registration };
+        last = verb;
+    }
+    text
 }
 
 /// Where `a` and `b` differ, without the values of parameters that are hidden.
@@ -295,3 +311,6 @@ fn same(a: &Value, b: &Value) -> bool {
         _ => a == b,
     }
 }
+
+#[cfg(test)]
+mod tests;

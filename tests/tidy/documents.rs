@@ -30,13 +30,28 @@ fn block<'a>(text: &'a str, first: &str) -> &'a str {
     rest.split_once("\n```\n").expect("the block ends").0
 }
 
+/// The commands, as `rosrescue --help` lists them.
+fn commands() -> Vec<String> {
+    let help = printed(&["--help"]);
+    let (_, list) = help.split_once("\nCommands:\n").unwrap();
+    let list = list.split("\n\n").next().unwrap();
+    let names = list.lines().filter_map(|line| {
+        let name = line.strip_prefix("  ")?;
+        let is_name = name.starts_with(|c: char| c.is_ascii_lowercase());
+        is_name.then(|| name.split_whitespace().next())?
+    });
+    let names: Vec<_> = names.map(str::to_owned).collect();
+    assert!(names.len() > 5, "{names:?}");
+    names
+}
+
 #[test]
 fn the_documents_have_the_help_as_the_program_prints_it() {
     let document = read("docs/cli.md");
-    for command in ["core", "proxy", "status", "top", "wait"] {
+    for command in commands() {
         assert_eq!(
             block(&document, &format!("$ rosrescue {command} --help")),
-            printed(&[command, "--help"]),
+            printed(&[&command, "--help"]),
             "put this help of `rosrescue {command}` into docs/cli.md"
         );
     }

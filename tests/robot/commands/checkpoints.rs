@@ -93,7 +93,7 @@ fn what_differs_is_said_in_words() {
         let expected = [
             format!("{a} is {before}"),
             format!("{b} is "),
-            format!("node /old at {api} only in {a}: subscribes /image, provides /old/reset"),
+            format!("node /old at {api} only in {a}: subscribes /image; provides /old/reset"),
             format!("/camera publishes /image only in {a}"),
             "parameter /a/b: 1 -> 2.0".to_owned(),
             format!("parameter /a/gone only in {a}: \"x\""),

@@ -210,6 +210,26 @@ fn another_node_at_the_same_address_is_left_alone() {
     assert!(!robot.state().knows("/gone"));
 }
 
+/// The mirror takes it as it takes every write, and the next master is given it.
+#[test]
+fn a_checkpoint_is_put_back_while_there_is_no_master() {
+    let mut robot = Robot::start_for_outages(Mode::Core);
+    robot.client().set_param("/x", 1);
+    let file = robot.scratch.path("file.yaml");
+    std::fs::copy(robot.rescue.checkpoint(), &file).unwrap();
+    robot.client().set_param("/x", 2);
+    robot.take_master_away();
+    let file = file.to_str().unwrap();
+    let text = run(&robot, &["restore", file, "--yes"]).ended(0);
+    assert!(
+        text.contains("set /x: 2 -> 1") && text.ends_with("read back"),
+        "{text}"
+    );
+    robot.revive_master();
+    robot.await_gate();
+    assert_eq!(robot.bare().param("/x"), Some(1.into()));
+}
+
 #[test]
 fn at_a_terminal_it_asks() {
     let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--restore", "never"]);
