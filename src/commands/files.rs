@@ -2,6 +2,7 @@
 
 use std::{
     fs,
+    io::IsTerminal,
     os::unix::fs::MetadataExt,
     path::{Path, PathBuf},
 };
@@ -17,6 +18,9 @@ use crate::{
     config,
     master::{Master, Request},
 };
+
+/// A file that takes longer than a second to read, in bytes.
+const LARGE: u64 = 16 << 20;
 
 /// A checkpoint that was read.
 pub(super) struct Opened {
@@ -104,6 +108,9 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
     if metadata.is_dir() {
         let why = format!("`{shown}` is a folder: give the checkpoint in it");
         return Err(Failure::Usage(why));
+    }
+    if metadata.len() > LARGE && std::io::stderr().is_terminal() {
+        eprintln!("reading `{shown}`, {} …", size(metadata.len()));
     }
     let loaded = store::read(path).map_err(|error| {
         Failure::Usage(match error {

@@ -38,22 +38,22 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
         done: false,
         failed: Vec::new(),
     };
-    let told = args.output.json;
+    let json = args.output.json;
     let does = !args.plan && !work.is_empty();
-    if !told || (does && !args.yes) {
+    if !json || (does && !args.yes) {
         print(&restored, &args.output)?;
     }
     if does {
-        if !(args.yes || agreed(told)?) {
+        if !(args.yes || agreed(json)?) {
             return Err(Failure::Failed("nothing was done".to_owned()));
         }
         restored.failed = work.carry_out(&file.state, &mut live, args.exact).await?;
         restored.done = restored.failed.is_empty();
-        if !told {
+        if !json {
             print(&Outcome(&restored), &args.output)?;
         }
     }
-    if told {
+    if json {
         print(&restored, &args.output)?;
     }
     Ok(if restored.failed.is_empty() {
@@ -63,9 +63,9 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Asks whoever is at the terminal. `silent`: the plan was not shown.
-fn agreed(silent: bool) -> Result<bool, Failure> {
-    if silent || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
+/// Asks whoever is at the terminal: not a program, which reads `json`.
+fn agreed(json: bool) -> Result<bool, Failure> {
+    if json || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         let why = "nothing was done: there is nobody to ask. --yes does it, --plan only says it";
         return Err(Failure::Usage(why.to_owned()));
     }
