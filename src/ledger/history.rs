@@ -30,25 +30,25 @@ impl Rescues {
         }
     }
 
-    /// Keeps the present state, beside traffic: a new master has just been brought to it.
+    /// Keeps the present state: a new master has just been brought to it. It is written beside traffic.
     pub(crate) fn keep(&mut self, now: Instant) {
-        let (ledger, bytes_most) = (self.ledger.clone(), self.bytes_most);
+        let bytes_most = self.bytes_most;
         if bytes_most == 0 || !self.allowance.take(now) {
             return;
         }
+        let place = self.ledger.with_store(|store, _| {
+            // A disk that is full or broken is not written to more than it must be.
+            let fits = store.snapshot_bytes() <= bytes_most && store.unprotected().is_none();
+            fits.then(|| store.path().to_owned())
+        });
+        let Some(path) = place.flatten() else {
+            tracing::debug!("the state of this rescue is not kept: no room, or no working disk");
+            return;
+        };
+        // Now: the health check is about to take out nodes that have died.
+        let checkpoint = self.ledger.checkpoint();
         tokio::task::spawn_blocking(move || {
-            let place = ledger.with_store(|store, _| {
-                // A disk that is full or broken is not written to more than it must be.
-                let fits = store.snapshot_bytes() <= bytes_most && store.unprotected().is_none();
-                fits.then(|| store.path().to_owned())
-            });
-            let Some(path) = place.flatten() else {
-                tracing::debug!(
-                    "the state of this rescue is not kept: no room, or no working disk"
-                );
-                return;
-            };
-            let kept = history::keep_rescue(&path, &ledger.checkpoint());
+            let kept = history::keep_rescue(&path, &checkpoint);
             match kept.and_then(|kept| history::trim(&path, bytes_most).map(|()| kept)) {
                 Ok(kept) => tracing::debug!(path = %kept.display(), "the rescue's state is kept"),
                 Err(error) => tracing::info!(%error, "the state of this rescue is not kept"),

@@ -4,7 +4,7 @@ use std::fs;
 
 use rosrescue::xmlrpc::Value;
 
-use crate::support::{Mode, Robot, Tool, eventually};
+use crate::support::{FakeNode, Mode, Robot, Tool, eventually};
 
 fn history(robot: &Robot) -> Vec<serde_json::Value> {
     let json = Tool::rosrescue(&robot.scratch, robot.port(), &["history", "--json"]).json(0);
@@ -50,9 +50,18 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     );
 
     robot.client().set_param("/before", 1);
+    let dead = FakeNode::start("/dead");
+    dead.publish(&robot.client(), "/scan", "x/Y");
+    drop(dead);
     robot.crash_master();
     eventually("the rescue is kept", || {
         names(&robot).contains(&"rescue-1".to_owned())
+    });
+    // As the master died: before the dead node was taken out.
+    let rescue = run(&robot, &["inspect", "rescue-1"]);
+    assert!(rescue.contains("  /dead at http"), "{rescue}");
+    eventually("the dead node is taken out", || {
+        !robot.state().knows("/dead")
     });
     robot.client().set_param("/before", 2);
     let text = Tool::rosrescue(
@@ -61,7 +70,10 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
         &["diff", "rescue-1", "--live"],
     );
     let text = text.ended(1);
-    assert!(text.ends_with("parameter /before: 1 -> 2"), "{text}");
+    assert!(
+        text.contains("node /dead at ") && text.ends_with("parameter /before: 1 -> 2"),
+        "{text}"
+    );
     robot.crash_master();
     eventually("the other one too", || {
         names(&robot).contains(&"rescue-2".to_owned())
