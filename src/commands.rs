@@ -1,5 +1,5 @@
 //! The commands that do not serve nodes: each asks a running rosrescue, reads a checkpoint or looks at this
-//! computer, prints what it has found, and ends with an [`Exit`] that a script can use.
+//! computer, prints what it has found, and ends with an exit status that a script can use.
 
 mod diff;
 mod files;

@@ -2,7 +2,7 @@
 
 use std::{
     fs,
-    io::IsTerminal,
+    io::{self, IsTerminal},
     os::unix::fs::MetadataExt,
     path::{Path, PathBuf},
 };
@@ -50,8 +50,13 @@ pub(super) fn present(place: &CheckpointArgs) -> PathBuf {
 
 /// The checkpoint that `file` means: a path, or a name or number of the history.
 pub(super) fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
-    if let Ok(path) = fs::canonicalize(file) {
-        return Ok(path);
+    match fs::canonicalize(file) {
+        Ok(path) => return Ok(path),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(error) => {
+            let why = format!("cannot read `{}`: {error}", file.display());
+            return Err(Failure::Usage(why));
+        }
     }
     let present = present(place);
     let listed = list(&present);
@@ -109,7 +114,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
         let why = format!("`{shown}` is a folder: give the checkpoint in it");
         return Err(Failure::Usage(why));
     }
-    if metadata.len() > LARGE && std::io::stderr().is_terminal() {
+    if metadata.len() > LARGE && io::stderr().is_terminal() {
         eprintln!("reading `{shown}`, {} …", size(metadata.len()));
     }
     let loaded = store::read(path).map_err(|error| {
