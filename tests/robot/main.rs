@@ -120,3 +120,6 @@ mod restart {
 
 /// The wall clock jumps.
 mod clock;
+
+/// The commands that the documents show.
+mod documents;

@@ -16,6 +16,7 @@
     reason = "a test"
 )]
 
+mod blocks;
 mod command;
 mod disk;
 mod failing;
@@ -38,6 +39,7 @@ mod status;
 mod streams;
 mod twins;
 
+pub(crate) use blocks::{blocks, documents};
 pub(crate) use command::{Ran, command, run};
 pub(crate) use disk::SmallDisk;
 pub(crate) use failing::{Failing, Failures, Forkserver, page};

@@ -1,8 +1,8 @@
 //! Documents say what the program says, and name what there is.
 
-use std::{collections::BTreeSet, fs, path::PathBuf, process::Command};
+use std::{collections::BTreeSet, fs, process::Command};
 
-use super::{read, root, rust_files};
+use super::{blocks::documents, commands::quoted, read, root, rust_files};
 
 /// A longer README is read by nobody: one screen and a half, and tables.
 const README_BYTES_MOST: usize = 12 << 10;
@@ -121,18 +121,6 @@ fn there_is_a_reason_for_every_dependency_and_for_no_other() {
     }
 }
 
-/// The documents at the top and below `docs`.
-fn documents() -> Vec<PathBuf> {
-    let folders = ["", "docs", "docs/decisions", "fuzz"].map(|folder| root().join(folder));
-    let files = folders
-        .iter()
-        .flat_map(|folder| fs::read_dir(folder).unwrap());
-    let files = files.map(|entry| entry.unwrap().path());
-    files
-        .filter(|file| file.extension().is_some_and(|extension| extension == "md"))
-        .collect()
-}
-
 /// The anchors of a document's headings, as they are made of the headings' text.
 fn anchors(text: &str) -> BTreeSet<String> {
     let mut fenced = false;
@@ -192,12 +180,6 @@ fn documents_that_the_source_names_exist() {
             );
         }
     }
-}
-
-/// What stands between backticks in a document, on one line.
-fn quoted(text: &str) -> impl Iterator<Item = &str> {
-    text.lines()
-        .flat_map(|line| line.split('`').skip(1).step_by(2))
 }
 
 /// A file that is renamed leaves its name behind in documents.

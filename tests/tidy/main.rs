@@ -8,6 +8,10 @@
     reason = "a test"
 )]
 
+#[path = "../support/blocks.rs"]
+#[allow(dead_code, reason = "`tests/robot` takes the rest")]
+mod blocks;
+mod commands;
 mod documents;
 mod lines;
 

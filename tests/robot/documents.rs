@@ -1,0 +1,87 @@
+//! The commands of the documents work: each section's blocks are pasted into a shell, as they stand, on a computer
+//! of its own (`tests/support/documents.sh`). What cannot be run there is in [`blocks::NOT_RUN`].
+
+use std::{fmt::Write as _, fs, path::Path, process::Command};
+
+use super::support::{Scratch, blocks, documents};
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// What a section that starts no rosrescue is read beside.
+const A_ROBOT: &str = "rosrescue core\nroslaunch --wait my_robot.launch\n";
+
+/// Runs what `document` has; panics with the output of the section that fails.
+fn run(document: &str) {
+    let text = fs::read_to_string(Path::new(ROOT).join(document)).unwrap();
+    let mut blocks = blocks(&text);
+    blocks.retain(|block| block.reason().is_none() && !block.is_transcript());
+    for section in blocks.chunk_by(|one, next| one.section == next.section) {
+        let starts = |name: &str| section.iter().any(|block| block.text.contains(name));
+        let mut script = ". tests/support/documents.sh\n".to_owned();
+        if !["rosrescue core", "rosrescue proxy", "examples/"]
+            .iter()
+            .any(|name| starts(name))
+        {
+            script += A_ROBOT;
+        }
+        for block in section {
+            write!(
+                script,
+                "echo '--- {document} line {}'\n{}",
+                block.line, block.text
+            )
+            .unwrap();
+        }
+        run_section(&script);
+    }
+}
+
+/// In namespaces of its own: its ports are free, `pkill` meets nobody else, and everything ends with the shell.
+#[track_caller]
+fn run_section(script: &str) {
+    let scratch = Scratch::new();
+    let mut command = Command::new("unshare");
+    scratch.prepare(&mut command);
+    let output = command
+        .args([
+            "--net",
+            "--mount",
+            "--pid",
+            "--fork",
+            "--mount-proc",
+            "--kill-child",
+        ])
+        .args(["timeout", "--kill-after=5", "100", "bash", "-euc", script])
+        .env("REPOSITORY", ROOT)
+        .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
+        .current_dir(ROOT)
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{} (namespaces need root):\n{script}\n{}{}",
+        output.status,
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+#[test]
+fn the_readme() {
+    run("README.md");
+}
+
+#[test]
+fn the_way_into_a_robot() {
+    run("ROS_MASTER_URI.md");
+}
+
+#[test]
+fn all_other_documents() {
+    for document in documents() {
+        let name = document.strip_prefix(ROOT).unwrap().to_str().unwrap();
+        if !["README.md", "ROS_MASTER_URI.md"].contains(&name) {
+            run(name);
+        }
+    }
+}

@@ -1,0 +1,136 @@
+//! The commands that documents show. A fenced block without a language, or in sh, bash or console, and every
+//! indented block is a block of commands; what a program prints is in a fence of `text`.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+/// What cannot be run by the test of the documents, and why; and what tests it otherwise. A block that has one of
+/// these words is left out.
+pub(crate) const NOT_RUN: [(&str, &str); 13] = [
+    ("cargo ", "builds and tests: `tests/run.sh` does"),
+    ("tests/run.sh", "runs this very test: `tests/run.sh`"),
+    (
+        "systemctl ",
+        "needs systemd: `tests/robot/restart/systemd.rs`",
+    ),
+    (
+        "journalctl ",
+        "needs systemd: `tests/robot/restart/systemd.rs`",
+    ),
+    (
+        "loginctl ",
+        "needs systemd: `tests/robot/restart/systemd.rs`",
+    ),
+    (
+        "rosrescue install",
+        "changes this computer: `tests/robot/restart/systemd.rs`",
+    ),
+    (
+        "rosrescue uninstall",
+        "changes this computer: `tests/robot/restart/systemd.rs`",
+    ),
+    ("apt ", "changes this computer: `tests/install_ros.sh`"),
+    ("apt-get ", "changes this computer: `tests/install_ros.sh`"),
+    ("dpkg ", "changes this computer: `tests/install_ros.sh`"),
+    (
+        "docker ",
+        "there is no Docker in CI; `tests/robot/restart/guardian.rs` has a process namespace",
+    ),
+    (
+        "robot_upstart",
+        "not in Debian: nobody runs it but `ROS_MASTER_URI.md` says so",
+    ),
+    (
+        "ROSRESCUE_SCRIPT=failed.txt",
+        "wants a failure's output: `tests/differential/script.rs`",
+    ),
+];
+
+/// A block of commands as a document has it, without its indentation.
+#[derive(Clone, Debug)]
+pub(crate) struct Block {
+    /// The line of the document on which it begins.
+    pub(crate) line: usize,
+    /// The heading above it.
+    pub(crate) section: String,
+    pub(crate) text: String,
+}
+
+impl Block {
+    /// Why it is not run, if it is not.
+    pub(crate) fn reason(&self) -> Option<&'static str> {
+        let found = NOT_RUN.iter().find(|(word, _)| self.text.contains(word));
+        found.map(|(_, reason)| *reason)
+    }
+
+    /// What a program printed, with the command above it: `$ rosrescue core --help`.
+    pub(crate) fn is_transcript(&self) -> bool {
+        self.text.starts_with("$ ")
+    }
+}
+
+/// Every document of the repository.
+pub(crate) fn documents() -> Vec<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let folders =
+        ["", "docs", "docs/decisions", "fuzz", "examples/robot"].map(|name| root.join(name));
+    let files = folders.iter().flat_map(fs::read_dir).flatten();
+    let files = files.map(|entry| entry.unwrap().path());
+    let mut files: Vec<_> = files
+        .filter(|file| file.extension().is_some_and(|extension| extension == "md"))
+        .collect();
+    files.sort();
+    files
+}
+
+/// The blocks of commands of a document, in its order.
+pub(crate) fn blocks(document: &str) -> Vec<Block> {
+    let mut blocks = Vec::new();
+    let mut section = String::new();
+    let mut lines = document.lines().zip(1..).peekable();
+    let mut after_blank = true;
+    while let Some((line, number)) = lines.next() {
+        let indent = indentation(line);
+        let mut body = Vec::new();
+        if let Some(language) = line.trim_start().strip_prefix("```") {
+            body.extend(
+                lines
+                    .by_ref()
+                    .map(|(line, _)| line)
+                    .take_while(|line| !line.trim_start().starts_with("```")),
+            );
+            if !["", "sh", "bash", "console"].contains(&language) {
+                body.clear();
+            }
+        } else if after_blank && indent >= 4 && !line.trim().is_empty() {
+            body.push(line);
+            while let Some((line, _)) =
+                lines.next_if(|(line, _)| line.trim().is_empty() || indentation(line) >= 4)
+            {
+                body.push(line);
+            }
+        } else if line.starts_with('#') {
+            section = line.trim_start_matches('#').trim().to_owned();
+        }
+        after_blank = line.trim().is_empty() || !body.is_empty();
+        if !body.is_empty() {
+            let indent = indentation(body[0]);
+            let text = body
+                .iter()
+                .map(|line| line.get(indent..).unwrap_or("").trim_end());
+            let text = text.collect::<Vec<_>>().join("\n").trim_end().to_owned() + "\n";
+            blocks.push(Block {
+                line: number,
+                section: section.clone(),
+                text,
+            });
+        }
+    }
+    blocks
+}
+
+fn indentation(line: &str) -> usize {
+    line.len() - line.trim_start_matches(' ').len()
+}

@@ -1,0 +1,98 @@
+# A computer for the commands of a document: what `tests/robot/documents.rs` puts before them. It is run as root in
+# a network, a mount and a process namespace, so that port 11311 and /opt are free to use, and `pkill` meets nobody else.
+#
+# The functions stand for what a person does beside the commands: what goes on running is given a terminal of its
+# own, and is waited for.
+
+scratch=$ROS_HOME
+ip link set lo up
+ip addr add 10.0.0.7/24 dev lo
+export HOME=$scratch/home
+unset ROS_HOME ROS_LOG_DIR # they lead there by themselves
+if [ ! -d /opt/ros/noetic ]; then
+    mount -t tmpfs none /opt
+    mkdir -p /opt/ros/noetic
+    : >/opt/ros/noetic/setup.bash # Debian's ROS needs no set-up
+fi
+
+# The repository, but files that the commands write stay here.
+mkdir -p "$HOME" "$scratch/here" "$scratch/bin" "$scratch/packages"
+cd "$scratch/here"
+ln -s "$REPOSITORY"/* .
+ln -s "$ROSRESCUE" "$scratch/bin/rosrescue"
+PATH=$scratch/bin:$PATH
+cat >my_robot.launch <<'LAUNCH'
+<launch>
+  <param name="robot/wheels" value="4" />
+  <node pkg="rosrescue_examples" type="talker.py" name="talker"><remap from="count" to="some_topic" /></node>
+  <node pkg="rosrescue_examples" type="listener.py" name="listener"><remap from="count" to="some_topic" /></node>
+</launch>
+LAUNCH
+mkdir "$scratch/packages/my_robot"
+cp my_robot.launch "$scratch/packages/my_robot"
+sed s/rosrescue_examples/my_robot/ "$REPOSITORY/examples/nodes/package.xml" >"$scratch/packages/my_robot/package.xml"
+export ROS_PACKAGE_PATH=$scratch/packages:$REPOSITORY/examples/nodes${ROS_PACKAGE_PATH:+:$ROS_PACKAGE_PATH}
+export ROS_MASTER_URI=http://127.0.0.1:11311
+
+# Waits for a command to succeed.
+within() { # SECONDS COMMAND...
+    local end=$((SECONDS + $1))
+    shift
+    until "$@" >/dev/null 2>&1; do
+        if [ "$SECONDS" -ge "$end" ]; then
+            echo "in vain: $*" >&2
+            tail -n 20 "$scratch"/terminal-*.log >&2
+            return 1
+        fi
+        sleep 0.05
+    done
+}
+
+terminals=0
+in_a_terminal() {
+    terminals=$((terminals + 1))
+    command "$@" >"$scratch/terminal-$terminals.log" 2>&1 &
+}
+
+calls_are_answered() { curl -fsS "http://127.0.0.1:${1:-11311}/ready"; }
+robot_is_up() { rosnode list | grep -x /talker && rostopic info /some_topic | grep -x ' \* /listener.*'; }
+master_answers() { ROS_MASTER_URI=http://127.0.0.1:$1 rosparam list; }
+
+sudo() { "$@"; }
+rosrescue() {
+    case ${1:-} in
+        core | proxy)
+            in_a_terminal rosrescue "$@"
+            within 30 calls_are_answered
+            ;;
+        top) timeout 20 "$scratch/bin/rosrescue" "$@" --count 2 ;;
+        *) command rosrescue "$@" ;;
+    esac
+}
+rosmaster() {
+    in_a_terminal rosmaster "$@"
+    within 30 master_answers 11312
+}
+roslaunch() {
+    in_a_terminal roslaunch "$@"
+    within 30 robot_is_up
+}
+# Debian has no rosrun.
+rosrun() {
+    case "$1 $2" in
+        'rosout rosout')
+            for rosout in /opt/ros/*/lib/rosout/rosout /usr/lib/rosout/rosout; do
+                [ ! -x "$rosout" ] || exec "$rosout"
+            done
+            ;;
+    esac
+    echo "no rosrun for $*" >&2
+    return 1
+}
+# What would go on until Ctrl-C: something has to come.
+rostopic() {
+    case ${1:-} in
+        echo | hz) timeout 20 "$(type -P rostopic)" "$@" 2>&1 | grep -m 1 . ;;
+        *) command rostopic "$@" ;;
+    esac
+}
