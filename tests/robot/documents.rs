@@ -38,7 +38,7 @@ fn run(document: &str) {
 
 /// In namespaces of its own: its ports are free, `pkill` meets nobody else, and everything ends with the shell.
 #[track_caller]
-fn run_section(script: &str) {
+fn run_section(script: &str) -> String {
     let scratch = Scratch::new();
     let mut command = Command::new("unshare");
     scratch.prepare(&mut command);
@@ -64,6 +64,7 @@ fn run_section(script: &str) {
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr)
     );
+    String::from_utf8(output.stdout).unwrap()
 }
 
 #[test]
@@ -84,4 +85,33 @@ fn all_other_documents() {
             run(name);
         }
     }
+}
+
+/// The lines of a picture, without its numbers.
+fn lines(picture: &str) -> Vec<String> {
+    let lines = picture
+        .lines()
+        .filter(|line| line.starts_with("<text class=\"line"));
+    let texts = lines.map(|line| line.split_once('>').unwrap().1);
+    let words = texts.map(|text| text.split(|c: char| c.is_ascii_digit() || c == '.'));
+    words
+        .map(|words| {
+            words
+                .filter(|word| !word.is_empty())
+                .collect::<Vec<_>>()
+                .join("0")
+        })
+        .collect()
+}
+
+#[test]
+fn the_recording_is_what_its_script_makes() {
+    let ours = fs::read_to_string(Path::new(ROOT).join("docs/rescue.svg")).unwrap();
+    let made = run_section(". tests/support/documents.sh\nexamples/record.sh");
+    assert!(lines(&made).len() > 10, "{made}");
+    assert_eq!(
+        lines(&ours),
+        lines(&made),
+        "examples/record.sh >docs/rescue.svg makes it anew"
+    );
 }

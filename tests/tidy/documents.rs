@@ -66,6 +66,18 @@ fn the_readme_stays_short() {
     );
 }
 
+/// `tests/robot/documents.rs` compares its lines with those of a new one.
+#[test]
+fn the_recording_is_small_and_needs_nothing_else() {
+    let picture = read("docs/rescue.svg");
+    assert!(picture.len() < 40 << 10, "{} bytes", picture.len());
+    let linked = picture.replace("xmlns=\"http://www.w3.org/2000/svg\"", "");
+    for foreign in ["href", "url(", "@import", "<script", "src="] {
+        assert!(!linked.contains(foreign), "docs/rescue.svg has {foreign}");
+    }
+    assert!(picture.contains("prefers-color-scheme: dark"));
+}
+
 #[test]
 fn the_documents_name_the_rust_that_is_needed() {
     let manifest = read("Cargo.toml");
