@@ -1,0 +1,73 @@
+#!/usr/bin/env bash
+# What a robot loses when nothing but `respawn` looks after its master: a bare rosmaster in a loop, as systemd's
+# Restart=always with RestartSec=0.1 has it. Shows it, kills the master, looks at what is left, and cleans up.
+
+cd "$(dirname "$0")/.." || exit
+. examples/common.sh
+need_ros
+need_scratch
+
+master_port=$(free_port)
+export ROS_MASTER_URI=http://127.0.0.1:$master_port/
+master_pid() {
+    /usr/bin/python3 -c 'import sys, xmlrpc.client; print(xmlrpc.client.ServerProxy(sys.argv[1]).getPid("/example")[2])' \
+        "$ROS_MASTER_URI" 2>/dev/null
+}
+heard() { grep -cE '^[0-9.]+ [0-9]+$' "$scratch/$1.log" || true; }
+has_heard() { [ "$(heard "$1")" -ge "$2" ]; }
+late_is_up() { rosnode list | grep -qx /late; }
+count() { "$@" 2>/dev/null | grep -c . || true; }
+
+step "A rosmaster that is started again 0.1 s after its end"
+start master bash -c "while :; do rosmaster --core -p $master_port; sleep 0.1; done"
+within 60 master_pid >/dev/null || give_up "the rosmaster did not start"
+took "ROS_MASTER_URI=$ROS_MASTER_URI"
+
+step "rosout, which is roscpp; a rospy talker and a rospy listener; a parameter and a /run_id"
+rosparam set /run_id "$(cat /proc/sys/kernel/random/uuid)"
+rosparam set /robot/wheels 4
+for rosout in /opt/ros/*/lib/rosout/rosout /usr/lib/rosout/rosout; do
+    [ ! -x "$rosout" ] || break
+done
+start_node rosout "$rosout"
+start_node talker examples/nodes/talker.py
+start_node listener examples/nodes/listener.py
+within 60 has_heard listener 100 || give_up "the listener hears nothing"
+took "$(count rosnode list) nodes, $(count rostopic list) topics, $(count rosservice list) services, $(count rosparam list) parameters"
+
+master=$(master_pid)
+step "kill -9 $master: the rosmaster is dead"
+killed=$EPOCHREALTIME
+kill -KILL "$master"
+is_back() { [ "$(master_pid)" != "$master" ] && [ -n "$(master_pid)" ]; }
+within 60 is_back || give_up "the rosmaster did not come back"
+say "after $(seconds "$killed" "$EPOCHREALTIME") s a new one, process $(master_pid), answers"
+
+step "What it knows, five seconds later"
+sleep 5
+say "$(count rosnode list) nodes, $(count rostopic list) topics, $(count rosservice list) services, $(count rosparam list) parameters"
+before=$(heard listener)
+within 10 has_heard listener $((before + 50)) || wrong "the listener, which was connected, hears nothing more"
+say "the listener, which was connected, goes on: $(heard listener) messages"
+rosparam get /robot/wheels >"$scratch/wheels.log" 2>&1 || true
+say "rosparam get /robot/wheels: $(tail -n 1 "$scratch/wheels.log")"
+
+step "A new listener asks the new rosmaster for the talker"
+start_node late examples/nodes/listener.py __name:=late
+within 60 late_is_up || give_up "the new listener does not come up"
+if within 5 has_heard late 1; then
+    wrong "it hears something, against expectation"
+else
+    say "five seconds later it has heard nothing; nodes: $(rosnode list | paste -sd ' ')"
+fi
+
+step "roslaunch --wait examples/robot.launch"
+start_node roslaunch roslaunch --wait examples/robot.launch
+within 60 grep -q 'master has started' "$scratch/roslaunch.log" || give_up "roslaunch finds no master"
+if within 5 grep -q 'started with pid' "$scratch/roslaunch.log"; then
+    wrong "it starts nodes, against expectation"
+else
+    say "five seconds later it has started nothing: it waits for a /run_id"
+fi
+
+[ "$failed" = 0 ] || give_up "it is not as docs/comparison.md says"
