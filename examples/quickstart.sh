@@ -137,8 +137,6 @@ unset ROS_HOSTNAME
 export ROS_MASTER_URI=$ROS_MASTER_URI ROS_IP=127.0.0.1
 END
 trap - EXIT
-read -r uri < <(status master)
-port=${uri%/}
 cat <<END
 
 It goes on running. In another terminal:
@@ -147,9 +145,9 @@ It goes on running. In another terminal:
     rosnode list
     rostopic echo /count
 
-Kill the master as often as you like (it comes back on the same port):
+Kill the master as often as you like, and see what nodes feel of it:
 
-    kill -9 \$(pgrep -f '[r]osmaster --core -p ${port##*:} ')
+    $(realpath "$ROSRESCUE") drill
 
 How it is: $ROS_MASTER_URI in a browser, or
 

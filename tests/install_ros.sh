@@ -46,6 +46,7 @@ ros_missing() {
     need rosout ros_has_rosout
     need g++ command -v g++
     need iproute2 command -v ip
+    need curl command -v curl
     need pkg-config command -v pkg-config
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs

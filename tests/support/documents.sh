@@ -65,7 +65,8 @@ rosrescue() {
             in_a_terminal rosrescue "$@"
             within 30 calls_are_answered
             ;;
-        top) timeout 20 "$scratch/bin/rosrescue" "$@" --count 2 ;;
+        top) command rosrescue "$@" --count 2 ;;
+        drill) command rosrescue "$@" --yes ;; # the person's answer
         *) command rosrescue "$@" ;;
     esac
 }
@@ -77,18 +78,10 @@ roslaunch() {
     in_a_terminal roslaunch "$@"
     within 30 robot_is_up
 }
-# Debian has no rosrun.
-rosrun() {
-    case "$1 $2" in
-        'rosout rosout')
-            for rosout in /opt/ros/*/lib/rosout/rosout /usr/lib/rosout/rosout; do
-                [ ! -x "$rosout" ] || exec "$rosout"
-            done
-            ;;
-    esac
-    echo "no rosrun for $*" >&2
-    return 1
-}
+# Debian has it in a package of its own, which needs catkin.
+if ! command -v rosrun >/dev/null; then
+    rosrun() { "/usr/lib/$1/$2" "${@:3}"; }
+fi
 # What would go on until Ctrl-C: something has to come.
 rostopic() {
     case ${1:-} in
