@@ -9,18 +9,17 @@ import time
 
 ROW, LEFT, TOP, WIDTH = 20, 18, 58, 860
 
-HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}">
+HEAD = """<svg xmlns="http://www.w3.org/2000/svg" xml:space="preserve" viewBox="0 0 {width} {height}" width="{width}" height="{height}">
 <title>A rosmaster is killed, and rosrescue brings a new one to the same state</title>
 <style>
-svg {{ --back: #fff; --edge: #d1d9e0; --text: #1f2328; --quiet: #59636e; --step: #0550ae; --dead: #b3261e; --good: #1a7f37 }}
+text {{ font: 13.5px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace }}
+.step, .dead {{ font-weight: 600 }}
+rect {{ fill: #fff; stroke: #d1d9e0 }} circle {{ fill: #d1d9e0 }} text {{ fill: #1f2328 }} .quiet {{ fill: #59636e }}
+.step {{ fill: #0550ae }} .dead {{ fill: #b3261e }} .good {{ fill: #1a7f37 }}
 @media (prefers-color-scheme: dark) {{
-svg {{ --back: #0d1117; --edge: #3d444d; --text: #e6edf3; --quiet: #9198a1; --step: #79c0ff; --dead: #ff7b72; --good: #56d364 }}
+rect {{ fill: #0d1117; stroke: #3d444d }} circle {{ fill: #3d444d }} text {{ fill: #e6edf3 }} .quiet {{ fill: #9198a1 }}
+.step {{ fill: #79c0ff }} .dead {{ fill: #ff7b72 }} .good {{ fill: #56d364 }}
 }}
-rect {{ fill: var(--back); stroke: var(--edge) }}
-circle {{ fill: var(--edge) }}
-text {{ font: 13.5px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; fill: var(--text); white-space: pre }}
-.quiet {{ fill: var(--quiet) }} .step {{ fill: var(--step); font-weight: 600 }}
-.dead {{ fill: var(--dead); font-weight: 600 }} .good {{ fill: var(--good) }}
 @keyframes come {{ from {{ opacity: .25 }} }}
 .line {{ animation: come 1ms backwards }}
 @media (prefers-reduced-motion: reduce) {{ .line {{ animation: none }} }}
