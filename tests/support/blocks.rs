@@ -8,7 +8,7 @@ use std::{
 
 /// What cannot be run by the test of the documents, and why; and what tests it otherwise. A block that has one of
 /// these words is left out.
-pub(crate) const NOT_RUN: [(&str, &str); 13] = [
+pub(crate) const NOT_RUN: [(&str, &str); 14] = [
     ("cargo ", "builds and tests: `tests/run.sh` does"),
     ("tests/run.sh", "runs this very test: `tests/run.sh`"),
     (
@@ -41,6 +41,10 @@ pub(crate) const NOT_RUN: [(&str, &str); 13] = [
     (
         "robot_upstart",
         "not in Debian: nobody runs it but `ROS_MASTER_URI.md` says so",
+    ),
+    (
+        "examples/robot/",
+        "takes minutes: `tests/robot/nodes/example.rs`",
     ),
     (
         "ROSRESCUE_SCRIPT=failed.txt",
