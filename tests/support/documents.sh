@@ -58,7 +58,6 @@ calls_are_answered() { curl -fsS "http://127.0.0.1:${1:-11311}/ready"; }
 robot_is_up() { rosnode list | grep -x /talker && rostopic info /some_topic | grep -x ' \* /listener.*'; }
 master_answers() { ROS_MASTER_URI=http://127.0.0.1:$1 rosparam list; }
 
-sudo() { "$@"; }
 rosrescue() {
     case ${1:-} in
         core | proxy)
