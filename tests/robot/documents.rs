@@ -51,7 +51,7 @@ fn run_section(script: &str) -> String {
             "--mount-proc",
             "--kill-child",
         ])
-        .args(["timeout", "--kill-after=5", "100", "bash", "-euc", script])
+        .args(["timeout", "--kill-after=5", "240", "bash", "-euc", script])
         .env("REPOSITORY", ROOT)
         .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
         .current_dir(ROOT)

@@ -62,7 +62,7 @@ rosrescue() {
     case ${1:-} in
         core | proxy)
             in_a_terminal rosrescue "$@"
-            within 30 calls_are_answered
+            within 60 calls_are_answered
             ;;
         top) command rosrescue "$@" --count 2 ;;
         drill) command rosrescue "$@" --yes ;; # the person's answer
@@ -71,11 +71,11 @@ rosrescue() {
 }
 rosmaster() {
     in_a_terminal rosmaster "$@"
-    within 30 master_answers 11312
+    within 60 master_answers 11312
 }
 roslaunch() {
     in_a_terminal roslaunch "$@"
-    within 30 robot_is_up
+    within 60 robot_is_up
 }
 # Debian has it in a package of its own, which needs catkin.
 if ! command -v rosrun >/dev/null; then
