@@ -14,7 +14,7 @@ pub use self::{
     },
     live::{For, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
-    tools::{HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool},
+    tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
 };
 
 /// Keeps a ROS 1 robot running when its master dies.

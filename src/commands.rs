@@ -1,7 +1,9 @@
 //! The commands that do not serve nodes: each asks a running rosrescue, reads a checkpoint or looks at this
 //! computer, prints what it has found, and ends with an exit status that a script can use.
 
+mod check;
 mod diff;
+mod drill;
 mod files;
 mod history;
 mod inspect;
@@ -62,6 +64,7 @@ impl Failure {
 
 /// Runs `tool` and says what it has found.
 pub fn run(tool: &Tool) -> ExitCode {
+    // Not the current thread alone: what decodes a large answer steps out of the runtime.
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -69,6 +72,8 @@ pub fn run(tool: &Tool) -> ExitCode {
     let ended = match runtime {
         Ok(runtime) => runtime.block_on(async {
             match tool {
+                Tool::Check(args) => check::run(args).await,
+                Tool::Drill(args) => drill::run(args).await,
                 Tool::Diff(args) => diff::run(args).await,
                 Tool::History(args) => history::run(args).await,
                 Tool::Inspect(args) => inspect::run(args).await,
@@ -121,4 +126,10 @@ fn plain(text: &str) -> String {
         }
     };
     text.chars().map(safe).collect()
+}
+
+/// A number of things, as in `1 message` and `2 messages`.
+fn counted(count: usize, thing: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{count} {thing}{plural}")
 }

@@ -17,13 +17,15 @@ use tokio::process::{Child, Command};
 
 use crate::{config::SupervisedConfig, guardian::handover};
 
+pub(crate) mod listeners;
 mod orphan;
 pub(crate) mod pidfd;
 mod rosout;
 mod spare;
 
+pub(crate) use orphan::is_in_our_network;
 pub(crate) use rosout::Rosout;
-pub(crate) use spare::Spare;
+pub(crate) use spare::{Spare, interpreter};
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
@@ -87,13 +89,8 @@ pub(crate) struct Rosmaster {
 impl Rosmaster {
     /// Finds the program. Its files are created next to `checkpoint`.
     pub(crate) fn find(config: &SupervisedConfig, checkpoint: &Path) -> Result<Self, ProcessError> {
-        let program = match &config.rosmaster {
-            Some(path) if is_program(path) => path.clone(),
-            Some(path) => return Err(ProcessError::NotAProgram { path: path.clone() }),
-            None => find_program("rosmaster", &["bin"]).ok_or(ProcessError::NoRosmaster)?,
-        };
         Ok(Self {
-            program,
+            program: find_rosmaster(config.rosmaster.as_deref())?,
             config: config.clone(),
             output: beside(checkpoint, ".rosmaster-output.log"),
             log_config: beside(checkpoint, ".rosmaster-logging.conf"),
@@ -125,7 +122,7 @@ impl Rosmaster {
     pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<u32> {
         let mut all = orphan::find(&orphan::owner(&self.checkpoint));
         all.retain(|pid| !runs(*pid, "rosout"));
-        let serves = |pid: &u32| port.is_some_and(|port| orphan::listens(*pid, port));
+        let serves = |pid: &u32| port.is_some_and(|port| listeners::listens(*pid, port));
         let found = all.iter().copied().find(serves);
         if found.is_none() {
             let name = self.program.file_name().unwrap_or_default();
@@ -195,6 +192,25 @@ impl Rosmaster {
     pub(crate) fn last_words(&self) -> String {
         tail_of(&self.output)
     }
+}
+
+/// The `given` rosmaster, or the one that is installed.
+pub(crate) fn find_rosmaster(given: Option<&Path>) -> Result<PathBuf, ProcessError> {
+    match given {
+        Some(path) if is_program(path) => Ok(path.to_owned()),
+        Some(path) => Err(ProcessError::NotAProgram {
+            path: path.to_owned(),
+        }),
+        None => find_program("rosmaster", &["bin"]).ok_or(ProcessError::NoRosmaster),
+    }
+}
+
+/// A command that runs `python` silently with the paths of the ROS that has `program`.
+pub(crate) fn python(python: &Path, program: &Path) -> Command {
+    let mut command = command(python);
+    add_ros_paths(&mut command, program, 2);
+    command.stdin(Stdio::null()).kill_on_drop(true);
+    command
 }
 
 /// Runs `program`, without variables meant for rosrescue alone.
@@ -298,6 +314,37 @@ pub(crate) fn runs(pid: u32, name: &str) -> bool {
     })
 }
 
+/// Whether a rosrescue with this checkpoint started the process `pid`.
+pub(crate) fn is_of(pid: u32, checkpoint: &Path) -> bool {
+    orphan::bears(pid, &orphan::owner(checkpoint))
+}
+
+/// Whether a rosrescue started the process `pid`.
+pub(crate) fn is_of_any(pid: u32) -> bool {
+    orphan::has_owner(pid) || parent_of(pid).is_some_and(is_rosrescue)
+}
+
+/// All processes that can be seen.
+pub(crate) fn all() -> impl Iterator<Item = u32> {
+    let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+}
+
+/// The parent of the process `pid`.
+pub(crate) fn parent_of(pid: u32) -> Option<u32> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The command's name in parentheses comes first and may contain anything.
+    let after = stat.rsplit(')').next()?;
+    after.split_whitespace().nth(1)?.parse().ok()
+}
+
+/// Whether the process `pid` runs rosrescue, also after its file was replaced.
+pub(crate) fn is_rosrescue(pid: u32) -> bool {
+    let program = std::fs::read_link(format!("/proc/{pid}/exe")).unwrap_or_default();
+    let name = program.file_name().unwrap_or_default();
+    name.as_encoded_bytes().starts_with(b"rosrescue")
+}
+
 /// Returns when the process `pid`, which is not our child, has ended.
 pub(crate) async fn ended(pid: u32) {
     if orphan::ended(pid).await.is_err() {
@@ -340,7 +387,7 @@ pub(crate) async fn output_of(
 }
 
 /// A program on the PATH, else in one of `folders` of an installed ROS.
-fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
+pub(crate) fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let on_path = std::env::split_paths(&path)
         .map(|folder| folder.join(name))

@@ -16,7 +16,7 @@ pub const DEFAULT_MASTER_PORT: u16 = 11311;
 pub type Lookup<'a> = &'a dyn Fn(&str) -> Option<String>;
 
 /// An invalid `ROS_MASTER_URI` or `--master`.
-#[derive(Debug, Error, PartialEq, Eq)]
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum UriError {
     /// Not of the form `http://HOST:PORT/`.

@@ -1,6 +1,8 @@
 //! The commands that do not serve nodes, and their options.
 
-use clap::{Args, Subcommand, builder::FalseyValueParser};
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 use super::{
     DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
@@ -10,6 +12,10 @@ use crate::hide::{self, Hide};
 /// A command that looks at a rosrescue, a checkpoint or this computer.
 #[derive(Debug, Subcommand)]
 pub enum Tool {
+    /// Look for what will trouble the robot, before it drives
+    Check(CheckArgs),
+    /// Kill the master on purpose while watching calls, topics and nodes, and give a verdict
+    Drill(DrillArgs),
     /// Say in words how two checkpoints differ, or a checkpoint and the running master. Exit status 1 if they do
     Diff(DiffArgs),
     /// List the checkpoints that are kept: of the last sessions, and of rescues
@@ -66,4 +72,98 @@ pub struct StatusArgs {
     /// In which form.
     #[command(flatten)]
     pub output: OutputArgs,
+}
+
+/// Options of `rosrescue check`.
+#[derive(Args, Clone, Debug)]
+pub struct CheckArgs {
+    /// Port that nodes use [default: the port of ROS_MASTER_URI, else 11311]
+    #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
+    #[arg(value_parser = clap::value_parser!(u16).range(1..))]
+    pub port: Option<u16>,
+    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
+    #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
+    pub checkpoint: Option<PathBuf>,
+    /// The rosmaster program [default: the one on the PATH, else in /opt/ros/*/bin]
+    #[arg(long, env = "ROSRESCUE_ROSMASTER", value_name = "FILE")]
+    pub rosmaster: Option<PathBuf>,
+    /// Check for `proxy` in front of this master, http://HOST:PORT, instead of for `core`
+    #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
+    pub master: Option<String>,
+    /// In which form.
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+/// Options of `rosrescue drill`.
+#[derive(Args, Clone, Debug)]
+pub struct DrillArgs {
+    /// Which one.
+    #[command(flatten)]
+    pub target: TargetArgs,
+    /// What is killed: each time with SIGKILL
+    #[arg(long, env = "ROSRESCUE_DRILL_KILL", value_enum, default_value_t = Victim::Master)]
+    pub kill: Victim,
+    /// How often. More than five deaths within a minute are a crash loop, so from the sixth on the
+    /// drill waits for the minute to pass
+    #[arg(
+        long,
+        env = "ROSRESCUE_DRILL_TIMES",
+        value_name = "COUNT",
+        default_value_t = 3
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub times: u32,
+    /// Stop the master with SIGSTOP instead of killing it, so that it hangs
+    #[arg(long, env = "ROSRESCUE_DRILL_HANG", conflicts_with_all = ["kill", "no_kill"])]
+    #[arg(value_parser = FalseyValueParser::new())]
+    pub hang: bool,
+    /// Kill nothing: only watch, for --seconds
+    #[arg(long, env = "ROSRESCUE_DRILL_NO_KILL", conflicts_with_all = ["kill", "times"])]
+    #[arg(value_parser = FalseyValueParser::new())]
+    pub no_kill: bool,
+    /// How long --no-kill watches, in seconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_DRILL_SECONDS",
+        value_name = "SECONDS",
+        default_value_t = 10
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=86_400))]
+    pub seconds: u32,
+    /// How long a recovery may take before the drill has failed, in seconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_DRILL_LIMIT",
+        value_name = "SECONDS",
+        default_value_t = 30
+    )]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=3600))]
+    pub limit: u32,
+    /// A topic to watch, as a subscriber; may be repeated [default: up to three that carry messages]
+    #[arg(
+        long,
+        env = "ROSRESCUE_DRILL_TOPIC",
+        value_name = "NAME",
+        value_delimiter = ','
+    )]
+    pub topic: Vec<String>,
+    /// Do not ask before anything is killed
+    #[arg(short, long, env = "ROSRESCUE_DRILL_YES")]
+    #[arg(value_parser = FalseyValueParser::new())]
+    pub yes: bool,
+    /// In which form.
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+/// What a drill kills.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Victim {
+    /// The rosmaster
+    Master,
+    /// rosrescue's worker
+    Worker,
+    /// Both at once
+    Both,
 }

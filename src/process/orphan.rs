@@ -32,16 +32,31 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 /// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes of other
 /// containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
-    let mut wanted = format!("{OWNER}=").into_bytes();
-    wanted.extend(owner.as_bytes());
-    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
-    let ids = processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
-    ids.filter(|pid| {
-        let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
-        let is_ours = environment.split(|byte| *byte == 0).any(|of| of == wanted);
-        is_ours && network(pid) == network(&"self") && !has_rosrescue(*pid)
-    })
-    .collect()
+    super::all()
+        .filter(|pid| bears(*pid, owner) && is_in_our_network(*pid) && !has_rosrescue(*pid))
+        .collect()
+}
+
+/// Whether the process `pid` was started with this `owner`.
+pub(super) fn bears(pid: u32, owner: &OsStr) -> bool {
+    owner_of(pid).is_some_and(|of| of == owner.as_bytes())
+}
+
+/// Whether a rosrescue started the process `pid`.
+pub(super) fn has_owner(pid: u32) -> bool {
+    owner_of(pid).is_some()
+}
+
+fn owner_of(pid: u32) -> Option<Vec<u8>> {
+    let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+    let start = format!("{OWNER}=").into_bytes();
+    let mut pairs = environment.split(|byte| *byte == 0);
+    pairs.find_map(|pair| pair.strip_prefix(&*start).map(<[u8]>::to_vec))
+}
+
+/// Whether the process `pid` is in our network namespace.
+pub(crate) fn is_in_our_network(pid: u32) -> bool {
+    network(&pid) == network(&"self")
 }
 
 /// The network namespace of a process.
@@ -52,37 +67,8 @@ fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
 /// Whether the parent of `pid` is a rosrescue, so that it is no orphan. Our own parent does not count: a
 /// guardian starts no masters, but as the first process of a container it inherits those of dead workers.
 fn has_rosrescue(pid: u32) -> bool {
-    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
-    // The command's name in parentheses comes first and may contain anything.
-    let after = stat.rsplit(')').next().unwrap_or_default();
-    let parent = after.split_whitespace().nth(1).unwrap_or_default();
-    if parent == parent_id().to_string() {
-        return false;
-    }
-    let program = fs::read_link(format!("/proc/{parent}/exe")).unwrap_or_default();
-    let name = program.file_name().unwrap_or_default();
-    name.as_bytes().starts_with(b"rosrescue")
-}
-
-/// Whether the process `pid` listens at `port`, on IPv4 as rosmaster does.
-pub(super) fn listens(pid: u32, port: u16) -> bool {
-    const LISTENING: &str = "0A";
-    let table = fs::read_to_string("/proc/self/net/tcp").unwrap_or_default();
-    let local = format!(":{port:04X}");
-    let sockets: Vec<_> = table
-        .lines()
-        .filter_map(|line| {
-            let columns: Vec<_> = line.split_whitespace().collect();
-            let is_it = columns.get(1)?.ends_with(&local) && *columns.get(3)? == LISTENING;
-            is_it.then(|| columns.get(9).map(|inode| format!("socket:[{inode}]")))?
-        })
-        .collect();
-    let open = fs::read_dir(format!("/proc/{pid}/fd"));
-    let mut open = open.into_iter().flatten().flatten();
-    open.any(|entry| {
-        let target = fs::read_link(entry.path()).unwrap_or_default();
-        sockets.iter().any(|socket| target == Path::new(socket))
-    })
+    let parent = super::parent_of(pid);
+    parent.is_some_and(|parent| parent != parent_id() && super::is_rosrescue(parent))
 }
 
 /// Returns when the process `pid`, which is not our child, has ended.
@@ -99,7 +85,6 @@ pub(super) async fn ended(pid: u32) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use std::{
-        net::TcpListener,
         process::{Command, Stdio},
         time::Duration,
     };
@@ -142,16 +127,6 @@ mod tests {
         assert_eq!(find(&owner), Vec::<u32>::new());
         kept.kill().unwrap();
         kept.wait().unwrap();
-    }
-
-    #[test]
-    fn who_listens_is_known() {
-        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = listener.local_addr().unwrap().port();
-        assert!(listens(std::process::id(), port));
-        assert!(!listens(1, port) || std::process::id() == 1);
-        drop(listener);
-        assert!(!listens(std::process::id(), port));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use tokio::{
     process::{Child, ChildStdin},
 };
 
-use super::{Rosmaster, command, orphan, signal_process};
+use super::{Rosmaster, command, listeners, signal_process};
 use crate::limit::rarely;
 
 /// A spare that does not listen after this time hangs: another master is started.
@@ -34,7 +34,7 @@ runpy.run_path(sys.argv[0], run_name='__main__')
 ";
 
 /// The interpreter and its arguments in the first line of `program`, if it is a Python script.
-fn interpreter(program: &Path) -> Option<Vec<String>> {
+pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
     let text = fs::read(program).ok()?;
     let line = text.split(|byte| *byte == b'\n').next()?;
     let words = std::str::from_utf8(line).ok()?.strip_prefix("#!")?;
@@ -98,7 +98,7 @@ impl Spare {
             let _ = input.write_all(format!("{port}\n").as_bytes()).await;
             drop(input);
             tokio::time::sleep(LIMIT).await;
-            if is_spare(pid) && !orphan::listens(pid, port) {
+            if is_spare(pid) && !listeners::listens(pid, port) {
                 rarely!(
                     warn,
                     pid,

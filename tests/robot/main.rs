@@ -92,7 +92,9 @@ mod cli {
 
 /// The commands that do not serve.
 mod commands {
+    mod check;
     mod checkpoints;
+    mod drill;
     mod history;
     mod params;
     mod restore;

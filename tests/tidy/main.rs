@@ -281,6 +281,7 @@ fn only_the_clock_reads_the_wall_clock() {
     let expected = [
         "app/startup.rs",
         "clock.rs",
+        "commands/check/facts.rs",
         "recovery/reporting.rs",
         "server/clients.rs",
         "server/pages.rs",

@@ -92,6 +92,13 @@ fn is_claimed(checkpoint: &Path) -> bool {
     tried == Err(rustix::io::Errno::WOULDBLOCK)
 }
 
+/// Whether a rosrescue uses this checkpoint; with its process id, if known.
+pub(crate) fn holder_of(checkpoint: &Path) -> Option<Option<u32>> {
+    let mut path = checkpoint.as_os_str().to_owned();
+    path.push(".lock");
+    is_claimed(checkpoint).then(|| File::open(path).ok().and_then(holder))
+}
+
 fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
     let mut options = OpenOptions::new();
     let mut file = options

@@ -1,0 +1,107 @@
+//! `rosrescue check`: what will trouble the robot, found before it drives.
+//!
+//! [`facts`] gathers and judges nothing, [`judge`] judges and looks at nothing.
+
+mod facts;
+mod judge;
+mod ros;
+mod units;
+
+use std::{convert::Infallible, fmt, time::Duration};
+
+use serde::Serialize;
+
+use self::facts::Facts;
+use super::{Exit, Failure, counted, print};
+use crate::{cli::CheckArgs, ros_env::MasterUri};
+
+pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
+    let master = args.master.as_deref().map(MasterUri::parse).transpose();
+    let master = master.map_err(|error| Failure::Usage(format!("--master: {error}")))?;
+    let facts = Facts::gather(args, master);
+    let slow = async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        eprintln!("still looking: names that no name server knows take their time");
+        std::future::pending::<Infallible>().await
+    };
+    let facts = tokio::select! {
+        facts = facts => facts,
+        never = slow => match never {},
+    };
+    let report = Report::new(judge::judge(&facts));
+    print(&report, &args.output)?;
+    Ok(match report.problems {
+        0 => Exit::Good,
+        _ => Exit::Bad,
+    })
+}
+
+/// How bad a finding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Severity {
+    Ok,
+    /// Worth knowing.
+    Note,
+    /// It may go wrong.
+    Warning,
+    /// It will go wrong.
+    Problem,
+}
+
+/// One thing that was looked at.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+struct Finding {
+    severity: Severity,
+    subject: &'static str,
+    /// What is so.
+    what: String,
+    /// What to do; empty if nothing is to be done.
+    todo: String,
+}
+
+/// All findings, the worst first.
+#[derive(Clone, Debug, Serialize)]
+struct Report {
+    problems: usize,
+    warnings: usize,
+    findings: Vec<Finding>,
+}
+
+impl Report {
+    fn new(mut findings: Vec<Finding>) -> Self {
+        let count = |of| findings.iter().filter(|one| one.severity == of).count();
+        let (problems, warnings) = (count(Severity::Problem), count(Severity::Warning));
+        findings.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
+        Self {
+            problems,
+            warnings,
+            findings,
+        }
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for finding in &self.findings {
+            let severity = match finding.severity {
+                Severity::Ok => "ok",
+                Severity::Note => "note",
+                Severity::Warning => "WARNING",
+                Severity::Problem => "PROBLEM",
+            };
+            writeln!(f, "{severity:<9}{:<16}{}", finding.subject, finding.what)?;
+            if !finding.todo.is_empty() {
+                writeln!(f, "{:<25}> {}", "", finding.todo)?;
+            }
+        }
+        match (self.problems, self.warnings) {
+            (0, 0) => writeln!(f, "Nothing stands in the way."),
+            (problems, warnings) => {
+                let (problems, warnings) =
+                    (counted(problems, "problem"), counted(warnings, "warning"));
+                writeln!(f, "{problems}, {warnings}")
+            }
+        }
+    }
+}

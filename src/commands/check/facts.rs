@@ -1,0 +1,412 @@
+//! What is so on this computer. Gathers and judges nothing.
+
+use std::{
+    fs, io,
+    net::{IpAddr, UdpSocket},
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
+
+use rustix::{
+    fs::{Access, StatVfsMountFlags},
+    process::{Resource, getrlimit},
+};
+use tokio::{task::JoinSet, time::timeout};
+
+use super::{
+    ros::{self, Program},
+    units::{self, Unit},
+};
+use crate::{
+    checkpoint::store,
+    cli::CheckArgs,
+    clock,
+    config::CHECKPOINT_NAME,
+    process::{self, Rosout, listeners},
+    resolver,
+    ros_env::{self, MasterUri, UriError},
+    server::listener::{self, ListenError},
+};
+
+/// How long a look-up of a name may take. A name server that does not answer takes longer.
+const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
+/// Programs that set the clock.
+const CLOCKS: [&str; 6] = [
+    "systemd-timesyn",
+    "chronyd",
+    "ntpd",
+    "openntpd",
+    "ptp4l",
+    "phc2sys",
+];
+
+/// All that is looked at.
+#[derive(Clone, Debug)]
+pub(super) struct Facts {
+    pub(super) version: &'static str,
+    /// The master of `proxy`, and what answers there; none for `core`.
+    pub(super) proxied: Option<(MasterUri, ros::Server)>,
+    pub(super) env: Environment,
+    /// The port that nodes use, or what is wrong with `ROS_MASTER_URI`.
+    pub(super) port: Result<Port, UriError>,
+    /// The name that this computer's nodes register.
+    pub(super) own: Host,
+    /// The host of `ROS_MASTER_URI`.
+    pub(super) master_host: Option<Host>,
+    /// Hosts of registered nodes, and some of the nodes, when rosrescue runs.
+    pub(super) node_hosts: Vec<(Host, Vec<String>)>,
+    pub(super) disk: Disk,
+    /// Most open files that this process may ask for.
+    pub(super) files: u64,
+    pub(super) clock: Clock,
+    /// How to run rosmaster; none for `proxy`.
+    pub(super) rosmaster: Option<Result<Program, String>>,
+    pub(super) has_rosout: bool,
+    /// The python3 on the PATH, if it lacks ROS.
+    pub(super) strange_python: Option<PathBuf>,
+    pub(super) units: Vec<Unit>,
+    /// Free memory, in bytes.
+    pub(super) memory: Option<u64>,
+    /// Masters that run beside rosrescue.
+    pub(super) masters: Vec<Process>,
+}
+
+/// ROS's variables.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Environment {
+    pub(super) master_uri: Option<String>,
+    pub(super) ip: Option<String>,
+    pub(super) hostname: Option<String>,
+}
+
+/// A name, or an address, and where it leads.
+#[derive(Clone, Debug)]
+pub(super) struct Host {
+    pub(super) name: String,
+    pub(super) addresses: Result<Vec<IpAddr>, String>,
+    /// Whether one of the addresses is of this computer.
+    pub(super) is_here: bool,
+    pub(super) took: Duration,
+}
+
+impl Host {
+    async fn find(name: &str) -> Self {
+        let start = Instant::now();
+        let found = match timeout(LOOKUP_LIMIT, resolver::addresses(name, 0)).await {
+            Ok(found) => found.map_err(|error| error.to_string()),
+            Err(_) => Err(format!(
+                "no name server answered in {} s",
+                LOOKUP_LIMIT.as_secs()
+            )),
+        };
+        let addresses = found.map(|found| found.iter().map(|at| at.ip()).collect::<Vec<_>>());
+        let mut all = addresses.iter().flatten();
+        Self {
+            name: name.to_owned(),
+            is_here: all.any(|address| is_here(*address)),
+            addresses,
+            took: start.elapsed(),
+        }
+    }
+
+    pub(super) fn is_loopback(&self) -> bool {
+        let addresses = self.addresses.as_deref().unwrap_or_default();
+        !addresses.is_empty() && addresses.iter().all(IpAddr::is_loopback)
+    }
+}
+
+/// The kernel lets us send from our own addresses only.
+fn is_here(address: IpAddr) -> bool {
+    UdpSocket::bind((address, 0)).is_ok()
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct Port {
+    pub(super) number: u16,
+    /// Why nobody can listen there, if somebody does not already.
+    pub(super) error: Option<String>,
+    /// Who answers there.
+    pub(super) taken: Option<Taken>,
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct Taken {
+    pub(super) by: Vec<Process>,
+    pub(super) server: ros::Server,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Process {
+    pub(super) pid: u32,
+    /// The name of its program.
+    pub(super) name: String,
+    pub(super) ports: Vec<u16>,
+}
+
+impl Process {
+    fn of(pid: u32) -> Self {
+        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+        Self {
+            pid,
+            name: name.trim_end().to_owned(),
+            ports: listeners::ports(pid),
+        }
+    }
+}
+
+/// Where the checkpoint goes.
+#[derive(Clone, Debug)]
+pub(super) struct Disk {
+    pub(super) checkpoint: PathBuf,
+    /// The folder, or the nearest above it that exists.
+    pub(super) folder: PathBuf,
+    /// Free bytes, and whether it is mounted read-only; or why that is not known.
+    pub(super) space: Result<(u64, bool), String>,
+    /// Why nothing can be written there.
+    pub(super) refused: Option<String>,
+    /// Type and source of the file system, as `ext4` and `/dev/sda1`.
+    pub(super) mount: Option<(String, String)>,
+    /// Another rosrescue uses the file, with this process id if it is known.
+    pub(super) holder: Option<Option<u32>>,
+    /// Whether the path is a folder.
+    pub(super) is_folder: bool,
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct Clock {
+    /// Seconds since 1970.
+    pub(super) now: f64,
+    /// When the newest file that we know was changed.
+    pub(super) newest: f64,
+    /// Who sets the clock.
+    pub(super) service: Option<String>,
+}
+
+impl Facts {
+    pub(super) async fn gather(args: &CheckArgs, master: Option<MasterUri>) -> Self {
+        let env = |name: &str| std::env::var(name).ok();
+        let set = |name: &str| env(name).filter(|value| !value.is_empty());
+        let environment = Environment {
+            master_uri: set("ROS_MASTER_URI"),
+            ip: set("ROS_IP"),
+            hostname: set("ROS_HOSTNAME"),
+        };
+        let hostname = rustix::system::uname();
+        let hostname = hostname.nodename().to_string_lossy().into_owned();
+        let own = ros_env::advertised_host(&env, &hostname, listener::local_address());
+        let checkpoint = args.checkpoint.clone();
+        let checkpoint = checkpoint.unwrap_or_else(|| ros_env::log_dir(&env).join(CHECKPOINT_NAME));
+        let master_uri = environment.master_uri.as_deref().map(MasterUri::parse);
+        let port = match (args.port, &master_uri) {
+            (Some(port), _) => Ok(port),
+            (None, Some(Ok(uri))) => Ok(uri.port),
+            (None, Some(Err(error))) => Err(UriError::clone(error)),
+            (None, None) => Ok(ros_env::DEFAULT_MASTER_PORT),
+        };
+        let port = match port {
+            Ok(number) => Ok(Port::look(number).await),
+            Err(error) => Err(error),
+        };
+        let proxied = match master {
+            Some(uri) => {
+                let server = ros::Server::ask(&uri).await;
+                Some((uri, server))
+            }
+            None => None,
+        };
+        let running = port.as_ref().ok().and_then(|port| port.taken.as_ref());
+        let mut node_hosts = Vec::new();
+        if let Some(ros::Server::Rosrescue { uri, .. }) = running.map(|taken| &taken.server) {
+            let mut lookups = JoinSet::new();
+            for (host, nodes) in ros::hosts_of_nodes(uri).await {
+                lookups.spawn(async move { (Host::find(&host).await, nodes) });
+            }
+            node_hosts = lookups.join_all().await;
+            node_hosts.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
+        }
+        let uri_host = master_uri.and_then(Result::ok).map(|uri| uri.host);
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            own: Host::find(&own).await,
+            master_host: match uri_host {
+                Some(host) => Some(Host::find(&host).await),
+                None => None,
+            },
+            node_hosts,
+            env: environment,
+            port,
+            rosmaster: match proxied {
+                Some(_) => None,
+                None => Some(Program::find(args.rosmaster.as_deref()).await),
+            },
+            proxied,
+            has_rosout: Rosout::find(&checkpoint).is_some(),
+            strange_python: ros::strange_python().await,
+            clock: Clock::read(&checkpoint),
+            disk: Disk::look(checkpoint),
+            files: getrlimit(Resource::Nofile).maximum.unwrap_or(u64::MAX),
+            units: units::find(),
+            memory: free_memory(),
+            masters: masters(),
+        }
+    }
+}
+
+impl Port {
+    async fn look(number: u16) -> Self {
+        let env = |name: &str| std::env::var(name).ok();
+        let addresses: Vec<_> = ros_env::bind_addresses(&env)
+            .into_iter()
+            .map(|address| (address, number).into())
+            .collect();
+        let (mut error, mut taken) = (None, None);
+        match listener::bind(&addresses, "-p") {
+            Ok(_) => {}
+            Err(ListenError::InUse { address, .. }) => {
+                let at = match address.ip().is_unspecified() {
+                    true => "localhost".to_owned(),
+                    false => address.ip().to_string(),
+                };
+                let at = MasterUri {
+                    host: at,
+                    port: number,
+                };
+                taken = Some(Taken {
+                    by: listeners::at(number).into_iter().map(Process::of).collect(),
+                    server: ros::Server::ask(&at).await,
+                });
+            }
+            Err(ListenError::Other { source, .. }) => error = Some(source.to_string()),
+        }
+        Self {
+            number,
+            error,
+            taken,
+        }
+    }
+}
+
+impl Disk {
+    fn look(checkpoint: PathBuf) -> Self {
+        let whole = std::path::absolute(&checkpoint).unwrap_or_else(|_| checkpoint.clone());
+        let mut above = whole.ancestors().skip(1);
+        let folder = above.find(|folder| folder.is_dir());
+        let folder = folder.unwrap_or_else(|| Path::new("/")).to_owned();
+        let folder = folder.canonicalize().unwrap_or(folder);
+        let space = rustix::fs::statvfs(&folder).map_err(|error| error.to_string());
+        let space = space.map(|space| {
+            let is_read_only = space.f_flag.contains(StatVfsMountFlags::RDONLY);
+            (space.f_bavail.saturating_mul(space.f_frsize), is_read_only)
+        });
+        let may_write = |path: &Path| rustix::fs::access(path, Access::WRITE_OK);
+        let is_missing = |error: &rustix::io::Errno| *error == rustix::io::Errno::NOENT;
+        let refused = rustix::fs::access(&folder, Access::WRITE_OK | Access::EXEC_OK).err();
+        let refused =
+            refused.or_else(|| may_write(&whole).err().filter(|error| !is_missing(error)));
+        Self {
+            mount: mount_of(&folder),
+            holder: store::holder_of(&whole),
+            is_folder: whole.is_dir(),
+            checkpoint: whole,
+            folder,
+            space,
+            refused: refused.map(|error| io::Error::from(error).to_string()),
+        }
+    }
+}
+
+/// Type and source of the file system that holds `folder`, from the table of mounts.
+fn mount_of(folder: &Path) -> Option<(String, String)> {
+    let table = fs::read_to_string("/proc/self/mountinfo").ok()?;
+    let mounts = table.lines().filter_map(|line| {
+        let (before, after) = line.split_once(" - ")?;
+        let point = before.split(' ').nth(4)?.replace("\\040", " ");
+        let mut after = after.split(' ');
+        let found = (after.next()?.to_owned(), after.next()?.to_owned());
+        folder.starts_with(&point).then_some((point.len(), found))
+    });
+    // Of two at the same place the later one hides the other.
+    mounts
+        .max_by_key(|(length, _)| *length)
+        .map(|(_, found)| found)
+}
+
+impl Clock {
+    fn read(checkpoint: &Path) -> Self {
+        let own = std::env::current_exe().unwrap_or_default();
+        let changed = [
+            checkpoint,
+            &own,
+            Path::new("/var/log/syslog"),
+            Path::new("/etc/passwd"),
+        ]
+        .into_iter()
+        .filter_map(|path| rustix::fs::stat(path).ok())
+        .map(|stat| stat.st_mtime as f64);
+        let synchronized = Path::new("/run/systemd/timesync/synchronized").exists();
+        let service = process::all()
+            .map(Process::of_name)
+            .find(|name| CLOCKS.contains(&&**name));
+        Self {
+            now: clock::wall_time(),
+            newest: changed.fold(0.0, f64::max),
+            service: match (synchronized, service) {
+                (true, _) => Some("systemd-timesyncd".to_owned()),
+                (false, service) => service,
+            },
+        }
+    }
+}
+
+impl Process {
+    fn of_name(pid: u32) -> String {
+        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+        name.trim_end().to_owned()
+    }
+}
+
+/// Masters in our network namespace that no rosrescue has started.
+fn masters() -> Vec<Process> {
+    process::all()
+        .filter(|pid| ["rosmaster", "roscore"].contains(&&*Process::of_name(*pid)))
+        .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
+        .map(Process::of)
+        .collect()
+}
+
+fn free_memory() -> Option<u64> {
+    let table = fs::read_to_string("/proc/meminfo").ok()?;
+    let line = table
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kib: u64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(kib << 10)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn hosts_are_told_by_their_addresses() {
+        let local = Host::find("127.0.0.1").await;
+        assert!(local.is_here && local.is_loopback());
+        // Reserved for documentation.
+        let far = Host::find("192.0.2.1").await;
+        assert!(!far.is_here && !far.is_loopback());
+        let nobody = Host::find("nobody.invalid").await;
+        assert!(!nobody.is_here && !nobody.is_loopback() && nobody.addresses.is_err());
+    }
+
+    #[test]
+    fn the_disk_of_a_checkpoint_that_is_not_there_yet_is_known() {
+        let folder = tempfile::tempdir().unwrap();
+        let disk = Disk::look(folder.path().join("a/b/checkpoint"));
+        assert_eq!(disk.folder, folder.path().canonicalize().unwrap());
+        assert!(disk.space.unwrap().0 > 0);
+        assert!(disk.mount.is_some() && disk.holder.is_none() && disk.refused.is_none());
+        assert!(Disk::look(folder.path().to_owned()).is_folder);
+        let (of, source) = mount_of(Path::new("/proc/1")).unwrap();
+        assert_eq!((&*of, &*source), ("proc", "proc"));
+    }
+}

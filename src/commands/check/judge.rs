@@ -1,0 +1,71 @@
+//! What the facts mean for a robot, and what to do. Looks at nothing.
+
+mod network;
+mod system;
+#[cfg(test)]
+mod tests;
+
+use super::{
+    Finding, Severity,
+    facts::{Facts, Process},
+};
+
+/// Judges everything.
+pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
+    let mut found = Findings(Vec::new());
+    found.port(facts);
+    found.master_uri(facts);
+    found.address(facts);
+    found.own_name(facts);
+    found.nodes(facts);
+    found.disk(&facts.disk, facts.port.as_ref().ok());
+    found.files(facts.files);
+    found.clock(&facts.clock);
+    found.ros(facts);
+    found.masters(facts);
+    found.systemd(facts);
+    found.memory(facts.memory);
+    found.0
+}
+
+struct Findings(Vec<Finding>);
+
+impl Findings {
+    fn add(&mut self, severity: Severity, subject: &'static str, what: String, todo: String) {
+        self.0.push(Finding {
+            severity,
+            subject,
+            what,
+            todo,
+        });
+    }
+
+    fn ok(&mut self, subject: &'static str, what: impl Into<String>) {
+        self.add(Severity::Ok, subject, what.into(), String::new());
+    }
+
+    fn note(&mut self, subject: &'static str, what: impl Into<String>, todo: impl Into<String>) {
+        self.add(Severity::Note, subject, what.into(), todo.into());
+    }
+
+    fn warn(&mut self, subject: &'static str, what: impl Into<String>, todo: impl Into<String>) {
+        self.add(Severity::Warning, subject, what.into(), todo.into());
+    }
+
+    fn bad(&mut self, subject: &'static str, what: impl Into<String>, todo: impl Into<String>) {
+        self.add(Severity::Problem, subject, what.into(), todo.into());
+    }
+}
+
+fn named(process: &Process) -> String {
+    let Process { pid, name, ports } = process;
+    match ports.first() {
+        Some(port) => format!("{name} (process {pid}, port {port})"),
+        None => format!("{name} (process {pid})"),
+    }
+}
+
+fn list(addresses: &[std::net::IpAddr]) -> String {
+    let all: Vec<_> = addresses.iter().map(ToString::to_string).collect();
+    all.join(", ")
+}

@@ -1,0 +1,281 @@
+//! Port, addresses and names.
+
+use super::{
+    super::{
+        facts::{Facts, Host, Port},
+        ros::Server,
+    },
+    Findings, list, named,
+};
+use crate::ros_env;
+
+/// A name that takes longer to look up delays every call to its node.
+const SLOW: u128 = 1000;
+
+impl Findings {
+    pub(super) fn port(&mut self, facts: &Facts) {
+        let Ok(Port {
+            number,
+            error,
+            taken,
+        }) = &facts.port
+        else {
+            // Said of ROS_MASTER_URI.
+            return;
+        };
+        if let Some(error) = error {
+            let todo = "choose another port or address: --port, ROS_IP";
+            return self.bad(
+                "port",
+                format!("nobody can listen at {number}: {error}"),
+                todo,
+            );
+        }
+        let Some(taken) = taken else {
+            return self.ok("port", format!("{number} is free"));
+        };
+        let by = match taken.by.as_slice() {
+            [] => "a process that only root can see".to_owned(),
+            all => all.iter().map(named).collect::<Vec<_>>().join(", "),
+        };
+        match &taken.server {
+            Server::Rosrescue {
+                version,
+                unprotected,
+                ..
+            } => {
+                self.ok(
+                    "port",
+                    format!("{number}: rosrescue {version} runs here: {by}"),
+                );
+                if version != facts.version {
+                    let own = facts.version;
+                    self.note(
+                        "port",
+                        format!("the running rosrescue is {version}, this program is {own}"),
+                        "start rosrescue anew when the robot is at rest",
+                    );
+                }
+                if let Some(why) = unprotected {
+                    let todo = "see docs/operations.md, Troubleshooting";
+                    self.bad(
+                        "checkpoint",
+                        format!("the running one is unprotected: {why}"),
+                        todo,
+                    );
+                }
+            }
+            Server::Master(pid) => {
+                let pid = pid.map_or_else(String::new, |pid| format!("kill {pid}, or "));
+                self.bad(
+                    "port",
+                    format!("{number} is in use by a master without rosrescue: {by}"),
+                    format!(
+                        "end that roscore or roslaunch ({pid}Ctrl-C where it runs), or keep it and use \
+                         `rosrescue proxy`"
+                    ),
+                );
+            }
+            _ => self.bad(
+                "port",
+                format!("{number} is in use by something that is no master: {by}"),
+                "end it, or choose another port with --port and in ROS_MASTER_URI",
+            ),
+        }
+    }
+
+    pub(super) fn master_uri(&mut self, facts: &Facts) {
+        const SUBJECT: &str = "ROS_MASTER_URI";
+        let Some(uri) = &facts.env.master_uri else {
+            return self.warn(
+                SUBJECT,
+                "is not set: roscpp nodes do not start",
+                "source ROS's setup.bash, or export ROS_MASTER_URI=http://HOST:11311",
+            );
+        };
+        let parsed = match ros_env::MasterUri::parse(uri) {
+            Ok(parsed) => parsed,
+            Err(error) => {
+                return self.bad(
+                    SUBJECT,
+                    error.to_string(),
+                    "export it with a host and a port",
+                );
+            }
+        };
+        if uri.trim() != uri {
+            let todo = "export it without blanks";
+            return self.bad(SUBJECT, format!("`{uri}` has blanks at its ends"), todo);
+        }
+        let Some(host) = &facts.master_host else {
+            return;
+        };
+        match &host.addresses {
+            Err(why) => self.bad(
+                SUBJECT,
+                format!("{uri}: {} has no address ({why})", host.name),
+                format!(
+                    "add `ADDRESS {}` to /etc/hosts, or use an address",
+                    host.name
+                ),
+            ),
+            Ok(addresses) if !host.is_here => self.bad(
+                SUBJECT,
+                format!(
+                    "{uri} is another computer ({}), and rosrescue would serve here",
+                    list(addresses)
+                ),
+                "check on that computer, or export the address of this one",
+            ),
+            Ok(_) => match &facts.port {
+                Ok(Port { number, .. }) if *number != parsed.port => self.bad(
+                    SUBJECT,
+                    format!(
+                        "{uri} has port {}, rosrescue would serve {number}",
+                        parsed.port
+                    ),
+                    "nodes of this shell would miss it: use one port for both",
+                ),
+                _ => self.ok(SUBJECT, format!("{uri} is this computer")),
+            },
+        }
+    }
+
+    /// `ROS_IP` and `ROS_HOSTNAME`.
+    pub(super) fn address(&mut self, facts: &Facts) {
+        let env = &facts.env;
+        for (subject, value) in [("ROS_HOSTNAME", &env.hostname), ("ROS_IP", &env.ip)] {
+            let Some(value) = value else { continue };
+            if value.trim() != value {
+                let todo = format!("export {subject}={}", value.trim());
+                self.bad(subject, format!("`{value}` has blanks at its ends"), todo);
+            } else if ros_env::bad_override(&|name| (name == subject).then(|| value.clone()))
+                .is_some()
+            {
+                let todo = "write one, without port or http://, as in robot or 10.0.0.7";
+                self.bad(
+                    subject,
+                    format!("`{value}` is not a host name or an address"),
+                    todo,
+                );
+            } else if subject == "ROS_IP" && value.parse::<std::net::IpAddr>().is_err() {
+                let todo = "put names into ROS_HOSTNAME, and an address into ROS_IP";
+                self.warn(subject, format!("`{value}` is not an address"), todo);
+            }
+        }
+        if let (Some(hostname), Some(ip)) = (&env.hostname, &env.ip)
+            && hostname != ip
+        {
+            self.warn(
+                "ROS_IP",
+                format!("{ip} is ignored: ROS_HOSTNAME={hostname} comes first"),
+                "unset one of the two",
+            );
+        }
+    }
+
+    /// The name that nodes of this computer register.
+    pub(super) fn own_name(&mut self, facts: &Facts) {
+        let (own, env) = (&facts.own, &facts.env);
+        let is_set = env.hostname.is_some() || env.ip.is_some();
+        let (subject, name) = match is_set {
+            true if env.hostname.is_some() => ("ROS_HOSTNAME", &own.name),
+            true => ("ROS_IP", &own.name),
+            false => ("host name", &own.name),
+        };
+        if name.trim() != name {
+            // Said of the variable.
+            return;
+        }
+        let others = others(facts);
+        match &own.addresses {
+            Err(why) => self.bad(
+                subject,
+                format!("{name} has no address ({why}): nobody reaches this computer's nodes"),
+                format!("add `ADDRESS {name}` to /etc/hosts, or export ROS_IP=ADDRESS"),
+            ),
+            Ok(_) if !own.is_here => self.bad(
+                subject,
+                format!("{}, which is not this computer", leads(own)),
+                format!("correct {name} in /etc/hosts, or export ROS_IP with an address of this computer"),
+            ),
+            Ok(_) if own.is_loopback() => {
+                let what = format!("{}, which only this computer reaches", leads(own));
+                let todo = "export ROS_IP with this computer's address in the network, before anything starts";
+                match others {
+                    Some(other) => {
+                        self.bad(subject, format!("{what}, and {other} takes part"), todo);
+                    }
+                    None if is_set => self.note(subject, what, ""),
+                    None => self.warn(
+                        subject,
+                        format!("{what} (Debian's /etc/hosts)"),
+                        format!("fine for a robot of one computer; otherwise {todo}"),
+                    ),
+                }
+            }
+            Ok(_) => self.ok(subject, leads(own)),
+        }
+        self.slow(subject, own);
+    }
+
+    fn slow(&mut self, subject: &'static str, host: &Host) {
+        if host.addresses.is_ok() && host.took.as_millis() > SLOW {
+            self.warn(
+                subject,
+                format!(
+                    "looking {} up takes {} ms",
+                    host.name,
+                    host.took.as_millis()
+                ),
+                "add it to /etc/hosts: every new connection waits so long",
+            );
+        }
+    }
+
+    pub(super) fn nodes(&mut self, facts: &Facts) {
+        for (host, nodes) in &facts.node_hosts {
+            let nodes = nodes.join(", ");
+            if let Err(why) = &host.addresses {
+                let name = &host.name;
+                self.bad(
+                    "nodes",
+                    format!("{nodes} registered at {name}, which has no address here ({why})"),
+                    format!(
+                        "add `ADDRESS {name}` to /etc/hosts of this computer, or set ROS_IP where the \
+                         nodes run"
+                    ),
+                );
+            }
+            self.slow("nodes", host);
+        }
+        let known = facts
+            .node_hosts
+            .iter()
+            .filter(|(host, _)| host.addresses.is_ok());
+        let known: Vec<_> = known.map(|(host, _)| &*host.name).collect();
+        if !known.is_empty() && known.len() == facts.node_hosts.len() {
+            self.ok(
+                "nodes",
+                format!("all registered hosts have addresses: {}", known.join(", ")),
+            );
+        }
+    }
+}
+
+/// A name and its addresses, or an address.
+fn leads(host: &Host) -> String {
+    let addresses = list(host.addresses.as_deref().unwrap_or_default());
+    match addresses == host.name {
+        true => addresses,
+        false => format!("{} is {addresses}", host.name),
+    }
+}
+
+/// Another computer that takes part, if one is known.
+fn others(facts: &Facts) -> Option<String> {
+    let hosts = facts.node_hosts.iter().map(|(host, _)| host);
+    let mut far = hosts.chain(&facts.master_host);
+    let far = far.find(|host| host.addresses.is_ok() && !host.is_here)?;
+    Some(far.name.clone())
+}

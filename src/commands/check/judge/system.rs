@@ -1,0 +1,242 @@
+//! This computer and the ROS on it.
+
+use super::{
+    super::{
+        facts::{Clock, Disk, Facts, Port},
+        ros::Server,
+        units::Kind,
+    },
+    Findings, named,
+};
+use crate::clock;
+
+/// Less free space than this is used up by a checkpoint and ROS's logs in no time, in bytes.
+const LITTLE_SPACE: u64 = 500 << 20;
+const NO_SPACE: u64 = 20 << 20;
+/// With fewer open files connections of clients become scarce; with fewer still rosrescue hardly works.
+const FEW_FILES: u64 = 4096;
+const TOO_FEW_FILES: u64 = 256;
+/// A rosmaster and rosrescue with a spare take some 60 MB.
+const LITTLE_MEMORY: u64 = 200 << 20;
+/// 2024-01-01: this program is younger.
+const EARLIEST: f64 = 1_704_067_200.0;
+/// A clock that is so far behind its own files has been set back.
+const BEHIND_FILES: f64 = 120.0;
+impl Findings {
+    pub(super) fn disk(&mut self, disk: &Disk, port: Option<&Port>) {
+        const SUBJECT: &str = "checkpoint";
+        let (path, folder) = (disk.checkpoint.display(), disk.folder.display());
+        let runs = port.and_then(|port| port.taken.as_ref());
+        let runs = runs.is_some_and(|taken| matches!(taken.server, Server::Rosrescue { .. }));
+        if let (Some(holder), false) = (disk.holder, runs) {
+            let who = holder.map_or_else(String::new, |pid| format!(", process {pid}"));
+            return self.bad(
+                SUBJECT,
+                format!("{path} is in use by another rosrescue{who}"),
+                "end that one, or give this one another --checkpoint",
+            );
+        }
+        if disk.is_folder {
+            return self.bad(SUBJECT, format!("{path} is a folder"), "name a file in it");
+        }
+        let (free, is_read_only) = match &disk.space {
+            Ok(space) => *space,
+            Err(why) => return self.bad(SUBJECT, format!("{folder}: {why}"), "repair the disk"),
+        };
+        if is_read_only {
+            let todo = "mount it writable, or choose another place with --checkpoint";
+            return self.bad(SUBJECT, format!("{folder} is mounted read-only"), todo);
+        }
+        if let Some(why) = &disk.refused {
+            let todo = format!(
+                "chown it to the user of rosrescue, or choose another --checkpoint than {path}"
+            );
+            return self.bad(SUBJECT, format!("{folder} cannot be written: {why}"), todo);
+        }
+        let mib = free >> 20;
+        let (of, source) = disk.mount.clone().unwrap_or_default();
+        let what = format!("{path}: {mib} MiB free on {source} ({of})");
+        let todo = "delete old logs (rosclean purge)";
+        match free {
+            ..NO_SPACE => self.bad(SUBJECT, what, todo),
+            NO_SPACE..LITTLE_SPACE => self.warn(SUBJECT, what, todo),
+            _ => self.ok(SUBJECT, what),
+        }
+        if of == "tmpfs" || of == "ramfs" {
+            let todo = "it survives crashes, not a power cut; for that choose a place on a disk";
+            self.note(SUBJECT, format!("{folder} is in memory"), todo);
+        } else if of.starts_with("nfs") || of == "cifs" || of.starts_with("fuse.sshfs") {
+            let todo = "choose a place on a disk of this computer: writes wait for the network";
+            self.warn(
+                SUBJECT,
+                format!("{folder} is on another computer ({of})"),
+                todo,
+            );
+        } else if source.starts_with("/dev/mmcblk") {
+            let todo = "it wears out and may stall for seconds; --sync never spares it, at the cost of what a power cut takes";
+            self.note(
+                SUBJECT,
+                format!("{folder} is on an SD card or eMMC ({source})"),
+                todo,
+            );
+        }
+    }
+
+    pub(super) fn files(&mut self, files: u64) {
+        let what = format!("{files} open files at most");
+        let todo = "raise it: `ulimit -Hn`, or LimitNOFILE= in the unit";
+        match files {
+            ..TOO_FEW_FILES => self.bad("descriptors", what, todo),
+            TOO_FEW_FILES..FEW_FILES => self.warn("descriptors", what, todo),
+            _ => self.ok("descriptors", what),
+        }
+    }
+
+    pub(super) fn clock(&mut self, clock: &Clock) {
+        let now = clock::wall_text(clock.now);
+        if clock.now < EARLIEST {
+            let todo = "set it, or wait for the network: tf drops everything when it jumps";
+            self.bad("clock", format!("says {now}"), todo);
+        } else if clock.now + BEHIND_FILES < clock.newest {
+            let newest = clock::wall_text(clock.newest);
+            let todo = "set it: logs and tf will be wrong";
+            self.warn(
+                "clock",
+                format!("says {now}, before files of {newest}"),
+                todo,
+            );
+        } else if let Some(service) = &clock.service {
+            self.ok("clock", format!("says {now}, set by {service}"));
+        } else {
+            self.note(
+                "clock",
+                format!("says {now}; no time service runs"),
+                "fine for one computer; with several tf needs chrony or systemd-timesyncd",
+            );
+        }
+    }
+
+    pub(super) fn ros(&mut self, facts: &Facts) {
+        match &facts.rosmaster {
+            None => {}
+            Some(Err(why)) => self.bad("rosmaster", why.clone(), "without it core does not start"),
+            Some(Ok(program)) => {
+                let path = program.path.display();
+                let version = program.version.as_deref().unwrap_or("of unknown version");
+                match &program.broken {
+                    Some(why) => self.bad(
+                        "rosmaster",
+                        format!("{path} does not run with {}: {why}", program.interpreter),
+                        "take conda, pyenv or the venv off the PATH (conda deactivate), and source \
+                         ROS's setup.bash",
+                    ),
+                    None => self.ok("rosmaster", format!("{path}, {version}")),
+                }
+                if !facts.has_rosout {
+                    let todo = "apt-get install rosout (ros-noetic-rosout), or --no-rosout";
+                    self.warn("rosout", "is not installed: nobody collects /rosout", todo);
+                }
+            }
+        }
+        if let Some(python) = &facts.strange_python {
+            self.warn(
+                "python",
+                format!("{} comes first on the PATH and has no ROS", python.display()),
+                "nodes that begin with `#!/usr/bin/env python3` fail: conda deactivate, or put /usr/bin first",
+            );
+        }
+        let Some((uri, server)) = &facts.proxied else {
+            return;
+        };
+        match server {
+            Server::Master(_) => self.ok("master", format!("{uri} answers")),
+            Server::Rosrescue { .. } => self.bad(
+                "master",
+                format!("--master {uri} is a rosrescue"),
+                "give the address of the real rosmaster",
+            ),
+            Server::Other => {
+                let todo = "give the address of the real rosmaster";
+                self.bad(
+                    "master",
+                    format!("what answers at {uri} is not a ROS master"),
+                    todo,
+                );
+            }
+            Server::Nobody | Server::Silent => self.warn(
+                "master",
+                format!("nobody answers at {uri}"),
+                "start it: on its first start proxy lets calls wait until it has seen a master",
+            ),
+        }
+    }
+
+    /// Masters beside rosrescue.
+    pub(super) fn masters(&mut self, facts: &Facts) {
+        let port = facts.port.as_ref().ok().map(|port| port.number);
+        let proxied = facts.proxied.as_ref().map(|(uri, _)| uri.port);
+        let others = facts.masters.iter().filter(|process| {
+            let at = |port: Option<u16>| port.is_some_and(|port| process.ports.contains(&port));
+            // The first is told with the port; the second is wanted.
+            !at(port) && !at(proxied)
+        });
+        let others: Vec<_> = others.map(named).collect();
+        if !others.is_empty() {
+            self.warn(
+                "masters",
+                format!("others run on this computer: {}", others.join(", ")),
+                "if one is forgotten, end it: nodes that use it do not see those of rosrescue",
+            );
+        }
+    }
+
+    pub(super) fn systemd(&mut self, facts: &Facts) {
+        let mut own = 0;
+        for unit in &facts.units {
+            let name = &unit.name;
+            match (unit.kind, unit.is_enabled) {
+                (Kind::Rosrescue, true) => {
+                    own += 1;
+                    self.ok("systemd", format!("{name} starts with the computer"));
+                }
+                (Kind::Rosrescue, false) => {
+                    let todo = format!("systemctl enable {name}");
+                    self.note(
+                        "systemd",
+                        format!("{name} does not start with the computer"),
+                        todo,
+                    );
+                }
+                (Kind::Roscore, true) if facts.proxied.is_none() => {
+                    let todo = format!("systemctl disable --now {name}");
+                    let what =
+                        format!("{name} starts a master with the computer, beside rosrescue");
+                    self.bad("systemd", what, todo);
+                }
+                (Kind::Roslaunch, true) => self.warn(
+                    "systemd",
+                    format!("{name} runs roslaunch, which starts a master where it finds none"),
+                    "add --wait to its roslaunch, and After=rosrescue.service to the unit",
+                ),
+                _ => {}
+            }
+        }
+        if own == 0 && facts.units.iter().all(|unit| unit.kind != Kind::Rosrescue) {
+            let todo = "`rosrescue install` makes one, for a robot that starts by itself";
+            self.note("systemd", "rosrescue has no unit here", todo);
+        }
+    }
+
+    pub(super) fn memory(&mut self, memory: Option<u64>) {
+        let Some(free) = memory else { return };
+        let what = format!("{} MiB are free", free >> 20);
+        match free < LITTLE_MEMORY {
+            true => self.warn(
+                "memory",
+                what,
+                "end something: the kernel kills what it likes",
+            ),
+            false => self.ok("memory", what),
+        }
+    }
+}

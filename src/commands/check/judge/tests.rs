@@ -1,0 +1,135 @@
+mod network;
+mod system;
+
+use std::{path::PathBuf, time::Duration};
+
+use super::{
+    super::{
+        Finding, Severity,
+        facts::{Clock, Disk, Environment, Facts, Host, Port, Process, Taken},
+        ros::{Program, Server},
+        units::{Kind, Unit},
+    },
+    judge,
+};
+fn host(name: &str, address: &str, is_here: bool) -> Host {
+    Host {
+        name: name.to_owned(),
+        addresses: Ok(vec![address.parse().unwrap()]),
+        is_here,
+        took: Duration::from_millis(1),
+    }
+}
+
+fn nowhere(name: &str) -> Host {
+    Host {
+        addresses: Err("Name or service not known".to_owned()),
+        ..host(name, "127.0.0.1", false)
+    }
+}
+
+/// A robot with nothing to say about.
+fn robot() -> Facts {
+    Facts {
+        version: "1.0.0",
+        proxied: None,
+        env: Environment {
+            master_uri: Some("http://robot:11311/".to_owned()),
+            ..Environment::default()
+        },
+        port: Ok(Port {
+            number: 11311,
+            error: None,
+            taken: None,
+        }),
+        own: host("robot", "10.0.0.7", true),
+        master_host: Some(host("robot", "10.0.0.7", true)),
+        node_hosts: Vec::new(),
+        disk: Disk {
+            checkpoint: PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml"),
+            folder: PathBuf::from("/home/r"),
+            space: Ok((10 << 30, false)),
+            refused: None,
+            mount: Some(("ext4".to_owned(), "/dev/sda1".to_owned())),
+            holder: None,
+            is_folder: false,
+        },
+        files: 1 << 20,
+        clock: Clock {
+            now: 1.8e9,
+            newest: 1.7e9,
+            service: Some("chronyd".to_owned()),
+        },
+        rosmaster: Some(Ok(Program {
+            path: PathBuf::from("/usr/bin/rosmaster"),
+            version: Some("1.15.15".to_owned()),
+            interpreter: "/usr/bin/python3".to_owned(),
+            broken: None,
+        })),
+        has_rosout: true,
+        strange_python: None,
+        units: vec![unit("rosrescue.service", Kind::Rosrescue, true)],
+        memory: Some(4 << 30),
+        masters: Vec::new(),
+    }
+}
+
+fn unit(name: &str, kind: Kind, is_enabled: bool) -> Unit {
+    Unit {
+        name: name.to_owned(),
+        kind,
+        is_enabled,
+    }
+}
+
+fn process(pid: u32, name: &str, port: u16) -> Process {
+    Process {
+        pid,
+        name: name.to_owned(),
+        ports: vec![port],
+    }
+}
+
+fn taken(server: Server) -> Option<Taken> {
+    Some(Taken {
+        by: vec![process(7, "who", 11311)],
+        server,
+    })
+}
+
+fn rosrescue(unprotected: Option<&str>) -> Server {
+    Server::Rosrescue {
+        version: "1.0.0".to_owned(),
+        uri: "http://robot:11311/".to_owned(),
+        unprotected: unprotected.map(str::to_owned),
+    }
+}
+
+fn port(facts: &mut Facts) -> &mut Port {
+    facts.port.as_mut().unwrap()
+}
+
+/// What is said when `spoil` is so, beside what is in order.
+fn said(spoil: impl FnOnce(&mut Facts)) -> Vec<Finding> {
+    let mut facts = robot();
+    spoil(&mut facts);
+    let mut found = judge(&facts);
+    found.retain(|finding| finding.severity != Severity::Ok);
+    found
+}
+
+/// One thing is said, with these words and something to do.
+#[track_caller]
+fn one(severity: Severity, subject: &str, words: &str, spoil: impl FnOnce(&mut Facts)) {
+    let found = said(spoil);
+    let [finding] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert_eq!(
+        (finding.severity, finding.subject),
+        (severity, subject),
+        "{found:?}"
+    );
+    assert!(finding.what.contains(words), "{finding:?} lacks {words}");
+    assert!(!finding.todo.is_empty(), "{finding:?}");
+}

@@ -1,0 +1,218 @@
+//! Port, addresses and names.
+
+use std::time::Duration;
+
+use super::{
+    super::super::{
+        Severity::{Note, Problem, Warning},
+        facts::{Facts, Taken},
+        ros::Server,
+    },
+    host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
+};
+use crate::ros_env::MasterUri;
+
+#[test]
+fn a_robot_in_order_has_nothing_to_be_told() {
+    assert_eq!(said(|_| {}), []);
+    assert!(judge(&robot()).len() >= 8);
+    // Also while rosrescue runs, with its own master, and its checkpoint in use.
+    let found = said(|facts| {
+        port(facts).taken = taken(rosrescue(None));
+        facts.disk.holder = Some(Some(7));
+        facts.node_hosts = vec![(host("robot", "10.0.0.7", true), vec!["/a".to_owned()])];
+    });
+    assert_eq!(found, []);
+}
+
+#[test]
+fn who_has_the_port() {
+    one(
+        Problem,
+        "port",
+        "a master without rosrescue: who (process 7, port 11311)",
+        |facts| {
+            port(facts).taken = taken(Server::Master(Some(7)));
+            facts.masters = vec![process(7, "rosmaster", 11311)];
+        },
+    );
+    one(Problem, "port", "something that is no master", |facts| {
+        port(facts).taken = taken(Server::Other);
+    });
+    one(
+        Problem,
+        "port",
+        "a process that only root can see",
+        |facts| {
+            port(facts).taken = Some(Taken {
+                by: Vec::new(),
+                server: Server::Silent,
+            });
+        },
+    );
+    one(
+        Problem,
+        "port",
+        "nobody can listen at 11311: denied",
+        |facts| {
+            port(facts).error = Some("denied".to_owned());
+        },
+    );
+    one(
+        Note,
+        "port",
+        "the running rosrescue is 1.0.0, this program is 2.0.0",
+        |facts| {
+            port(facts).taken = taken(rosrescue(None));
+            facts.version = "2.0.0";
+        },
+    );
+    one(
+        Problem,
+        "checkpoint",
+        "unprotected: the disk is full",
+        |facts| {
+            port(facts).taken = taken(rosrescue(Some("the disk is full")));
+        },
+    );
+    one(
+        Warning,
+        "masters",
+        "rosmaster (process 9, port 12000)",
+        |facts| {
+            facts.masters = vec![process(9, "rosmaster", 12000)];
+        },
+    );
+}
+
+#[test]
+fn traps_of_ros_master_uri() {
+    let uri = |facts: &mut Facts, uri: &str| facts.env.master_uri = Some(uri.to_owned());
+    one(Warning, "ROS_MASTER_URI", "is not set", |facts| {
+        facts.env.master_uri = None;
+        facts.master_host = None;
+    });
+    one(
+        Problem,
+        "ROS_MASTER_URI",
+        "is not the URI of a master",
+        |facts| {
+            uri(facts, "robot:11311");
+            facts.port = Err(MasterUri::parse("robot:11311").unwrap_err());
+            facts.master_host = None;
+        },
+    );
+    one(Problem, "ROS_MASTER_URI", "blanks", |facts| {
+        uri(facts, "http://robot:11311/ ")
+    });
+    one(Problem, "ROS_MASTER_URI", "base has no address", |facts| {
+        uri(facts, "http://base:11311/");
+        facts.master_host = Some(nowhere("base"));
+    });
+    one(
+        Problem,
+        "ROS_MASTER_URI",
+        "is another computer (10.0.0.9)",
+        |facts| {
+            uri(facts, "http://base:11311/");
+            facts.master_host = Some(host("base", "10.0.0.9", false));
+        },
+    );
+    one(
+        Problem,
+        "ROS_MASTER_URI",
+        "has port 11312, rosrescue would serve 11311",
+        |facts| {
+            uri(facts, "http://robot:11312/");
+        },
+    );
+}
+
+#[test]
+fn traps_of_ros_ip_and_ros_hostname() {
+    let ip = |facts: &mut Facts, ip: &str| facts.env.ip = Some(ip.to_owned());
+    one(Problem, "ROS_IP", "`10.0.0.7 ` has blanks", |facts| {
+        ip(facts, "10.0.0.7 ");
+        facts.own = nowhere("10.0.0.7 ");
+    });
+    one(
+        Problem,
+        "ROS_HOSTNAME",
+        "`http://robot` is not a host name",
+        |facts| {
+            facts.env.hostname = Some("http://robot".to_owned());
+        },
+    );
+    one(Warning, "ROS_IP", "`robot` is not an address", |facts| {
+        ip(facts, "robot")
+    });
+    one(
+        Warning,
+        "ROS_IP",
+        "10.0.0.8 is ignored: ROS_HOSTNAME=robot",
+        |facts| {
+            ip(facts, "10.0.0.8");
+            facts.env.hostname = Some("robot".to_owned());
+        },
+    );
+    one(
+        Problem,
+        "ROS_IP",
+        "10.0.0.8, which is not this computer",
+        |facts| {
+            ip(facts, "10.0.0.8");
+            facts.own = host("10.0.0.8", "10.0.0.8", false);
+        },
+    );
+    one(
+        Problem,
+        "ROS_IP",
+        "127.0.0.1, which only this computer reaches, and base takes part",
+        |facts| {
+            ip(facts, "127.0.0.1");
+            facts.own = host("127.0.0.1", "127.0.0.1", true);
+            facts.node_hosts = vec![(host("base", "10.0.0.9", false), vec!["/a".to_owned()])];
+        },
+    );
+    let alone = said(|facts| {
+        ip(facts, "127.0.0.1");
+        facts.own = host("127.0.0.1", "127.0.0.1", true);
+    });
+    assert_eq!(alone.len(), 1, "{alone:?}");
+    assert_eq!((alone[0].severity, alone[0].subject), (Note, "ROS_IP"));
+}
+
+#[test]
+fn names_that_lead_nowhere_or_elsewhere() {
+    one(Problem, "host name", "robot has no address", |facts| {
+        facts.own = nowhere("robot")
+    });
+    one(
+        Problem,
+        "host name",
+        "robot is 10.0.0.9, which is not this computer",
+        |facts| {
+            facts.own = host("robot", "10.0.0.9", false);
+        },
+    );
+    one(
+        Warning,
+        "host name",
+        "robot is 127.0.1.1, which only this computer reaches",
+        |facts| {
+            facts.own = host("robot", "127.0.1.1", true);
+        },
+    );
+    one(Warning, "host name", "takes 4000 ms", |facts| {
+        facts.own.took = Duration::from_secs(4);
+    });
+    one(
+        Problem,
+        "nodes",
+        "/a, /b registered at arm, which has no address here",
+        |facts| {
+            let nodes = ["/a", "/b"].map(str::to_owned).to_vec();
+            facts.node_hosts = vec![(nowhere("arm"), nodes)];
+        },
+    );
+}

@@ -1,0 +1,179 @@
+//! This computer and the ROS on it.
+
+use std::path::PathBuf;
+
+use super::{
+    super::super::{
+        Severity::{Note, Problem, Warning},
+        facts::Facts,
+        ros::Server,
+        units::Kind,
+    },
+    one, process, rosrescue, said, unit,
+};
+use crate::ros_env::MasterUri;
+
+#[test]
+fn where_the_checkpoint_goes() {
+    let mount = |facts: &mut Facts, of: &str, source: &str| {
+        facts.disk.mount = Some((of.to_owned(), source.to_owned()));
+    };
+    one(
+        Problem,
+        "checkpoint",
+        "in use by another rosrescue, process 9",
+        |facts| {
+            facts.disk.holder = Some(Some(9));
+        },
+    );
+    one(Problem, "checkpoint", "is a folder", |facts| {
+        facts.disk.is_folder = true
+    });
+    one(Problem, "checkpoint", "5 MiB free", |facts| {
+        facts.disk.space = Ok((5 << 20, false))
+    });
+    one(Warning, "checkpoint", "50 MiB free", |facts| {
+        facts.disk.space = Ok((50 << 20, false))
+    });
+    one(Problem, "checkpoint", "read-only", |facts| {
+        facts.disk.space = Ok((1 << 40, true))
+    });
+    one(Problem, "checkpoint", "I/O error", |facts| {
+        facts.disk.space = Err("I/O error".to_owned());
+    });
+    one(
+        Problem,
+        "checkpoint",
+        "cannot be written: Permission denied",
+        |facts| {
+            facts.disk.refused = Some("Permission denied".to_owned());
+        },
+    );
+    one(Note, "checkpoint", "is in memory", |facts| {
+        mount(facts, "tmpfs", "tmpfs")
+    });
+    one(
+        Warning,
+        "checkpoint",
+        "is on another computer (nfs4)",
+        |facts| {
+            mount(facts, "nfs4", "nas:/home");
+        },
+    );
+    one(
+        Note,
+        "checkpoint",
+        "is on an SD card or eMMC (/dev/mmcblk0p2)",
+        |facts| {
+            mount(facts, "ext4", "/dev/mmcblk0p2");
+        },
+    );
+}
+
+#[test]
+fn what_the_computer_lacks() {
+    one(Problem, "descriptors", "64 open files", |facts| {
+        facts.files = 64
+    });
+    one(Warning, "descriptors", "1024 open files", |facts| {
+        facts.files = 1024
+    });
+    one(Problem, "clock", "says 1970-01-01T00:01:00Z", |facts| {
+        facts.clock.now = 60.0
+    });
+    one(Warning, "clock", "before files of", |facts| {
+        facts.clock.newest = 1.9e9
+    });
+    one(Note, "clock", "no time service runs", |facts| {
+        facts.clock.service = None
+    });
+    one(Warning, "memory", "100 MiB are free", |facts| {
+        facts.memory = Some(100 << 20)
+    });
+    assert_eq!(said(|facts| facts.memory = None), []);
+}
+
+#[test]
+fn the_ros_that_is_installed() {
+    one(
+        Problem,
+        "rosmaster",
+        "no rosmaster is on the PATH",
+        |facts| {
+            facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+        },
+    );
+    one(
+        Problem,
+        "rosmaster",
+        "does not run with /usr/bin/python3: No module",
+        |facts| {
+            if let Some(Ok(program)) = &mut facts.rosmaster {
+                program.broken = Some("No module".to_owned());
+            }
+        },
+    );
+    one(Warning, "rosout", "is not installed", |facts| {
+        facts.has_rosout = false
+    });
+    one(
+        Warning,
+        "python",
+        "/opt/conda/bin/python3 comes first",
+        |facts| {
+            facts.strange_python = Some(PathBuf::from("/opt/conda/bin/python3"));
+        },
+    );
+}
+
+#[test]
+fn the_master_of_a_proxy() {
+    let proxy = |facts: &mut Facts, server| {
+        facts.rosmaster = None;
+        facts.proxied = Some((MasterUri::parse("http://robot:11411").unwrap(), server));
+        facts.masters = vec![process(9, "rosmaster", 11411)];
+        // It is wanted there.
+        facts
+            .units
+            .push(unit("roscore.service", Kind::Roscore, true));
+    };
+    assert_eq!(said(|facts| proxy(facts, Server::Master(Some(9)))), []);
+    one(Warning, "master", "nobody answers", |facts| {
+        proxy(facts, Server::Nobody)
+    });
+    one(Problem, "master", "is not a ROS master", |facts| {
+        proxy(facts, Server::Other)
+    });
+    one(Problem, "master", "is a rosrescue", |facts| {
+        proxy(facts, rosrescue(None))
+    });
+}
+
+#[test]
+fn units_of_systemd() {
+    let with = |kind, is_enabled| {
+        move |facts: &mut Facts| facts.units.push(unit("robot.service", kind, is_enabled))
+    };
+    one(
+        Problem,
+        "systemd",
+        "robot.service starts a master",
+        with(Kind::Roscore, true),
+    );
+    one(
+        Warning,
+        "systemd",
+        "robot.service runs roslaunch",
+        with(Kind::Roslaunch, true),
+    );
+    assert_eq!(said(with(Kind::Roscore, false)), []);
+    one(Note, "systemd", "no unit", |facts| facts.units.clear());
+    one(
+        Note,
+        "systemd",
+        "does not start with the computer",
+        |facts| {
+            facts.units[0].is_enabled = false;
+        },
+    );
+}

@@ -1,0 +1,186 @@
+//! Asks what answers at a port, and how this computer's ROS runs. Judges nothing.
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use serde::Deserialize;
+
+use crate::{
+    commands::running::Running,
+    master,
+    nodes::client::{self, Sign},
+    process,
+    ros_env::MasterUri,
+    xmlrpc::{Call, Value},
+};
+
+/// How long a server may take to answer.
+const ANSWER_LIMIT: Duration = Duration::from_secs(3);
+/// How long Python may take to import a module.
+const IMPORT_LIMIT: Duration = Duration::from_secs(20);
+/// Some names of nodes stand for all at a host.
+const SOME: usize = 3;
+
+/// What answers at an address.
+#[derive(Clone, Debug)]
+pub(super) enum Server {
+    Rosrescue {
+        version: String,
+        uri: String,
+        unprotected: Option<String>,
+    },
+    /// A master, with the process id that it says.
+    Master(Option<i32>),
+    /// Something listens there that does not speak XML-RPC.
+    Other,
+    /// Nothing listens there.
+    Nobody,
+    /// No answer in time.
+    Silent,
+}
+
+/// What is needed of `/status.json`, of any version.
+#[derive(Deserialize)]
+struct Page {
+    version: String,
+    uri: String,
+    unprotected: Option<String>,
+}
+
+impl Server {
+    pub(super) async fn ask(address: &MasterUri) -> Self {
+        let running = Running {
+            address: address.clone(),
+        };
+        let page = tokio::time::timeout(ANSWER_LIMIT, running.get("/status.json")).await;
+        if let Ok(Ok((_, json))) = &page
+            && let Ok(page) = serde_json::from_slice::<Page>(json)
+        {
+            return Self::Rosrescue {
+                version: page.version,
+                uri: page.uri,
+                unprotected: page.unprotected,
+            };
+        }
+        let (uri, get_pid) = (address.to_string(), master::get_pid());
+        match client::ask_for(&uri, &get_pid, ANSWER_LIMIT).await {
+            (Sign::Alive, pid) => Self::Master(pid.as_ref().and_then(Value::as_int)),
+            (Sign::Dead, _) => Self::Nobody,
+            (Sign::Silent, _) if page.is_err() => Self::Silent,
+            (Sign::Silent, _) => Self::Other,
+        }
+    }
+}
+
+/// The hosts of the nodes that the master at `uri` knows, with some of the nodes.
+pub(super) async fn hosts_of_nodes(uri: &str) -> BTreeMap<String, Vec<String>> {
+    let ask = async |method: &str, params: Vec<Value>| {
+        let params = std::iter::once("/rosrescue_check".into()).chain(params);
+        let call = Call::new(method, params.collect());
+        client::ask_for(uri, &call, ANSWER_LIMIT).await.1
+    };
+    let mut hosts = BTreeMap::<_, Vec<String>>::new();
+    let state = ask("getSystemState", Vec::new()).await;
+    let mut names = Vec::new();
+    for list in state.iter().filter_map(Value::as_array).flatten() {
+        for entry in list.as_array().unwrap_or_default() {
+            if let Some([_, Value::Array(nodes)]) = entry.as_array() {
+                names.extend(nodes.iter().filter_map(Value::as_str).map(str::to_owned));
+            }
+        }
+    }
+    names.sort();
+    names.dedup();
+    for name in names {
+        let Some(Value::String(api)) = ask("lookupNode", vec![name.as_str().into()]).await else {
+            continue;
+        };
+        if let Ok(address) = MasterUri::parse(&api) {
+            let nodes = hosts.entry(address.host).or_default();
+            if nodes.len() < SOME {
+                nodes.push(name);
+            }
+        }
+    }
+    hosts
+}
+
+/// A rosmaster that is there.
+#[derive(Clone, Debug)]
+pub(super) struct Program {
+    pub(super) path: PathBuf,
+    /// The version in its package.
+    pub(super) version: Option<String>,
+    /// Its first line.
+    pub(super) interpreter: String,
+    /// Why Python does not run it; none if it does, or is not Python.
+    pub(super) broken: Option<String>,
+}
+
+impl Program {
+    /// The given one, or the one that `core` would find.
+    pub(super) async fn find(given: Option<&Path>) -> Result<Self, String> {
+        let path = process::find_rosmaster(given).map_err(|error| error.to_string())?;
+        let interpreter = process::interpreter(&path).unwrap_or_default();
+        let broken = match interpreter.split_first() {
+            Some(_) if given.is_some() => None,
+            Some((python, arguments)) => import(python, arguments, "rosmaster.main", &path).await,
+            None => None,
+        };
+        Ok(Self {
+            version: version(&path),
+            interpreter: interpreter.join(" "),
+            path,
+            broken,
+        })
+    }
+}
+
+/// The version in the `package.xml` that belongs to `program`.
+fn version(program: &Path) -> Option<String> {
+    let real = program.canonicalize().ok()?;
+    let prefix = real.parent()?.parent()?;
+    let package = fs::read_to_string(prefix.join("share/rosmaster/package.xml")).ok()?;
+    let (_, rest) = package.split_once("<version>")?;
+    Some(rest.split_once('<')?.0.trim().to_owned())
+}
+
+/// Imports `module` as the ROS of `program` would. What Python says if it cannot.
+async fn import(
+    python: &str,
+    arguments: &[String],
+    module: &str,
+    program: &Path,
+) -> Option<String> {
+    let mut command = process::python(Path::new(python), program);
+    let import = format!("import {module}");
+    let run = command.args(arguments).args(["-c", &import]).output();
+    match tokio::time::timeout(IMPORT_LIMIT, run).await {
+        Ok(Ok(output)) if output.status.success() => None,
+        Ok(Ok(output)) => {
+            let said = String::from_utf8_lossy(&output.stderr);
+            let last = said.lines().rfind(|line| !line.trim().is_empty());
+            Some(last.unwrap_or("no reason given").to_owned())
+        }
+        Ok(Err(error)) => Some(error.to_string()),
+        Err(_) => Some(format!("no end in {} s", IMPORT_LIMIT.as_secs())),
+    }
+}
+
+/// The python3 that nodes with `#!/usr/bin/env python3` get, if it comes before the system's and lacks ROS.
+pub(super) async fn strange_python() -> Option<PathBuf> {
+    let python = process::find_program("python3", &[])?;
+    if ["/usr/bin/python3", "/bin/python3"]
+        .iter()
+        .any(|own| python == Path::new(own))
+    {
+        return None;
+    }
+    let name = python.to_string_lossy().into_owned();
+    let broken = import(&name, &[], "rosgraph", Path::new("/")).await;
+    broken.map(|_| python)
+}

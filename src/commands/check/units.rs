@@ -1,0 +1,182 @@
+//! Units of systemd that start a master. Judges nothing.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+/// Where units lie, the first before the others.
+const FOLDERS: [&str; 4] = [
+    "/etc/systemd/system",
+    "/run/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+];
+/// Largest unit or script that is read, in bytes.
+const MOST: u64 = 1 << 20;
+
+/// A unit that has to do with ROS.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Unit {
+    pub(super) name: String,
+    pub(super) kind: Kind,
+    /// Whether it starts with the computer.
+    pub(super) is_enabled: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Rosrescue,
+    /// It runs a roscore or a rosmaster.
+    Roscore,
+    /// It runs roslaunch, which starts a master where it finds none.
+    Roslaunch,
+}
+
+/// All units that have to do with ROS, by name.
+pub(super) fn find() -> Vec<Unit> {
+    let mut folders: Vec<_> = FOLDERS.iter().map(PathBuf::from).collect();
+    if let Some(home) = std::env::var_os("HOME") {
+        folders.insert(0, Path::new(&home).join(".config/systemd/user"));
+    }
+    in_folders(&folders)
+}
+
+fn in_folders(folders: &[PathBuf]) -> Vec<Unit> {
+    let mut units = Vec::<Unit>::new();
+    for folder in folders {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let is_unit = name.ends_with(".service") || name.ends_with(".socket");
+            if !is_unit || units.iter().any(|unit| unit.name == name) {
+                continue;
+            }
+            if let Some(kind) = kind_of(&read(&entry.path())) {
+                units.push(Unit {
+                    is_enabled: is_enabled(folders, &name),
+                    name,
+                    kind,
+                });
+            }
+        }
+    }
+    units.sort_by(|a, b| a.name.cmp(&b.name));
+    units
+}
+
+/// The text of a small file.
+fn read(path: &Path) -> String {
+    match fs::metadata(path) {
+        Ok(metadata) if metadata.is_file() && metadata.len() < MOST => {
+            let text = fs::read(path).unwrap_or_default();
+            String::from_utf8_lossy(&text).into_owned()
+        }
+        // A masked unit leads to /dev/null.
+        _ => String::new(),
+    }
+}
+
+/// By what a unit starts, or by the script that it starts, as those of robot_upstart.
+fn kind_of(unit: &str) -> Option<Kind> {
+    let mut found = None;
+    for line in unit.lines() {
+        if line.trim_start().starts_with("ListenStream=11311") {
+            found = Some(Kind::Rosrescue);
+        }
+        let Some(command) = line.trim_start().strip_prefix("ExecStart=") else {
+            continue;
+        };
+        let of_command = words(command);
+        let script = command.split_whitespace().next().unwrap_or_default();
+        let script = script.trim_start_matches(['-', '@', '+', '!', ':']);
+        let of_script = || {
+            // What ROS's own program does is known by its arguments.
+            let text = match script.ends_with("roslaunch") {
+                true => String::new(),
+                false => read(Path::new(script)),
+            };
+            text.starts_with("#!").then(|| words(&text)).flatten()
+        };
+        found = found.or(of_command).or_else(of_script);
+    }
+    found
+}
+
+/// What these words run.
+fn words(text: &str) -> Option<Kind> {
+    let lines = text
+        .lines()
+        .filter(|line| !line.trim_start().starts_with('#'));
+    let names: Vec<_> = lines
+        .flat_map(|line| line.split(|c: char| c.is_whitespace() || "/;'\"()".contains(c)))
+        .collect();
+    let has = |name: &str| names.contains(&name);
+    match () {
+        () if has("rosrescue") => Some(Kind::Rosrescue),
+        () if has("roscore") || has("rosmaster") => Some(Kind::Roscore),
+        // With --wait it starts no master.
+        () if has("roslaunch") && !has("--wait") => Some(Kind::Roslaunch),
+        () => None,
+    }
+}
+
+fn is_enabled(folders: &[PathBuf], name: &str) -> bool {
+    folders.iter().any(|folder| {
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        let mut wants = entries.map(|entry| entry.path()).filter(|path| {
+            let end = path.extension().unwrap_or_default();
+            end == "wants" || end == "requires"
+        });
+        wants.any(|wants| wants.join(name).symlink_metadata().is_ok())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn units_are_known_by_what_they_start() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let script = path("robot-start");
+        fs::write(
+            &script,
+            "#!/bin/bash\n# roscore is not started here\nroslaunch /tmp/x.launch &\n",
+        )
+        .unwrap();
+        let start = format!("[Service]\nExecStart={}\n", script.display());
+        for (name, text) in [
+            (
+                "core.service",
+                "ExecStart=/bin/sh -c '. /opt/ros/noetic/setup.sh; roscore'",
+            ),
+            ("rescue.service", "ExecStart=/usr/local/bin/rosrescue core"),
+            ("robot.service", &start),
+            (
+                "waits.service",
+                "ExecStart=/usr/bin/roslaunch --wait a b.launch",
+            ),
+            ("other.service", "ExecStart=/usr/bin/other roscored"),
+            ("notes.txt", "ExecStart=roscore"),
+        ] {
+            fs::write(path(name), text).unwrap();
+        }
+        fs::create_dir(path("multi-user.target.wants")).unwrap();
+        let link = path("multi-user.target.wants/core.service");
+        std::os::unix::fs::symlink(path("core.service"), link).unwrap();
+        let unit = |name: &str, kind, is_enabled| Unit {
+            name: name.to_owned(),
+            kind,
+            is_enabled,
+        };
+        assert_eq!(
+            in_folders(&[folder.path().to_owned()]),
+            [
+                unit("core.service", Kind::Roscore, true),
+                unit("rescue.service", Kind::Rosrescue, false),
+                unit("robot.service", Kind::Roslaunch, false),
+            ]
+        );
+    }
+}

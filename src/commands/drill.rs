@@ -1,0 +1,315 @@
+//! `rosrescue drill`: kills on purpose, watches as a node would, and gives a verdict.
+
+mod calls;
+mod kill;
+mod node;
+mod robot;
+mod target;
+mod tcpros;
+mod topics;
+mod verdict;
+
+use std::{
+    io::{IsTerminal, Write},
+    time::{Duration, Instant},
+};
+
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    task::JoinHandle,
+    time::{sleep, timeout},
+};
+use tokio_util::sync::CancellationToken;
+
+use self::{
+    calls::{Api, Callers, Calls},
+    node::Node,
+    robot::Robot,
+    target::Target,
+    topics::Topic,
+    verdict::{Verdict, names},
+};
+use super::{Exit, Failure, counted, print, running::Running};
+use crate::{
+    cli::{DrillArgs, Victim},
+    process,
+    status::summary::Status,
+    xmlrpc::Value,
+};
+
+/// Names of drills' nodes and parameters begin so; the process id follows.
+const PREFIX: &str = "/rosrescue_drill_";
+/// How long the robot is watched before the first kill, and to choose topics.
+const BEFORE: Duration = Duration::from_secs(2);
+/// Topics that are watched if none is named.
+const TOPICS: usize = 3;
+/// How long tidying up may take.
+const TIDY_LIMIT: Duration = Duration::from_secs(15);
+
+pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
+    let running = Running::find(&args.target)?;
+    let name = format!("{PREFIX}{}", std::process::id());
+    let api = Api {
+        uri: running.address.to_string(),
+        caller: name.clone(),
+    };
+    let target = Target { running, api };
+    let status = target.running.status().await?;
+    if !args.no_kill {
+        agree(args, &target).await?;
+    }
+    let node = Node::start(name).await;
+    let node = node.map_err(|error| Failure::Failed(format!("cannot listen: {error}")))?;
+    let mut drill = Drill {
+        args,
+        target,
+        node,
+        topics: Vec::new(),
+        calls: None,
+    };
+    let signals = [SignalKind::interrupt(), SignalKind::terminate()].map(signal);
+    let [Ok(mut interrupt), Ok(mut terminate)] = signals else {
+        return Err(Failure::Failed("cannot receive signals".to_owned()));
+    };
+    let stop = CancellationToken::new();
+    let ended = tokio::select! {
+        verdict = drill.hold(&status, &stop) => verdict,
+        _ = interrupt.recv() => Err(interrupted()),
+        _ = terminate.recv() => Err(interrupted()),
+    };
+    // Callers finish the call that they are at: nothing is registered after what follows.
+    stop.cancel();
+    let tidied = drill.tidy_up().await;
+    let mut verdict = match ended {
+        Ok(verdict) => verdict,
+        Err(failure) => return tidied.map_err(Failure::Failed).and(Err(failure)),
+    };
+    if let Err(why) = tidied {
+        verdict.passed = false;
+        verdict.failures.push(why);
+    }
+    print(&verdict, &args.output)?;
+    Ok(if verdict.passed {
+        Exit::Good
+    } else {
+        Exit::Bad
+    })
+}
+
+fn interrupted() -> Failure {
+    Failure::Failed("interrupted: there is no verdict; the drill has tidied up".to_owned())
+}
+
+/// Says what will be killed, and asks.
+async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
+    target.refuse_others().await?;
+    let kill = if args.hang { Victim::Master } else { args.kill };
+    let victims = names(&target.victims(kill).await?);
+    let how = if args.hang { "SIGSTOP" } else { "SIGKILL" };
+    eprintln!(
+        "This sends {how} to {victims} of {}, {}.",
+        target.running.address,
+        counted(args.times as usize, "time")
+    );
+    if args.yes {
+        return Ok(());
+    }
+    if !std::io::stdin().is_terminal() {
+        return Err(Failure::Usage(
+            "nothing is killed without consent: say --yes, or run the drill on a terminal, or with \
+             --no-kill"
+                .to_owned(),
+        ));
+    }
+    eprint!("Is the robot on the bench, and should it begin? [y/N] ");
+    let _ = std::io::stderr().flush();
+    let mut answer = String::new();
+    let read = std::io::stdin().read_line(&mut answer);
+    match read.is_ok() && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
+        true => Ok(()),
+        false => Err(Failure::Failed("nothing was killed".to_owned())),
+    }
+}
+
+struct Drill<'a> {
+    args: &'a DrillArgs,
+    target: Target,
+    node: Node,
+    topics: Vec<Topic>,
+    /// The callers, as long as they run.
+    calls: Option<JoinHandle<Calls>>,
+}
+
+impl Drill<'_> {
+    /// What the callers found, once they have ended.
+    async fn calls(&mut self) -> Calls {
+        let calls = match &mut self.calls {
+            Some(calls) => calls.await.unwrap_or_default(),
+            None => Calls::default(),
+        };
+        self.calls = None;
+        calls
+    }
+
+    fn key(&self) -> &str {
+        &self.node.name
+    }
+
+    /// The whole drill, without what [`Self::tidy_up`] does.
+    async fn hold(
+        &mut self,
+        status: &Status,
+        stop: &CancellationToken,
+    ) -> Result<Verdict, Failure> {
+        let start = Instant::now();
+        eprintln!("watching what is normal, and which topics carry messages");
+        let api = self.target.api.clone();
+        self.remove_left_behind().await?;
+        let before = Robot::read(&api).await.map_err(Failure::Failed)?;
+        // To all parameters: what others change is no failure of rosrescue.
+        let subscribe = [self.node.api.as_str().into(), "/".into()];
+        let subscribed = api.call("subscribeParam", &subscribe).await;
+        subscribed.map_err(Failure::Failed)?;
+        let callers = Callers {
+            api: api.clone(),
+            node_api: self.node.api.clone(),
+            heard: self.node.heard.clone(),
+            key: self.key().to_owned(),
+            topic: format!("{}/topic", self.key()),
+        };
+        self.calls = Some(tokio::spawn(callers.run(stop.clone())));
+        self.choose_topics().await?;
+        sleep(BEFORE).await;
+        let meanwhile = Robot::read(&api).await.map_err(Failure::Failed)?;
+        for topic in &self.topics {
+            topic.begin();
+        }
+        let kills = if self.args.no_kill {
+            eprintln!("watching for {} s", self.args.seconds);
+            sleep(Duration::from_secs(self.args.seconds.into())).await;
+            Vec::new()
+        } else {
+            self.kill().await?
+        };
+        stop.cancel();
+        let calls = self.calls().await;
+        let updates = self.node.heard.updates();
+        let (now, watched) = (Instant::now(), self.topics.iter());
+        let topics = watched.map(|topic| topic.report(now, &updates)).collect();
+        let after = Robot::read(&api).await;
+        let (nodes, facts) = before.counts();
+        let mut verdict = Verdict {
+            passed: false,
+            uri: self.target.running.address.to_string(),
+            version: status.version.clone(),
+            seconds: start.elapsed().as_secs_f64(),
+            kills,
+            calls,
+            topics,
+            nodes,
+            registrations_and_parameters: facts,
+            failures: Vec::new(),
+            notes: Vec::new(),
+        };
+        let difference = match after {
+            Ok(after) => before.compare(&meanwhile, &after, &self.node.heard.changed()),
+            Err(why) => robot::Difference {
+                lost: vec![format!("the state could not be read at the end: {why}")],
+                new: Vec::new(),
+            },
+        };
+        let shutdown = self.node.heard.shutdown();
+        verdict.judge(difference, shutdown, self.args.limit);
+        Ok(verdict)
+    }
+
+    /// Subscribes to the topics that are to be watched.
+    async fn choose_topics(&mut self) -> Result<(), Failure> {
+        let api = self.target.api.clone();
+        if !self.args.topic.is_empty() {
+            for topic in &self.args.topic {
+                let name = format!("/{}", topic.trim_start_matches('/'));
+                let topic = Topic::subscribe(&api, &self.node, &name).await;
+                let topic = topic.map_err(Failure::Failed)?;
+                let published = topic.has_publishers();
+                self.topics.push(topic);
+                if !published {
+                    let what = format!("--topic: nobody publishes {name}");
+                    return Err(Failure::Usage(what));
+                }
+            }
+            return Ok(());
+        }
+        let mut found = Vec::new();
+        for name in topics::candidates(&api).await.map_err(Failure::Failed)? {
+            match Topic::subscribe(&api, &self.node, &name).await {
+                Ok(topic) => found.push(topic),
+                Err(why) => {
+                    eprintln!("not watched: {why}");
+                    let _ = topics::unregister(&api, &self.node, &name).await;
+                }
+            }
+        }
+        sleep(BEFORE).await;
+        let names: Vec<_> = found.iter().map(|topic| topic.name.clone()).collect();
+        topics::sort(&mut found);
+        found.truncate(TOPICS);
+        for name in names {
+            if !found.iter().any(|topic| topic.name == name) {
+                let _ = topics::unregister(&api, &self.node, &name).await;
+            }
+        }
+        self.topics.extend(found);
+        Ok(())
+    }
+
+    /// Deletes the parameters of drills that were killed themselves. Their registrations go with the next
+    /// health check.
+    async fn remove_left_behind(&self) -> Result<(), Failure> {
+        let api = &self.target.api;
+        let keys = api
+            .call("getParamNames", &[])
+            .await
+            .map_err(Failure::Failed)?;
+        for key in keys.as_array().unwrap_or_default() {
+            let pid = key.as_str().and_then(|key| key.strip_prefix(PREFIX));
+            let pid = pid.and_then(|pid| pid.parse().ok());
+            if pid.is_some_and(|pid| !process::is_alive(pid)) {
+                let _ = api.call("deleteParam", std::slice::from_ref(key)).await;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes everything back that the drill has left in the master.
+    async fn tidy_up(&mut self) -> Result<(), String> {
+        self.calls().await;
+        let api = &self.target.api;
+        let work = async {
+            let mut done = Ok(());
+            for topic in &self.topics {
+                done = done.and(topic.unsubscribe(api, &self.node).await);
+            }
+            let topic = format!("{}/topic", self.key());
+            done = done.and(topics::unregister(api, &self.node, &topic).await);
+            let unsubscribe = [self.node.api.as_str().into(), "/".into()];
+            done = done.and(api.call("unsubscribeParam", &unsubscribe).await.map(drop));
+            let keys = api.call("getParamNames", &[]).await?;
+            let key = Value::from(self.key());
+            if keys.as_array().is_some_and(|keys| keys.contains(&key)) {
+                done = done.and(api.call("deleteParam", &[key]).await.map(drop));
+            }
+            done
+        };
+        let done = timeout(TIDY_LIMIT, work).await;
+        let done = done.unwrap_or_else(|_| Err(format!("no answer in {} s", TIDY_LIMIT.as_secs())));
+        done.map_err(|why| {
+            format!(
+                "the drill could not tidy up: {why}. {} goes with the next health check, its \
+                 parameter with `rosparam delete {}`",
+                self.node.name,
+                self.key()
+            )
+        })
+    }
+}

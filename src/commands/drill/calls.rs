@@ -1,0 +1,229 @@
+//! Calls of the Master API, made all the time as nodes make them, and how long they took.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use serde::Serialize;
+use tokio::time::{sleep, timeout};
+use tokio_util::sync::CancellationToken;
+
+use super::node::Heard;
+use crate::{
+    nodes::client::{self, Sign},
+    xmlrpc::{Call, Value},
+};
+
+/// A call that takes longer has failed. rosrescue promises to answer everything sooner.
+const LIMIT: Duration = Duration::from_secs(10);
+/// Pause between two calls of a loop.
+const PAUSE: Duration = Duration::from_millis(5);
+/// Most failures that are told.
+const MOST: usize = 5;
+
+/// The Master API at an address, called by one node.
+#[derive(Clone, Debug)]
+pub(super) struct Api {
+    pub(super) uri: String,
+    pub(super) caller: String,
+}
+
+/// An answer, and what it took.
+struct Answer {
+    value: Result<Value, String>,
+    took: Duration,
+    /// The connection broke, and the call was made again, as rospy and roscpp do.
+    again: bool,
+}
+
+impl Api {
+    async fn ask(&self, method: &str, params: &[Value]) -> Answer {
+        let own = std::iter::once(Value::from(self.caller.as_str()));
+        let call = Call::new(method, own.chain(params.iter().cloned()).collect());
+        let start = Instant::now();
+        let mut again = false;
+        loop {
+            let (sign, value) = client::ask_for(&self.uri, &call, LIMIT).await;
+            let took = start.elapsed();
+            let value = match (sign, value) {
+                (_, Some(value)) => Ok(value),
+                (Sign::Alive, None) => Err("was refused".to_owned()),
+                (Sign::Dead, None) => Err("found nobody listening".to_owned()),
+                (Sign::Silent, None) if took >= LIMIT => {
+                    Err(format!("had no answer in {} s", LIMIT.as_secs()))
+                }
+                (Sign::Silent, None) if !again => {
+                    again = true;
+                    continue;
+                }
+                (Sign::Silent, None) => Err("lost its connection twice".to_owned()),
+            };
+            let value = value.map_err(|why| {
+                let first = params.first().and_then(Value::as_str).unwrap_or_default();
+                format!("{method}({first}) {why}")
+            });
+            return Answer { value, took, again };
+        }
+    }
+
+    pub(super) async fn call(&self, method: &str, params: &[Value]) -> Result<Value, String> {
+        self.ask(method, params).await.value
+    }
+}
+
+/// How calls of one kind went.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Waits {
+    pub(super) calls: u64,
+    pub(super) longest_ms: f64,
+    /// Made twice, because the connection had been broken.
+    pub(super) again: u64,
+    pub(super) failed: u64,
+    /// Some of the failures.
+    pub(super) failures: Vec<String>,
+}
+
+impl Waits {
+    fn took(&mut self, took: Duration) {
+        self.calls += 1;
+        self.longest_ms = self.longest_ms.max(took.as_secs_f64() * 1e3);
+    }
+
+    fn fail(&mut self, why: String) {
+        self.failed += 1;
+        if self.failures.len() < MOST {
+            self.failures.push(why);
+        }
+    }
+
+    fn add(&mut self, answer: Answer) -> Option<Value> {
+        self.took(answer.took);
+        self.again += u64::from(answer.again);
+        answer.value.map_err(|why| self.fail(why)).ok()
+    }
+
+    fn merge(mut self, other: Self) -> Self {
+        self.calls += other.calls;
+        self.longest_ms = self.longest_ms.max(other.longest_ms);
+        self.again += other.again;
+        self.failed += other.failed;
+        self.failures.extend(other.failures);
+        self.failures.truncate(MOST);
+        self
+    }
+}
+
+/// How all calls went.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Calls {
+    pub(super) reads: Waits,
+    pub(super) writes: Waits,
+    /// From a write to the notification of its subscriber.
+    pub(super) notifications: Waits,
+}
+
+/// What the callers use, all of it the drill's own.
+#[derive(Clone, Debug)]
+pub(super) struct Callers {
+    pub(super) api: Api,
+    /// The drill's node.
+    pub(super) node_api: String,
+    pub(super) heard: Arc<Heard>,
+    /// A parameter that nobody else uses.
+    pub(super) key: String,
+    /// A topic that nobody else uses.
+    pub(super) topic: String,
+}
+
+impl Callers {
+    /// Calls until `stop`.
+    pub(super) async fn run(self, stop: CancellationToken) -> Calls {
+        let (reads, (written, read_back, notifications), registered) =
+            tokio::join!(self.read(&stop), self.write(&stop), self.register(&stop));
+        Calls {
+            reads: reads.merge(read_back),
+            writes: written.merge(registered),
+            notifications,
+        }
+    }
+
+    /// One caller only reads: a node that looks for another one.
+    async fn read(&self, stop: &CancellationToken) -> Waits {
+        let mut waits = Waits::default();
+        let name = [self.api.caller.as_str().into()];
+        while !stop.is_cancelled() {
+            let answer = self.api.ask("lookupNode", &name).await;
+            if let Some(found) = waits.add(answer)
+                && found.as_str() != Some(&self.node_api)
+            {
+                waits.fail("lookupNode gave a wrong address".to_owned());
+            }
+            sleep(PAUSE).await;
+        }
+        waits
+    }
+
+    /// One caller sets a parameter, waits for the notification, and reads it.
+    async fn write(&self, stop: &CancellationToken) -> (Waits, Waits, Waits) {
+        let (mut written, mut read, mut told) = <(Waits, Waits, Waits)>::default();
+        let mut seen = self.heard.param.subscribe();
+        let mut number = 0;
+        // The master does not notify a node of what it has set itself.
+        let another = Api {
+            caller: format!("{}_writer", self.api.caller),
+            ..self.api.clone()
+        };
+        while !stop.is_cancelled() {
+            number += 1;
+            let start = Instant::now();
+            let set = [self.key.as_str().into(), number.into()];
+            let answer = another.ask("setParam", &set).await;
+            if written.add(answer).is_none() {
+                sleep(PAUSE).await;
+                continue;
+            }
+            let answer = self.api.ask("getParam", &[self.key.as_str().into()]).await;
+            if let Some(value) = read.add(answer)
+                && value.as_int() != Some(number)
+            {
+                read.fail("getParam gave another value than was set before".to_owned());
+            }
+            let notified = timeout(LIMIT, seen.wait_for(|seen| *seen >= number));
+            match notified.await {
+                Ok(_) => told.took(start.elapsed()),
+                Err(_) => told.fail(format!(
+                    "no paramUpdate in {} s: nobody reaches nodes at {}",
+                    LIMIT.as_secs(),
+                    self.node_api
+                )),
+            }
+            sleep(PAUSE).await;
+        }
+        (written, read, told)
+    }
+
+    /// One caller registers and unregisters all the time. A subscriber of any type leaves no type behind.
+    async fn register(&self, stop: &CancellationToken) -> Waits {
+        let mut waits = Waits::default();
+        let (topic, api) = (self.topic.as_str(), self.node_api.as_str());
+        while !stop.is_cancelled() {
+            let register = [topic.into(), "*".into(), api.into()];
+            let answer = self.api.ask("registerSubscriber", &register).await;
+            waits.add(answer);
+            // Said only as long as it is so: the health check would register what is missing.
+            self.heard.subscribes(topic, true);
+            sleep(PAUSE).await;
+            self.heard.subscribes(topic, false);
+            let unregister = [topic.into(), api.into()];
+            let answer = self.api.ask("unregisterSubscriber", &unregister).await;
+            if waits.add(answer) == Some(Value::Int(0)) {
+                waits.fail(format!(
+                    "the registration as a subscriber of {topic} was gone"
+                ));
+            }
+            sleep(PAUSE).await;
+        }
+        waits
+    }
+}

@@ -1,0 +1,107 @@
+//! Kills, and waits for what comes after.
+
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+use tokio::time::{sleep, timeout};
+
+use super::{
+    Drill,
+    target::Stopped,
+    verdict::{Kill, names},
+};
+use crate::{cli::Victim, commands::Failure, process};
+
+/// How long it is watched after each recovery: notifications that were missed come then.
+const AFTER: Duration = Duration::from_millis(1500);
+/// How often the recovery is looked for.
+const LOOK: Duration = Duration::from_millis(20);
+/// How long a master is made to hang. It counts as hung after some 1.6 s.
+const HANG: Duration = Duration::from_secs(4);
+/// So many deaths within that time are not a crash loop yet.
+const DEATHS: usize = 5;
+const DEATHS_WITHIN: Duration = Duration::from_secs(61);
+impl Drill<'_> {
+    /// Kills as often as is asked for, and waits for each recovery.
+    pub(super) async fn kill(&self) -> Result<Vec<Kill>, Failure> {
+        let kill = if self.args.hang {
+            Victim::Master
+        } else {
+            self.args.kill
+        };
+        let (mut kills, mut times) = (Vec::new(), Vec::<Instant>::new());
+        for number in 1..=self.args.times {
+            let fifth = times.iter().rev().nth(DEATHS - 1);
+            let pause = fifth.map(|then| DEATHS_WITHIN.saturating_sub(then.elapsed()));
+            if let Some(pause) = pause.filter(|pause| !pause.is_zero()) {
+                eprintln!(
+                    "waiting {} s: more deaths now would be a crash loop",
+                    pause.as_secs()
+                );
+                sleep(pause).await;
+            }
+            // Looked for each time: they are others after each kill.
+            let victims = self.target.victims(kill).await?;
+            let signal = if self.args.hang { "SIGSTOP" } else { "SIGKILL" };
+            eprintln!(
+                "{number} of {}: {signal} to {}",
+                self.args.times,
+                names(&victims)
+            );
+            let start = Instant::now();
+            times.push(start);
+            let mut stopped = None;
+            for (_, pid) in &victims {
+                if self.args.hang {
+                    stopped = Some(Stopped::new(*pid));
+                } else {
+                    process::signal_process(*pid, Signal::KILL);
+                }
+            }
+            let limit = Duration::from_secs(self.args.limit.into());
+            let recovered = timeout(limit, self.recovered(&victims, stopped)).await;
+            let recovered_ms = recovered
+                .is_ok()
+                .then(|| start.elapsed().as_secs_f64() * 1e3);
+            let failed = recovered.is_err();
+            kills.push(Kill {
+                killed: victims,
+                signal,
+                recovered_ms,
+            });
+            if failed {
+                eprintln!("calls do not pass again: the drill ends");
+                break;
+            }
+            sleep(AFTER).await;
+        }
+        Ok(kills)
+    }
+
+    /// Waits until calls pass to a living master again, and whoever was killed has a successor. A master that
+    /// hangs may go on as well.
+    async fn recovered(&self, victims: &[(&'static str, u32)], mut stopped: Option<Stopped>) {
+        let start = Instant::now();
+        loop {
+            if let Ok(status) = self.target.running.status().await
+                && status.open
+            {
+                let mut replaced = true;
+                for (name, pid) in victims {
+                    replaced &= match *name {
+                        "worker" => status.pid != *pid,
+                        _ => self.target.master_pid().await.is_ok_and(|now| now != *pid),
+                    };
+                }
+                let goes_on = self.args.hang && stopped.is_none();
+                if replaced || goes_on {
+                    return;
+                }
+            }
+            if start.elapsed() > HANG {
+                stopped = None;
+            }
+            sleep(LOOK).await;
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! The processes that a drill kills: finds them, and makes sure that they are what they seem.
+
+use std::{path::Path, time::Duration};
+
+use rustix::process::Signal;
+use tokio::net::TcpStream;
+
+use super::calls::Api;
+use crate::{
+    cli::Victim,
+    commands::{Failure, running::Running},
+    process::{self, listeners},
+    resolver,
+    ros_env::MasterUri,
+    status::summary::Status,
+};
+
+/// How long connecting may take.
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+
+/// The running rosrescue and its master.
+#[derive(Clone, Debug)]
+pub(super) struct Target {
+    pub(super) running: Running,
+    pub(super) api: Api,
+}
+
+impl Target {
+    /// The processes to kill, by what they are: the master first.
+    pub(super) async fn victims(&self, kill: Victim) -> Result<Vec<(&'static str, u32)>, Failure> {
+        let status = &self.running.status().await?;
+        let mut victims = Vec::new();
+        if kill != Victim::Worker {
+            victims.push(("master", self.master(status).await?));
+        }
+        if kill != Victim::Master {
+            victims.push(("worker", self.worker(status)?));
+        }
+        Ok(victims)
+    }
+
+    /// The master's process. It says its id itself, and it must listen where rosrescue calls it.
+    async fn master(&self, status: &Status) -> Result<u32, Failure> {
+        let address =
+            MasterUri::parse(&status.master).map_err(|error| Failure::Failed(error.to_string()))?;
+        if !is_here(&address).await {
+            return Err(Failure::Usage(format!(
+                "the master at {} is not on this computer: run the drill there, or with --no-kill",
+                status.master
+            )));
+        }
+        let pid = self.master_pid().await.map_err(Failure::Failed)?;
+        let is_master =
+            process::runs(pid, "rosmaster") || process::is_of(pid, Path::new(&status.checkpoint));
+        if is_master && listeners::listens(pid, address.port) {
+            return Ok(pid);
+        }
+        Err(Failure::Usage(format!(
+            "process {pid} is said to be the master at {}, but what can be seen of it does not say \
+             so: run the drill as the user of rosrescue, and not in another container",
+            status.master
+        )))
+    }
+
+    pub(super) async fn master_pid(&self) -> Result<u32, String> {
+        let pid = self.api.call("getPid", &[]).await?;
+        let pid = pid.as_int().and_then(|pid| u32::try_from(pid).ok());
+        pid.ok_or_else(|| "getPid gave no process id".to_owned())
+    }
+
+    /// rosrescue's worker. It says its id itself, and it must listen at the port.
+    fn worker(&self, status: &Status) -> Result<u32, Failure> {
+        if !status.guarded {
+            return Err(Failure::Usage(
+                "rosrescue runs without a guardian: nobody would start it again (--no-guardian?)"
+                    .to_owned(),
+            ));
+        }
+        let port = self.running.address.port;
+        match process::is_rosrescue(status.pid) && listeners::listens(status.pid, port) {
+            true => Ok(status.pid),
+            false => Err(Failure::Usage(format!(
+                "process {} is said to be rosrescue's worker, but it cannot be seen to listen at port \
+                 {port}: run the drill as the user of rosrescue, and not in another container",
+                status.pid
+            ))),
+        }
+    }
+
+    /// Refuses a rosrescue of another computer.
+    pub(super) async fn refuse_others(&self) -> Result<(), Failure> {
+        let address = &self.running.address;
+        if is_here(address).await {
+            return Ok(());
+        }
+        Err(Failure::Usage(format!(
+            "the rosrescue at {address} is on another computer, where nothing can be killed from \
+             here: run the drill there, or with --no-kill"
+        )))
+    }
+}
+
+/// Whether a connection to `address` ends on this computer.
+async fn is_here(address: &MasterUri) -> bool {
+    let connect = async {
+        let addresses = resolver::addresses(&address.host, address.port).await?;
+        let stream = TcpStream::connect(&*addresses).await?;
+        let (here, there) = (stream.local_addr()?.ip(), stream.peer_addr()?.ip());
+        std::io::Result::Ok(there.is_loopback() || here == there)
+    };
+    let here = tokio::time::timeout(CONNECT_LIMIT, connect).await;
+    matches!(here, Ok(Ok(true)))
+}
+
+/// A process that hangs until this is dropped.
+#[derive(Debug)]
+pub(super) struct Stopped(u32);
+
+impl Stopped {
+    pub(super) fn new(pid: u32) -> Self {
+        process::signal_process(pid, Signal::STOP);
+        Self(pid)
+    }
+}
+
+impl Drop for Stopped {
+    fn drop(&mut self) {
+        process::signal_process(self.0, Signal::CONT);
+    }
+}

@@ -1,0 +1,336 @@
+//! Topics that the drill watches as a subscriber.
+
+use std::{
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use serde::Serialize;
+use tokio::{task::JoinHandle, time::timeout};
+
+use super::{calls::Api, node::Node, tcpros::Link};
+use crate::xmlrpc::Value;
+
+/// How long a publisher may take to accept a subscriber.
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+/// With fewer messages before the first kill nobody knows what pause is normal.
+const FEWEST: u64 = 10;
+/// No shorter pause is held against a stream: computers have other things to do.
+const SHORTEST_GAP: Duration = Duration::from_secs(1);
+/// How much longer than normal a pause must be to count as a failure.
+const LONGER: u32 = 10;
+/// Topics that are tried when none is named.
+const CANDIDATES: usize = 12;
+
+/// What came over one link.
+#[derive(Debug, Default)]
+struct Seen {
+    messages: u64,
+    /// Whether numbers tell what is lost. Not those of a throttled topic, which skip some from the beginning.
+    is_numbered: bool,
+    number: Option<u32>,
+    lost: u64,
+    last: Option<Instant>,
+    longest: Duration,
+    /// The longest pause before the first kill, if it is known.
+    normal: Option<Duration>,
+    ended: Option<String>,
+}
+
+impl Seen {
+    fn message(&mut self, now: Instant, number: Option<u32>) {
+        self.pause(now);
+        self.messages += 1;
+        self.last = Some(now);
+        self.is_numbered |= number.is_some() && self.number.is_none();
+        if let (Some(before), Some(number)) = (self.number, number) {
+            // A publisher that begins anew has lost its link, which is told otherwise.
+            let missing = number.wrapping_sub(before).wrapping_sub(1);
+            self.lost += u64::from(missing).min(1 << 20) * u64::from(missing < 1 << 31);
+        }
+        self.number = number.or(self.number);
+    }
+
+    fn pause(&mut self, now: Instant) {
+        if let Some(last) = self.last {
+            self.longest = self.longest.max(now.saturating_duration_since(last));
+        }
+    }
+
+    /// From now on something is killed.
+    fn begin(&mut self) {
+        self.normal = (self.messages >= FEWEST).then_some(self.longest);
+        self.longest = Duration::ZERO;
+        self.is_numbered &= self.lost == 0;
+    }
+
+    fn failures(&self, publisher: &str) -> Vec<String> {
+        let mut failures = Vec::new();
+        if let Some(why) = &self.ended {
+            failures.push(format!("the link to {publisher} was lost ({why})"));
+        } else if let Some(normal) = self.normal
+            && self.longest > SHORTEST_GAP.max(normal * LONGER)
+        {
+            failures.push(format!(
+                "no message of {publisher} came for {} ms, before it was {} ms at most",
+                self.longest.as_millis(),
+                normal.as_millis()
+            ));
+        }
+        if self.is_numbered && self.lost > 0 {
+            failures.push(format!("{} messages of {publisher} were lost", self.lost));
+        }
+        failures
+    }
+}
+
+fn lock(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
+    seen.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A link that is read until it is dropped.
+#[derive(Debug)]
+struct Watched {
+    /// The publisher's address.
+    publisher: String,
+    seen: Arc<Mutex<Seen>>,
+    task: JoinHandle<()>,
+}
+
+impl Drop for Watched {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+/// A subscription, with a link to each publisher.
+#[derive(Debug)]
+pub(super) struct Topic {
+    pub(super) name: String,
+    links: Vec<Watched>,
+}
+
+/// How it went with one topic.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Report {
+    pub(super) topic: String,
+    pub(super) publishers: usize,
+    pub(super) messages: u64,
+    /// None if the messages have no number.
+    pub(super) lost: Option<u64>,
+    pub(super) longest_gap_ms: f64,
+    /// Before the first kill; none if too few messages came to tell.
+    pub(super) normal_gap_ms: Option<f64>,
+    pub(super) failures: Vec<String>,
+}
+
+impl Topic {
+    /// Subscribes to `topic` as a node does, and connects to all of its publishers.
+    pub(super) async fn subscribe(api: &Api, node: &Node, topic: &str) -> Result<Self, String> {
+        let register = [topic.into(), "*".into(), node.api.as_str().into()];
+        let publishers = api.call("registerSubscriber", &register).await?;
+        node.heard.subscribes(topic, true);
+        let publishers = publishers.as_array().unwrap_or_default();
+        let mut links = Vec::new();
+        for publisher in publishers.iter().filter_map(Value::as_str) {
+            let link = timeout(CONNECT_LIMIT, connect(api, publisher, topic)).await;
+            let link = link.map_err(|_| "no answer".to_owned()).flatten();
+            let seen = Arc::<Mutex<Seen>>::default();
+            let task = match link {
+                Ok(link) => tokio::spawn(read(link, seen.clone())),
+                Err(why) => {
+                    return Err(format!("{topic}: cannot connect to {publisher}: {why}"));
+                }
+            };
+            links.push(Watched {
+                publisher: publisher.to_owned(),
+                seen,
+                task,
+            });
+        }
+        Ok(Self {
+            name: topic.to_owned(),
+            links,
+        })
+    }
+
+    pub(super) async fn unsubscribe(&self, api: &Api, node: &Node) -> Result<(), String> {
+        unregister(api, node, &self.name).await
+    }
+
+    pub(super) fn has_publishers(&self) -> bool {
+        !self.links.is_empty()
+    }
+
+    fn messages(&self) -> u64 {
+        self.links
+            .iter()
+            .map(|link| lock(&link.seen).messages)
+            .sum()
+    }
+
+    /// From now on something is killed.
+    pub(super) fn begin(&self) {
+        for link in &self.links {
+            lock(&link.seen).begin();
+        }
+    }
+
+    /// How it went until `now`. `updates`: what the node was told of publishers.
+    pub(super) fn report(&self, now: Instant, updates: &[(String, Vec<String>)]) -> Report {
+        let mut report = Report {
+            topic: self.name.clone(),
+            publishers: self.links.len(),
+            messages: self.messages(),
+            lost: None,
+            longest_gap_ms: 0.0,
+            normal_gap_ms: None,
+            failures: Vec::new(),
+        };
+        let ms = |time: Duration| time.as_secs_f64() * 1e3;
+        for link in &self.links {
+            let mut seen = lock(&link.seen);
+            seen.pause(now);
+            report.longest_gap_ms = report.longest_gap_ms.max(ms(seen.longest));
+            let normal = report.normal_gap_ms.into_iter().chain(seen.normal.map(ms));
+            report.normal_gap_ms = normal.reduce(f64::max);
+            if seen.is_numbered {
+                report.lost = Some(report.lost.unwrap_or_default() + seen.lost);
+            }
+            report.failures.extend(seen.failures(&link.publisher));
+            let left_out = updates
+                .iter()
+                .any(|(topic, list)| *topic == self.name && !list.contains(&link.publisher));
+            if left_out {
+                let publisher = &link.publisher;
+                report.failures.push(format!(
+                    "subscribers were told that {publisher} publishes no more"
+                ));
+            }
+        }
+        report
+    }
+}
+
+/// Takes the registration as a subscriber of `topic` away.
+pub(super) async fn unregister(api: &Api, node: &Node, topic: &str) -> Result<(), String> {
+    node.heard.subscribes(topic, false);
+    let params = [topic.into(), node.api.as_str().into()];
+    api.call("unregisterSubscriber", &params).await.map(drop)
+}
+
+async fn connect(api: &Api, publisher: &str, topic: &str) -> Result<Link, String> {
+    let node = Api {
+        uri: publisher.to_owned(),
+        caller: api.caller.clone(),
+    };
+    let protocols = Value::Array(vec![vec!["TCPROS"].into()]);
+    let answer = node
+        .call("requestTopic", &[topic.into(), protocols])
+        .await?;
+    let Some([_, Value::String(host), Value::Int(port)]) = answer.as_array() else {
+        return Err("it does not offer TCPROS".to_owned());
+    };
+    let port = u16::try_from(*port).map_err(|error| error.to_string())?;
+    Link::connect((host, port), &api.caller, topic).await
+}
+
+async fn read(mut link: Link, seen: Arc<Mutex<Seen>>) {
+    loop {
+        match link.next().await {
+            Ok(number) => lock(&seen).message(Instant::now(), number),
+            Err(error) => {
+                lock(&seen).ended = Some(error.to_string());
+                return;
+            }
+        }
+    }
+}
+
+/// Topics that somebody publishes and that are cheap to watch.
+pub(super) async fn candidates(api: &Api) -> Result<Vec<String>, String> {
+    let published = api.call("getPublishedTopics", &["".into()]).await?;
+    let mut topics: Vec<_> = published
+        .as_array()
+        .unwrap_or_default()
+        .iter()
+        .filter_map(|pair| match pair.as_array() {
+            Some([Value::String(topic), Value::String(of)]) => Some((topic.clone(), of.clone())),
+            _ => None,
+        })
+        .filter(|(topic, of)| !topic.starts_with("/rosout") && !is_heavy(of))
+        .map(|(topic, _)| topic)
+        .collect();
+    topics.sort();
+    topics.truncate(CANDIDATES);
+    Ok(topics)
+}
+
+/// Whether one subscriber more would cost the robot something.
+fn is_heavy(message_type: &str) -> bool {
+    [
+        "Image",
+        "PointCloud",
+        "Disparity",
+        "OccupancyGrid",
+        "Octomap",
+    ]
+    .iter()
+    .any(|word| message_type.contains(word))
+}
+
+/// Sorts the best to watch first: with numbers, and with many messages.
+pub(super) fn sort(topics: &mut Vec<Topic>) {
+    topics.retain(|topic| topic.messages() > 0);
+    let is_numbered = |topic: &Topic| topic.links.iter().any(|link| lock(&link.seen).is_numbered);
+    topics.sort_by_key(|topic| std::cmp::Reverse((is_numbered(topic), topic.messages())));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_is_judged_by_its_links_its_numbers_and_its_own_rhythm() {
+        let start = Instant::now();
+        let at = |ms| start + Duration::from_millis(ms);
+        let stream = |until: u64| {
+            let mut seen = Seen::default();
+            for number in 0..20 {
+                seen.message(at(number * 50), Some(u32::try_from(number).unwrap()));
+            }
+            seen.begin();
+            for number in 20..until {
+                seen.message(at(number * 50), Some(u32::try_from(number).unwrap()));
+            }
+            seen
+        };
+        let mut whole = stream(60);
+        whole.pause(at(3_100));
+        assert_eq!(whole.failures("/p"), Vec::<String>::new());
+        assert_eq!(whole.normal, Some(Duration::from_millis(50)));
+        let mut stopped = stream(60);
+        stopped.pause(at(5_000));
+        assert_eq!(stopped.failures("/p").len(), 1);
+        let mut lost = stream(60);
+        lost.message(at(3_000), Some(63));
+        assert_eq!(lost.lost, 3);
+        assert_eq!(lost.failures("/p"), ["3 messages of /p were lost"]);
+        let mut cut = stream(60);
+        cut.ended = Some("early eof".to_owned());
+        assert!(cut.failures("/p")[0].contains("was lost (early eof)"));
+        let mut throttled = Seen::default();
+        for number in 0..20 {
+            throttled.message(at(u64::from(number) * 50), Some(number * 3));
+        }
+        throttled.begin();
+        throttled.message(at(1_000), Some(60));
+        assert_eq!(throttled.failures("/p"), Vec::<String>::new());
+        let mut rare = Seen::default();
+        rare.message(at(0), None);
+        rare.begin();
+        rare.pause(at(60_000));
+        assert_eq!(rare.failures("/p"), Vec::<String>::new());
+        assert!(!rare.is_numbered);
+    }
+}

@@ -1,0 +1,335 @@
+//! `rosrescue check` on this computer, with the traps set.
+
+use std::fs;
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::support::{Process, Rosmaster, Scratch, Setup, behind, free_port};
+
+/// A check of port `port` in an environment that is in order.
+fn check(scratch: &Scratch, port: u16) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+    scratch.prepare(&mut command);
+    command
+        .args(["check", "--port", &port.to_string()])
+        .env("ROS_MASTER_URI", format!("http://127.0.0.1:{port}"));
+    command
+}
+
+/// What a check found.
+struct Found {
+    report: Value,
+    status: Option<i32>,
+}
+
+impl Found {
+    #[track_caller]
+    fn by(command: &mut Command) -> Self {
+        let mut process = Process::start("a check", command.arg("--json"));
+        let status = process.wait_output().code();
+        Self {
+            report: serde_json::from_str(&process.stdout().join("\n")).expect("JSON"),
+            status,
+        }
+    }
+
+    /// The findings of this severity.
+    fn of(&self, severity: &str) -> Vec<&Value> {
+        let all = self.report["findings"].as_array().unwrap().iter();
+        all.filter(|finding| finding["severity"] == severity)
+            .collect()
+    }
+
+    /// It is a problem, the only one, and says these words.
+    #[track_caller]
+    fn assert_problem(&self, subject: &str, words: &str) {
+        let problems = self.of("problem");
+        assert_eq!(problems.len(), 1, "{:#}", self.report);
+        assert_eq!(problems[0]["subject"], subject, "{problems:?}");
+        let what = problems[0]["what"].as_str().unwrap();
+        assert!(what.contains(words), "{what}");
+        assert_ne!(problems[0]["todo"], "", "{problems:?}");
+        assert_eq!(
+            (self.status, &self.report["problems"]),
+            (Some(1), &1.into())
+        );
+    }
+
+    #[track_caller]
+    fn assert_no_problem(&self) {
+        assert_eq!(self.of("problem"), Vec::<&Value>::new());
+        assert_eq!(self.status, Some(0));
+    }
+
+    /// What is said of `subject`.
+    #[track_caller]
+    fn said(&self, subject: &str) -> String {
+        let all = self.report["findings"].as_array().unwrap().iter();
+        let of: Vec<_> = all
+            .filter(|finding| finding["subject"] == subject)
+            .map(|finding| finding["what"].as_str().unwrap())
+            .collect();
+        assert!(!of.is_empty(), "nothing of {subject}: {:#}", self.report);
+        of.join("\n")
+    }
+}
+
+#[test]
+fn a_computer_in_order_has_no_problem() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let found = Found::by(&mut check(&scratch, port));
+    found.assert_no_problem();
+    assert_eq!(found.said("port"), format!("{port} is free"));
+    assert!(found.said("rosmaster").contains("1.1"));
+    // Nothing was left behind, not even a folder.
+    assert_eq!(fs::read_dir(scratch.log_dir()).unwrap().count(), 0);
+    let mut words = Process::start("a check", &mut check(&scratch, port));
+    words.wait_output();
+    let said = words.stdout();
+    let port = format!("ok       port            {port} is free");
+    assert!(said.contains(&port), "{said:?}");
+    assert!(said.last().unwrap().starts_with("0 problems, "), "{said:?}");
+}
+
+#[test]
+fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let port = master.client().port();
+    let found = Found::by(&mut check(&scratch, port));
+    let who = format!("rosmaster (process {}, port {port})", master.pid());
+    found.assert_problem("port", &who);
+    // In front of it there is no problem, and behind oneself there is.
+    let uri = format!("http://127.0.0.1:{port}");
+    let free = free_port();
+    let found = Found::by(check(&scratch, free).args(["--master", &uri]));
+    found.assert_no_problem();
+    assert!(found.said("master").contains("answers"));
+    let nobody = format!("http://127.0.0.1:{}", free_port());
+    let found = Found::by(check(&scratch, free).args(["--master", &nobody]));
+    found.assert_no_problem();
+    assert!(found.said("master").contains("nobody answers"));
+    let rescue = Setup::proxy(&scratch, port).start();
+    let found = Found::by(&mut check(&scratch, rescue.port()));
+    found.assert_no_problem();
+    let runs = found.said("port");
+    assert!(
+        runs.contains("rosrescue 0.1.0 runs here: rosrescue (process "),
+        "{runs}"
+    );
+    let found = Found::by(check(&scratch, free).args(["--master", &rescue.client().uri()]));
+    let problems: Vec<_> = found
+        .of("problem")
+        .iter()
+        .map(|one| one["subject"].clone())
+        .collect();
+    // The checkpoint is that of the running one.
+    assert_eq!(problems, ["checkpoint", "master"]);
+}
+
+#[test]
+fn a_node_at_a_host_without_an_address_is_found() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let rescue = Setup::proxy(&scratch, master.client().port()).start();
+    let register = ["/lost", "/chatter", "*", "http://nobody.invalid:4711/"];
+    let register = register.map(rosrescue::xmlrpc::Value::from).to_vec();
+    rescue.client().ok("registerSubscriber", register);
+    let found = Found::by(&mut check(&scratch, rescue.port()));
+    found.assert_problem("nodes", "/lost registered at nobody.invalid");
+}
+
+#[test]
+fn something_else_at_the_port() {
+    let scratch = Scratch::new();
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let closing = std::thread::spawn(move || {
+        // The status page and the Master API are asked for.
+        for _ in 0..2 {
+            drop(listener.accept());
+        }
+        listener
+    });
+    let found = Found::by(&mut check(&scratch, port));
+    found.assert_problem("port", "something that is no master");
+    drop(closing.join());
+}
+
+#[test]
+fn traps_in_the_environment() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    for (key, value, subject, words) in [
+        ("ROS_IP", "127.0.0.1 ", "ROS_IP", "has blanks"),
+        (
+            "ROS_IP",
+            "192.0.2.1",
+            "ROS_IP",
+            "192.0.2.1, which is not this computer",
+        ),
+        (
+            "ROS_HOSTNAME",
+            "nobody.invalid",
+            "ROS_HOSTNAME",
+            "nobody.invalid has no address",
+        ),
+        (
+            "ROS_HOSTNAME",
+            "http://localhost",
+            "ROS_HOSTNAME",
+            "is not a host name",
+        ),
+        (
+            "ROS_MASTER_URI",
+            "http://nobody.invalid:11311",
+            "ROS_MASTER_URI",
+            "has no address",
+        ),
+        (
+            "ROS_MASTER_URI",
+            "http://192.0.2.1:11311",
+            "ROS_MASTER_URI",
+            "is another computer",
+        ),
+        (
+            "ROS_MASTER_URI",
+            "http://127.0.0.1:1",
+            "ROS_MASTER_URI",
+            "has port 1, rosrescue",
+        ),
+        (
+            "ROS_MASTER_URI",
+            "localhost:11311",
+            "ROS_MASTER_URI",
+            "is not the URI of a master",
+        ),
+        (
+            "ROSRESCUE_ROSMASTER",
+            "/nowhere/rosmaster",
+            "rosmaster",
+            "/nowhere/rosmaster",
+        ),
+        (
+            "ROSRESCUE_CHECKPOINT",
+            "/proc/1/checkpoint",
+            "checkpoint",
+            "/proc/1",
+        ),
+    ] {
+        let mut command = check(&scratch, port);
+        if key == "ROS_HOSTNAME" {
+            command.env_remove("ROS_IP");
+        }
+        let found = Found::by(command.env(key, value));
+        let problems = found.of("problem");
+        let about: Vec<_> = problems
+            .iter()
+            .filter(|one| one["subject"] == subject)
+            .collect();
+        let said: String = about
+            .iter()
+            .map(|one| one["what"].as_str().unwrap())
+            .collect();
+        assert!(said.contains(words), "{key}={value}: {:#}", found.report);
+        assert_eq!(found.status, Some(1));
+    }
+}
+
+#[test]
+fn no_rosmaster_no_descriptors_and_no_permission() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let found = Found::by(check(&scratch, port).env("PATH", "/nowhere"));
+    found.assert_problem("rosmaster", "no rosmaster is on the PATH");
+    // A python without ROS before the system's.
+    let tools = scratch.path("tools");
+    fs::create_dir(&tools).unwrap();
+    std::os::unix::fs::symlink("/bin/false", tools.join("python3")).unwrap();
+    let path = format!("{}:/usr/bin:/bin", tools.display());
+    let found = Found::by(check(&scratch, port).env("PATH", path));
+    found.assert_no_problem();
+    assert!(found.said("python").contains("tools/python3 comes first"));
+    let mut few = Command::new("sh");
+    few.args(["-c", r#"ulimit -n 100; exec "$0" "$@""#]);
+    let found = Found::by(&mut behind(few, &check(&scratch, port)));
+    found.assert_problem("descriptors", "100 open files");
+    // Somebody who may not write there.
+    let mut nobody = Command::new("setpriv");
+    nobody.args([
+        "--reuid",
+        "65534",
+        "--clear-groups",
+        "--inh-caps=-all",
+        "--",
+    ]);
+    // The program's own folder may be closed to others.
+    let shared = tempfile::Builder::new().tempdir_in("/tmp").unwrap();
+    let program = shared.path().join("rosrescue");
+    fs::copy(env!("CARGO_BIN_EXE_rosrescue"), &program).unwrap();
+    open_to_all(shared.path());
+    let mut command = Command::new(&program);
+    scratch.prepare(&mut command);
+    let closed = shared.path().join("closed");
+    fs::create_dir(&closed).unwrap();
+    let checkpoint = closed.join("checkpoint");
+    command
+        .args(["check", "--port", &port.to_string(), "--checkpoint"])
+        .arg(&checkpoint)
+        .env("ROS_MASTER_URI", format!("http://127.0.0.1:{port}"));
+    let found = Found::by(&mut behind(nobody, &command));
+    found.assert_problem("checkpoint", "cannot be written: Permission denied");
+}
+
+fn open_to_all(folder: &std::path::Path) {
+    use std::os::unix::fs::PermissionsExt;
+    fs::set_permissions(folder, fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+/// Debian's trap: the computer's own name is 127.0.1.1. And a roscore that starts with the computer.
+#[test]
+fn the_hosts_file_and_the_units_of_this_computer() {
+    let scratch = Scratch::new();
+    let port = free_port();
+    let hosts = scratch.path("hosts");
+    fs::write(&hosts, "127.0.0.1 localhost\n127.0.1.1 robot\n").unwrap();
+    let units = scratch.path("units");
+    fs::create_dir_all(units.join("multi-user.target.wants")).unwrap();
+    let core = units.join("roscore.service");
+    fs::write(&core, "[Service]\nExecStart=/opt/ros/noetic/bin/roscore\n").unwrap();
+    std::os::unix::fs::symlink(&core, units.join("multi-user.target.wants/roscore.service"))
+        .unwrap();
+    const INSIDE: &str = r#"mount --bind "$0" /etc/hosts && mount --bind "$1" /run && mkdir -p /run/systemd/system &&
+        cp -a "$2/." /run/systemd/system && hostname robot && shift 2 && exec "$@""#;
+    let run = scratch.path("run");
+    fs::create_dir(&run).unwrap();
+    let mut own = Command::new("unshare");
+    own.args(["--mount", "--uts", "sh", "-c", INSIDE]);
+    own.arg(&hosts).arg(&run).arg(&units);
+    let mut command = check(&scratch, port);
+    command.env_remove("ROS_IP");
+    let found = Found::by(&mut behind(own, &command));
+    found.assert_problem("systemd", "roscore.service starts a master");
+    assert!(
+        found
+            .said("host name")
+            .contains("robot is 127.0.1.1, which only this computer reaches"),
+        "{:#}",
+        found.report
+    );
+}
+
+#[test]
+fn bad_input_is_one_sentence() {
+    let scratch = Scratch::new();
+    let mut process = Process::start("a check", check(&scratch, 1).args(["--master", "here"]));
+    assert_eq!(process.wait_output().code(), Some(2));
+    let said = process.stderr();
+    assert_eq!(said.len(), 1, "{said:?}");
+    assert!(
+        said[0].contains("--master: `here` is not the URI"),
+        "{said:?}"
+    );
+}

@@ -1,0 +1,337 @@
+//! `rosrescue drill` on real robots.
+
+use std::process::Command;
+
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::support::{
+    FakeNode, LIBRARIES, Library, Mode, Netns, Node, Process, Robot, Scratch, Setup, alive,
+    eventually, find_program, free_port, ros_command,
+};
+
+/// A drill at `port`.
+fn drill(scratch: &Scratch, port: u16, options: &[&str]) -> Process {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+    scratch.prepare(&mut command);
+    command
+        .args([
+            "drill",
+            "--json",
+            "--uri",
+            &format!("http://127.0.0.1:{port}"),
+        ])
+        .args(options);
+    Process::start(format!("a drill {options:?}"), &mut command)
+}
+
+/// The verdict, and the exit status that goes with it.
+#[track_caller]
+fn verdict(mut drill: Process) -> Value {
+    let status = drill.wait_output().code();
+    let verdict: Value = serde_json::from_str(&drill.stdout().join("\n")).expect("a verdict");
+    let expected = if verdict["passed"] == true { 0 } else { 1 };
+    assert_eq!(status, Some(expected), "{verdict:#}");
+    verdict
+}
+
+#[track_caller]
+fn assert_passed(verdict: &Value) {
+    assert_eq!(verdict["passed"], true, "{verdict:#}");
+    assert_eq!(verdict["failures"], Value::Array(Vec::new()), "{verdict:#}");
+    for calls in ["reads", "writes", "notifications"] {
+        let calls = &verdict["calls"][calls];
+        assert!(calls["calls"].as_u64().unwrap() > 20, "{verdict:#}");
+        assert!(calls["longest_ms"].as_f64().unwrap() > 0.0);
+    }
+}
+
+/// It has failed, and says so.
+#[track_caller]
+fn assert_failed(verdict: &Value, words: &str) {
+    assert_eq!(verdict["passed"], false, "{verdict:#}");
+    let failures = verdict["failures"].to_string();
+    assert!(failures.contains(words), "{verdict:#}");
+}
+
+fn talkers(robot: &Robot) -> Vec<Node> {
+    LIBRARIES
+        .map(|(library, suffix)| {
+            let name = format!("__name:=talker_{suffix}");
+            robot.node(library, "talker", &["50", "quiet", &name])
+        })
+        .into()
+}
+
+#[test]
+fn a_master_is_killed_and_nobody_notices() {
+    let robot = Robot::start(Mode::Core);
+    let nodes = talkers(&robot);
+    // Messages with numbers.
+    let mut log = ros_command(&robot.scratch, find_program("rostopic"), robot.port());
+    log.args(["pub", "-r", "50", "/log", "rosgraph_msgs/Log", "{msg: hi}"]);
+    let log = Process::start("a log", &mut log);
+    eventually("the log is published", || {
+        !robot.state().publishers_of("/log").is_empty()
+    });
+    robot.client().set_param("/robot/wheels", 4);
+    let before = robot.settled_state();
+    let first = robot.master_pid();
+    let found = verdict(drill(
+        &robot.scratch,
+        robot.port(),
+        &["--yes", "--times", "2"],
+    ));
+    assert_passed(&found);
+    assert_eq!(found["kills"].as_array().unwrap().len(), 2);
+    assert_eq!(
+        found["kills"][0]["killed"][0],
+        serde_json::json!(["master", first])
+    );
+    assert!(found["kills"][1]["recovered_ms"].as_f64().unwrap() > 0.0);
+    assert!(!alive(first));
+    let (log_topic, chatter) = (&found["topics"][0], &found["topics"][1]);
+    assert_eq!(
+        (&log_topic["topic"], &log_topic["lost"]),
+        (&"/log".into(), &0.into())
+    );
+    assert_eq!(
+        (&chatter["topic"], &chatter["lost"]),
+        (&"/chatter".into(), &Value::Null)
+    );
+    assert_eq!(chatter["publishers"], 2);
+    for topic in [log_topic, chatter] {
+        assert!(topic["messages"].as_u64().unwrap() > 100, "{found:#}");
+    }
+    assert_eq!(found["nodes"], 4, "the talkers, the log and rosout");
+    // It has left nothing behind.
+    robot.await_state(&before, "after the drill");
+    drop((nodes, log));
+}
+
+#[test]
+fn the_worker_and_both_at_once() {
+    let scratch = Scratch::new();
+    let rescue = Setup::core(&scratch, free_port()).guarded().start();
+    let mut talker = Node::start(
+        &scratch,
+        Library::Rospy,
+        rescue.port(),
+        "talker",
+        &["50", "quiet"],
+    );
+    for kill in ["worker", "both"] {
+        let options = [
+            "--yes", "--times", "1", "--kill", kill, "--topic", "chatter",
+        ];
+        let found = verdict(drill(&scratch, rescue.port(), &options));
+        assert_passed(&found);
+        let killed = found["kills"][0]["killed"].as_array().unwrap();
+        assert_eq!(killed.len(), if kill == "both" { 2 } else { 1 });
+        for victim in killed {
+            assert!(!alive(u32::try_from(victim[1].as_u64().unwrap()).unwrap()));
+        }
+    }
+    assert!(talker.exited().is_none());
+}
+
+#[test]
+fn a_master_that_hangs_is_left_alive_by_a_proxy() {
+    let robot = Robot::start(Mode::Proxy);
+    let found = verdict(drill(
+        &robot.scratch,
+        robot.port(),
+        &["--yes", "--times", "1", "--hang"],
+    ));
+    assert_passed(&found);
+    assert_eq!(found["kills"][0]["signal"], "SIGSTOP");
+    assert!(
+        found["notes"]
+            .to_string()
+            .contains("no topic carried messages")
+    );
+    assert!(
+        robot.bare().master_pid().is_some(),
+        "the same master goes on"
+    );
+}
+
+#[test]
+fn only_watching() {
+    let robot = Robot::start(Mode::Core);
+    let _nodes = talkers(&robot);
+    let master = robot.master_pid();
+    let found = verdict(drill(
+        &robot.scratch,
+        robot.port(),
+        &["--no-kill", "--seconds", "1"],
+    ));
+    assert_passed(&found);
+    assert_eq!(found["kills"], Value::Array(Vec::new()));
+    assert_eq!(robot.master_pid(), master);
+}
+
+#[test]
+fn it_fails_when_a_node_dies_and_its_stream_is_cut() {
+    let robot = Robot::start(Mode::Core);
+    let mut nodes = talkers(&robot);
+    let mut drill = drill(&robot.scratch, robot.port(), &["--yes", "--times", "1"]);
+    drill.wait_line("that it kills", |line| line.starts_with("1 of 1"));
+    nodes[0].kill();
+    let found = verdict(drill);
+    assert_failed(&found, "the node /talker_py");
+    assert_failed(&found, "was lost");
+}
+
+#[test]
+fn it_fails_when_nobody_starts_the_master_again() {
+    let robot = Robot::start(Mode::Proxy);
+    let before = robot.client().ok("getSystemState", vec!["/test".into()]);
+    let options = ["--yes", "--times", "1", "--limit", "2"];
+    let found = verdict(drill(&robot.scratch, robot.port(), &options));
+    assert_failed(&found, "2 s after the SIGKILL of the master");
+    assert_eq!(found["kills"][0]["recovered_ms"], Value::Null);
+    // The mirror answered all the time, and nothing is left in it.
+    assert_eq!(found["calls"]["reads"]["failed"], 0);
+    assert_eq!(
+        robot.client().ok("getSystemState", vec!["/test".into()]),
+        before
+    );
+}
+
+#[test]
+fn it_fails_when_the_state_is_not_the_same_but_not_for_what_nodes_change() {
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    client.set_param("/robot/wheels", 4);
+    let node = FakeNode::start("/node");
+    node.subscribe(&client, "/commands", "std_msgs/String");
+    let mut changed = drill(&robot.scratch, robot.port(), &["--yes", "--times", "1"]);
+    changed.wait_line("that it kills", |line| line.starts_with("1 of 1"));
+    client.set_param("/robot/wheels", 5);
+    let found = verdict(changed);
+    assert_passed(&found);
+    let notes = found["notes"].to_string();
+    assert!(
+        notes.contains("the parameter /robot/wheels has changed: somebody did so"),
+        "{notes}"
+    );
+    let mut lost = drill(&robot.scratch, robot.port(), &["--yes", "--times", "1"]);
+    lost.wait_line("that it kills", |line| line.starts_with("1 of 1"));
+    node.unsubscribe(&client, "/commands");
+    assert_failed(&verdict(lost), "/node as subscriber of /commands is gone");
+}
+
+#[test]
+fn an_interrupted_drill_leaves_nothing_behind() {
+    let robot = Robot::start(Mode::Core);
+    let _nodes = talkers(&robot);
+    let before = robot.settled_state();
+    for which in [Signal::INT, Signal::TERM] {
+        let options = ["--no-kill", "--seconds", "600"];
+        let mut drill = drill(&robot.scratch, robot.port(), &options);
+        drill.wait_line("that it watches", |line| line.starts_with("watching for"));
+        let names = robot.client().ok("getParamNames", vec!["/test".into()]);
+        let names = format!("{names:?}");
+        assert!(names.contains("/rosrescue_drill_"), "{names}");
+        drill.signal(which);
+        assert_eq!(drill.wait_output().code(), Some(1));
+        assert!(drill.stderr().join(" ").contains("tidied up"));
+        robot.await_state(&before, "after an interrupted drill");
+    }
+    // One that is killed itself: the next takes its parameter away, a health check its registrations.
+    let mut killed = drill(
+        &robot.scratch,
+        robot.port(),
+        &["--no-kill", "--seconds", "600"],
+    );
+    killed.wait_line("that it watches", |line| line.starts_with("watching for"));
+    killed.kill();
+    let options = ["--yes", "--times", "1"];
+    assert_passed(&verdict(drill(&robot.scratch, robot.port(), &options)));
+    robot.await_state(&before, "after the drill that follows");
+}
+
+#[test]
+fn nothing_is_killed_without_consent_or_understanding() {
+    let robot = Robot::start(Mode::Core);
+    let refused = |options: &[&str], status, words: &str| {
+        let mut drill = drill(&robot.scratch, robot.port(), options);
+        assert_eq!(drill.wait_output().code(), Some(status), "{options:?}");
+        let said = drill.stderr().join("\n");
+        assert!(said.contains(words), "{said}");
+    };
+    let master = robot.master_pid();
+    refused(&[], 2, "say --yes");
+    refused(&["--yes", "--kill", "worker"], 2, "without a guardian");
+    refused(
+        &["--no-kill", "--topic", "/nothere"],
+        2,
+        "nobody publishes /nothere",
+    );
+    refused(&["--yes", "--times", "0"], 2, "--times");
+    assert_eq!(robot.master_pid(), master);
+    let mut nobody = drill(&robot.scratch, free_port(), &["--yes"]);
+    assert_eq!(nobody.wait_output().code(), Some(3));
+    assert!(nobody.stderr()[0].contains("no rosrescue at"));
+}
+
+/// A person at a terminal is asked.
+#[test]
+fn a_person_is_asked() {
+    let robot = Robot::start(Mode::Core);
+    let master = robot.master_pid();
+    let ask = |answer: &str| {
+        let own = env!("CARGO_BIN_EXE_rosrescue");
+        let uri = robot.client().uri();
+        let line = format!("{own} drill --times 1 --uri {uri}");
+        let mut command = Command::new("sh");
+        robot.scratch.prepare(&mut command);
+        command.args([
+            "-c",
+            r#"tail -n +1 -f "$1" | script --quiet --return --command "$0" /dev/null"#,
+        ]);
+        let typed = robot.scratch.path(format!("typed-{answer}"));
+        std::fs::write(&typed, format!("{answer}\n")).unwrap();
+        Process::start("a drill on a terminal", command.arg(line).arg(typed))
+    };
+    let mut no = ask("n");
+    no.wait_line("the question", |line| {
+        line.contains("Is the robot on the bench")
+    });
+    no.wait_line("that nothing happened", |line| {
+        line.contains("nothing was killed")
+    });
+    assert_eq!(robot.master_pid(), master);
+    let mut yes = ask("y");
+    yes.wait_line("the verdict", |line| {
+        line.contains("PASSED: master killed 1 time")
+    });
+    assert_ne!(robot.master_pid(), master);
+}
+
+/// Needs root.
+#[test]
+fn on_another_computer_it_only_watches() {
+    let (scratch, computer) = (Scratch::new(), Netns::new());
+    let (near, far) = (computer.near(), computer.far(2));
+    let rescue = Setup::core(&scratch, free_port())
+        .env("ROS_IP", &far)
+        .wrapped(|command| computer.inside(command))
+        .start();
+    let drill = |options: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+        scratch.prepare(&mut command);
+        let uri = format!("http://{far}:{}", rescue.port());
+        command
+            .args(["drill", "--json", "--uri", &uri])
+            .args(options)
+            .env("ROS_IP", &near);
+        Process::start(format!("a drill {options:?}"), &mut command)
+    };
+    let mut refused = drill(&["--yes"]);
+    assert_eq!(refused.wait_output().code(), Some(2));
+    let said = refused.stderr().join(" ");
+    assert!(said.contains("is on another computer"), "{said}");
+    assert_passed(&verdict(drill(&["--no-kill", "--seconds", "1"])));
+}
