@@ -19,9 +19,15 @@ else
 fi
 took "the page: $ROS_MASTER_URI"
 
-step "the robot: examples/robot/launch.sh, which compiles the C++ nodes and runs roslaunch"
-start_node robot examples/robot/launch.sh "$scratch"
-within 180 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot does not come up"
+# Kept, so that it is there the next time.
+built=${CARGO_TARGET_DIR:-$PWD/target}/example-robot
+step "compile the robot's C++ nodes, where that has not been done"
+examples/robot/build.sh "$built/robot_example_cpp" || give_up "they cannot be compiled"
+took "in $built"
+
+step "the robot: examples/robot/launch.sh"
+start_node robot examples/robot/launch.sh "$built" bag:="$scratch/robot.bag"
+within 120 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot does not come up"
 took "$(rosnode list | wc -l) nodes; it has reached the first place"
 
 step "the master is yours to kill:"
