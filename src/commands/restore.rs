@@ -7,6 +7,7 @@ use std::{
     fmt,
     io::{self, IsTerminal, Write},
     sync::Arc,
+    time::{Duration, Instant},
 };
 
 use serde::Serialize;
@@ -144,9 +145,9 @@ impl Work {
             let call = Request::new(Method::DeleteParam, [CALLER_ID, name]);
             (format!("delete {name}"), call)
         });
-        make(live, set.chain(delete), &mut failed).await?;
+        make(live, set.chain(delete).collect(), &mut failed).await?;
         let register = self.still_there(live, file, &mut failed).await?;
-        make(live, register.into_iter(), &mut failed).await?;
+        make(live, register, &mut failed).await?;
         // What was refused is told with the master's own words.
         if failed.is_empty() {
             let now = live.state(file).await?;
@@ -210,10 +211,11 @@ fn rank(call: &Request) -> u8 {
 /// Makes calls, each with what it is for. Adds those that were refused to `failed`.
 async fn make(
     live: &mut Live,
-    calls: impl Iterator<Item = (String, Request)>,
+    calls: Vec<(String, Request)>,
     failed: &mut Vec<String>,
 ) -> Result<(), Failure> {
-    let mut calls = calls.peekable();
+    let (total, mut done, mut said) = (calls.len(), 0, Instant::now());
+    let mut calls = calls.into_iter().peekable();
     while calls.peek().is_some() {
         let (mut texts, mut batch, mut bytes) = (Vec::new(), Vec::new(), 0);
         while batch.len() < CALLS_AT_ONCE
@@ -224,9 +226,14 @@ async fn make(
             texts.push(text);
             batch.push(call);
         }
+        done += batch.len();
         let refused = live.make(batch).await?;
         let refused = texts.into_iter().zip(refused);
         failed.extend(refused.filter_map(|(text, why)| Some(format!("{text}: {}", why?))));
+        if said.elapsed() >= Duration::from_secs(1) && io::stderr().is_terminal() {
+            eprintln!("{done} of {total} calls …");
+            said = Instant::now();
+        }
     }
     Ok(())
 }
