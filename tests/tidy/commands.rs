@@ -66,10 +66,10 @@ fn mistake(words: &[&str]) -> Option<String> {
             let Some(help) = help(&command) else {
                 return Some("there is no such command".to_owned());
             };
-            let options = arguments.iter().filter(|word| word.starts_with("--"));
-            let mut options = options
-                .map(|word| word.split('=').next().unwrap())
-                .filter(|word| *word != "--");
+            // What follows `--` is another command's.
+            let own = arguments.iter().take_while(|word| **word != "--");
+            let options = own.filter(|word| word.starts_with("--"));
+            let mut options = options.map(|word| word.split('=').next().unwrap());
             let is_known = |option: &str| {
                 help.split([' ', '\n', '=', ',', '['])
                     .any(|word| word == option)
