@@ -42,7 +42,7 @@ fn commands(line: &str) -> impl Iterator<Item = Vec<&str>> {
     line.split(['|', ';', '&']).filter_map(|command| {
         let mut words = command.split_whitespace().peekable();
         while words
-            .next_if(|word| ["$", "sudo", "rosrun"].contains(word) || word.contains('='))
+            .next_if(|word| ["$", "sudo"].contains(word) || word.contains('='))
             .is_some()
         {}
         let words: Vec<_> = words.collect();
