@@ -1,17 +1,17 @@
-//! Lines of the log that could come by the thousand: so many at once, then one from time to time. The rest is
-//! logged at level debug and counted.
+//! What could come by the thousand, such as lines of the log and files of a crash loop: so many at once, then one
+//! from time to time.
 
 use std::{
     sync::{Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
-/// Lines at once.
+/// At once.
 const BURST: u32 = 10;
 /// Afterwards one more for each of these: some 300 a day.
 const REFILL: Duration = Duration::from_secs(300);
 
-/// How often one line is logged.
+/// How often one thing is done.
 #[derive(Debug)]
 pub(crate) struct Limit(Mutex<Bucket>);
 
@@ -32,7 +32,7 @@ impl Limit {
         }))
     }
 
-    /// Whether it is logged now. If so, the number of those left out before it; none if there are none.
+    /// Whether it is done now. If so, the number of those left out before it; none if there are none.
     pub(crate) fn pass(&self, now: Instant) -> Option<Option<u64>> {
         let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         bucket.pass(now)
@@ -60,7 +60,7 @@ impl Bucket {
     }
 }
 
-/// As the macro of `tracing` of that level, but [rate-limited](self).
+/// As the macro of `tracing` of that level, but [rate-limited](self). The rest is logged at level debug.
 macro_rules! rarely {
     ($level:ident, $($line:tt)+) => {{
         static LIMIT: $crate::limit::Limit = $crate::limit::Limit::new();
