@@ -3,6 +3,7 @@
 mod files;
 mod live;
 mod serve;
+mod service;
 mod tools;
 
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
@@ -14,6 +15,7 @@ pub use self::{
     },
     live::{For, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
+    service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
 };
 
@@ -23,7 +25,7 @@ pub use self::{
 /// what changes, and brings a restarted master back to the same state before it lets calls through.
 /// Without a command it is `rosrescue core`.
 #[derive(Debug, Parser)]
-#[command(name = "rosrescue", version, max_term_width = 100)]
+#[command(name = "rosrescue", version = env!("ROSRESCUE_VERSION"), max_term_width = 100)]
 #[command(args_conflicts_with_subcommands = true, disable_help_subcommand = true)]
 pub struct Cli {
     /// What to run; `core` if it is left out.

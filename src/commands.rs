@@ -2,18 +2,22 @@
 //! computer, prints what it has found, and ends with an exit status that a script can use.
 
 mod check;
+mod completions;
 mod diff;
 mod drill;
 mod files;
 mod history;
 mod inspect;
+mod install;
 mod live;
+mod man;
 mod params;
 mod restore;
 mod running;
 mod status;
 mod terminal;
 mod top;
+mod uninstall;
 mod verify;
 mod wait;
 
@@ -73,14 +77,18 @@ pub fn run(tool: &Tool) -> ExitCode {
         Ok(runtime) => runtime.block_on(async {
             match tool {
                 Tool::Check(args) => check::run(args).await,
-                Tool::Drill(args) => drill::run(args).await,
+                Tool::Completions(args) => completions::run(args).await,
                 Tool::Diff(args) => diff::run(args).await,
+                Tool::Drill(args) => drill::run(args).await,
                 Tool::History(args) => history::run(args).await,
                 Tool::Inspect(args) => inspect::run(args).await,
+                Tool::Install(args) => install::run(args).await,
+                Tool::Man(args) => man::run(args).await,
                 Tool::Params(args) => params::run(args).await,
                 Tool::Restore(args) => restore::run(args).await,
                 Tool::Status(args) => status::run(args).await,
                 Tool::Top(args) => top::run(args).await,
+                Tool::Uninstall(args) => uninstall::run(args).await,
                 Tool::Verify(args) => verify::run(args).await,
                 Tool::Wait(args) => wait::run(args).await,
             }

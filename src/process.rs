@@ -1,6 +1,7 @@
 //! Child processes: finds, starts and ends rosmaster and rosout. It reports and never decides.
 
 use std::{
+    ffi::OsStr,
     fs::{File, OpenOptions},
     io::{self, Write},
     net::{Ipv4Addr, SocketAddrV4},
@@ -29,6 +30,9 @@ pub(crate) use spare::{Spare, interpreter};
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
+/// The PATH that systemd gives to services.
+pub(crate) const SERVICE_PATH: &str =
+    "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin";
 /// Where ROS installs programs that are not on the PATH.
 const ROS_PREFIXES: &str = "/opt/ros";
 /// rosmaster's default logging also has a handler for the screen, which imports half of rospy: a
@@ -386,10 +390,19 @@ pub(crate) async fn output_of(
         .then(|| String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
+/// The rosmaster that a process with this PATH finds.
+pub(crate) fn find_rosmaster_on(path: &OsStr) -> Option<PathBuf> {
+    find_program_on(path, "rosmaster", &["bin"])
+}
+
 /// A program on the PATH, else in one of `folders` of an installed ROS.
 pub(crate) fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
-    let on_path = std::env::split_paths(&path)
+    find_program_on(&path, name, folders)
+}
+
+fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf> {
+    let on_path = std::env::split_paths(path)
         .map(|folder| folder.join(name))
         .find(|p| is_program(p));
     on_path.or_else(|| {
@@ -436,8 +449,6 @@ fn bind_loopback(port: u16) -> io::Result<Socket> {
 
 #[cfg(test)]
 mod tests {
-    use std::ffi::OsStr;
-
     use super::*;
 
     #[test]

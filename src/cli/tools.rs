@@ -6,6 +6,7 @@ use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 use super::{
     DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
+    service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
 use crate::hide::{self, Hide};
 
@@ -14,14 +15,20 @@ use crate::hide::{self, Hide};
 pub enum Tool {
     /// Look for what will trouble the robot, before it drives
     Check(CheckArgs),
-    /// Kill the master on purpose while watching calls, topics and nodes, and give a verdict
-    Drill(DrillArgs),
+    /// Print a completion script for a shell
+    Completions(CompletionsArgs),
     /// Say in words how two checkpoints differ, or a checkpoint and the running master. Exit status 1 if they do
     Diff(DiffArgs),
+    /// Kill the master on purpose while watching calls, topics and nodes, and give a verdict
+    Drill(DrillArgs),
     /// List the checkpoints that are kept: of the last sessions, and of rescues
     History(HistoryArgs),
     /// Say what a checkpoint holds, also beside a running rosrescue
     Inspect(InspectArgs),
+    /// Make a service of systemd of it, which starts with the computer
+    Install(InstallArgs),
+    /// Print the manual page, or write all of them into a folder
+    Man(ManArgs),
     /// Print the parameters of a checkpoint, for `rosparam load`
     Params(ParamsArgs),
     /// Put a checkpoint back into a running rosrescue: its parameters, and the registrations of its nodes that are
@@ -31,6 +38,8 @@ pub enum Tool {
     Status(StatusArgs),
     /// Show live what goes on: calls a second, slowest callers, nodes, rescues
     Top(TopArgs),
+    /// Take back what `rosrescue install` has done
+    Uninstall(UninstallArgs),
     /// Check that a checkpoint is whole. If it is damaged, say what can still be used, with exit status 1
     Verify(VerifyArgs),
     /// Wait until calls are answered, for start scripts

@@ -120,6 +120,12 @@ mod restart {
     mod worker;
 }
 
+/// It is installed, as a service of a real systemd and as a package.
+mod service {
+    mod booted;
+    mod install;
+}
+
 /// The wall clock jumps.
 mod clock;
 

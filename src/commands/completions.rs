@@ -1,0 +1,13 @@
+//! `rosrescue completions`: a completion script, made of the command line's own definition.
+
+use clap::CommandFactory;
+
+use super::{Exit, Failure, print_line};
+use crate::cli::{Cli, CompletionsArgs};
+
+pub(super) async fn run(args: &CompletionsArgs) -> Result<Exit, Failure> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut Cli::command(), "rosrescue", &mut script);
+    print_line(String::from_utf8_lossy(&script).trim_end())?;
+    Ok(Exit::Good)
+}

@@ -1,0 +1,301 @@
+//! A service of a real systemd, which is process 1 of namespaces of its own. Needs root and systemd.
+
+use std::fs;
+use std::process::{Child, Command, Output, Stdio};
+
+use crate::support::{Scratch, eventually};
+
+const BOOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/boot_systemd.sh");
+const PROGRAM: &str = "/opt/rosrescue/rosrescue";
+
+/// A computer that has been booted. It ends on drop.
+pub(super) struct Booted {
+    unshare: Child,
+    pid: String,
+    _scratch: Scratch,
+}
+
+impl Booted {
+    #[track_caller]
+    pub(super) fn new() -> Self {
+        let scratch = Scratch::new();
+        let kinds = "--mount --pid --cgroup --net --uts --ipc --fork --kill-child";
+        let folder = scratch.path("computer");
+        fs::create_dir(&folder).unwrap();
+        let file = fs::File::create(scratch.path("boot.log")).unwrap();
+        let unshare = Command::new("unshare")
+            .args(kinds.split(' '))
+            .args([
+                BOOT,
+                folder.to_str().unwrap(),
+                env!("CARGO_BIN_EXE_rosrescue"),
+            ])
+            .stdin(Stdio::null())
+            .stdout(file.try_clone().unwrap())
+            .stderr(file)
+            .spawn()
+            .unwrap();
+        let id = unshare.id();
+        let child =
+            || fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap_or_default();
+        eventually("the first process", || !child().trim().is_empty());
+        let pid = child().trim().to_owned();
+        let booted = Self {
+            unshare,
+            pid,
+            _scratch: scratch,
+        };
+        // Before, its root is this computer's.
+        eventually(
+            "systemd as the first process: it needs root, and Debian's systemd-sysv and dbus",
+            || {
+                let name = fs::read_to_string(format!("/proc/{}/comm", booted.pid));
+                name.is_ok_and(|name| name.trim() == "systemd")
+            },
+        );
+        let state = || booted.run("systemctl is-system-running || true");
+        eventually("a boot", || {
+            ["running\n", "degraded\n"].contains(&&*state())
+        });
+        let failed = booted.run("systemctl list-units --failed --no-legend");
+        assert_eq!(state(), "running\n", "{failed}");
+        booted.run("useradd --create-home robot");
+        booted
+    }
+
+    fn output(&self, script: &str) -> Output {
+        Command::new("nsenter")
+            .args([
+                "-t", &self.pid, "-m", "-p", "-n", "-u", "-i", "-C", "-r", "-w",
+            ])
+            .args([
+                "env",
+                "-i",
+                "HOME=/root",
+                "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+            ])
+            .args(["sh", "-c", script])
+            .stdin(Stdio::null())
+            .output()
+            .unwrap()
+    }
+
+    pub(super) fn try_run(&self, script: &str) -> Result<String, String> {
+        let output = self.output(script);
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        match output.status.success() {
+            true => Ok(text),
+            false => Err(format!(
+                "{script}: {:?}: {text}{errors}",
+                output.status.code()
+            )),
+        }
+    }
+
+    #[track_caller]
+    pub(super) fn run(&self, script: &str) -> String {
+        self.try_run(script).unwrap_or_else(|said| panic!("{said}"))
+    }
+
+    fn write(&self, path: &str, text: &str) {
+        self.run(&format!(
+            "mkdir -p $(dirname {path}); cat >{path} <<'END'\n{text}\nEND"
+        ));
+    }
+
+    /// A call of the Master API at the robot's port, as Python prints its answer.
+    #[track_caller]
+    pub(super) fn call(&self, call: &str) -> String {
+        self.run(&format!(
+            "/usr/bin/python3 -c 'import xmlrpc.client as x; print(x.ServerProxy(\"http://127.0.0.1:11311\").{call})'"
+        ))
+    }
+
+    pub(super) fn property(&self, name: &str) -> String {
+        let value = self.run(&format!(
+            "systemctl show --value -p {name} rosrescue.service"
+        ));
+        value.trim().to_owned()
+    }
+
+    #[track_caller]
+    pub(super) fn wait_protected(&self) {
+        eventually("STATUS=protected", || {
+            self.property("StatusText").starts_with("protected")
+        });
+    }
+
+    /// Every file where an installation could leave something.
+    fn files(&self) -> String {
+        self.run("find /etc /usr/local /usr/lib/systemd -path '/etc/.*' -prune -o -print | sort")
+    }
+}
+
+impl Drop for Booted {
+    fn drop(&mut self) {
+        let _ = Command::new("kill").args(["-9", &self.pid]).status();
+        let _ = self.unshare.wait();
+    }
+}
+
+/// A robot as it was before: a unit for roscore, and one of robot_upstart.
+fn with_units_of_old() -> Booted {
+    let robot = Booted::new();
+    robot.write(
+        "/etc/systemd/system/roscore.service",
+        "[Service]\nUser=robot\nExecStart=/bin/bash -c 'exec roscore'\n[Install]\nWantedBy=multi-user.target",
+    );
+    robot.write(
+        "/usr/sbin/myrobot-start",
+        "#!/bin/bash\nexec sleep 1000 # roslaunch\nroslaunch base.launch &",
+    );
+    robot.write(
+        "/etc/systemd/system/myrobot.service",
+        "[Service]\nExecStart=/usr/sbin/myrobot-start\n[Install]\nWantedBy=multi-user.target",
+    );
+    robot.run(
+        "chmod +x /usr/sbin/myrobot-start; systemctl enable --now roscore.service myrobot.service",
+    );
+    robot
+}
+
+#[test]
+fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
+    let robot = with_units_of_old();
+    let before = robot.files();
+    let shown = robot.run(&format!("SUDO_USER=robot {PROGRAM} install --dry-run"));
+    assert!(shown.contains("disable --now roscore.service"), "{shown}");
+    assert!(
+        shown.contains("myrobot.service") && shown.contains("`--wait`"),
+        "{shown}"
+    );
+    let unasked = robot.output(&format!("SUDO_USER=robot {PROGRAM} install"));
+    assert_eq!(unasked.status.code(), Some(2), "{unasked:?}");
+    assert_eq!(robot.files(), before);
+
+    robot.run(&format!(
+        "SUDO_USER=robot ROS_HOSTNAME=localhost {PROGRAM} install --yes"
+    ));
+    robot.wait_protected();
+    assert!(
+        robot
+            .try_run("systemctl is-enabled roscore.service")
+            .is_err()
+    );
+    assert!(robot.try_run("pgrep -x roscore").is_err());
+    assert!(robot.property("Before").contains("myrobot.service"));
+    robot.run("pgrep -x -u robot rosmaster; test -s /home/robot/.ros/log/latest-chkpt.yaml");
+    assert!(
+        robot
+            .call("setParam(\"/test\", \"/kept\", 7)")
+            .starts_with("[1,")
+    );
+    let verified = robot.output("systemd-analyze verify rosrescue.service rosrescue.socket");
+    let complaints = String::from_utf8_lossy(&verified.stderr).into_owned();
+    assert!(!complaints.contains("rosrescue"), "{complaints}");
+    let again = robot.run(&format!(
+        "SUDO_USER=robot ROS_HOSTNAME=localhost {PROGRAM} install --yes"
+    ));
+    assert!(again.contains("nothing to change"), "{again}");
+
+    // Dies, and hangs.
+    robot.write(
+        "/etc/systemd/system/rosrescue.service.d/test.conf",
+        "[Service]\nWatchdogSec=1",
+    );
+    robot.run("systemctl daemon-reload");
+    let master = robot.run("pgrep -x rosmaster");
+    for (signal, result) in [("KILL", "signal"), ("STOP", "watchdog")] {
+        let worker = robot.property("MainPID");
+        robot.run(&format!("kill -{signal} {worker}"));
+        // systemd holds the port: the call waits.
+        assert!(
+            robot
+                .call("getParam(\"/test\", \"/kept\")")
+                .ends_with(" 7]\n"),
+            "{signal}"
+        );
+        eventually("another worker", || {
+            !["0", &worker].contains(&&*robot.property("MainPID"))
+        });
+        let journal = robot.run("journalctl -u rosrescue.service");
+        assert!(
+            journal.contains(&format!("Failed with result '{result}'")),
+            "{journal}"
+        );
+        assert_eq!(
+            robot.run("pgrep -x rosmaster"),
+            master,
+            "{signal}: rosmaster is another one"
+        );
+        robot.wait_protected();
+    }
+    robot.run("kill -9 $(pgrep -x rosmaster)");
+    eventually("another master", || {
+        robot.run("pgrep -x rosmaster || true") != master
+    });
+    assert!(
+        robot
+            .call("getParam(\"/test\", \"/kept\")")
+            .ends_with(" 7]\n")
+    );
+
+    // A new version of it.
+    let worker = robot.property("MainPID");
+    robot.run("sed -i 's/Written by/Written long ago by/' /etc/systemd/system/rosrescue.service");
+    let refused = robot.output(&format!("SUDO_USER=robot {PROGRAM} install --yes"));
+    assert_eq!(refused.status.code(), Some(1), "{refused:?}");
+    assert!(
+        String::from_utf8_lossy(&refused.stdout).contains("rosrescue.service was changed since")
+    );
+    robot.run("sed -i 's/Written long ago by/Written by/' /etc/systemd/system/rosrescue.service");
+    robot.run(&format!("{PROGRAM} install --yes -- core -t 6"));
+    eventually("another worker", || {
+        !["0", &worker].contains(&&*robot.property("MainPID"))
+    });
+    assert!(robot.property("ExecStart").contains("core -t 6"));
+    assert!(
+        robot
+            .call("getParam(\"/test\", \"/kept\")")
+            .ends_with(" 7]\n")
+    );
+
+    robot.run("rm -r /etc/systemd/system/rosrescue.service.d");
+    robot.run(&format!("{PROGRAM} uninstall --yes"));
+    assert_eq!(robot.files(), before);
+    assert!(robot.try_run("pgrep -x rosrescue").is_err());
+    eventually("roscore", || {
+        robot.run("systemctl is-enabled roscore; systemctl is-active roscore")
+            == "enabled\nactive\n"
+    });
+}
+
+#[test]
+fn a_user_has_a_service_without_root() {
+    let robot = Booted::new();
+    robot.run("loginctl enable-linger robot");
+    let as_user = |command: &str| {
+        format!(
+            "cd /home/robot && exec setpriv --reuid=robot --regid=robot --init-groups env HOME=/home/robot USER=robot \
+             XDG_RUNTIME_DIR=/run/user/$(id -u robot) {command}"
+        )
+    };
+    eventually("the user's systemd", || {
+        robot
+            .try_run(&as_user("systemctl --user is-system-running"))
+            .is_ok()
+    });
+    let files = "sh -c 'find .config .local ! -type d 2>/dev/null | sort'";
+    let before = robot.run(&as_user(files));
+    robot.run(&as_user(&format!("{PROGRAM} install --user --yes")));
+    let status = "systemctl --user show --value -p StatusText rosrescue.service";
+    eventually("STATUS=protected", || {
+        robot.run(&as_user(status)).starts_with("protected")
+    });
+    robot.run("pgrep -x -u robot rosmaster");
+    robot.run(&as_user(&format!("{PROGRAM} uninstall --user --yes")));
+    let after = robot.run(&as_user(files));
+    assert_eq!(after, before);
+    assert!(robot.try_run("pgrep -x rosrescue").is_err());
+}

@@ -1,0 +1,218 @@
+//! What `rosrescue install` says and refuses, without a systemd: nothing is started here.
+
+use std::fs;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::process::{Command, Output};
+
+use crate::support::Scratch;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_rosrescue");
+
+/// `rosrescue ARGUMENTS` of a user whose home is in `scratch`.
+fn rosrescue(scratch: &Scratch, arguments: &[&str]) -> Output {
+    let mut command = Command::new(PROGRAM);
+    scratch.prepare(&mut command);
+    command
+        .env_remove("ROS_HOME")
+        .env_remove("ROS_LOG_DIR")
+        .env_remove("XDG_CONFIG_HOME");
+    command
+        .env_remove("XDG_RUNTIME_DIR")
+        .env_remove("ROS_MASTER_URI")
+        .env("SYSTEMD_OFFLINE", "1");
+    command
+        .env("HOME", scratch.path(""))
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+#[track_caller]
+fn said(output: &Output, code: i32) -> String {
+    assert_eq!(output.status.code(), Some(code), "{output:?}");
+    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+}
+
+#[test]
+fn what_makes_no_sense_is_said_in_a_sentence() {
+    let scratch = Scratch::new();
+    let nobody = ["--run-as", "nobody-of-this-name"];
+    for (arguments, sentence) in [
+        (&["--user", "--system"][..], "cannot be used with"),
+        (&["--user", "--run-as", "root"], "cannot be used with"),
+        (&nobody, "there is no user `nobody-of-this-name`"),
+        (&["--dry-run"], "say who runs it, as in --run-as robot"),
+        (
+            &["--user", "--", "status"],
+            "a service runs `core` or `proxy`",
+        ),
+        (&["--user", "--", "proxy"], "--master"),
+        (&["--user", "--", "core", "--hold", "-3"], "--hold"),
+        (
+            &["--user", "--", "core", "--checkpoint", "here.yaml"],
+            "write the whole path of here.yaml",
+        ),
+        (&["--user"], "nobody can be asked here"),
+        (&["--user", "--json"], "nobody can be asked here"),
+    ] {
+        let output = rosrescue(&scratch, &[&["install"], arguments].concat());
+        let said = said(&output, 2);
+        assert!(said.contains(sentence), "{arguments:?}: {said}");
+    }
+    assert!(!scratch.path(".config").exists());
+}
+
+#[test]
+fn it_is_idempotent_and_leaves_foreign_files_alone() {
+    let scratch = Scratch::new();
+    let install = ["install", "--user", "--yes"];
+    let units = scratch.path(".config/systemd/user");
+    let service = units.join("rosrescue.service");
+    fs::create_dir_all(&units).unwrap();
+    fs::write(&service, "[Service]\nExecStart=/bin/true\n").unwrap();
+    let refused = said(&rosrescue(&scratch, &install), 1);
+    assert!(
+        refused.contains("rosrescue.service was not written by `rosrescue install`"),
+        "{refused}"
+    );
+    assert!(!units.join("rosrescue.socket").exists());
+    fs::remove_file(&service).unwrap();
+
+    let done = said(&rosrescue(&scratch, &install), 0);
+    assert!(
+        done.contains(".local/bin/rosrescue (this program"),
+        "{done}"
+    );
+    let text = fs::read_to_string(&service).unwrap();
+    assert!(text.contains("\nEnvironment=ROS_IP=127.0.0.1\n"), "{text}");
+    let socket = fs::read_to_string(units.join("rosrescue.socket")).unwrap();
+    assert!(
+        socket.contains("\nListenStream=127.0.0.1:11311\n"),
+        "{socket}"
+    );
+    let copy = scratch.path(".local/bin/rosrescue");
+    assert_eq!(copy.metadata().unwrap().permissions().mode() & 0o777, 0o755);
+    assert!(said(&rosrescue(&scratch, &install), 0).starts_with("nothing to change"));
+
+    // What is chosen stays chosen; what is changed by hand is nobody's to overwrite.
+    said(
+        &rosrescue(
+            &scratch,
+            &[&install[..], &["--", "core", "-p", "11399"]].concat(),
+        ),
+        0,
+    );
+    assert!(said(&rosrescue(&scratch, &install), 0).starts_with("nothing to change"));
+    assert!(
+        fs::read_to_string(&service)
+            .unwrap()
+            .contains("rosrescue core -p 11399\n")
+    );
+    fs::write(&service, "# mine\n").unwrap();
+    let refused = said(&rosrescue(&scratch, &install), 1);
+    assert!(
+        refused.contains("rosrescue.service was changed since"),
+        "{refused}"
+    );
+    let left = said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 1);
+    assert!(left.contains("rosrescue.service stays"), "{left}");
+    assert!(service.exists() && !copy.exists());
+    let nothing = said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 0);
+    assert!(nothing.contains("nothing is installed here"), "{nothing}");
+}
+
+#[test]
+fn units_that_start_a_master_are_found_and_the_plan_is_json() {
+    let scratch = Scratch::new();
+    let units = scratch.path(".config/systemd/user");
+    let wants = units.join("default.target.wants");
+    fs::create_dir_all(&wants).unwrap();
+    for (name, command) in [
+        ("old.service", "/bin/sh -c 'exec roscore'"),
+        ("robot.service", "/usr/bin/roslaunch a b.launch"),
+    ] {
+        fs::write(
+            units.join(name),
+            format!("[Service]\nExecStart={command}\n"),
+        )
+        .unwrap();
+        symlink(units.join(name), wants.join(name)).unwrap();
+    }
+    let json = said(
+        &rosrescue(&scratch, &["install", "--user", "--dry-run", "--json"]),
+        0,
+    );
+    let plan: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let changes = plan["changes"].as_array().unwrap();
+    let commands: Vec<_> = changes
+        .iter()
+        .filter_map(|it| it["command"].as_array())
+        .collect();
+    assert_eq!(commands[0].last().unwrap(), "old.service", "{json}");
+    assert!(json.contains("Before=robot.service"), "{json}");
+    assert!(
+        plan["notes"][0]
+            .as_str()
+            .unwrap()
+            .contains("give roslaunch `--wait`"),
+        "{json}"
+    );
+
+    let proxy = [
+        "install",
+        "--user",
+        "--dry-run",
+        "--",
+        "proxy",
+        "--master",
+        "http://127.0.0.1:11312",
+    ];
+    let refused = said(&rosrescue(&scratch, &proxy), 1);
+    assert!(
+        refused.contains("old.service") && refused.contains("give it another port"),
+        "{refused}"
+    );
+}
+
+/// sudo clears the environment of the commands that it runs.
+#[test]
+fn settings_of_whoever_calls_sudo_are_found() {
+    let scratch = Scratch::new();
+    let sudo = scratch.path("sudo");
+    fs::copy("/bin/sh", &sudo).unwrap();
+    let output = Command::new(&sudo)
+        .args([
+            "-c",
+            &format!("unset ROS_IP; SUDO_USER=root {PROGRAM} install --dry-run; exit $?"),
+        ])
+        .env("ROS_IP", "10.0.0.7")
+        .env_remove("ROS_MASTER_URI")
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(said.contains("+ Environment=ROS_IP=10.0.0.7"), "{output:?}");
+    assert!(said.contains("+ User=root"), "{said}");
+}
+
+#[test]
+fn completions_are_those_of_the_command_line() {
+    let scratch = Scratch::new();
+    for shell in ["bash", "zsh", "fish"] {
+        let script = said(&rosrescue(&scratch, &["completions", shell]), 0);
+        assert!(
+            script.contains("reap-dead-nodes") && script.contains("uninstall"),
+            "{shell}"
+        );
+    }
+    assert!(said(&rosrescue(&scratch, &["completions", "cmd"]), 2).contains("possible values"));
+    let page = said(&rosrescue(&scratch, &["man"]), 0);
+    assert!(
+        page.contains(".TH rosrescue 1") && page.contains("ROSRESCUE_CHECKPOINT"),
+        "{page}"
+    );
+    said(
+        &rosrescue(&scratch, &["man", scratch.path("pages").to_str().unwrap()]),
+        0,
+    );
+    assert!(scratch.path("pages/rosrescue-install.1").exists());
+}

@@ -1,0 +1,47 @@
+#!/bin/sh
+# boot_systemd.sh FOLDER PROGRAM: becomes a systemd as process 1 of namespaces of its own, over a copy of this
+# computer's files that vanishes with it. PROGRAM is there as /opt/rosrescue/rosrescue. Needs root.
+#
+#     unshare --mount --pid --cgroup --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM
+set -eu
+folder=$1
+program=$2
+mount -t tmpfs tmpfs "$folder"
+mkdir "$folder/upper" "$folder/work" "$folder/root"
+mount -t overlay -o "lowerdir=/,upperdir=$folder/upper,workdir=$folder/work" overlay "$folder/root"
+root=$folder/root
+mkdir -p "$root/opt/rosrescue"
+: >"$root/opt/rosrescue/rosrescue"
+mount --bind "$program" "$root/opt/rosrescue/rosrescue"
+mount -t proc proc "$root/proc"
+mount -o bind,ro "$root/proc/sys" "$root/proc/sys"
+mount -t sysfs -o ro sysfs "$root/sys"
+mount -t cgroup2 cgroup2 "$root/sys/fs/cgroup"
+mount -t tmpfs -o mode=755 tmpfs "$root/dev"
+for device in null zero full random urandom tty; do
+    : >"$root/dev/$device"
+    mount --bind "/dev/$device" "$root/dev/$device"
+done
+mkdir "$root/dev/pts" "$root/dev/shm"
+mount -t devpts -o newinstance,ptmxmode=0666 devpts "$root/dev/pts"
+ln -s pts/ptmx "$root/dev/ptmx"
+mount -t tmpfs tmpfs "$root/run"
+mount -t tmpfs -o mode=1777 tmpfs "$root/tmp"
+ip link set lo up
+hostname robot
+echo robot >"$root/etc/hostname"
+echo "127.0.0.1 localhost robot" >"$root/etc/hosts"
+: >"$root/etc/machine-id"
+# Nothing of this computer's own services; the journal is what is looked at.
+rm -rf "$root"/etc/systemd/system/*.wants "$root"/var/log/journal
+for unit in sysctl modules-load remount-fs udevd udev-trigger; do
+    ln -sf /dev/null "$root/etc/systemd/system/systemd-$unit.service"
+done
+cat >"$root/etc/systemd/system/multi-user.target" <<'UNIT'
+[Unit]
+Requires=basic.target
+After=basic.target
+AllowIsolate=yes
+UNIT
+exec env -i container=rosrescue-test PATH=/usr/sbin:/usr/bin:/sbin:/bin \
+    chroot "$root" /lib/systemd/systemd --unit=multi-user.target --log-target=journal --show-status=no
