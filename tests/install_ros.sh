@@ -51,6 +51,7 @@ ros_missing() {
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs
     need libfaketime has_libfaketime
+    need debootstrap command -v debootstrap
     need systemd-sysv test -x /lib/systemd/systemd
     need dbus command -v dbus-daemon
 }

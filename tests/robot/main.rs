@@ -124,6 +124,7 @@ mod restart {
 mod service {
     mod booted;
     mod install;
+    mod package;
 }
 
 /// The wall clock jumps.

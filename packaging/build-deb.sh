@@ -1,0 +1,60 @@
+#!/bin/sh
+# packaging/build-deb.sh [--debug] [--version VERSION]: makes a Debian package and prints its name.
+#
+# --debug takes the program that `cargo build` has made, for tests. Needs cargo-deb, which it installs into
+# target/tools if it is missing there.
+set -eu
+cd "$(dirname "$0")/.."
+target=${CARGO_TARGET_DIR:-target}
+cargo_deb=3.8.0
+
+profile=release
+version=
+fast=
+while [ $# -gt 0 ]; do
+    case $1 in
+    --debug) profile=dev fast=--fast ;;
+    --version) version=$2 && shift ;;
+    *) echo "build-deb.sh: what is $1? It takes --debug and --version VERSION" >&2 && exit 2 ;;
+    esac
+    shift
+done
+
+deb=$target/tools/bin/cargo-deb
+if ! "$deb" --version 2>/dev/null | grep -qxF "cargo-deb $cargo_deb"; then
+    echo "build-deb.sh: installing cargo-deb $cargo_deb into $target/tools: some two minutes on two cores" >&2
+    cargo install --quiet --locked --version "$cargo_deb" --root "$target/tools" cargo-deb
+fi
+
+if [ "$profile" = dev ]; then
+    program=$target/debug/rosrescue
+else
+    cargo build --release --locked
+    program=$target/release/rosrescue
+fi
+
+# What is made of the command line's own definition, and of the units' templates.
+assets=target/package
+rm -rf "$assets"
+mkdir -p "$assets/completions" "$assets/systemd"
+"$program" man "$assets/man"
+gzip -9n "$assets"/man/*.1
+for shell in bash zsh fish; do
+    "$program" completions "$shell" >"$assets/completions/$shell"
+done
+# Nobody's robot yet: a user that systemd makes for it, and all addresses.
+fill() {
+    sed -e "s|@ORIGIN@|Of the package rosrescue. \`rosrescue install\` makes one for your robot, which goes before it.|" \
+        -e "s|@ACCOUNT@|DynamicUser=yes\nStateDirectory=rosrescue\nEnvironment=ROS_HOME=/var/lib/rosrescue|" \
+        -e '/@HARDENING@/ { r packaging/systemd/hardening.in' -e 'd }' \
+        -e "s|@ENVIRONMENT@|/etc/default/rosrescue|" -e "s|@COMMAND@|/usr/bin/rosrescue core|" \
+        -e "s|@TARGET@|multi-user.target|" -e "s|@LISTEN@|ListenStream=11311|" \
+        -e '/^@[A-Z]*@$/d' "$1"
+}
+for unit in service socket; do
+    fill "packaging/systemd/rosrescue.$unit.in" >"$assets/systemd/rosrescue.$unit"
+done
+
+# shellcheck disable=SC2086 # no version, no words
+CARGO_TARGET_DIR=$target "$deb" --quiet --locked --no-build --profile "$profile" --strip $fast \
+    ${version:+--deb-version "$version"} --output "$target/deb/"

@@ -1,0 +1,157 @@
+//! The Debian package: in a Debian that debootstrap has just made, and under a systemd.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+
+use super::booted::Booted;
+use crate::support::eventually;
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// Two versions of the package, 0.2.0 and 0.2.1, made once. It takes two minutes where cargo-deb is missing.
+#[track_caller]
+fn packages() -> &'static [PathBuf; 2] {
+    static PACKAGES: OnceLock<[PathBuf; 2]> = OnceLock::new();
+    PACKAGES.get_or_init(|| {
+        ["0.2.0", "0.2.1"].map(|version| {
+            let output = Command::new("packaging/build-deb.sh")
+                .args(["--debug", "--version", version])
+                .current_dir(ROOT)
+                .stderr(Stdio::inherit())
+                .output()
+                .unwrap();
+            assert!(
+                output.status.success(),
+                "packaging/build-deb.sh: {output:?}"
+            );
+            let name = String::from_utf8(output.stdout).unwrap();
+            Path::new(ROOT).join(name.trim())
+        })
+    })
+}
+
+/// Runs `script` in a fresh Debian, with the packages in /given.
+#[track_caller]
+fn in_fresh_debian(script: &str) -> String {
+    let folder = packages()[0].parent().unwrap();
+    let cache = Path::new(ROOT).join("target/fresh-debian");
+    let output = Command::new(Path::new(ROOT).join("tests/support/fresh_debian.sh"))
+        .args([&*cache, folder])
+        .args(["sh", "-euxc", script])
+        .stdin(Stdio::null())
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        output.status.success(),
+        "{errors} (needs root and debootstrap, see tests/install_ros.sh)"
+    );
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn name(package: &Path) -> &str {
+    package.file_name().unwrap().to_str().unwrap()
+}
+
+#[test]
+fn a_package_is_installed_upgraded_removed_and_purged_without_a_trace() {
+    let [old, new] = packages();
+    let said = in_fresh_debian(&format!(
+        r#"
+        list() {{ find / -xdev -path /given -prune -o -path /proc -prune -o -path /var/lib/dpkg -prune \
+            -o -path /var/log -prune -o -path /var/cache -prune -o -print | sort; }}
+        touch /tmp/before /tmp/after
+        list >/tmp/before
+        dpkg -i /given/{old} >/dev/null
+        rosrescue --version
+        dpkg -s rosrescue | grep ^Version
+        zcat /usr/share/man/man1/rosrescue-core.1.gz | grep -c ROSRESCUE_CHECKPOINT
+        bash -nc ". /usr/share/bash-completion/completions/rosrescue"
+        grep -c install /usr/share/zsh/vendor-completions/_rosrescue \
+            /usr/share/fish/vendor_completions.d/rosrescue.fish /usr/share/bash-completion/completions/rosrescue
+        ls /usr/lib/systemd/system/rosrescue.* /usr/share/doc/rosrescue/copyright
+        dpkg --verify rosrescue
+        echo ROS_IP=10.0.0.7 >>/etc/default/rosrescue
+        dpkg -i /given/{new} >/dev/null
+        dpkg -s rosrescue | grep ^Version
+        tail -n 1 /etc/default/rosrescue
+        dpkg -r rosrescue >/dev/null
+        test ! -e /usr/bin/rosrescue
+        ls /etc/default/rosrescue
+        dpkg -P rosrescue >/dev/null
+        list >/tmp/after
+        diff /tmp/before /tmp/after || true
+        "#,
+        old = name(old),
+        new = name(new)
+    ));
+    let lines: Vec<_> = said.lines().collect();
+    assert!(lines[0].starts_with("rosrescue 0.2.0"), "{said}");
+    assert_eq!(lines[1], "Version: 0.2.0", "{said}");
+    assert_eq!(lines[2], "1", "{said}");
+    for line in &lines[3..6] {
+        assert!(!line.ends_with(":0"), "{said}");
+    }
+    // The last line is that of /etc/default: nothing is left after the purge.
+    let last = [
+        "/usr/lib/systemd/system/rosrescue.service",
+        "/usr/lib/systemd/system/rosrescue.socket",
+        "/usr/share/doc/rosrescue/copyright",
+        "Version: 0.2.1",
+        "ROS_IP=10.0.0.7",
+        "/etc/default/rosrescue",
+    ];
+    assert_eq!(lines[6..], last, "{said}");
+}
+
+#[test]
+fn a_running_robot_notices_nothing_of_an_upgrade_and_its_service_goes_with_the_package() {
+    let [old, new] = packages();
+    let robot = Booted::new();
+    let install = |package: &Path| robot.run(&format!("dpkg -i {}", package.display()));
+    let said = install(old);
+    assert!(said.contains("sudo rosrescue install"), "{said}");
+    assert!(
+        robot
+            .try_run("systemctl is-active rosrescue.socket")
+            .is_err()
+    );
+
+    // The package's own unit.
+    robot.run("systemctl enable --now rosrescue.socket rosrescue.service");
+    robot.wait_protected();
+    robot.run("pgrep -x rosmaster; test -s /var/lib/rosrescue/log/latest-chkpt.yaml");
+    robot.call("setParam(\"/test\", \"/kept\", 7)");
+    let (worker, master) = (robot.property("MainPID"), robot.run("pgrep -x rosmaster"));
+    let said = install(new);
+    assert!(
+        said.contains("systemctl kill --signal=KILL --kill-who=main"),
+        "{said}"
+    );
+    assert_eq!(robot.property("MainPID"), worker);
+    robot.run("systemctl kill --signal=KILL --kill-who=main rosrescue.service");
+    eventually("another worker", || {
+        !["0", &worker].contains(&&*robot.property("MainPID"))
+    });
+    assert!(
+        robot
+            .call("getParam(\"/test\", \"/kept\")")
+            .ends_with(" 7]\n")
+    );
+    assert_eq!(robot.run("pgrep -x rosmaster"), master);
+    robot.run("systemctl disable --now rosrescue.socket rosrescue.service");
+
+    // One of `rosrescue install` goes before it, and goes with it.
+    robot.run("SUDO_USER=robot rosrescue install --yes");
+    robot.wait_protected();
+    robot.run("pgrep -x -u robot rosmaster");
+    robot.run("dpkg -P rosrescue");
+    assert!(
+        robot
+            .try_run("pgrep -x rosmaster || pgrep -x rosrescue")
+            .is_err()
+    );
+    let left = robot.run("find /etc /usr /var/lib /run/systemd -xdev -name '*rosrescue*' -not -path '/var/lib/dpkg/*'");
+    assert_eq!(left, "");
+}

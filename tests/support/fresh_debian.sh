@@ -1,0 +1,33 @@
+#!/bin/sh
+# fresh_debian.sh CACHE FOLDER COMMAND...: runs COMMAND in a Debian (or Ubuntu) as debootstrap makes it, of this
+# computer's own release. FOLDER is there as /given. What COMMAND changes vanishes. CACHE is made once; it takes about
+# a minute. Needs root and debootstrap.
+set -eu
+cache=$1
+folder=$2
+shift 2
+if [ ! -d "$cache" ]; then
+    . /etc/os-release
+    # As apt of this computer has it.
+    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' "Codename: $VERSION_CODENAME" | head -n 1)
+    rm -rf "$cache.new"
+    debootstrap --variant=minbase "$VERSION_CODENAME" "$cache.new" "$mirror" >"$cache.log" 2>&1 || {
+        echo "fresh_debian.sh: debootstrap cannot make a $VERSION_CODENAME:" >&2
+        tail -n 3 "$cache.log" >&2
+        exit 1
+    }
+    rm -rf "$cache.new"/var/cache/apt/archives/*.deb
+    mv "$cache.new" "$cache"
+fi
+exec unshare --mount --pid --net --fork --kill-child sh -eu -c '
+    cache=$1 folder=$2
+    shift 2
+    mount -t tmpfs tmpfs /mnt
+    mkdir /mnt/upper /mnt/work /mnt/root
+    mount -t overlay -o "lowerdir=$cache,upperdir=/mnt/upper,workdir=/mnt/work" overlay /mnt/root
+    mkdir /mnt/root/given
+    mount --bind "$folder" /mnt/root/given
+    mount -t proc proc /mnt/root/proc
+    exec env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root DEBIAN_FRONTEND=noninteractive \
+        chroot /mnt/root "$@"
+' sh "$cache" "$folder" "$@"
