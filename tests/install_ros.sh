@@ -51,6 +51,10 @@ ros_missing() {
     need libroscpp-dev pkg-config --exists roscpp
     need libstd-msgs-dev pkg-config --exists std_msgs
     need libfaketime has_libfaketime
+    need rosbash command -v rosrun
+    need catkin command -v catkin_make
+    need cmake command -v cmake
+    need make command -v make
     need debootstrap command -v debootstrap
     need systemd-sysv test -x /lib/systemd/systemd
     need dbus command -v dbus-daemon

@@ -123,6 +123,7 @@ mod restart {
 /// It is installed, as a service of a real systemd and as a package.
 mod service {
     mod booted;
+    mod catkin;
     mod install;
     mod package;
 }

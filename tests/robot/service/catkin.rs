@@ -1,0 +1,109 @@
+//! The catkin package: built by catkin, and used by rosrun and roslaunch.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::process::Command;
+
+use crate::support::{Client, Process, Scratch, eventually, free_port, ros_command, signal};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// A workspace in which catkin has built and installed the package, with the program of this test.
+#[track_caller]
+fn workspace(scratch: &Scratch) {
+    let source = scratch.path("src");
+    fs::create_dir(&source).unwrap();
+    symlink(ROOT, source.join("rosrescue")).unwrap();
+    let program = format!("-DROSRESCUE_PROGRAM={}", env!("CARGO_BIN_EXE_rosrescue"));
+    let output = Command::new("catkin_make")
+        .args([
+            "--directory",
+            scratch.path("").to_str().unwrap(),
+            &program,
+            "install",
+        ])
+        // catkin is for the system's Python.
+        .env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin")
+        .output();
+    let output = output.expect("catkin_make: tests/run.sh installs catkin and cmake");
+    assert!(output.status.success(), "{output:?}");
+}
+
+/// `program` in the installed workspace.
+fn ros(scratch: &Scratch, program: &str, port: u16) -> Command {
+    let mut command = ros_command(scratch, "sh", port);
+    let setup = scratch.path("install/setup.sh");
+    let setup = setup.to_str().unwrap();
+    command.args(["-c", &format!(". {setup} && exec \"$0\" \"$@\""), program]);
+    command.env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin");
+    command
+}
+
+#[test]
+fn catkin_builds_a_package_for_rosrun_and_roslaunch() {
+    let scratch = Scratch::new();
+    workspace(&scratch);
+    let port = free_port();
+    let output = ros(&scratch, "rosrun", port)
+        .args(["rosrescue", "rosrescue", "--version"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        said.starts_with(concat!("rosrescue ", env!("CARGO_PKG_VERSION"))),
+        "{output:?}"
+    );
+
+    let mut roslaunch = ros(&scratch, "roslaunch", port);
+    roslaunch.args(["rosrescue", "core.launch", "args:=--no-rosout -t 4"]);
+    let mut roslaunch = Process::start("roslaunch", &mut roslaunch);
+    let master = Client::new(port);
+    let is_launched =
+        || master.param("/roslaunch/uris").is_some() && master.param("/rosrescue/pid").is_some();
+    eventually("roslaunch has a master", || {
+        assert!(roslaunch.exited().is_none(), "{}", roslaunch.log());
+        master.connect().is_ok() && is_launched()
+    });
+    let pid = || match master.ok("getPid", vec!["/test".into()]) {
+        Value::Int(pid) => u32::try_from(pid).unwrap(),
+        other => panic!("{other:?}"),
+    };
+    let first = pid();
+    signal(first, Signal::KILL);
+    eventually("another master", || pid() != first);
+    assert!(is_launched());
+
+    let second = pid();
+    roslaunch.signal(Signal::INT);
+    assert_eq!(roslaunch.wait().code(), Some(0), "{}", roslaunch.log());
+    assert!(
+        !roslaunch.log().contains("Exception"),
+        "{}",
+        roslaunch.log()
+    );
+    eventually("the end of rosrescue and its rosmaster", || {
+        master.connect().is_err() && !Path::new(&format!("/proc/{second}")).exists()
+    });
+}
+
+#[test]
+fn a_launch_file_finds_the_master_that_is_there() {
+    let scratch = Scratch::new();
+    workspace(&scratch);
+    let master = crate::support::Rosmaster::start(&scratch);
+    let run_id = master.client().ok(
+        "setParam",
+        vec!["/test".into(), "/run_id".into(), "1-2".into()],
+    );
+    assert_eq!(run_id, Value::Int(0));
+    let output = ros(&scratch, "roslaunch", master.port)
+        .args(["rosrescue", "core.launch"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(said.contains("/rosrescue/pid: none"), "{output:?}");
+    assert!(output.status.success(), "{output:?}");
+}
