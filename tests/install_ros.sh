@@ -33,6 +33,13 @@ need() { # PACKAGES CHECK...
     "$@" >/dev/null 2>&1 || echo "$packages"
 }
 
+has_pam_systemd() {
+    for library in /lib/*/security/pam_systemd.so; do
+        [ ! -r "$library" ] || return 0
+    done
+    return 1
+}
+
 # The packages of what does not work here. `python3` may be another one than ROS was made for.
 ros_missing() {
     for tool in rosmaster roslaunch rosnode rostopic rosservice rosparam; do
@@ -58,6 +65,9 @@ ros_missing() {
     need debootstrap command -v debootstrap
     need systemd-sysv test -x /lib/systemd/systemd
     need dbus command -v dbus-daemon
+    need libpam-systemd has_pam_systemd
+    need procps command -v pgrep
+    need dpkg-dev command -v dpkg-shlibdeps
 }
 
 install_missing() { # PACKAGES...

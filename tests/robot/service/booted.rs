@@ -47,7 +47,7 @@ impl Booted {
         };
         // Before, its root is this computer's.
         eventually(
-            "systemd as the first process: it needs root, and Debian's systemd-sysv and dbus",
+            "systemd as the first process, by root, with systemd-sysv and dbus (boot.log in the scratch folder says more)",
             || {
                 let name = fs::read_to_string(format!("/proc/{}/comm", booted.pid));
                 name.is_ok_and(|name| name.trim() == "systemd")
