@@ -32,7 +32,7 @@ use crate::{
         clients::Clients,
         idle::Idle,
         listener,
-        pages::{Pages, Rate},
+        pages::{Pages, status::Rate},
     },
     status::{Board, Mode, stats::Stats},
     upstream::{Upstream, pool::Pool},
@@ -266,6 +266,9 @@ pub async fn run(
             clients,
             stats,
             rate: Rate::new(Instant::now()),
+            hide: config.hide,
+            stop: halt.clone(),
+            desk: Default::default(),
         },
     });
     let permits = Arc::new(Semaphore::new(config.max_connections));

@@ -12,6 +12,7 @@ use thiserror::Error;
 use crate::{
     checkpoint::session::Restore,
     cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, SyncPolicy},
+    hide::Hide,
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
 };
@@ -104,6 +105,8 @@ pub struct Config {
     pub max_connections: usize,
     /// Largest request body in bytes.
     pub max_body: usize,
+    /// Whose values the page does not show.
+    pub hide: Hide,
 }
 
 /// Where the master is, or how to run it.
@@ -277,6 +280,7 @@ impl Config {
             master_connections: usize_of(args.master_connections),
             max_connections: usize_of(args.max_connections),
             max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),
+            hide: args.hide.hide_values.clone(),
         })
     }
 }

@@ -4,6 +4,7 @@ pub(crate) mod client;
 pub(crate) mod health_check;
 mod identify;
 pub(crate) mod notifications;
+mod removed;
 mod visits;
 
 use std::{
@@ -23,6 +24,7 @@ use self::{
     health_check::CheckResult,
     identify::{IDENTIFY_AFTER, New},
     notifications::Notifications,
+    removed::Removed,
     visits::Visits,
 };
 use crate::{
@@ -54,6 +56,7 @@ pub struct Nodes {
     visits: Visits,
     new: New,
     unreachable: Mutex<Unreachable>,
+    pub(crate) removed: Removed,
     /// Recoveries whose health check is not over.
     checks: AtomicUsize,
     /// Nodes that have not been asked yet, or have not answered yet.
@@ -80,6 +83,7 @@ impl Nodes {
             visits: Visits::default(),
             new: New::default(),
             unreachable: Mutex::default(),
+            removed: Removed::default(),
             checks: AtomicUsize::new(0),
             unanswered: AtomicUsize::new(0),
             changed: Notify::new(),

@@ -9,6 +9,7 @@ use clap::{
 
 use ipnet::IpNet;
 
+use super::tools::HideArgs;
 use crate::checkpoint::session::Restore;
 
 /// Options of `rosrescue core`. The short ones are roscore's.
@@ -229,6 +230,9 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub max_body: u64,
+    /// Of what the page shows.
+    #[command(flatten)]
+    pub hide: HideArgs,
     /// Run as a single process, without a guardian that keeps the port and starts rosrescue again
     /// when it dies: for a debugger, or under a supervisor that does so. A socket unit of systemd
     /// takes the guardian's place by itself

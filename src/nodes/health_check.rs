@@ -395,5 +395,8 @@ async fn remove(nodes: &Nodes, name: &Name, api: &str) -> bool {
     let node = name.node.clone();
     let (call, condition) = (Request::multicall(calls), Condition { node, last_calls });
     let reply = nodes.write_queue.call_if(call, condition).await;
+    if reply.is_some() {
+        nodes.removed.add(&name.node);
+    }
     reply.is_some()
 }

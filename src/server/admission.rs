@@ -33,20 +33,9 @@ const BROWSER_TYPES: [&str; 3] = [
 /// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client does. The
 /// content type may be missing, as in a browser's POST of a typed array.
 pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
-    for origin in headers.get_all(ORIGIN) {
+    if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
-        let origin = String::from_utf8_lossy(origin.as_bytes());
-        let site = origin.strip_prefix("http://").map(str::as_bytes);
-        let own = headers.get(HOST).map(|host| host.as_bytes());
-        if !site
-            .zip(own)
-            .is_some_and(|(a, b)| a.eq_ignore_ascii_case(b))
-        {
-            return Err(Refusal {
-                status: StatusCode::FORBIDDEN,
-                reason: format!("a page of `{origin:.100}` may not call the master"),
-            });
-        }
+        check_origin(headers)?;
     }
     let Some(content_type) = headers.get(CONTENT_TYPE) else {
         return Ok(());
@@ -67,12 +56,38 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     Ok(())
 }
 
+/// Whether a GET with these headers may have a page. A browser keeps its answer from the pages of other sites
+/// anyway, but not the connection to `/events`, of which there are few.
+pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+    check_host(headers, names)?;
+    check_origin(headers)
+}
+
+/// Whether no other site's page asks.
+fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
+    for origin in headers.get_all(ORIGIN) {
+        let origin = String::from_utf8_lossy(origin.as_bytes());
+        let site = origin.strip_prefix("http://").map(str::as_bytes);
+        let own = headers.get(HOST).map(|host| host.as_bytes());
+        if !site
+            .zip(own)
+            .is_some_and(|(a, b)| a.eq_ignore_ascii_case(b))
+        {
+            return Err(Refusal {
+                status: StatusCode::FORBIDDEN,
+                reason: format!("a page of `{origin:.100}` may not call the master"),
+            });
+        }
+    }
+    Ok(())
+}
+
 /// Whether `Host` is an address or a name of this computer. After DNS rebinding, a page whose own name was
 /// pointed at this computer sends that name.
 ///
 /// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain may follow
 /// its host name. That is safe: the status page changes nothing.
-pub(crate) fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
+fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
         let has_domain = |own: &&String| {

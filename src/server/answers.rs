@@ -10,7 +10,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use http_body_util::{BodyExt, Full};
+use http_body_util::BodyExt;
 use hyper::body::Body;
 use tokio::sync::{Mutex as Turn, Notify, OwnedSemaphorePermit, Semaphore};
 
@@ -235,7 +235,7 @@ impl Answers {
             answers: self.clone(),
             _room: room,
         };
-        HttpReply::from_parts(head, Full::new(Bytes::from_owner(counted)))
+        HttpReply::from_parts(head, Bytes::from_owner(counted).into())
     }
 }
 

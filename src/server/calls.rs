@@ -34,7 +34,7 @@ use crate::{
 /// cost it its registration, or end the node.
 #[derive(Debug, Error)]
 #[error("closed without an answer: {0}")]
-pub struct Closed(pub(super) &'static str);
+pub(crate) struct Closed(pub(super) &'static str);
 
 /// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
 /// millisecond, and within some ten behind a call that keeps its interpreter busy.
@@ -76,7 +76,7 @@ pub struct LargeAnswer {
 
 impl Calls {
     /// Answers a call of `peer`. `call` is none if its body could not be decoded.
-    pub async fn answer(
+    pub(crate) async fn answer(
         &self,
         peer: SocketAddr,
         head: Head,

@@ -1,44 +1,80 @@
-//! Status page and metrics, by GET on the port that nodes use. Read-only.
+//! The page, the status and the metrics, by GET on the port that nodes use. Read-only.
 //!
 //! | path | answer |
 //! |---|---|
-//! | `/` | the status as text |
+//! | `/` | the page for a browser, the status as text for anybody else |
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
+//! | `/state.json` | nodes, topics, services and parameters |
+//! | `/graph.svg` | the computation graph |
+//! | `/events` | what changes, as it happens |
 //! | `/metrics` | counters in Prometheus' text format |
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master or by the mirror, else 503 |
 
-use std::{
-    sync::{Arc, Mutex, PoisonError},
-    time::Instant,
+mod events;
+mod graph;
+mod params;
+mod robot;
+pub(crate) mod status;
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use hyper::{
+    HeaderMap, StatusCode, Uri,
+    header::{
+        ACCEPT, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue,
+        REFERRER_POLICY, VARY, X_CONTENT_TYPE_OPTIONS,
+    },
 };
+use serde::Serialize;
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
 
-use hyper::StatusCode;
-
+use self::{
+    events::Feed,
+    graph::{Drawn, Graph, Selection},
+    params::Members,
+    robot::Robot,
+    status::Rate,
+};
 use super::{
+    Server,
     clients::Clients,
-    replies::{HttpReply, page, text},
+    replies::{HttpReply, page as reply, text},
 };
 use crate::{
-    clock,
     gate::{self, State},
+    hide::Hide,
     ledger::Ledger,
     master::Master,
     nodes::Nodes,
-    status::{
-        Board, Disk,
-        condition::{Situation, condition},
-        metrics::metrics,
-        stats::Stats,
-        summary::{Journal, SCHEMA, Status},
-    },
+    status::{Board, metrics::metrics, stats::Stats},
     upstream::Upstream,
 };
 
-/// Shortest time over which calls a second are counted.
-const SAMPLE: f64 = 1.0;
-/// Callers listed as the slowest.
-const SLOWEST: usize = 20;
+const HTML: &str = "text/html; charset=utf-8";
+const JSON: &str = "application/json";
+
+/// Of `/state.json`. A change that a reader could stumble over gets another number.
+const SCHEMA: u32 = 1;
+/// Most nodes, topics or services in it.
+const LISTED: usize = 5000;
+/// Kept length of what a page is asked for, in characters.
+const ASKED: usize = 500;
+
+/// Who may do what to a page: load its own script, style and data, and nothing else.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
+                      img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Headers of every page.
+const HEADERS: [(HeaderName, &str); 5] = [
+    (CONTENT_SECURITY_POLICY, POLICY),
+    (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+    (REFERRER_POLICY, "no-referrer"),
+    (CACHE_CONTROL, "no-store"),
+    (VARY, "Accept"),
+];
 
 pub struct Pages {
     /// What nodes use as `ROS_MASTER_URI`.
@@ -51,155 +87,211 @@ pub struct Pages {
     pub board: Arc<Board>,
     pub clients: Arc<Clients>,
     pub stats: &'static Stats,
-    pub rate: Rate,
+    pub(crate) rate: Rate,
+    /// Whose values are not shown.
+    pub hide: Hide,
+    /// Ends what listeners read.
+    pub stop: CancellationToken,
+    /// What a page needs and keeps for the next one.
+    pub(crate) desk: Desk,
 }
 
-/// Calls a second, counted from one time that somebody asks to the next: at rest it costs nothing.
+/// What pages share.
 #[derive(Debug)]
-pub struct Rate(Mutex<Sample>);
-
-#[derive(Debug)]
-struct Sample {
-    at: Instant,
-    calls: u64,
-    rate: f64,
+pub(crate) struct Desk {
+    drawn: Drawn,
+    feed: Feed,
+    /// A whole state is made for one after the other.
+    reading: Semaphore,
 }
 
-impl Rate {
-    pub fn new(now: Instant) -> Self {
-        Self(Mutex::new(Sample {
-            at: now,
-            calls: 0,
-            rate: 0.0,
-        }))
-    }
-
-    /// The rate at `now`, after so many `calls` in all.
-    fn at(&self, now: Instant, calls: u64) -> f64 {
-        let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let seconds = now.saturating_duration_since(last.at).as_secs_f64();
-        if seconds >= SAMPLE {
-            let new = calls.saturating_sub(last.calls) as f64;
-            *last = Sample {
-                at: now,
-                calls,
-                rate: new / seconds,
-            };
+impl Default for Desk {
+    fn default() -> Self {
+        Self {
+            drawn: Drawn::default(),
+            feed: Feed::default(),
+            reading: Semaphore::new(1),
         }
-        (last.rate * 10.0).round() / 10.0
     }
+}
+
+/// The page at `uri`.
+pub(super) async fn page(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpReply {
+    let mut reply = answer(server, uri, headers).await;
+    for (name, value) in HEADERS {
+        reply
+            .headers_mut()
+            .insert(name, HeaderValue::from_static(value));
+    }
+    reply
+}
+
+async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpReply {
+    let pages = &server.pages;
+    match uri.path() {
+        "/" if wants_html(headers) => {
+            reply(StatusCode::OK, HTML, include_str!("pages/web/page.html"))
+        }
+        "/" => text(StatusCode::OK, pages.status().to_string()),
+        "/page.css" => reply(StatusCode::OK, "text/css", include_str!("pages/web/page.css")),
+        "/page.js" => reply(StatusCode::OK, "text/javascript", include_str!("pages/web/page.js")),
+        "/status.json" => json(serde_json::to_string_pretty(&pages.status())),
+        "/state.json" => state(server, Asked::read(uri)).await,
+        "/graph.svg" => {
+            let picture = pages.picture(Asked::read(uri).selection).await;
+            reply(StatusCode::OK, "image/svg+xml", picture)
+        }
+        "/events" => {
+            let mut events = events::listen(server);
+            if events.status() == StatusCode::OK {
+                let kind = HeaderValue::from_static("text/event-stream");
+                events.headers_mut().insert(CONTENT_TYPE, kind);
+            }
+            events
+        }
+        "/metrics" => reply(
+            StatusCode::OK,
+            "text/plain; version=0.0.4",
+            metrics(pages.stats, &pages.status()),
+        ),
+        "/live" => text(StatusCode::OK, "live\n".to_owned()),
+        "/ready" if pages.gate.state() != State::Unknown => {
+            text(StatusCode::OK, "ready\n".to_owned())
+        }
+        "/ready" => text(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "no master was ever seen: calls wait for one\n".to_owned(),
+        ),
+        _ => text(
+            StatusCode::NOT_FOUND,
+            "no such page; there are /, /status.json, /state.json, /graph.svg, /events, /metrics, /live and /ready\n"
+                .to_owned(),
+        ),
+    }
+}
+
+/// Whether a browser asks. curl takes anything.
+fn wants_html(headers: &HeaderMap) -> bool {
+    let accepted = headers.get_all(ACCEPT).into_iter();
+    let mut accepted = accepted.filter_map(|accepted| accepted.to_str().ok());
+    accepted.any(|accepted| accepted.contains("text/html"))
+}
+
+fn json(text: serde_json::Result<String>) -> HttpReply {
+    match text {
+        Ok(json) => reply(StatusCode::OK, JSON, json + "\n"),
+        Err(error) => super::replies::text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")),
+    }
+}
+
+/// What of a page is asked for.
+#[derive(Debug, Default)]
+struct Asked {
+    selection: Selection,
+    /// Only the parameters of a namespace,
+    params: Option<String>,
+    /// or those with this in their names.
+    search: Option<String>,
+}
+
+impl Asked {
+    fn read(uri: &Uri) -> Self {
+        let mut asked = Self::default();
+        let query = uri.query().unwrap_or_default();
+        for (name, value) in form_urlencoded::parse(query.as_bytes()) {
+            let value = value.chars().take(ASKED).collect();
+            match &*name {
+                "filter" => asked.selection.filter = value,
+                "debug" => asked.selection.debug = value == "1",
+                "leaves" => asked.selection.leaves = value == "1",
+                "tall" => asked.selection.tall = value == "1",
+                "params" => asked.params = Some(value),
+                "search" => asked.search = Some(value),
+                _ => {}
+            }
+        }
+        asked
+    }
+}
+
+/// What `/state.json` answers.
+#[derive(Debug, Serialize)]
+struct WholeState {
+    schema: u32,
+    /// As in the events.
+    version: u64,
+    registrations: u64,
+    /// How many are registered; the lists may be shorter.
+    totals: Totals,
+    #[serde(flatten)]
+    robot: Robot,
+    params: Members,
+}
+
+#[derive(Debug, Serialize)]
+struct Totals {
+    nodes: usize,
+    topics: usize,
+    services: usize,
+}
+
+async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
+    // Never closed.
+    let _turn = server.pages.desk.reading.acquire().await;
+    let server = server.clone();
+    let work = move || {
+        let pages = &server.pages;
+        let (version, params) = (
+            pages.ledger.version(),
+            pages.ledger.with_mirror(Master::with_params_only),
+        );
+        let params = params.params();
+        match (asked.params, asked.search) {
+            (_, Some(search)) => json(serde_json::to_string(&params::search(
+                params,
+                &search,
+                &pages.hide,
+            ))),
+            (Some(name), _) => match params::members(params, &name, &pages.hide) {
+                Some(members) => json(serde_json::to_string(&members)),
+                None => text(
+                    StatusCode::NOT_FOUND,
+                    "there is no such namespace now\n".to_owned(),
+                ),
+            },
+            (None, None) => {
+                let mut robot = Robot::read(&pages.ledger, &pages.nodes);
+                let registrations = robot.digest();
+                let totals = Totals {
+                    nodes: robot.nodes.len(),
+                    topics: robot.topics.len(),
+                    services: robot.services.len(),
+                };
+                robot.nodes.truncate(LISTED);
+                robot.topics.truncate(LISTED);
+                robot.services.truncate(LISTED);
+                let params = params::members(params, "", &pages.hide);
+                json(serde_json::to_string(&WholeState {
+                    schema: SCHEMA,
+                    version,
+                    registrations,
+                    totals,
+                    robot,
+                    params: params.unwrap_or_default(),
+                }))
+            }
+        }
+    };
+    let made = tokio::task::spawn_blocking(work).await;
+    made.unwrap_or_else(|error| text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")))
 }
 
 impl Pages {
-    pub fn page(&self, path: &str) -> HttpReply {
-        let status = self.status();
-        match path {
-            "/" => text(StatusCode::OK, status.to_string()),
-            "/status.json" => match serde_json::to_string_pretty(&status) {
-                Ok(json) => page(StatusCode::OK, "application/json", json + "\n"),
-                Err(error) => text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")),
-            },
-            "/metrics" => page(
-                StatusCode::OK,
-                "text/plain; version=0.0.4",
-                metrics(self.stats, &status),
-            ),
-            "/live" => text(StatusCode::OK, "live\n".to_owned()),
-            "/ready" if status.ready => text(StatusCode::OK, "ready\n".to_owned()),
-            "/ready" => text(
-                StatusCode::SERVICE_UNAVAILABLE,
-                "no master was ever seen: calls wait for one\n".to_owned(),
-            ),
-            _ => text(
-                StatusCode::NOT_FOUND,
-                "no such page; there are /, /status.json, /metrics, /live and /ready\n".to_owned(),
-            ),
-        }
-    }
-
-    fn status(&self) -> Status {
-        let counters = self.stats.list().into_iter();
-        let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
-        let gate = self.gate.state();
-        let gate_since = self.gate.since().into_std();
-        let stands_in = matches!(gate, State::StandingIn | State::Injecting);
-        let facts = self.board.read();
-        let unprotected = self.ledger.unprotected();
-        let master = self.upstream.address().to_string();
-        let situation = Situation {
-            gate,
-            gate_since,
-            unprotected: unprotected.clone(),
-            master: master.clone(),
-        };
-        let rescues = facts.reports.iter().filter(|report| report.is_rescue());
-        let last = facts.reports.back();
-        Status {
-            schema: SCHEMA,
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-            mode: facts.mode,
-            pid: std::process::id(),
-            started: clock::wall_time_of(facts.started),
-            uptime: facts.started.elapsed().as_secs_f64(),
-            uri: self.uri.clone(),
-            condition: condition(&situation, &facts),
-            master,
-            master_pid: last.map(|report| report.master_pid),
-            open: gate.is_open(),
-            ready: gate != State::Unknown,
-            standing_in_since: stands_in.then(|| clock::wall_time_of(gate_since)),
-            pending_writes: self.ledger.pending(),
-            crash_loop: facts.crash_loop.is_some(),
-            deaths: facts.deaths,
-            checkpoint: self.checkpoint.clone(),
-            unprotected,
-            journal: self.journal(&facts.disk),
-            guarded: facts.guarded.is_guarded(),
-            guarded_by: facts.guarded.to_string(),
-            state: self.ledger.with_mirror(Master::counts),
-            unreachable: self.nodes.unreachable(),
-            recoveries: facts.recoveries,
-            last_recovery: last.cloned(),
-            rescues: facts.rescues,
-            last_rescues: rescues.cloned().collect(),
-            calls_per_second: self.rate.at(Instant::now(), self.stats.calls.value()),
-            slowest_callers: self.clients.slowest(SLOWEST),
-            clients: self.clients.list(),
-            counters: counters.collect(),
-        }
-    }
-
-    fn journal(&self, disk: &Disk) -> Journal {
-        let sizes = self
-            .ledger
-            .with_store(|store, _| (store.seq(), store.journal_bytes(), store.snapshot_bytes()));
-        let (seq, bytes, snapshot_bytes) = sizes.unwrap_or_default();
-        let (at, from) = disk.compacted.unzip();
-        Journal {
-            records: seq.saturating_sub(from.unwrap_or(seq)),
-            bytes,
-            snapshot_bytes,
-            last_compaction: at.map(clock::wall_time_of),
-            disk_free_bytes: disk.free,
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-
-    #[test]
-    fn calls_a_second_are_counted_between_two_that_ask() {
-        let start = Instant::now();
-        let rate = Rate::new(start);
-        let at = |ms, calls| rate.at(start + Duration::from_millis(ms), calls);
-        assert_eq!(at(100, 50), 0.0, "too early to say");
-        assert_eq!(at(2_000, 100), 50.0);
-        assert_eq!(at(2_500, 900), 50.0, "what was said last");
-        assert_eq!(at(4_000, 200), 50.0);
-        assert_eq!(at(14_000, 201), 0.1);
+    async fn picture(&self, selection: Selection) -> Bytes {
+        let robot = Robot::read(&self.ledger, &self.nodes);
+        self.desk
+            .drawn
+            .picture(Graph::new(&robot, &selection))
+            .await
     }
 }

@@ -1,11 +1,19 @@
 //! Replies over HTTP: the master's bytes, or our own.
 
+use std::{
+    convert::Infallible,
+    pin::Pin,
+    task::{Context, Poll},
+};
+
 use bytes::Bytes;
 use http_body_util::Full;
 use hyper::{
     Response, StatusCode,
+    body::{Body, Frame, SizeHint},
     header::{CONTENT_ENCODING, CONTENT_TYPE, HeaderValue, SERVER},
 };
+use tokio::sync::mpsc;
 
 use crate::{
     master::Request,
@@ -15,7 +23,54 @@ use crate::{
 };
 
 /// What hyper sends.
-pub(crate) type HttpReply = Response<Full<Bytes>>;
+pub(crate) type HttpReply = Response<Content>;
+
+/// The body of a reply.
+#[derive(Debug)]
+pub(crate) enum Content {
+    /// All of it is there.
+    Whole(Full<Bytes>),
+    /// It is made as long as somebody reads it.
+    Events(mpsc::Receiver<Bytes>),
+}
+
+impl From<Bytes> for Content {
+    fn from(bytes: Bytes) -> Self {
+        Self::Whole(Full::new(bytes))
+    }
+}
+
+impl Body for Content {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        match &mut *self {
+            Self::Whole(whole) => Pin::new(whole).poll_frame(cx),
+            Self::Events(events) => {
+                let event = events.poll_recv(cx);
+                event.map(|event| event.map(|event| Ok(Frame::data(event))))
+            }
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        match self {
+            Self::Whole(whole) => whole.is_end_stream(),
+            Self::Events(_) => false,
+        }
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        match self {
+            Self::Whole(whole) => whole.size_hint(),
+            Self::Events(_) => SizeHint::default(),
+        }
+    }
+}
 
 /// The mirror's reply, or the master's from a batch, with our address in place of the master's.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
@@ -36,7 +91,7 @@ pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> Htt
 }
 
 fn plain(raw: RawReply) -> HttpReply {
-    let mut reply = Response::new(Full::new(raw.body));
+    let mut reply = Response::new(Content::from(raw.body));
     *reply.status_mut() = raw.status;
     if let Some(reason) = raw.reason {
         reply.extensions_mut().insert(reason);
@@ -55,7 +110,7 @@ pub(super) fn xml(reply: &Reply) -> HttpReply {
 
 /// A reply of our own that is encoded already.
 pub(super) fn encoded(reply: impl Into<Bytes>) -> HttpReply {
-    let mut http = Response::new(Full::new(reply.into()));
+    let mut http = Response::new(Content::from(reply.into()));
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static("text/xml"));
     http
@@ -67,8 +122,8 @@ pub(super) fn no_shutdown(why: &str) -> HttpReply {
 }
 
 /// A reply that is not XML-RPC.
-pub(super) fn page(status: StatusCode, kind: &'static str, text: String) -> HttpReply {
-    let mut http = Response::new(Full::new(Bytes::from(text)));
+pub(super) fn page(status: StatusCode, kind: &'static str, content: impl Into<Bytes>) -> HttpReply {
+    let mut http = Response::new(Content::from(content.into()));
     *http.status_mut() = status;
     http.headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static(kind));

@@ -21,6 +21,7 @@ use super::{
     body::{self, BodyError, Room},
     calls::Closed,
     deadlines::Deadlines,
+    pages,
     replies::{HttpReply, text, xml},
 };
 use crate::{
@@ -71,9 +72,9 @@ async fn route(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     match *request.method() {
-        Method::GET => match admission::check_host(request.headers(), &server.names) {
+        Method::GET => match admission::check_get(request.headers(), &server.names) {
             Ok(()) => {
-                let made = server.pages.page(request.uri().path());
+                let made = pages::page(&server, request.uri(), request.headers()).await;
                 page(&server, made, deadlines).await
             }
             Err(refusal) => Ok(refuse(&server, peer, &refusal)),

@@ -284,7 +284,8 @@ fn only_the_clock_reads_the_wall_clock() {
         "commands/check/facts.rs",
         "recovery/reporting.rs",
         "server/clients.rs",
-        "server/pages.rs",
+        "server/pages/robot.rs",
+        "server/pages/status.rs",
         "status/condition.rs",
     ];
     assert_eq!(users, expected.map(|name| root().join("src").join(name)));

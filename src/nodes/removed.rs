@@ -1,0 +1,47 @@
+//! Nodes that were found dead and taken out, for the page.
+
+use std::{
+    collections::VecDeque,
+    sync::{Mutex, PoisonError},
+    time::Instant,
+};
+
+/// So many are remembered.
+const MOST: usize = 100;
+
+/// The nodes that were taken out last, the oldest first.
+#[derive(Debug, Default)]
+pub(crate) struct Removed(Mutex<VecDeque<(String, Instant)>>);
+
+impl Removed {
+    pub(super) fn add(&self, node: &str) {
+        let mut removed = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        removed.retain(|(name, _)| name != node);
+        if removed.len() == MOST {
+            removed.pop_front();
+        }
+        removed.push_back((node.to_owned(), Instant::now()));
+    }
+
+    /// Their names, and when they were taken out. They may have come back.
+    pub(crate) fn list(&self) -> Vec<(String, Instant)> {
+        let removed = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        removed.iter().cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_is_listed_once_and_the_oldest_are_forgotten() {
+        let removed = Removed::default();
+        for index in (0..=MOST).chain([7]) {
+            removed.add(&format!("/{index}"));
+        }
+        let names: Vec<_> = removed.list().into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names.len(), MOST);
+        assert_eq!([&names[0], &names[MOST - 1]], ["/1", "/7"]);
+    }
+}

@@ -1,0 +1,294 @@
+//! Parameters as the page shows them: a part of the tree at a time, so that a hundred thousand are no burden,
+//! with the values hidden that the operator wants hidden.
+
+use serde::Serialize;
+
+use crate::{
+    hide::Hide,
+    xmlrpc::{Struct, Value},
+};
+
+/// Entries that are sent at once. What is left out says so, and can be asked for.
+const ENTRIES: usize = 1000;
+/// Kept length of a value, in characters. A robot's description may have a million.
+const TEXT: usize = 2000;
+/// Results of a search.
+const FOUND: usize = 200;
+
+/// A parameter or a namespace.
+#[derive(Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Entry {
+    /// The last part of its name; of what was searched, the whole name.
+    name: String,
+    /// `namespace`, or what rosparam calls the value.
+    #[serde(rename = "type")]
+    kind: &'static str,
+    /// A value as text; none if it is hidden.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    value: Option<String>,
+    /// The value is longer.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    cut: bool,
+    /// The value is not shown.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    hidden: bool,
+    /// What is in a namespace; none if it must be asked for.
+    #[serde(flatten)]
+    members: Option<Members>,
+    /// Parameters in a namespace and below.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    count: Option<usize>,
+}
+
+/// What is in a namespace, sorted by name.
+#[derive(Debug, Default, PartialEq, Eq, Serialize)]
+pub(super) struct Members {
+    members: Vec<Entry>,
+    /// Further members that are left out.
+    more: usize,
+}
+
+/// What is in the namespace of that name; none if it is not one.
+pub(super) fn members(tree: &Struct, name: &str, hide: &Hide) -> Option<Members> {
+    let mut namespace = tree;
+    for part in name.split('/').filter(|part| !part.is_empty()) {
+        let Some(Value::Struct(inner)) = namespace.get(part) else {
+            return None;
+        };
+        namespace = inner;
+    }
+    let mut room = ENTRIES;
+    let name = name.trim_end_matches('/');
+    Some(list(namespace, name, hide, &mut room))
+}
+
+/// Takes from `room` what it lists.
+fn list(namespace: &Struct, name: &str, hide: &Hide, room: &mut usize) -> Members {
+    let mut sorted: Vec<_> = namespace.iter().collect();
+    sorted.sort_by_key(|(name, _)| *name);
+    let shown = sorted.len().min(*room);
+    *room -= shown;
+    let members = sorted.iter().take(shown).map(|(part, value)| {
+        let name = format!("{name}/{part}");
+        match value {
+            Value::Struct(inner) if !inner.is_empty() => {
+                let (count, entries) = size(inner);
+                let members = (entries <= *room).then(|| list(inner, &name, hide, room));
+                Entry {
+                    members,
+                    count: Some(count),
+                    ..Entry::named((*part).clone(), "namespace")
+                }
+            }
+            value => Entry::of((*part).clone(), &name, value, hide),
+        }
+    });
+    Members {
+        members: members.collect(),
+        more: sorted.len() - shown,
+    }
+}
+
+/// The parameters below `namespace`, and with the namespaces.
+fn size(namespace: &Struct) -> (usize, usize) {
+    let sizes = namespace.values().map(|value| match value {
+        Value::Struct(inner) if !inner.is_empty() => {
+            let (count, entries) = size(inner);
+            (count, entries + 1)
+        }
+        _ => (1, 1),
+    });
+    sizes.fold((0, 0), |(a, b), (c, d)| (a + c, b + d))
+}
+
+/// The parameters in whose full names `text` occurs, whatever its case. Values are not searched: one could
+/// find out hidden ones.
+pub(super) fn search(tree: &Struct, text: &str, hide: &Hide) -> Members {
+    let mut found = Members::default();
+    collect(tree, "", &text.to_lowercase(), hide, &mut found);
+    found.members.sort_by(|a, b| a.name.cmp(&b.name));
+    found
+}
+
+fn collect(namespace: &Struct, above: &str, text: &str, hide: &Hide, found: &mut Members) {
+    for (part, value) in namespace {
+        let name = format!("{above}/{part}");
+        match value {
+            Value::Struct(inner) if !inner.is_empty() => collect(inner, &name, text, hide, found),
+            _ if !name.to_lowercase().contains(text) => {}
+            _ if found.members.len() == FOUND => found.more += 1,
+            value => found
+                .members
+                .push(Entry::of(name.clone(), &name, value, hide)),
+        }
+    }
+}
+
+impl Entry {
+    fn named(name: String, kind: &'static str) -> Self {
+        Self {
+            name,
+            kind,
+            value: None,
+            cut: false,
+            hidden: false,
+            members: None,
+            count: None,
+        }
+    }
+
+    /// A value, called `name` here and `full` in the tree.
+    fn of(name: String, full: &str, value: &Value, hide: &Hide) -> Self {
+        let kind = match value {
+            Value::Nil => "none",
+            Value::Bool(_) => "bool",
+            Value::Int(_) | Value::BigInt(_) => "int",
+            Value::Double(_) => "double",
+            Value::String(_) => "str",
+            Value::DateTime(_) => "date",
+            Value::Base64(_) => "binary",
+            Value::Array(_) => "list",
+            Value::Struct(_) => "dict",
+        };
+        if hide.hides(full) {
+            return Self {
+                hidden: true,
+                ..Self::named(name, kind)
+            };
+        }
+        let mut text = String::new();
+        match value {
+            // Members of structs in a list have names of their own.
+            Value::Array(_) => write(&hide.mask(full, value), &mut text),
+            Value::String(words) => text.extend(words.chars().take(TEXT + 1)),
+            value => write(value, &mut text),
+        }
+        let end = text.char_indices().nth(TEXT).map(|(end, _)| end);
+        if let Some(end) = end {
+            text.truncate(end);
+        }
+        Self {
+            value: Some(text),
+            cut: end.is_some(),
+            ..Self::named(name, kind)
+        }
+    }
+}
+
+/// Writes a value in one line; not much more than can be shown.
+fn write(value: &Value, to: &mut String) {
+    if to.len() > 4 * TEXT {
+        return;
+    }
+    match value {
+        Value::Nil => to.push_str("null"),
+        Value::Bool(truth) => to.push_str(if *truth { "true" } else { "false" }),
+        Value::Int(number) => to.push_str(&number.to_string()),
+        Value::Double(number) => to.push_str(&format!("{number:?}")),
+        Value::BigInt(text) | Value::DateTime(text) => to.push_str(text),
+        Value::String(text) => {
+            to.push('"');
+            to.extend(text.chars().take(TEXT));
+            to.push('"');
+        }
+        Value::Base64(bytes) => to.push_str(&format!("{} bytes", bytes.len())),
+        Value::Array(elements) => {
+            to.push('[');
+            for (index, element) in elements.iter().enumerate() {
+                if index > 0 {
+                    to.push_str(", ");
+                }
+                write(element, to);
+            }
+            to.push(']');
+        }
+        Value::Struct(members) => {
+            to.push('{');
+            for (index, (name, value)) in members.iter().enumerate() {
+                if index > 0 {
+                    to.push_str(", ");
+                }
+                to.push_str(&format!("{name}: "));
+                write(value, to);
+            }
+            to.push('}');
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tree(members: &[(&str, Value)]) -> Struct {
+        let members = members.iter().cloned();
+        members
+            .map(|(key, value)| (key.to_owned(), value))
+            .collect()
+    }
+
+    fn json(of: &impl Serialize) -> serde_json::Value {
+        serde_json::to_value(of).unwrap()
+    }
+
+    #[test]
+    fn a_tree_is_sorted_and_shows_values_but_the_hidden_ones() {
+        let hide = "password|secret".parse().unwrap();
+        let login = tree(&[("user", "me".into()), ("Password", "hunter2".into())]);
+        let logins = Value::Array(vec![Value::Struct(login.clone()), 0.5.into()]);
+        let given = tree(&[
+            ("wifi", Value::Struct(login)),
+            ("secret", Value::Struct(tree(&[("a", 1.into())]))),
+            ("rate", 10.0.into()),
+            ("list", logins),
+            ("empty", Value::Struct(tree(&[]))),
+        ]);
+        let shown = json(&members(&given, "", &hide));
+        let expected = serde_json::json!({"more": 0, "members": [
+            {"name": "empty", "type": "dict", "value": "{}"},
+            {"name": "list", "type": "list", "value": "[{user: \"me\", Password: \"(hidden)\"}, 0.5]"},
+            {"name": "rate", "type": "double", "value": "10.0"},
+            {"name": "secret", "type": "namespace", "count": 1, "more": 0, "members": [
+                {"name": "a", "type": "int", "hidden": true}]},
+            {"name": "wifi", "type": "namespace", "count": 2, "more": 0, "members": [
+                {"name": "Password", "type": "str", "hidden": true},
+                {"name": "user", "type": "str", "value": "me"}]},
+        ]});
+        assert_eq!(shown, expected);
+        let found = json(&search(&given, "PASS", &hide));
+        let expected = serde_json::json!({"more": 0, "members": [
+            {"name": "/wifi/Password", "type": "str", "hidden": true}]});
+        assert_eq!(found, expected);
+        assert_eq!(search(&given, "hunter", &hide), Members::default());
+        assert_eq!(members(&given, "/rate", &hide), None);
+        assert_eq!(
+            json(&members(&given, "/wifi/", &hide))["members"][1]["value"],
+            "me"
+        );
+    }
+
+    #[test]
+    fn a_large_tree_is_sent_in_parts() {
+        let hide = "".parse().unwrap();
+        let many = |count: usize| {
+            let members = (0..count).map(|index| (format!("p{index:06}"), Value::Int(1)));
+            Value::Struct(members.collect())
+        };
+        let given = tree(&[("big", many(100_000)), ("small", many(10))]);
+        let shown = json(&members(&given, "/", &hide));
+        assert_eq!(shown["members"][0]["count"], 100_000);
+        assert!(shown["members"][0]["members"].is_null());
+        assert_eq!(shown["members"][1]["members"].as_array().unwrap().len(), 10);
+        let part = members(&given, "/big", &hide).unwrap();
+        assert_eq!(
+            (part.members.len(), part.more),
+            (ENTRIES, 100_000 - ENTRIES)
+        );
+        let found = search(&given, "p09", &hide);
+        assert_eq!((found.members.len(), found.more), (FOUND, 10_000 - FOUND));
+        let long = tree(&[("long", Value::from("ü".repeat(1_000_000)))]);
+        let shown = json(&members(&long, "", &hide));
+        assert_eq!(shown["members"][0]["cut"], true);
+        assert_eq!(shown["members"][0]["value"], "ü".repeat(TEXT));
+    }
+}

@@ -1,0 +1,228 @@
+//! Who is registered, as the page shows it.
+
+use std::{
+    collections::{BTreeMap, HashSet},
+    hash::{DefaultHasher, Hash, Hasher},
+};
+
+use serde::Serialize;
+
+use crate::{clock, ledger::Ledger, master::Snapshot, nodes::Nodes, replay::Token};
+
+/// What is known of a node's life. Nodes are asked after a rescue, when they do not take a notification, and
+/// with `--reap-dead-nodes`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Health {
+    /// Nothing is known against it.
+    Alive,
+    /// It does not answer, and is not known to be dead. It stays registered.
+    Unreachable,
+    /// It was found dead and taken out, and has not come back.
+    Dead,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
+pub(super) struct Node {
+    pub(super) name: String,
+    pub(super) health: Health,
+    /// Its own XML-RPC address.
+    pub(super) api: String,
+    /// Its process on its computer, if it has been asked.
+    pub(super) pid: Option<i32>,
+    pub(super) publishes: Vec<String>,
+    pub(super) subscribes: Vec<String>,
+    pub(super) serves: Vec<String>,
+    /// When it was taken out: seconds since 1970.
+    pub(super) removed_at: Option<u64>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
+pub(super) struct Topic {
+    pub(super) name: String,
+    #[serde(rename = "type")]
+    pub(super) kind: String,
+    pub(super) publishers: Vec<String>,
+    pub(super) subscribers: Vec<String>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
+pub(super) struct Service {
+    pub(super) name: String,
+    pub(super) node: String,
+    pub(super) api: String,
+}
+
+/// Sorted by name.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash, Serialize)]
+pub(super) struct Robot {
+    pub(super) nodes: Vec<Node>,
+    pub(super) topics: Vec<Topic>,
+    pub(super) services: Vec<Service>,
+}
+
+impl Robot {
+    /// What the mirror holds now.
+    pub(super) fn read(ledger: &Ledger, nodes: &Nodes) -> Self {
+        let unreachable: HashSet<String> = nodes.unreachable().into_iter().collect();
+        let (snapshot, pids) = ledger.with_activity(|mirror, activity| {
+            let pids = mirror.nodes().filter_map(|(name, api)| {
+                let (pid, _) = activity.pid_of(name, api)?;
+                Some((name.to_owned(), pid))
+            });
+            let pids: BTreeMap<String, i32> = pids.collect();
+            (mirror.snapshot(), pids)
+        });
+        let mut robot = Self::of(snapshot);
+        for node in &mut robot.nodes {
+            node.pid = pids.get(&node.name).copied();
+            if unreachable.contains(&node.name) {
+                node.health = Health::Unreachable;
+            }
+        }
+        for (name, at) in nodes.removed.list() {
+            let here = robot.nodes.iter().any(|node| node.name == name);
+            if !here {
+                let at = clock::wall_time_of(at);
+                robot.nodes.push(Node {
+                    health: Health::Dead,
+                    removed_at: Some(at.round() as u64),
+                    ..Node::registered(name, String::new())
+                });
+            }
+        }
+        robot.nodes.sort_by(|a, b| a.name.cmp(&b.name));
+        robot
+    }
+
+    /// What a snapshot holds, without rosrescue's own token.
+    pub(super) fn of(snapshot: Snapshot) -> Self {
+        let mut nodes: BTreeMap<String, Node> = BTreeMap::new();
+        for (name, node) in snapshot.nodes {
+            if !Token::is_ours(&name) {
+                nodes.insert(name.clone(), Node::registered(name, node.api));
+            }
+        }
+        let mut topics = BTreeMap::new();
+        for (published, registrations) in
+            [(true, snapshot.publishers), (false, snapshot.subscribers)]
+        {
+            for (name, callers) in registrations {
+                for caller in &callers {
+                    let Some(node) = nodes.get_mut(caller) else {
+                        continue;
+                    };
+                    let list = match published {
+                        true => &mut node.publishes,
+                        false => &mut node.subscribes,
+                    };
+                    list.push(name.clone());
+                }
+                let kind = snapshot.topic_types.get(&name);
+                let topic = topics.entry(name.clone()).or_insert_with(|| Topic {
+                    kind: kind.map_or("*", String::as_str).to_owned(),
+                    name,
+                    publishers: Vec::new(),
+                    subscribers: Vec::new(),
+                });
+                match published {
+                    true => topic.publishers = callers,
+                    false => topic.subscribers = callers,
+                }
+            }
+        }
+        let services = snapshot.services.into_iter().map(|(name, entry)| {
+            if let Some(node) = nodes.get_mut(&entry.node) {
+                node.serves.push(name.clone());
+            }
+            Service {
+                name,
+                node: entry.node,
+                api: entry.api,
+            }
+        });
+        let mut services: Vec<_> = services.collect();
+        services.sort_by(|a, b| a.name.cmp(&b.name));
+        let mut nodes: Vec<_> = nodes.into_values().collect();
+        for node in &mut nodes {
+            for list in [&mut node.publishes, &mut node.subscribes, &mut node.serves] {
+                list.sort();
+            }
+        }
+        Self {
+            nodes,
+            topics: topics.into_values().collect(),
+            services,
+        }
+    }
+
+    /// Changes with every change. A number that JavaScript can hold.
+    pub(super) fn digest(&self) -> u64 {
+        let mut hasher = DefaultHasher::new();
+        for node in &self.nodes {
+            // Seconds that are read from a clock may differ by one.
+            (&node.name, node.health, &node.api, node.pid).hash(&mut hasher);
+        }
+        (&self.topics, &self.services).hash(&mut hasher);
+        hasher.finish() >> 12
+    }
+}
+
+impl Node {
+    fn registered(name: String, api: String) -> Self {
+        Self {
+            name,
+            api,
+            health: Health::Alive,
+            pid: None,
+            publishes: Vec::new(),
+            subscribes: Vec::new(),
+            serves: Vec::new(),
+            removed_at: None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::master::{Master, Method, Request};
+
+    #[test]
+    fn each_name_is_where_it_belongs() {
+        let mut master = Master::default();
+        let api = "http://robot:1/";
+        for (method, name, kind) in [
+            (Method::RegisterPublisher, "/image", "sensor_msgs/Image"),
+            (Method::RegisterSubscriber, "/trigger", "*"),
+        ] {
+            master.apply(&Request::new(method, ["/camera", name, kind, api]));
+        }
+        let service = ["/camera", "/capture", "rosrpc://robot:2", api];
+        master.apply(&Request::new(Method::RegisterService, service));
+        let subscription = ["/viewer", "/image", "*", "http://robot:3/"];
+        master.apply(&Request::new(Method::RegisterSubscriber, subscription));
+        let robot = Robot::of(master.snapshot());
+        let shown = serde_json::to_value(&robot).unwrap();
+        let expected = serde_json::json!({
+            "nodes": [
+                {"name": "/camera", "health": "alive", "api": api, "pid": null, "publishes": ["/image"],
+                 "subscribes": ["/trigger"], "serves": ["/capture"], "removed_at": null},
+                {"name": "/viewer", "health": "alive", "api": "http://robot:3/", "pid": null, "publishes": [],
+                 "subscribes": ["/image"], "serves": [], "removed_at": null},
+            ],
+            "topics": [
+                {"name": "/image", "type": "sensor_msgs/Image", "publishers": ["/camera"], "subscribers": ["/viewer"]},
+                {"name": "/trigger", "type": "*", "publishers": [], "subscribers": ["/camera"]},
+            ],
+            "services": [{"name": "/capture", "node": "/camera", "api": "rosrpc://robot:2"}],
+        });
+        assert_eq!(shown, expected);
+        let before = robot.digest();
+        master.apply(&Request::new(
+            Method::UnregisterSubscriber,
+            ["/viewer", "/image", "http://robot:3/"],
+        ));
+        assert_ne!(Robot::of(master.snapshot()).digest(), before);
+    }
+}

@@ -1,0 +1,147 @@
+//! The status of this moment.
+
+use std::{
+    sync::{Mutex, PoisonError},
+    time::Instant,
+};
+
+use super::Pages;
+use crate::{
+    clock,
+    gate::State,
+    master::Master,
+    status::{
+        Disk,
+        condition::{Situation, condition},
+        summary::{Journal, SCHEMA, Status},
+    },
+};
+
+/// Shortest time over which calls a second are counted.
+const SAMPLE: f64 = 1.0;
+/// Callers listed as the slowest.
+const SLOWEST: usize = 20;
+
+/// Calls a second, counted from one time that somebody asks to the next: at rest it costs nothing.
+#[derive(Debug)]
+pub(crate) struct Rate(Mutex<Sample>);
+
+#[derive(Debug)]
+struct Sample {
+    at: Instant,
+    calls: u64,
+    rate: f64,
+}
+
+impl Rate {
+    pub(crate) fn new(now: Instant) -> Self {
+        Self(Mutex::new(Sample {
+            at: now,
+            calls: 0,
+            rate: 0.0,
+        }))
+    }
+
+    /// The rate at `now`, after so many `calls` in all.
+    fn at(&self, now: Instant, calls: u64) -> f64 {
+        let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let seconds = now.saturating_duration_since(last.at).as_secs_f64();
+        if seconds >= SAMPLE {
+            let new = calls.saturating_sub(last.calls) as f64;
+            *last = Sample {
+                at: now,
+                calls,
+                rate: new / seconds,
+            };
+        }
+        (last.rate * 10.0).round() / 10.0
+    }
+}
+
+impl Pages {
+    pub(super) fn status(&self) -> Status {
+        let counters = self.stats.list().into_iter();
+        let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
+        let gate = self.gate.state();
+        let gate_since = self.gate.since().into_std();
+        let stands_in = matches!(gate, State::StandingIn | State::Injecting);
+        let facts = self.board.read();
+        let unprotected = self.ledger.unprotected();
+        let master = self.upstream.address().to_string();
+        let situation = Situation {
+            gate,
+            gate_since,
+            unprotected: unprotected.clone(),
+            master: master.clone(),
+        };
+        let rescues = facts.reports.iter().filter(|report| report.is_rescue());
+        let last = facts.reports.back();
+        Status {
+            schema: SCHEMA,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            mode: facts.mode,
+            pid: std::process::id(),
+            started: clock::wall_time_of(facts.started),
+            uptime: facts.started.elapsed().as_secs_f64(),
+            uri: self.uri.clone(),
+            condition: condition(&situation, &facts),
+            master,
+            master_pid: last.map(|report| report.master_pid),
+            open: gate.is_open(),
+            ready: gate != State::Unknown,
+            standing_in_since: stands_in.then(|| clock::wall_time_of(gate_since)),
+            pending_writes: self.ledger.pending(),
+            crash_loop: facts.crash_loop.is_some(),
+            deaths: facts.deaths,
+            checkpoint: self.checkpoint.clone(),
+            unprotected,
+            journal: self.journal(&facts.disk),
+            guarded: facts.guarded.is_guarded(),
+            guarded_by: facts.guarded.to_string(),
+            state: self.ledger.with_mirror(Master::counts),
+            unreachable: self.nodes.unreachable(),
+            recoveries: facts.recoveries,
+            last_recovery: last.cloned(),
+            rescues: facts.rescues,
+            last_rescues: rescues.cloned().collect(),
+            calls_per_second: self.rate.at(Instant::now(), self.stats.calls.value()),
+            slowest_callers: self.clients.slowest(SLOWEST),
+            clients: self.clients.list(),
+            counters: counters.collect(),
+        }
+    }
+
+    fn journal(&self, disk: &Disk) -> Journal {
+        let sizes = self
+            .ledger
+            .with_store(|store, _| (store.seq(), store.journal_bytes(), store.snapshot_bytes()));
+        let (seq, bytes, snapshot_bytes) = sizes.unwrap_or_default();
+        let (at, from) = disk.compacted.unzip();
+        Journal {
+            records: seq.saturating_sub(from.unwrap_or(seq)),
+            bytes,
+            snapshot_bytes,
+            last_compaction: at.map(clock::wall_time_of),
+            disk_free_bytes: disk.free,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn calls_a_second_are_counted_between_two_that_ask() {
+        let start = Instant::now();
+        let rate = Rate::new(start);
+        let at = |ms, calls| rate.at(start + Duration::from_millis(ms), calls);
+        assert_eq!(at(100, 50), 0.0, "too early to say");
+        assert_eq!(at(2_000, 100), 50.0);
+        assert_eq!(at(2_500, 900), 50.0, "what was said last");
+        assert_eq!(at(4_000, 200), 50.0);
+        assert_eq!(at(14_000, 201), 0.1);
+    }
+}

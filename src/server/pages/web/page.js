@@ -1,0 +1,701 @@
+// The page of rosrescue. Names of nodes, topics and parameters come from the network: they are only ever set
+// as text, never as markup.
+
+const $ = (id) => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+/** Rows of a list; more are found by searching. */
+const ROWS = 300;
+/** Seconds without any event after which the connection counts as lost; there is one every 15. */
+const SILENCE = 40;
+/** Shortest pause between two readings of the state, in milliseconds. */
+const PAUSE = 2000;
+
+const CONDITIONS = {
+  protected: ["good", "Protected"],
+  standing_in: ["warn", "Standing in for the master"],
+  crash_loop: ["bad", "Crash loop of the master"],
+  unprotected: ["bad", "UNPROTECTED"],
+  waiting: ["warn", "Waiting for a first master"],
+};
+const OUTCOMES = {
+  begun: "a new session was begun",
+  injected: "a new master was given the whole state",
+  adopted: "a running master was taken over",
+  reconciled: "the same master goes on, and was told what changed",
+  resumed: "the same master goes on",
+};
+
+let status = null;
+let now = null;
+let robot = null;
+/** Milliseconds by which the robot's clock is ahead of this one. */
+let skew = 0;
+
+// ---- small things
+
+/** An element with attributes and children; strings become text. */
+function el(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== undefined && value !== false) made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+/** Sets text, if it is another one: a screen reader says only what is new. */
+function say(id, text) {
+  if ($(id).textContent !== text) $(id).textContent = text;
+}
+
+const robotTime = () => (Date.now() + skew) / 1000;
+
+function span(seconds) {
+  const s = Math.max(0, Math.round(seconds));
+  if (s < 60) return `${s} s`;
+  if (s < 3600) return `${Math.floor(s / 60)} min ${s % 60} s`;
+  if (s < 86400) return `${Math.floor(s / 3600)} h ${Math.floor((s % 3600) / 60)} min`;
+  return `${Math.floor(s / 86400)} d ${Math.floor((s % 86400) / 3600)} h`;
+}
+
+function ms(value) {
+  if (value >= 10000) return span(value / 1000);
+  if (value >= 1000) return `${(value / 1000).toFixed(1)} s`;
+  return `${value < 10 ? value.toFixed(1) : Math.round(value)} ms`;
+}
+
+function size(bytes) {
+  if (bytes === null || bytes === undefined) return "–";
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let unit = 0;
+  while (bytes >= 1000 && unit < units.length - 1) {
+    bytes /= 1000;
+    unit += 1;
+  }
+  return `${unit > 0 && bytes < 10 ? bytes.toFixed(1) : Math.round(bytes)} ${units[unit]}`;
+}
+
+const clock = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
+const date = new Intl.DateTimeFormat(undefined, { year: "numeric", month: "short", day: "numeric" });
+
+function moment(seconds) {
+  const at = new Date(seconds * 1000);
+  const today = date.format(new Date(robotTime() * 1000)) === date.format(at);
+  return today ? clock.format(at) : `${date.format(at)}, ${clock.format(at)}`;
+}
+
+const plural = (count, one, many = `${one}s`) => `${count} ${count === 1 ? one : many}`;
+
+/** Calls `work` when `wait` milliseconds have passed without another call. */
+function debounced(work, wait) {
+  let timer;
+  return () => {
+    clearTimeout(timer);
+    timer = setTimeout(work, wait);
+  };
+}
+
+// ---- the connection
+
+let source = null;
+let heard = 0;
+
+function connect() {
+  source?.close();
+  heard = Date.now();
+  source = new EventSource("/events");
+  source.onopen = () => {
+    setLink("live", "live");
+    heard = Date.now();
+    compareClocks();
+    readState();
+  };
+  source.onerror = () => {
+    setLink("lost", "no answer from rosrescue; trying again");
+    // The browser itself comes again after a lost connection, but not after a refusal.
+    if (source.readyState === EventSource.CLOSED) setTimeout(refused, 2000);
+  };
+  source.addEventListener("status", (event) => {
+    heard = Date.now();
+    status = JSON.parse(event.data);
+    showStatus();
+  });
+  source.addEventListener("now", (event) => {
+    heard = Date.now();
+    const before = now;
+    now = JSON.parse(event.data);
+    showNow();
+    const isOther = before && before.registrations !== now.registrations;
+    if (isOther || (tab === "params" && before?.version !== now.version)) readState();
+  });
+}
+
+/** Too many pages are open: the status is asked for, until there is a place. */
+async function refused() {
+  try {
+    const answer = await fetch("/status.json");
+    if (answer.ok) {
+      status = await answer.json();
+      setLink("waiting", "many pages are open: every 2 s");
+      now = { ...status, gate: status.open ? "open" : "standing_in" };
+      showStatus();
+      showNow();
+      readState();
+    }
+  } catch {
+    // It is away.
+  }
+  connect();
+}
+
+function setLink(is, text) {
+  $("link").dataset.is = is;
+  say("link", text);
+  document.body.classList.toggle("lost", is === "lost");
+}
+
+async function compareClocks() {
+  try {
+    const asked = Date.now();
+    const answer = await fetch("/live");
+    const there = Date.parse(answer.headers.get("date"));
+    const offset = there + 500 - (asked + Date.now()) / 2;
+    // The header has whole seconds.
+    skew = Math.abs(offset) > 2000 ? offset : 0;
+  } catch {
+    // It is away again.
+  }
+}
+
+let reading = false;
+let again = false;
+
+/** Reads the state, now or when the pause since the last time is over. */
+async function readState() {
+  if (reading) {
+    again = true;
+    return;
+  }
+  [reading, again] = [true, false];
+  try {
+    const answer = await fetch("/state.json");
+    if (answer.ok) {
+      const before = robot;
+      robot = await answer.json();
+      showCounts();
+      const isOther = before?.registrations !== robot.registrations;
+      if (isOther || JSON.stringify(before.params) !== JSON.stringify(robot.params)) showList();
+      if (isOther) readGraph();
+    }
+  } catch {
+    // The next event asks again.
+  }
+  setTimeout(() => {
+    reading = false;
+    if (again) readState();
+  }, PAUSE);
+}
+
+// ---- condition, figures, rescues
+
+function showStatus() {
+  const { condition } = status;
+  const [is, title] = CONDITIONS[condition.name] ?? ["warn", condition.name];
+  $("condition").dataset.is = is === "good" && condition.action ? "warn" : is;
+  say("condition-name", title);
+  say("condition-text", condition.text);
+  say("condition-action", condition.action ?? "");
+  $("condition-action").hidden = !condition.action;
+  say("uri", status.uri);
+  document.title = `${title} – rosrescue`;
+  say("version", `${status.version} ${status.mode}, process ${status.pid}`);
+  $("version").title = `guarded by ${status.guarded_by}`;
+  showRescues();
+  showTimes();
+  showCounts();
+}
+
+function showNow() {
+  const away = now.gate !== "open";
+  const texts = { open: "up", standing_in: "away", injecting: "coming back", unknown: "not seen yet" };
+  say("master", texts[now.gate] ?? now.gate);
+  const journal = now.journal ?? {};
+  say("journal", plural(journal.records ?? 0, "record"));
+  say("journal-more", size((journal.bytes ?? 0) + (journal.snapshot_bytes ?? 0)));
+  say("disk", size(journal.disk_free_bytes));
+  if (away || document.querySelector("#rescues .now")) showRescues();
+}
+
+function showTimes() {
+  if (!status) return;
+  const { since } = status.condition;
+  say("condition-since", `since ${moment(since)} (${span(robotTime() - since)})`);
+  say("uptime", span(robotTime() - status.started));
+  const running = document.querySelector("#rescues .now .total");
+  if (running && status.standing_in_since) running.textContent = span(robotTime() - status.standing_in_since);
+}
+
+function showCounts() {
+  if (!status) return;
+  const deaths = status.deaths ? `, died ${status.deaths === 1 ? "once" : `${status.deaths} times`}` : "";
+  say("master-more", `${status.master_pid ? `process ${status.master_pid}` : ""}${deaths}`);
+  const sick = robot ? robot.nodes.filter((node) => node.health === "unreachable").length : 0;
+  const dead = robot ? robot.nodes.filter((node) => node.health === "dead").length : 0;
+  say("count-nodes", robot ? String(robot.totals.nodes - dead) : "–");
+  const parts = [];
+  if (sick) parts.push(`${sick} unreachable`);
+  if (dead) parts.push(`${dead} dead`);
+  say("sick", parts.length ? parts.join(", ") : robot ? "all alive" : "");
+}
+
+function showRescues() {
+  const rescues = [...(status?.last_rescues ?? [])].reverse();
+  const rows = [];
+  if (now && (now.gate === "standing_in" || now.gate === "injecting") && status?.standing_in_since) {
+    const what = now.gate === "injecting"
+      ? "a new master is given the state"
+      : "there is no master: the mirror answers in its place";
+    rows.push(el("li", { class: "now" },
+      el("time", {}, moment(status.standing_in_since)),
+      el("div", { class: "track" }),
+      el("span", { class: "total" }, span(robotTime() - status.standing_in_since)),
+      el("span", { class: "what" }, `under way: ${what}, ${plural(now.pending_writes ?? 0, "change")} to be handed over`)));
+  }
+  rows.push(...rescues.slice(0, 8).map(rescueRow));
+  const rest = rescues.slice(8);
+  if (rest.length) {
+    const older = el("li", {}, el("button", { type: "button", onclick: () => older.replaceWith(...rest.map(rescueRow)) }, `${rest.length} older`));
+    rows.push(older);
+  }
+  $("rescues-list").replaceChildren(...rows);
+  $("rescues-none").hidden = rows.length > 0;
+  $("rescues-key").hidden = rows.length === 0;
+  say("rescues-count", status?.rescues ? `${status.rescues} since the start` : "");
+}
+
+function rescueRow(rescue) {
+  const { absence_ms: absence, inspection_ms: inspection, injection_ms: injection, total_ms: total } = rescue.phases;
+  const check = rescue.health_check_ms;
+  const parts = [
+    ["absence", absence, "no master"],
+    ["inspection", inspection, "to read it"],
+    ["injection", injection, "to restore it"],
+    ["rest", Math.max(0, total - absence - inspection - injection), "until calls passed"],
+    // It goes on beside the calls, and for longer: not to scale.
+    ["check", check === null ? 0 : Math.min(check, total / 2), "nodes asked, calls pass"],
+  ].filter(([, length]) => length > 0.05);
+  const track = el("div", { class: "track", role: "img" });
+  for (const [name, length, words] of parts) {
+    const part = el("i", { class: name, title: `${ms(name === "check" ? check : length)} ${words}` });
+    part.style.flexGrow = length;
+    track.append(part);
+  }
+  const phases = `${ms(absence)} without a master, ${ms(inspection)} to read it, ${ms(injection)} to restore it` +
+    (check === null ? "" : `, nodes asked within ${ms(check)}`);
+  track.setAttribute("aria-label", phases);
+  const calls = rescue.unanswered
+    ? `${plural(rescue.answered, "call")} answered meanwhile, ${rescue.unanswered} in vain`
+    : `${plural(rescue.answered, "call")} answered meanwhile, none lost`;
+  const lists = [
+    ["could not be restored", rescue.not_restored],
+    ["differs", rescue.mismatches],
+    ["dead nodes taken out", rescue.removed],
+    ["corrected, as the nodes say", rescue.reconciled],
+    ["nodes that do not answer", rescue.unreachable],
+  ].filter(([, names]) => names?.length).map(([what, names]) => `${what}: ${names.join(", ")}`);
+  const cause = rescue.cause + (rescue.ended ? ` (${rescue.ended})` : "");
+  const words = [`${cause}: ${OUTCOMES[rescue.outcome] ?? rescue.outcome}`, calls, phases, ...lists];
+  const at = new Date(rescue.detected_at * 1000);
+  return el("li", {},
+    el("time", { datetime: at.toISOString() }, clock.format(at), el("small", {}, date.format(at))),
+    track,
+    el("span", { class: "total" }, ms(total)),
+    el("span", { class: "what" }, words.join("; ")));
+}
+
+// ---- calls a second
+
+const rates = [];
+let counted = null;
+
+function countCalls() {
+  const calls = now?.counters?.calls;
+  if (calls === undefined) return;
+  const at = performance.now();
+  if (counted && calls >= counted.calls && !document.body.classList.contains("lost")) {
+    rates.push((1000 * (calls - counted.calls)) / (at - counted.at));
+    if (rates.length > 60) rates.shift();
+    const rate = rates.at(-1);
+    say("calls", rate >= 10 || rate === 0 ? String(Math.round(rate)) : rate.toFixed(1));
+    const most = Math.max(1, ...rates);
+    const points = rates.map((value, index) => `${(120 * (index + 60 - rates.length)) / 59},${30 - (27 * value) / most}`);
+    const [area, line] = $("spark").children;
+    line.setAttribute("points", points.join(" "));
+    area.setAttribute("points", [`${(120 * (60 - rates.length)) / 59},32`, ...points, "120,32"].join(" "));
+  }
+  counted = { calls, at };
+}
+
+// ---- the graph
+
+const picture = $("picture");
+let view = null;
+let whole = null;
+let drawing = 0;
+/** The smallest scale at which a picture is shown at first: on a phone its height, and a part of its width. */
+const least = () => (isTall() && whole ? Math.min(0.7, picture.clientHeight / whole.height) : 0.4);
+
+const isTall = () => picture.clientHeight > picture.clientWidth;
+
+function graphQuery() {
+  const query = new URLSearchParams();
+  const filter = $("graph-filter").value.trim();
+  if (filter) query.set("filter", filter);
+  if ($("graph-leaves").checked) query.set("leaves", "1");
+  if ($("graph-debug").checked) query.set("debug", "1");
+  if (isTall()) query.set("tall", "1");
+  return query.size ? `/graph.svg?${query}` : "/graph.svg";
+}
+
+async function readGraph() {
+  const url = graphQuery();
+  const number = ++drawing;
+  $("graph-file").href = url;
+  let text;
+  try {
+    const answer = await fetch(url);
+    if (!answer.ok) return;
+    text = await answer.text();
+  } catch {
+    return;
+  }
+  // A later one is on its way.
+  if (number !== drawing) return;
+  const parsed = new DOMParser().parseFromString(text, "image/svg+xml").documentElement;
+  if (parsed.namespaceURI !== SVG || parsed.localName !== "svg") return;
+  const svg = document.importNode(parsed, true);
+  const [x, y, width, height] = svg.getAttribute("viewBox").split(" ").map(Number);
+  const isSame = whole?.width === width && whole?.height === height;
+  whole = { x, y, width, height };
+  svg.removeAttribute("width");
+  svg.removeAttribute("height");
+  picture.replaceChildren(svg);
+  if (isSame) show(view);
+  else fit(least());
+  if (chosen) choose(chosen, false);
+}
+
+/** The whole picture, but no larger than its own size, and at first no smaller than one can make out. */
+function fit(smallest = 0) {
+  const { clientWidth, clientHeight } = picture;
+  if (!whole || !clientWidth || !clientHeight) return;
+  const scale = Math.max(smallest, Math.min(1, clientWidth / whole.width, clientHeight / whole.height));
+  const width = clientWidth / scale;
+  const height = clientHeight / scale;
+  // Of what is too long the beginning is shown.
+  const from = (start, length, shown) => start - Math.max(0, shown - length) / 2;
+  show({ x: from(whole.x, whole.width, width), y: from(whole.y, whole.height, height), width, height });
+}
+
+function show(next) {
+  view = next;
+  picture.firstElementChild?.setAttribute("viewBox", `${view.x} ${view.y} ${view.width} ${view.height}`);
+}
+
+/** Zooms such that what is at this place of the picture stays there. */
+function zoom(factor, atX = picture.clientWidth / 2, atY = picture.clientHeight / 2) {
+  if (!view) return;
+  const scale = view.width / picture.clientWidth;
+  const wanted = Math.min(Math.max(scale / factor, 0.2), 40);
+  const change = wanted / scale;
+  show({
+    x: view.x + atX * scale * (1 - change),
+    y: view.y + atY * scale * (1 - change),
+    width: view.width * change,
+    height: view.height * change,
+  });
+}
+
+function pan(dx, dy) {
+  if (!view) return;
+  const scale = view.width / picture.clientWidth;
+  show({ ...view, x: view.x - dx * scale, y: view.y - dy * scale });
+}
+
+const pointers = new Map();
+let travelled = 0;
+
+picture.addEventListener("pointerdown", (event) => {
+  if (pointers.size === 0) travelled = 0;
+  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+});
+picture.addEventListener("pointermove", (event) => {
+  const last = pointers.get(event.pointerId);
+  if (!last) return;
+  const [dx, dy] = [event.clientX - last.x, event.clientY - last.y];
+  travelled += Math.abs(dx) + Math.abs(dy);
+  if (travelled > 6 && !picture.hasPointerCapture(event.pointerId)) picture.setPointerCapture(event.pointerId);
+  picture.classList.add("moved");
+  const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+  if (other) {
+    const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y);
+    const box = picture.getBoundingClientRect();
+    const at = { x: event.clientX, y: event.clientY };
+    zoom(distance(at) / Math.max(1, distance(last)), (at.x + other.x) / 2 - box.left, (at.y + other.y) / 2 - box.top);
+    pan(dx / 2, dy / 2);
+  } else {
+    pan(dx, dy);
+  }
+  pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+});
+for (const name of ["pointerup", "pointercancel"]) {
+  picture.addEventListener(name, (event) => {
+    pointers.delete(event.pointerId);
+    if (pointers.size === 0) picture.classList.remove("moved");
+  });
+}
+picture.addEventListener("click", (event) => {
+  if (travelled > 6) return;
+  const box = event.target.closest?.(".box");
+  choose(box ? idOf(box) : null);
+});
+// Without a key the wheel scrolls the page, until the picture has been clicked.
+picture.addEventListener("wheel", (event) => {
+  if (!event.ctrlKey && !event.metaKey && !picture.contains(document.activeElement)) return;
+  event.preventDefault();
+  const box = picture.getBoundingClientRect();
+  zoom(Math.exp(-event.deltaY / 400), event.clientX - box.left, event.clientY - box.top);
+}, { passive: false });
+picture.addEventListener("keydown", (event) => {
+  const step = 60;
+  const actions = {
+    "+": () => zoom(1.3), "=": () => zoom(1.3), "-": () => zoom(1 / 1.3), 0: () => fit(),
+    ArrowLeft: () => pan(step, 0), ArrowRight: () => pan(-step, 0), ArrowUp: () => pan(0, step), ArrowDown: () => pan(0, -step),
+    Escape: () => choose(null),
+  };
+  if (event.ctrlKey || event.metaKey || event.altKey || !actions[event.key]) return;
+  event.preventDefault();
+  actions[event.key]();
+});
+
+const idOf = (box) => ("node" in box.dataset ? ["node", box.dataset.node] : ["topic", box.dataset.topic]);
+
+// ---- details of a node or a topic
+
+/** What is chosen: its kind and its name. */
+let chosen = null;
+
+function choose(next, isNew = true) {
+  chosen = next;
+  const svg = picture.querySelector("svg");
+  for (const marked of picture.querySelectorAll(".chosen, .near")) marked.classList.remove("chosen", "near");
+  const box = next && [...picture.querySelectorAll(".box")].find((of) => of.dataset[next[0]] === next[1]);
+  svg?.classList.toggle("choice", Boolean(box));
+  if (box) {
+    box.classList.add("chosen");
+    const { id } = box.dataset;
+    for (const line of picture.querySelectorAll(".lines path")) {
+      const { from, to } = line.dataset;
+      if (from !== id && to !== id) continue;
+      line.classList.add("near");
+      picture.querySelector(`[data-id="${from === id ? to : from}"]`)?.classList.add("near");
+    }
+  }
+  if (isNew || next) showDetails();
+}
+
+function nameButton(kind, name) {
+  return el("button", { type: "button", class: "name", onclick: () => choose([kind, name]) }, name);
+}
+
+function nameList(title, kind, names) {
+  if (!names.length) return [];
+  const items = names.map((name) => el("li", {}, kind ? nameButton(kind, name) : name));
+  return [el("h4", {}, title), el("ul", {}, ...items)];
+}
+
+function showDetails() {
+  const panel = $("details");
+  panel.hidden = !chosen;
+  if (!chosen || !robot) return;
+  const [kind, name] = chosen;
+  const found = (kind === "node" ? robot.nodes : robot.topics).find((of) => of.name === name);
+  const parts = [el("h3", {}, name)];
+  if (!found) {
+    parts.push(el("p", {}, "It is not registered any more."));
+  } else if (kind === "node") {
+    parts.push(
+      el("p", {}, health(found), found.api ? ` ${found.api}` : "", found.pid ? `, process ${found.pid}` : ""),
+      ...nameList("publishes", "topic", found.publishes),
+      ...nameList("subscribes", "topic", found.subscribes),
+      ...nameList("serves", null, found.serves));
+  } else {
+    parts.push(
+      el("p", {}, typeOf(found)),
+      ...nameList("published by", "node", found.publishers),
+      ...nameList("subscribed by", "node", found.subscribers));
+  }
+  panel.lastElementChild.replaceChildren(...parts);
+}
+
+function health(node) {
+  const texts = {
+    alive: "alive",
+    unreachable: "unreachable: kept, and asked again",
+    dead: `dead, taken out ${node.removed_at ? moment(node.removed_at) : ""}`,
+  };
+  return el("span", { class: "health", "data-is": node.health }, texts[node.health] ?? node.health);
+}
+
+const typeOf = (topic) => (topic.type === "*" ? "type not known" : topic.type);
+
+// ---- lists
+
+let tab = "nodes";
+const tabs = ["nodes", "topics", "services", "params"];
+
+function selectTab(next, focus) {
+  tab = next;
+  for (const name of tabs) {
+    const button = $(`tab-${name}`);
+    button.setAttribute("aria-selected", String(name === tab));
+    button.tabIndex = name === tab ? 0 : -1;
+  }
+  if (focus) $(`tab-${tab}`).focus();
+  $("list").setAttribute("aria-labelledby", `tab-${tab}`);
+  $("list").scrollTop = 0;
+  if (tab === "params") readState();
+  showList();
+}
+
+function showList() {
+  if (!robot) return;
+  const text = $("list-filter").value.trim().toLowerCase();
+  if (tab === "params") return showParams(text);
+  const has = (...words) => !text || words.flat().some((word) => word.toLowerCase().includes(text));
+  const rows = {
+    nodes: () => robot.nodes.filter((of) => has(of.name, of.publishes, of.subscribes, of.serves)).map((of) => [
+      nameButton("node", of.name), health(of), where(of), names(of.publishes), names(of.subscribes), names(of.serves)]),
+    topics: () => robot.topics.filter((of) => has(of.name, of.type)).map((of) => [
+      nameButton("topic", of.name), typeOf(of), names(of.publishers), names(of.subscribers)]),
+    services: () => robot.services.filter((of) => has(of.name, of.node)).map((of) => [of.name, nameButton("node", of.node), of.api]),
+  }[tab]();
+  const heads = {
+    nodes: ["node", "", "address", "publishes", "subscribes", "serves"],
+    topics: ["topic", "type", "published by", "subscribed by"],
+    services: ["service", "node", "address"],
+  }[tab];
+  const left = rows.length - ROWS + Math.max(0, robot.totals[tab] - robot[tab].length);
+  const body = rows.slice(0, ROWS).map((row) => el("tr", {}, ...row.map((cell, index) => {
+    const label = index > 0 && heads[index] ? heads[index] : undefined;
+    const kind = !Array.isArray(cell) ? undefined : label === "address" ? "names where" : "names";
+    return el("td", { class: kind, "data-label": label }, ...[cell].flat());
+  })));
+  const table = el("table", {}, el("thead", {}, el("tr", {}, ...heads.map((head) => el("th", { scope: "col" }, head)))), el("tbody", {}, ...body));
+  const note = rows.length === 0 ? `no ${tab} ${text ? "match" : "are registered"}` : left > 0 ? `${left} more: search for a name` : null;
+  const shown = rows.length ? [table] : [];
+  $("list").replaceChildren(...shown, ...(note ? [el("p", { class: "quiet" }, note)] : []));
+}
+
+function where(node) {
+  const api = node.api.replace(/^http:\/\//, "").replace(/\/$/, "");
+  return [el("span", {}, api), ...(node.pid ? [el("span", {}, `process ${node.pid}`)] : [])];
+}
+
+/** A few of many names; all of them are in the details. */
+function names(list) {
+  const shown = list.slice(0, 5).map((name) => el("span", {}, name));
+  return list.length > 5 ? [...shown, el("span", {}, `and ${list.length - 5} more`)] : shown;
+}
+
+// ---- parameters
+
+const opened = new Set();
+let asked = 0;
+
+async function showParams(text) {
+  const number = ++asked;
+  if (!text) {
+    const { members, more } = robot.params;
+    return $("list").replaceChildren(members.length ? paramList(members, more, "") : el("p", { class: "quiet" }, "no parameters"));
+  }
+  const found = await ask({ search: text });
+  if (number !== asked || !found) return;
+  const list = found.members.length ? paramList(found.members, found.more, null) : el("p", { class: "quiet" }, "no parameter matches");
+  $("list").replaceChildren(list);
+}
+
+async function ask(query) {
+  try {
+    const answer = await fetch(`/state.json?${new URLSearchParams(query)}`);
+    return answer.ok ? await answer.json() : null;
+  } catch {
+    return null;
+  }
+}
+
+/** The entries of the namespace `above`, or of a search: they have whole names. */
+function paramList(entries, more, above) {
+  const items = entries.map((entry) => {
+    const name = above === null ? entry.name : `${above}/${entry.name}`;
+    if (entry.type === "namespace") return el("li", {}, namespace(entry, name));
+    const value = entry.hidden
+      ? el("i", {}, "(hidden)")
+      : el("span", {}, entry.value + (entry.cut ? " …" : ""));
+    return el("li", { class: "param", title: `${name}, ${entry.type}` }, el("b", {}, entry.name), ": ", value);
+  });
+  if (more) items.push(el("li", { class: "quiet" }, `${more} more: search for a name`));
+  return el("ul", {}, ...items);
+}
+
+function namespace(entry, name) {
+  const made = el("details", {}, el("summary", {}, `${entry.name}/ `, el("small", {}, String(entry.count))));
+  const fill = async () => {
+    if (made.childElementCount > 1) return;
+    const part = entry.members ? entry : await ask({ params: name });
+    if (part && made.childElementCount === 1) made.append(paramList(part.members, part.more, name));
+  };
+  made.addEventListener("toggle", () => {
+    if (made.open) {
+      opened.add(name);
+      fill();
+    } else {
+      opened.delete(name);
+    }
+  });
+  if (opened.has(name)) {
+    made.open = true;
+    fill();
+  }
+  return made;
+}
+
+// ---- what the person does
+
+for (const name of tabs) {
+  $(`tab-${name}`).addEventListener("click", () => selectTab(name));
+  $(`tab-${name}`).addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (step) selectTab(tabs[(tabs.indexOf(tab) + step + tabs.length) % tabs.length], true);
+  });
+}
+$("list-filter").addEventListener("input", debounced(showList, 150));
+$("graph-filter").addEventListener("input", debounced(readGraph, 200));
+$("graph-leaves").addEventListener("change", readGraph);
+$("graph-debug").addEventListener("change", readGraph);
+$("zoom-in").addEventListener("click", () => zoom(1.4));
+$("zoom-out").addEventListener("click", () => zoom(1 / 1.4));
+$("zoom-all").addEventListener("click", () => fit());
+$("details-close").addEventListener("click", () => choose(null));
+new ResizeObserver(() => fit(least())).observe(picture);
+
+setInterval(() => {
+  countCalls();
+  showTimes();
+  if (Date.now() - heard > SILENCE * 1000) {
+    setLink("lost", "no answer from rosrescue; trying again");
+    connect();
+  }
+}, 1000);
+connect();
