@@ -90,6 +90,12 @@ mod cli {
     mod stop;
 }
 
+/// The page in a browser, and what it is made of.
+mod page {
+    mod answers;
+    mod browser;
+}
+
 /// The commands that do not serve.
 mod commands {
     mod check;

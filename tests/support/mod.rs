@@ -17,6 +17,7 @@
 )]
 
 mod blocks;
+mod browser;
 mod command;
 mod disk;
 mod failing;
@@ -40,6 +41,7 @@ mod streams;
 mod twins;
 
 pub(crate) use blocks::{blocks, documents};
+pub(crate) use browser::Browser;
 pub(crate) use command::{Ran, command, run};
 pub(crate) use disk::SmallDisk;
 pub(crate) use failing::{Failing, Failures, Forkserver, page};

@@ -220,6 +220,13 @@ impl Wire {
         })
     }
 
+    /// What has come, or comes next.
+    pub(crate) fn some(&mut self) -> io::Result<Vec<u8>> {
+        let part = self.stream.fill_buf()?.to_vec();
+        self.stream.consume(part.len());
+        Ok(part)
+    }
+
     /// One whole answer, as long as its Content-Length says; without one, up to the end.
     pub(crate) fn response(&mut self) -> io::Result<Response> {
         let mut response = self.head()?;

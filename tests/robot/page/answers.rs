@@ -1,0 +1,215 @@
+//! What the pages answer, without a browser.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::support::{
+    Client, Mode, Response, Robot, Scratch, Setup, Wire, eventually, request, tree,
+};
+
+const SECRET: &str = "hunter2";
+
+fn get(client: &Client, path: &str, headers: &[&str]) -> Response {
+    let page = request(&format!("GET {path} HTTP/1.1"), headers, b"");
+    client.exchange(&page).unwrap()
+}
+
+fn json(client: &Client, path: &str) -> Value {
+    let page = get(client, path, &[]);
+    assert_eq!(page.code, 200, "{path}");
+    serde_json::from_slice(&page.body).unwrap()
+}
+
+/// Somebody who listens to `/events`.
+fn listen(port: u16) -> (Wire, Response) {
+    let mut wire = Wire::connect("127.0.0.1", port).unwrap();
+    wire.send(&request("GET /events HTTP/1.1", &[], b""))
+        .unwrap();
+    let head = wire.head().unwrap();
+    (wire, head)
+}
+
+#[test]
+fn a_browser_gets_the_page_and_curl_gets_text() {
+    let robot = Robot::start(Mode::Core);
+    let client = robot.client();
+    let text = get(&client, "/", &["Accept: */*"]);
+    assert_eq!(
+        text.header("content-type"),
+        Some("text/plain; charset=utf-8")
+    );
+    assert!(text.text().starts_with("protected"), "{}", text.text());
+    let html = get(
+        &client,
+        "/",
+        &["Accept: text/html,application/xhtml+xml,*/*;q=0.8"],
+    );
+    assert_eq!(
+        html.header("content-type"),
+        Some("text/html; charset=utf-8")
+    );
+    for (path, kind) in [
+        ("/page.js", "text/javascript"),
+        ("/page.css", "text/css"),
+        ("/graph.svg", "image/svg+xml"),
+        ("/state.json", "application/json"),
+    ] {
+        let page = get(&client, path, &[]);
+        assert_eq!(
+            (page.code, page.header("content-type")),
+            (200, Some(kind)),
+            "{path}"
+        );
+        let policy = page.header("content-security-policy").unwrap();
+        assert!(policy.starts_with("default-src 'none'; script-src 'self'"));
+        assert!(!policy.contains("unsafe"));
+        assert_eq!(page.header("x-content-type-options"), Some("nosniff"));
+    }
+    let (live, ready) = (get(&client, "/live", &[]), get(&client, "/ready", &[]));
+    assert_eq!((live.code, ready.code), (200, 200));
+    assert_eq!(get(&client, "/favicon.ico", &[]).code, 404);
+    // A page of another site, which could take the few places of listeners.
+    for path in ["/events", "/state.json"] {
+        let refused = get(&client, path, &["Origin: http://evil.example"]);
+        assert_eq!(refused.code, 403);
+    }
+}
+
+#[test]
+fn no_answer_holds_a_hidden_value() {
+    let robot = Robot::start_with(Mode::Core, &["--hide-values", "^/login|pin$"]);
+    let client = robot.client();
+    let list = rosrescue::xmlrpc::Value::Array(vec![tree! { "pin" => SECRET }]);
+    client.set_param("/login", tree! { "user" => SECRET });
+    client.set_param(
+        "/door",
+        tree! { "PIN" => SECRET, "list" => list, "password" => "shown" },
+    );
+    let (mut wire, _) = listen(robot.port());
+    for path in [
+        "/",
+        "/status.json",
+        "/metrics",
+        "/state.json",
+        "/state.json?params=/login",
+        "/state.json?params=/door",
+        "/state.json?search=pin",
+        "/state.json?search=log",
+        "/state.json?search=hunter2",
+        "/graph.svg?filter=hunter2",
+    ] {
+        let page = get(&client, path, &["Accept: text/html"]).text();
+        assert!(
+            !page.replace("filter=hunter2", "").contains(SECRET),
+            "{path}: {page}"
+        );
+    }
+    let door = json(&client, "/state.json?params=/door");
+    assert!(door.to_string().contains("shown"), "{door}");
+    assert!(!String::from_utf8_lossy(&wire.some().unwrap()).contains(SECRET));
+}
+
+#[test]
+fn a_pattern_that_is_none_is_refused_in_a_sentence() {
+    let scratch = Scratch::new();
+    for command in ["core", "proxy"] {
+        let mut rescue = Setup::bare(&scratch, [command, "--hide-values", "a(b"])
+            .env("ROSRESCUE_MASTER", "http://127.0.0.1:1")
+            .spawn();
+        assert_eq!(rescue.wait_output().code(), Some(2));
+        let said = rescue.stderr().join("\n");
+        assert!(
+            said.contains("--hide-values") && said.contains("unclosed group"),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn a_hundred_thousand_parameters_are_sent_in_parts_and_hold_up_nobody() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    let client = robot.client();
+    let many =
+        (0..100_000).map(|index| (format!("p{index}"), rosrescue::xmlrpc::Value::Int(index)));
+    client.set_param("/many", rosrescue::xmlrpc::Value::Struct(many.collect()));
+    client.set_param("/few", 1);
+    let page = get(&client, "/state.json", &[]);
+    assert!(page.body.len() < 10_000, "{} bytes", page.body.len());
+    let state: Value = serde_json::from_slice(&page.body).unwrap();
+    let many = state["params"]["members"].as_array().unwrap();
+    let many = many.iter().find(|member| member["name"] == "many").unwrap();
+    assert_eq!(many["count"], 100_000);
+    let part = json(&client, "/state.json?params=%2Fmany");
+    assert_eq!(part["members"].as_array().unwrap().len(), 1000);
+    assert_eq!(part["more"], 99_000);
+    assert_eq!(
+        json(&client, "/state.json?search=p77777")["members"][0]["value"],
+        "77777"
+    );
+    assert_eq!(get(&client, "/state.json?params=/none", &[]).code, 404);
+}
+
+#[test]
+fn a_few_may_listen_and_hear_of_every_change() {
+    let mut robot = Robot::start(Mode::Core);
+    let mut listeners: Vec<_> = (0..16).map(|_| listen(robot.port())).collect();
+    for (_, head) in &listeners {
+        assert_eq!(head.header("content-type"), Some("text/event-stream"));
+    }
+    let (_, refused) = listen(robot.port());
+    assert_eq!(refused.code, 503);
+    let (wire, _) = &mut listeners[0];
+    let mut heard = String::new();
+    let mut hears = |what: &str, words: &[&str]| {
+        eventually(what, || {
+            heard += &String::from_utf8_lossy(&wire.some().unwrap());
+            words.iter().all(|word| heard.contains(word))
+        });
+    };
+    hears(
+        "the status and the figures",
+        &["event: status\n", "event: now\n", r#""name":"protected""#],
+    );
+    robot.client().set_param("/new", 1);
+    robot.crash_master();
+    hears(
+        "the rescue",
+        &[r#""standing_in"#, r#""outcome":"injected""#],
+    );
+    // One that leaves makes room.
+    listeners.truncate(15);
+    eventually("there is room again", || listen(robot.port()).1.code == 200);
+    assert!(robot.rescue.terminate().success(), "nobody is waited for");
+}
+
+/// A dashboard with a metric that is not there shows nothing, and an alert never comes.
+#[test]
+fn every_metric_of_the_examples_exists() {
+    let mut robot = Robot::start(Mode::Core);
+    robot.crash_master();
+    let metrics = get(&robot.client(), "/metrics", &[]).text();
+    let mut seen = 0;
+    for file in ["grafana/rosrescue.json", "prometheus/alerts.yaml"] {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("examples")
+            .join(file);
+        let text = fs::read_to_string(&file).unwrap();
+        for (at, _) in text.match_indices("rosrescue_") {
+            let rest = text.split_at(at).1;
+            let end = rest.find(|c: char| !c.is_ascii_lowercase() && c != '_');
+            let name = rest.split_at(end.unwrap()).0;
+            let is_there = [" ", "{"]
+                .iter()
+                .any(|end| metrics.contains(&format!("\n{name}{end}")));
+            assert!(
+                is_there,
+                "{} names {name}, which is not in:\n{metrics}",
+                file.display()
+            );
+            seen += 1;
+        }
+    }
+    assert!(seen > 25, "{seen}");
+}
