@@ -211,7 +211,7 @@ impl Master {
 
     /// The calls that remove a node, as the node itself would send them at its end.
     ///
-    /// A reference by a service that another node took over stays: [`Self::forget_calls`] removes it, too.
+    /// A reference by a service that another node took over stays: `forget_calls` removes it, too.
     pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();

@@ -59,6 +59,17 @@ impl FromIterator<(String, Value)> for Struct {
     }
 }
 
+/// For tests.
+#[cfg(test)]
+impl From<&[(&str, Value)]> for Struct {
+    fn from(members: &[(&str, Value)]) -> Self {
+        let members = members.iter().cloned();
+        members
+            .map(|(key, value)| (key.to_owned(), value))
+            .collect()
+    }
+}
+
 impl<const N: usize> From<[(String, Value); N]> for Struct {
     fn from(members: [(String, Value); N]) -> Self {
         members.into_iter().collect()

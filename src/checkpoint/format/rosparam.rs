@@ -84,10 +84,7 @@ mod tests {
     use super::*;
 
     fn tree(members: &[(&str, Value)]) -> Struct {
-        let members = members.iter().cloned();
-        members
-            .map(|(key, value)| (key.to_owned(), value))
-            .collect()
+        members.into()
     }
 
     #[test]
