@@ -10,8 +10,8 @@ use crate::hide::Hide;
 /// Where checkpoints are.
 #[derive(Args, Clone, Debug)]
 pub struct CheckpointArgs {
-    /// The checkpoint in use, beside which others are kept [default: latest-chkpt.yaml in $ROS_LOG_DIR,
-    /// $ROS_HOME/log or ~/.ros/log]
+    /// The checkpoint in use, beside which others are kept [default: that of the rosrescue that runs on this
+    /// computer, else latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
 }

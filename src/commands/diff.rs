@@ -11,10 +11,10 @@ use crate::{
 };
 
 pub(super) async fn run(args: &DiffArgs) -> Result<Exit, Failure> {
-    let a = files::read(&args.a, &args.read)?;
+    let a = files::read(&args.a, &args.read).await?;
     let (b, state, names) = match &args.b {
         Some(b) => {
-            let b = files::read(b, &args.read)?;
+            let b = files::read(b, &args.read).await?;
             (b.path.display().to_string(), b.state, ["A", "B"])
         }
         None => {

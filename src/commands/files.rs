@@ -7,14 +7,17 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::Failure;
+use super::{
+    Failure,
+    running::{Running, is_here},
+};
 use crate::{
     checkpoint::{
         format::{Entry, Session},
         session,
         store::{self, OpenError, history},
     },
-    cli::{CheckpointArgs, ReadArgs},
+    cli::{CheckpointArgs, ReadArgs, TargetArgs},
     config,
     master::{Master, Request},
 };
@@ -42,14 +45,29 @@ pub(super) struct Opened {
 }
 
 /// The checkpoint in use, links resolved.
-pub(super) fn present(place: &CheckpointArgs) -> PathBuf {
+pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     let env = |name: &str| std::env::var(name).ok();
-    let path = config::checkpoint_path(place.checkpoint.as_deref(), &env);
+    let running = match place.checkpoint {
+        None => of_running().await,
+        Some(_) => None,
+    };
+    let path =
+        running.unwrap_or_else(|| config::checkpoint_path(place.checkpoint.as_deref(), &env));
     fs::canonicalize(&path).unwrap_or(path)
 }
 
+/// The checkpoint of the rosrescue that runs on this computer. As a service it has another home than whoever asks.
+async fn of_running() -> Option<PathBuf> {
+    let uri = std::env::var("ROSRESCUE_URI").ok();
+    let running = Running::find(&TargetArgs { uri }).ok()?;
+    if !is_here(&running.address).await {
+        return None;
+    }
+    Some(running.status().await.ok()?.checkpoint.into())
+}
+
 /// The checkpoint that `file` means: a path, or a name or number of the history.
-pub(super) fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
+pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failure> {
     match fs::canonicalize(file) {
         Ok(path) => return Ok(path),
         Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -58,7 +76,7 @@ pub(super) fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf, Failu
             return Err(Failure::Usage(why));
         }
     }
-    let present = present(place);
+    let present = present(place).await;
     let listed = list(&present);
     let wanted = file.to_string_lossy();
     let named = |(number, kept): (usize, &Listed)| {
@@ -158,8 +176,8 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
 }
 
 /// Reads the checkpoint that `file` means. Refuses a damaged one, unless that is asked for.
-pub(super) fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure> {
-    let opened = open(&find(file, &args.place)?)?;
+pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure> {
+    let opened = open(&find(file, &args.place).await?)?;
     let path = opened.path.display();
     if !opened.exact && !args.damaged {
         let why = opened

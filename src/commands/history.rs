@@ -12,7 +12,7 @@ use super::{
 use crate::{cli::HistoryArgs, clock};
 
 pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
-    let present = files::present(&args.place);
+    let present = files::present(&args.place).await;
     let rows = files::list(&present)
         .into_iter()
         .zip(1..)

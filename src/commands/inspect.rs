@@ -23,11 +23,11 @@ pub(super) async fn run(args: &InspectArgs) -> Result<Exit, Failure> {
     let file = match &args.file {
         Some(file) => file,
         None => {
-            present = files::present(&args.read.place);
+            present = files::present(&args.read.place).await;
             &present
         }
     };
-    let opened = files::read(file, &args.read)?;
+    let opened = files::read(file, &args.read).await?;
     print(
         &Inspected::new(&opened, &args.hide.hide_values),
         &args.output,

@@ -29,7 +29,7 @@ const CALLS_AT_ONCE: usize = 200;
 const BYTES_AT_ONCE: usize = 4 << 20;
 
 pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
-    let file = files::read(&args.file, &args.read)?;
+    let file = files::read(&args.file, &args.read).await?;
     let mut live = Live::connect(&Running::find(&args.target)?).await?;
     let work = Work::plan(&Arc::new(file.state.clone()), &mut live, args.exact).await?;
     let mut restored = Restored {

@@ -1,6 +1,6 @@
 //! Finding and asking the running rosrescue.
 
-use std::time::Duration;
+use std::{io, time::Duration};
 
 use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
@@ -127,4 +127,16 @@ impl Running {
         let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
         Ok((head.status, body))
     }
+}
+
+/// Whether a connection to `address` ends on this computer.
+pub(super) async fn is_here(address: &MasterUri) -> bool {
+    let connect = async {
+        let addresses = resolver::addresses(&address.host, address.port).await?;
+        let stream = TcpStream::connect(&*addresses).await?;
+        let (here, there) = (stream.local_addr()?.ip(), stream.peer_addr()?.ip());
+        io::Result::Ok(there.is_loopback() || here == there)
+    };
+    let here = timeout(ANSWER_LIMIT, connect).await;
+    matches!(here, Ok(Ok(true)))
 }

@@ -8,7 +8,7 @@ use super::{Exit, Failure, files, print};
 use crate::{cli::VerifyArgs, master::Counts};
 
 pub(super) async fn run(args: &VerifyArgs) -> Result<Exit, Failure> {
-    let opened = files::open(&files::find(&args.file, &args.place)?)?;
+    let opened = files::open(&files::find(&args.file, &args.place).await?)?;
     let verified = Verified {
         file: opened.path.display().to_string(),
         whole: opened.damage.is_empty(),

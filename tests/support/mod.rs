@@ -18,7 +18,6 @@
 
 mod blocks;
 mod browser;
-mod command;
 mod disk;
 mod failing;
 mod fake;
@@ -42,7 +41,6 @@ mod twins;
 
 pub(crate) use blocks::{blocks, documents};
 pub(crate) use browser::Browser;
-pub(crate) use command::{Ran, command, run};
 pub(crate) use disk::SmallDisk;
 pub(crate) use failing::{Failing, Failures, Forkserver, page};
 pub(crate) use fake::{FakeMaster, FakeNode, Heard};
@@ -56,7 +54,7 @@ pub(crate) use process::{Process, alive, behind, signal, stop};
 pub(crate) use relay::Relay;
 pub(crate) use rescue::{Rescue, Setup};
 pub(crate) use robot::{Mode, Robot};
-pub(crate) use ros::{NODES, Rosmaster, Tool, cpp_nodes, find_program, ros_command};
+pub(crate) use ros::{NODES, Rosmaster, Tool, command, cpp_nodes, find_program, ros_command};
 pub(crate) use rpc::{Client, Response, Wire, encode_call, http_request, request, unreadable};
 pub(crate) use scratch::{Scratch, free_port};
 pub(crate) use state::State;

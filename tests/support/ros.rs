@@ -136,8 +136,11 @@ impl Tool {
     /// Runs a command of rosrescue for the one at `port`, until it ends by itself.
     #[track_caller]
     pub(crate) fn rosrescue(scratch: &Scratch, port: u16, arguments: &[&str]) -> Self {
-        let program = env!("CARGO_BIN_EXE_rosrescue");
-        Self::wait(&mut ros_command(scratch, program, port), arguments)
+        Self::wait(&mut command(scratch, port, &[]), arguments)
+    }
+
+    pub(crate) fn exit(&self) -> i32 {
+        self.status.code().expect("an exit status")
     }
 
     #[track_caller]
@@ -163,6 +166,13 @@ impl Tool {
     pub(crate) fn json(self, status: i32) -> serde_json::Value {
         serde_json::from_str(&self.ended(status)).expect("JSON")
     }
+}
+
+/// `rosrescue ARGUMENTS`, with `ROS_MASTER_URI` for the port.
+pub(crate) fn command(scratch: &Scratch, port: u16, arguments: &[&str]) -> Command {
+    let mut command = ros_command(scratch, env!("CARGO_BIN_EXE_rosrescue"), port);
+    command.args(arguments).current_dir(scratch.path(""));
+    command
 }
 
 /// The folder of the compiled roscpp nodes. They are compiled here, and nowhere else, when a source

@@ -1,22 +1,20 @@
 //! The processes that a drill kills: finds them, and makes sure that they are what they seem.
 
-use std::{path::Path, time::Duration};
+use std::path::Path;
 
 use rustix::process::Signal;
-use tokio::net::TcpStream;
 
 use super::calls::Api;
 use crate::{
     cli::Victim,
-    commands::{Failure, running::Running},
+    commands::{
+        Failure,
+        running::{Running, is_here},
+    },
     process::{self, listeners},
-    resolver,
     ros_env::MasterUri,
     status::summary::Status,
 };
-
-/// How long connecting may take.
-const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 
 /// The running rosrescue and its master.
 #[derive(Clone, Debug)]
@@ -98,18 +96,6 @@ impl Target {
              here: run the drill there, or with --no-kill"
         )))
     }
-}
-
-/// Whether a connection to `address` ends on this computer.
-async fn is_here(address: &MasterUri) -> bool {
-    let connect = async {
-        let addresses = resolver::addresses(&address.host, address.port).await?;
-        let stream = TcpStream::connect(&*addresses).await?;
-        let (here, there) = (stream.local_addr()?.ip(), stream.peer_addr()?.ip());
-        std::io::Result::Ok(there.is_loopback() || here == there)
-    };
-    let here = tokio::time::timeout(CONNECT_LIMIT, connect).await;
-    matches!(here, Ok(Ok(true)))
 }
 
 /// A process that hangs until this is dropped.

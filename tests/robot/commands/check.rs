@@ -115,10 +115,12 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let found = Found::by(&mut check(&scratch, rescue.port()));
     found.assert_no_problem();
     let runs = found.said("port");
-    assert!(
-        runs.contains("rosrescue 0.1.0 runs here: rosrescue (process "),
-        "{runs}"
+    let it = concat!(
+        "rosrescue ",
+        env!("CARGO_PKG_VERSION"),
+        " runs here: rosrescue (process "
     );
+    assert!(runs.contains(it), "{runs}");
     let found = Found::by(check(&scratch, free).args(["--master", &rescue.client().uri()]));
     let problems: Vec<_> = found
         .of("problem")

@@ -4,7 +4,7 @@ use std::fs;
 
 use rosrescue::xmlrpc::Value;
 
-use crate::support::{FakeNode, Mode, Robot, Tool, eventually};
+use crate::support::{FakeNode, Mode, Robot, Scratch, Tool, eventually};
 
 fn history(robot: &Robot) -> Vec<serde_json::Value> {
     let json = Tool::rosrescue(&robot.scratch, robot.port(), &["history", "--json"]).json(0);
@@ -37,6 +37,9 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     }
     let kept = [3, 4, 5, 6, 7].map(|number| format!("session-{number}"));
     assert_eq!(names(&robot), [&["present".to_owned()][..], &kept].concat());
+    // Somebody with another home, as a service has, asks for the same.
+    let elsewhere = Tool::rosrescue(&Scratch::new(), robot.port(), &["history", "--json"]);
+    assert_eq!(elsewhere.json(0)["kept"].as_array().unwrap().len(), 6);
     // By name, and by number.
     let run = |robot: &Robot, arguments: &[&str]| {
         Tool::rosrescue(&robot.scratch, robot.port(), arguments).ended(0)

@@ -5,7 +5,7 @@ use std::net::TcpListener;
 use std::thread;
 
 use crate::support::{
-    FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, free_port, page, params, run,
+    FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, Tool, eventually, free_port, page, params,
 };
 
 #[test]
@@ -14,8 +14,8 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     let (scratch, port) = (&robot.scratch, robot.port());
     let talker = FakeNode::start("/talker");
     talker.publish(&robot.client(), "/topic", "std_msgs/String");
-    let good = run(scratch, port, &["status"]);
-    assert_eq!(good.exit, 0, "{good:?}");
+    let good = Tool::rosrescue(scratch, port, &["status"]);
+    assert_eq!(good.exit(), 0, "{good:?}");
     assert!(good.stdout.starts_with("protected, since "), "{good:?}");
     assert!(good.stdout.contains("Nodes run as usual"), "{good:?}");
     assert!(good.stdout.lines().count() <= 10, "{good:?}");
@@ -27,8 +27,8 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     robot.kill_master_at_once(dead);
     eventually("the mirror stands in", || !robot.is_open());
     robot.client().set_param("/meanwhile", 1);
-    let away = run(&robot.scratch, port, &["status"]);
-    assert_eq!(away.exit, 1, "{away:?}");
+    let away = Tool::rosrescue(&robot.scratch, port, &["status"]);
+    assert_eq!(away.exit(), 1, "{away:?}");
     assert!(
         away.stdout
             .starts_with("standing in for the master, since "),
@@ -40,15 +40,16 @@ fn it_says_what_nodes_notice_and_what_to_do() {
             .contains("\nto do       start the master at http://"),
         "{away:?}"
     );
-    let json = run(&robot.scratch, port, &["status", "--json"]);
-    assert_eq!((json.exit, &json.json()["schema"]), (1, &1.into()));
-    assert_eq!(json.json()["condition"]["name"], "standing_in");
-    assert_eq!(json.json()["pending_writes"], 1);
+    let json = Tool::rosrescue(&robot.scratch, port, &["status", "--json"]);
+    let json = json.json(1);
+    assert_eq!(json["schema"], 1);
+    assert_eq!(json["condition"]["name"], "standing_in");
+    assert_eq!(json["pending_writes"], 1);
 
     robot.revive_master();
     robot.await_recovery(dead);
-    let after = run(&robot.scratch, port, &["status"]);
-    assert_eq!(after.exit, 0, "{after:?}");
+    let after = Tool::rosrescue(&robot.scratch, port, &["status"]);
+    assert_eq!(after.exit(), 0, "{after:?}");
     assert!(
         after.stdout.contains("rescues     1, the last:\n"),
         "{after:?}"
@@ -59,7 +60,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
             .contains("a new master was given the whole state"),
         "{after:?}"
     );
-    let json = run(&robot.scratch, port, &["status", "--json"]).json();
+    let json = Tool::rosrescue(&robot.scratch, port, &["status", "--json"]).json(0);
     let rescue = &json["last_rescues"][0];
     assert_eq!(rescue["outcome"], "injected", "{rescue}");
     assert_eq!(json["last_rescues"].as_array().unwrap().len(), 1);
@@ -83,7 +84,7 @@ fn it_prints_no_commands_for_a_terminal() {
     let evil = "/evil\u{1b}[2J";
     robot.client().call("getPid", params![evil]).unwrap();
     for command in [&["status"][..], &["top", "--count", "1"]] {
-        let ran = run(&robot.scratch, robot.port(), command);
+        let ran = Tool::rosrescue(&robot.scratch, robot.port(), command);
         assert!(!ran.stdout.contains('\u{1b}'), "{ran:?}");
     }
 }
@@ -91,18 +92,18 @@ fn it_prints_no_commands_for_a_terminal() {
 #[test]
 fn nobody_there_or_somebody_else_is_exit_status_3() {
     let scratch = Scratch::new();
-    let nobody = run(&scratch, free_port(), &["status"]);
-    assert_eq!(nobody.exit, 3, "{nobody:?}");
+    let nobody = Tool::rosrescue(&scratch, free_port(), &["status"]);
+    assert_eq!(nobody.exit(), 3, "{nobody:?}");
     assert!(
         nobody.stderr.contains("no rosrescue at http://127.0.0.1:"),
         "{nobody:?}"
     );
     let master = Rosmaster::start(&scratch);
-    let bare = run(&scratch, master.client().port(), &["status"]);
-    assert_eq!(bare.exit, 3, "{bare:?}");
+    let bare = Tool::rosrescue(&scratch, master.client().port(), &["status"]);
+    assert_eq!(bare.exit(), 3, "{bare:?}");
     assert!(bare.stderr.contains("a bare rosmaster perhaps"), "{bare:?}");
-    let nonsense = run(&scratch, 1, &["status", "--uri", "nonsense"]);
-    assert_eq!(nonsense.exit, 2, "{nonsense:?}");
+    let nonsense = Tool::rosrescue(&scratch, 1, &["status", "--uri", "nonsense"]);
+    assert_eq!(nonsense.exit(), 2, "{nonsense:?}");
     assert_eq!(nonsense.stderr.lines().count(), 1, "{nonsense:?}");
 }
 
@@ -122,8 +123,8 @@ fn a_newer_rosrescue_is_said_to_be_one() {
             );
         }
     });
-    let ran = run(&Scratch::new(), port, &["status"]);
-    assert_eq!(ran.exit, 1, "{ran:?}");
+    let ran = Tool::rosrescue(&Scratch::new(), port, &["status"]);
+    assert_eq!(ran.exit(), 1, "{ran:?}");
     assert!(
         ran.stderr.contains("version 9.9.9, newer than this one"),
         "{ran:?}"
@@ -136,7 +137,7 @@ fn it_says_that_nodes_wait_for_a_first_master() {
     let scratch = Scratch::new();
     let rescue = Setup::proxy(&scratch, free_port()).spawn();
     eventually("the status says so", || {
-        let ran = run(&scratch, rescue.port(), &["status"]);
-        ran.exit == 1 && ran.stdout.contains("Nodes wait") && ran.stdout.contains("\nto do ")
+        let ran = Tool::rosrescue(&scratch, rescue.port(), &["status"]);
+        ran.exit() == 1 && ran.stdout.contains("Nodes wait") && ran.stdout.contains("\nto do ")
     });
 }

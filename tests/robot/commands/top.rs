@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use crate::support::{
-    Mode, NODES, Process, Robot, behind, command, eventually, free_port, params, run,
+    Mode, NODES, Process, Robot, Tool, behind, command, eventually, free_port, params,
 };
 
 /// What `rosrescue top` leaves on a terminal of `size` after `key` (or a signal's number): the last line of the script's
@@ -69,14 +69,14 @@ fn without_a_terminal_it_prints_blocks_or_json_lines() {
     let mut robot = Robot::start(Mode::Core);
     robot.crash_master();
     let client = robot.client();
-    let text = run(&robot.scratch, robot.port(), &["top", "--count", "2"]);
-    assert_eq!(text.exit, 0, "{text:?}");
+    let text = Tool::rosrescue(&robot.scratch, robot.port(), &["top", "--count", "2"]);
+    assert_eq!(text.exit(), 0, "{text:?}");
     assert_eq!(text.stdout.matches("rosrescue top ").count(), 2, "{text:?}");
     assert!(text.stdout.contains("rescues so far: 1\n"), "{text:?}");
     for _ in 0..100 {
         client.call("getPid", params!["/busy"]).unwrap();
     }
-    let json = run(
+    let json = Tool::rosrescue(
         &robot.scratch,
         robot.port(),
         &["top", "--count", "2", "--json"],
@@ -113,6 +113,6 @@ fn a_rosrescue_that_goes_away_is_waited_for() {
     robot.rescue.start_again();
     eventually("it goes on", || top.stdout().len() > before);
     assert_eq!(top.terminate().code(), Some(0));
-    let nobody = run(&robot.scratch, free_port(), &["top"]);
-    assert_eq!(nobody.exit, 3, "{nobody:?}");
+    let nobody = Tool::rosrescue(&robot.scratch, free_port(), &["top"]);
+    assert_eq!(nobody.exit(), 3, "{nobody:?}");
 }

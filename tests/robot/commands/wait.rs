@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use crate::support::{
-    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, command, free_port, run,
+    FakeNode, Mode, Process, Robot, Rosmaster, Scratch, Setup, Tool, command, free_port,
 };
 
 #[test]
@@ -27,9 +27,9 @@ fn it_waits_for_what_is_not_there_yet() {
     let rescue = rescue.spawn();
     let _master = Rosmaster::start_at(&scratch, master_port);
     assert_eq!(answered.wait().code(), Some(0));
-    let protected = run(&scratch, port, &["wait", "--for", "protected", "--json"]);
-    assert_eq!(protected.exit, 0, "{protected:?}");
-    assert_eq!(protected.json()["met"], true);
+    let protected = Tool::rosrescue(&scratch, port, &["wait", "--for", "protected", "--json"]);
+    assert_eq!(protected.exit(), 0, "{protected:?}");
+    assert_eq!(protected.json(0)["met"], true);
     assert!(all.exited().is_none(), "there is no talker");
     let talker = FakeNode::start("/talker");
     talker.publish(&rescue.client(), "/topic", "std_msgs/String");
@@ -44,20 +44,20 @@ fn it_ends_in_time_and_says_what_is_missing() {
     let robot = Robot::start(Mode::Core);
     let start = Instant::now();
     let arguments = ["wait", "--for", "master", "/nobody", "--timeout", "0.5"];
-    let ran = run(&robot.scratch, robot.port(), &arguments);
+    let ran = Tool::rosrescue(&robot.scratch, robot.port(), &arguments);
     assert!(start.elapsed().as_secs_f64() >= 0.5);
-    assert_eq!(ran.exit, 1, "{ran:?}");
+    assert_eq!(ran.exit(), 1, "{ran:?}");
     assert!(ran.stdout.contains("the node /nobody"), "{ran:?}");
     assert!(!ran.stdout.contains("a master"), "{ran:?}");
-    let nobody = run(&robot.scratch, free_port(), &["wait", "--timeout", "0.1"]);
-    assert_eq!(nobody.exit, 1, "{nobody:?}");
+    let nobody = Tool::rosrescue(&robot.scratch, free_port(), &["wait", "--timeout", "0.1"]);
+    assert_eq!(nobody.exit(), 1, "{nobody:?}");
     for wrong in [["--for", "everything"], ["--timeout", "-1"]] {
-        let ran = run(
+        let ran = Tool::rosrescue(
             &robot.scratch,
             robot.port(),
             &[&["wait"], &wrong[..]].concat(),
         );
-        assert_eq!(ran.exit, 2, "{ran:?}");
+        assert_eq!(ran.exit(), 2, "{ran:?}");
     }
 }
 
@@ -68,7 +68,7 @@ fn answers_are_not_a_master() {
     robot.take_master_away();
     let exit = |what: &str| {
         let arguments = ["wait", "--for", what, "--timeout", "0.1"];
-        run(&robot.scratch, robot.port(), &arguments).exit
+        Tool::rosrescue(&robot.scratch, robot.port(), &arguments).exit()
     };
     assert_eq!(exit("answered"), 0);
     assert_eq!(exit("master"), 1);
