@@ -48,19 +48,20 @@ pub struct Counts {
 
 impl fmt::Display for Counts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            nodes,
-            publishers,
-            subscribers,
-            services,
-            params,
-            param_subscribers,
-        } = self;
-        write!(
-            f,
-            "{nodes} nodes, {publishers} publishers, {subscribers} subscribers, {services} \
-             services, {params} parameters, {param_subscribers} parameter subscriptions"
-        )
+        let counts = [
+            (self.nodes, "node"),
+            (self.publishers, "publisher"),
+            (self.subscribers, "subscriber"),
+            (self.services, "service"),
+            (self.params, "parameter"),
+            (self.param_subscribers, "parameter subscription"),
+        ];
+        for (index, (count, what)) in counts.into_iter().enumerate() {
+            let comma = if index > 0 { ", " } else { "" };
+            let plural = if count == 1 { "" } else { "s" };
+            write!(f, "{comma}{count} {what}{plural}")?;
+        }
+        Ok(())
     }
 }
 
