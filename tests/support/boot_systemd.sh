@@ -1,11 +1,13 @@
 #!/bin/sh
-# boot_systemd.sh FOLDER PROGRAM: becomes a systemd as process 1 of namespaces of its own, over a copy of this
-# computer's files that vanishes with it. PROGRAM is there as /opt/rosrescue/rosrescue. Needs root.
+# boot_systemd.sh FOLDER PROGRAM GIVEN: becomes a systemd as process 1 of namespaces of its own, over a copy of this
+# computer's files that vanishes with it. PROGRAM is there as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
+# Needs root.
 #
-#     unshare --mount --pid --cgroup --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM
+#     unshare --mount --pid --cgroup --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM GIVEN
 set -eu
 folder=$1
 program=$2
+given=$3
 mount -t tmpfs tmpfs "$folder"
 mkdir "$folder/upper" "$folder/work" "$folder/root"
 mount -t overlay -o "lowerdir=/,upperdir=$folder/upper,workdir=$folder/work" overlay "$folder/root"
@@ -13,6 +15,8 @@ root=$folder/root
 mkdir -p "$root/opt/rosrescue"
 : >"$root/opt/rosrescue/rosrescue"
 mount --bind "$program" "$root/opt/rosrescue/rosrescue"
+mkdir "$root/given"
+mount --bind "$given" "$root/given"
 mount -t proc proc "$root/proc"
 mount -o bind,ro "$root/proc/sys" "$root/proc/sys"
 mount -t sysfs -o ro sysfs "$root/sys"

@@ -60,7 +60,7 @@ fn a_checkpoint_is_inspected_beside_the_running_rosrescue() {
 
 #[test]
 fn what_differs_is_said_in_words() {
-    let robot = Robot::start(Mode::Core);
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let client = robot.client();
     client.set_param("/a", tree! { "b" => 1, "gone" => "x" });
     client.set_param("/token", "one");

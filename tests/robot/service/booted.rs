@@ -1,6 +1,7 @@
 //! A service of a real systemd, which is process 1 of namespaces of its own. Needs root and systemd.
 
 use std::fs;
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
 use crate::support::{Scratch, eventually};
@@ -12,7 +13,7 @@ const PROGRAM: &str = "/opt/rosrescue/rosrescue";
 pub(super) struct Booted {
     unshare: Child,
     pid: String,
-    _scratch: Scratch,
+    scratch: Scratch,
 }
 
 impl Booted {
@@ -20,8 +21,9 @@ impl Booted {
     pub(super) fn new() -> Self {
         let scratch = Scratch::new();
         let kinds = "--mount --pid --cgroup --net --uts --ipc --fork --kill-child";
-        let folder = scratch.path("computer");
+        let [folder, given] = ["computer", "given"].map(|name| scratch.path(name));
         fs::create_dir(&folder).unwrap();
+        fs::create_dir(&given).unwrap();
         let file = fs::File::create(scratch.path("boot.log")).unwrap();
         let unshare = Command::new("unshare")
             .args(kinds.split(' '))
@@ -29,6 +31,7 @@ impl Booted {
                 BOOT,
                 folder.to_str().unwrap(),
                 env!("CARGO_BIN_EXE_rosrescue"),
+                given.to_str().unwrap(),
             ])
             .stdin(Stdio::null())
             .stdout(file.try_clone().unwrap())
@@ -43,7 +46,7 @@ impl Booted {
         let booted = Self {
             unshare,
             pid,
-            _scratch: scratch,
+            scratch,
         };
         // Before, its root is this computer's.
         eventually(
@@ -96,6 +99,13 @@ impl Booted {
     #[track_caller]
     pub(super) fn run(&self, script: &str) -> String {
         self.try_run(script).unwrap_or_else(|said| panic!("{said}"))
+    }
+
+    /// Copies `file` to it. Returns its name there: the file's own folder may be hidden, as /tmp is.
+    pub(super) fn give(&self, file: &Path) -> String {
+        let name = file.file_name().unwrap();
+        fs::copy(file, self.scratch.path("given").join(name)).unwrap();
+        format!("/given/{}", name.display())
     }
 
     fn write(&self, path: &str, text: &str) {

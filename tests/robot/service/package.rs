@@ -109,7 +109,7 @@ fn a_package_is_installed_upgraded_removed_and_purged_without_a_trace() {
 fn a_running_robot_notices_nothing_of_an_upgrade_and_its_service_goes_with_the_package() {
     let [old, new] = packages();
     let robot = Booted::new();
-    let install = |package: &Path| robot.run(&format!("dpkg -i {}", package.display()));
+    let install = |package: &Path| robot.run(&format!("dpkg -i {}", robot.give(package)));
     let said = install(old);
     assert!(said.contains("sudo rosrescue install"), "{said}");
     assert!(
