@@ -89,6 +89,15 @@ impl Heard {
                     Some(Value::Int(number)) if key.starts_with(PREFIX) => {
                         self.param.send_replace(number);
                     }
+                    // Told once more after an outage: all that is below the subscribed namespace.
+                    Some(Value::Struct(all)) if key == "/" => {
+                        let ours = all
+                            .iter()
+                            .find(|(key, _)| format!("/{key}").starts_with(PREFIX));
+                        if let Some(number) = ours.and_then(|(_, value)| value.as_int()) {
+                            self.param.send_replace(number);
+                        }
+                    }
                     _ => {
                         // The master ends keys with a slash, for comparing.
                         let key = key.trim_end_matches('/').to_owned();
