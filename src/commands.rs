@@ -124,7 +124,7 @@ fn print_line(text: &str) -> Result<bool, Failure> {
     }
 }
 
-/// `text` without what a terminal would take for commands: names come from whoever calls.
+/// `text` without what a terminal would take for commands: names come from the network.
 fn plain(text: &str) -> String {
     let safe = |c: char| {
         if c.is_control() && c != '\n' {

@@ -6,7 +6,7 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Parameters of whoever started the present session. roslaunch compares `/run_id` with its own, and has its
+/// Parameters that belong to the start of the present session. roslaunch compares `/run_id` with its own, and has its
 /// addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 

@@ -155,7 +155,7 @@ pub struct CommonArgs {
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
     /// Take out nodes that have died, so that they do not stay registered for ever: every node is asked so
-    /// often whether it lives, in seconds, and whoever is registered with the port of a node that registers
+    /// often whether it lives, in seconds, and any other node registered with the port of a node that registers
     /// is taken out first. 0 for only after a recovery, as ROS has it
     #[arg(
         long,

@@ -22,7 +22,7 @@ pub struct InstallArgs {
     /// Where to.
     #[command(flatten)]
     pub scope: ScopeArgs,
-    /// Who runs the service [default: whoever called sudo]
+    /// User that runs the service [default: the one who called sudo]
     #[arg(
         long,
         env = "ROSRESCUE_RUN_AS",

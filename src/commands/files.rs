@@ -56,7 +56,7 @@ pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
     fs::canonicalize(&path).unwrap_or(path)
 }
 
-/// The checkpoint of the rosrescue that runs on this computer. As a service it has another home than whoever asks.
+/// The checkpoint of the rosrescue that runs on this computer. A service has another home than the user who asks.
 async fn of_running() -> Option<PathBuf> {
     let uri = std::env::var("ROSRESCUE_URI").ok();
     let running = Running::find(&TargetArgs { uri }).ok()?;

@@ -64,7 +64,7 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
     })
 }
 
-/// Asks whoever is at the terminal: not a program, which reads `json`.
+/// Asks at the terminal, unless the output is `json` for a program.
 fn agreed(json: bool) -> Result<bool, Failure> {
     if json || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         let why = "nothing was done: there is nobody to ask. --yes does it, --plan only says it";

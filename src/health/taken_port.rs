@@ -1,5 +1,5 @@
 //! Ports that pass from one node to another. A port has one process behind it: when a node registers with a
-//! port, whoever was registered with it before is gone.
+//! port, any node registered with it before is gone.
 //!
 //! A master does not know that. When the old node is started again, at another port, it sends a `shutdown` to
 //! the former one, where by now an innocent node listens (ros_comm issue 2241).

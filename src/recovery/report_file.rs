@@ -1,4 +1,4 @@
-//! The reports of rescues as files beside the checkpoint, for whoever asks next week what happened.
+//! The reports of rescues as files beside the checkpoint, for questions next week.
 
 use std::{
     fs::{self, OpenOptions},

@@ -1,4 +1,4 @@
-//! With `--reap-dead-nodes`, whoever is registered with a port that another node registers is taken out first.
+//! With `--reap-dead-nodes`, a node whose port another node registers is taken out first.
 //! Nobody is asked: a node cannot answer before its registration is done.
 
 use std::{sync::Arc, time::Instant};

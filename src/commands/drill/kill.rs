@@ -78,7 +78,7 @@ impl Drill<'_> {
         Ok(kills)
     }
 
-    /// Waits until calls pass to a living master again, and whoever was killed has a successor. A master that
+    /// Waits until calls pass to a living master again, and each killed process has a successor. A master that
     /// hangs may go on as well.
     async fn recovered(&self, victims: &[(&'static str, u32)], mut stopped: Option<Stopped>) {
         let start = Instant::now();

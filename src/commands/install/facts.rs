@@ -19,7 +19,7 @@ use crate::commands::Failure;
 /// A longer file is no script that starts a robot.
 const LARGEST_SCRIPT: u64 = 64 << 10;
 
-/// The environment of whoever typed the command. sudo clears it, but its own process has it still.
+/// The environment of the user who typed the command. sudo clears it, but its own process has it still.
 pub(super) fn caller_environment() -> BTreeMap<String, String> {
     let own = std::env::vars_os()
         .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));

@@ -201,7 +201,7 @@ impl Plan {
             )),
             Kind::Master if found.of_user != facts.place.user => self.obstacles.push(format!(
                 "{unit} ({path}) starts a master, and another systemd runs it: `{manager} disable --now {unit}`, as \
-                 whoever it belongs to, and do this again"
+                 the user it belongs to, and do this again"
             )),
             Kind::Master => {
                 let command = facts.place.systemctl(&["disable", "--now", unit]);

@@ -43,7 +43,7 @@ impl Units<'_> {
         let settings = match settings.collect::<Vec<_>>() {
             lines if lines.is_empty() => String::new(),
             lines => format!(
-                "# As it was in the shell of whoever installed it.\n{}",
+                "# As it was in the shell that installed it.\n{}",
                 lines.join("\n")
             ),
         };
