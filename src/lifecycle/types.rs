@@ -93,7 +93,7 @@ impl Cause {
     pub fn as_str(self) -> &'static str {
         match self {
             Self::ConnectionLost => "the connection to the master ended",
-            Self::ThreadEnded => "the master began to end",
+            Self::ThreadEnded => "the master is ending",
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
             Self::Stopping => "rosrescue stops",

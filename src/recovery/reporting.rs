@@ -112,6 +112,10 @@ impl Driver {
         report.ended = self.process.as_mut().and_then(MasterProcess::take_end);
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
+        if report.ended.is_some() && quiet.contains(&cause) {
+            // What was noticed first was the beginning of that.
+            report.cause = Cause::Exited.as_str().into();
+        }
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
             // Usual: a master with `-t` closes each idle connection, and the threads of a master that is
             // being stopped end before it does.
