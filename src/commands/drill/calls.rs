@@ -209,10 +209,10 @@ impl Callers {
         let (topic, api) = (self.topic.as_str(), self.node_api.as_str());
         while !stop.is_cancelled() {
             let register = [topic.into(), "*".into(), api.into()];
+            // Said before it is so, as by nodes: the health check would take back what the node does not know of.
+            self.heard.subscribes(topic, true);
             let answer = self.api.ask("registerSubscriber", &register).await;
             waits.add(answer);
-            // Said only as long as it is so: the health check would register what is missing.
-            self.heard.subscribes(topic, true);
             sleep(PAUSE).await;
             self.heard.subscribes(topic, false);
             let unregister = [topic.into(), api.into()];
