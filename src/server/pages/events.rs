@@ -149,6 +149,8 @@ async fn look(server: Arc<Server>) {
             (known, latest)
         };
         let Ok((same, latest)) = tokio::task::spawn_blocking(look).await else {
+            // It panicked. The next listener starts another one.
+            pages.desk.feed.running.store(false, Ordering::Release);
             break;
         };
         known = same;
