@@ -58,6 +58,8 @@ pub(crate) struct Driver {
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     rescues: Rescues,
+    /// The gate opens to a master that has just been restored.
+    restored: bool,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     connection: Option<Connection>,
@@ -98,6 +100,7 @@ impl Driver {
             board,
             process,
             rescues,
+            restored: false,
             spawn_error: None,
             connection: None,
             ended: None,
@@ -424,6 +427,10 @@ impl Driver {
     fn open_gate(&mut self) {
         self.said = None;
         self.examiner.open_gate();
+        if std::mem::take(&mut self.restored) {
+            // Not before: calls need not wait for a copy of the state.
+            self.rescues.keep(Instant::now());
+        }
     }
 
     fn spawn(&mut self) -> Option<Input> {

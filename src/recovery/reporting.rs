@@ -132,9 +132,7 @@ impl Driver {
         if let (Some(checkpoint), Outcome::Resumed) = (&checkpoint, report.outcome) {
             report_file::keep(checkpoint.clone(), report.clone());
         }
-        if report.outcome == Outcome::Injected {
-            self.rescues.keep(Instant::now());
-        }
+        self.restored = report.outcome == Outcome::Injected;
         if !self.lifecycle.has_served() {
             // After a restart of rosrescue it is unknown what changed just before.
             self.examiner.ledger.with_activity(|mirror, activity| {
