@@ -25,7 +25,7 @@ use crate::master::Snapshot;
 use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
-pub(crate) use frame::{Framed, push_body, scan, seal};
+pub(crate) use frame::{Framed, push_body, push_record, read_records, scan, seal};
 pub use rosparam::{for_rosparam, shown};
 
 /// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512)

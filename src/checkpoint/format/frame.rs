@@ -73,6 +73,37 @@ pub(crate) fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
     out.push(b'\n');
 }
 
+/// Belongs to no file.
+const NO_FILE: Stamp = Stamp(0);
+
+/// Appends a record's line that belongs to no file.
+pub(crate) fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
+    let start = out.len();
+    push_body(out, record.seq, &record.entry)?;
+    seal(out, start, NO_FILE);
+    Ok(())
+}
+
+/// Reads lines of [`push_record`].
+///
+/// # Errors
+///
+/// Why they are not what was written.
+pub(crate) fn read_records(lines: &[u8]) -> Result<Vec<Record>, String> {
+    let lines = lines
+        .strip_suffix(b"\n")
+        .ok_or("the last line has no end")?;
+    let lines = lines.split(|byte| *byte == b'\n');
+    let records = lines.map(|line| {
+        let line = open_line(line).filter(|(_, stamp, _)| *stamp == NO_FILE);
+        let (seq, _, body) = line.ok_or("a line is no record, or damaged")?;
+        let body = std::str::from_utf8(body).map_err(|error| error.to_string())?;
+        let entry = document::read_record(body)?;
+        Ok(Record { seq, entry })
+    });
+    records.collect()
+}
+
 fn push_hex(out: &mut Vec<u8>, number: u32) {
     out.extend(
         (0..8)
