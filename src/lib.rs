@@ -25,6 +25,7 @@
 //! * `gate`: whether calls pass to the master.
 //! * `status`: plain data for people and monitors, filled by other modules.
 //! * [`checkpoint::store`]: the checkpoint on the disk.
+//! * [`cluster`]: several computers, of which one leads; its decisions are pure.
 //! * `ledger`: mirror and journal under one lock.
 //! * `upstream`: connections to the master.
 //! * `write_queue`: writes on their way to the master, in order.
@@ -43,6 +44,7 @@ pub mod app;
 pub mod checkpoint;
 pub mod cli;
 pub mod clock;
+pub mod cluster;
 pub mod commands;
 pub mod config;
 pub(crate) mod gate;

@@ -1,0 +1,14 @@
+//! Several computers: one leads, the others follow, and one of them takes over.
+//!
+//! Two keys in etcd, below the robot's prefix, decide who leads. `leader` says who, and its revision is the
+//! *term*. `alive` is written by every transaction of the leader, at least four times in the time to live.
+//! Whoever has seen no change of both for the time to live, by its own clock, may claim. Every transaction of
+//! the leader succeeds only if `leader` has its term and `alive` is as the previous one left it. So one that
+//! was cut off can commit nothing, and one that is sent twice has its effect once. The records of calls are
+//! in `journal/`, and travel in the same transaction. See decision 28.
+//!
+//! * [`machine`]: who leads, and what may be acknowledged; pure.
+
+pub mod machine;
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,394 @@
+//! Decides who leads, what may be acknowledged, and when this computer is alone.
+//!
+//! A state machine without IO, as [`crate::lifecycle`] is: the shell passes in what happened and when, and
+//! carries out the returned actions. Every deadline is in here. All computers use their own clocks, and only
+//! to measure times: a clock may show anything, and may run up to a tenth too fast or too slow.
+
+use std::time::{Duration, Instant};
+
+mod due;
+mod flight;
+mod types;
+
+use self::flight::{Flight, Reign};
+pub use types::{
+    Action, Alive, Answer, Commit, Guard, Input, Leader, Op, Role, Settings, View, WhenAlone,
+};
+
+/// How long a request may take before it counts as [`Answer::Silence`]. Longer than a time to live: an etcd
+/// that takes 2 s for each answer still tells who leads.
+pub const ANSWER_LIMIT: Duration = Duration::from_secs(5);
+/// Pause before a request that was not answered is sent again.
+const RETRY: Duration = Duration::from_millis(100);
+/// How often the leader writes `alive` within the time to live.
+const BEATS: u32 = 4;
+/// The part of the time to live by which a leader stops before another one may begin: a tenth each for a
+/// clock that is slow and one that is fast.
+const MARGIN: u32 = 5;
+/// How long after the time to live a next leader is waited for. A claim takes three delays of the network.
+const PATIENCE: Duration = Duration::from_millis(300);
+/// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
+const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
+
+/// The state machine.
+#[derive(Debug)]
+pub struct Machine {
+    settings: Settings,
+    role: Role,
+    view: View,
+    started: Option<Instant>,
+    /// When `view` was seen for the first time; another one that differs only in its own revision is no other.
+    observed: Option<Instant>,
+    /// When etcd was heard of last.
+    heard: Option<Instant>,
+    reign: Option<Reign>,
+    flight: Option<Flight>,
+    retry_at: Option<Instant>,
+    numbers: u64,
+    claims: u64,
+    /// The mirror holds the journal up to here,
+    followed: u64,
+    /// unless it has to be made anew.
+    stale: bool,
+    recorded: u64,
+    committed: u64,
+    acknowledged: u64,
+    /// Whether the leader's rosrescue answers, and since when that is so.
+    peer: Option<(bool, Instant)>,
+    releasing: Option<String>,
+}
+
+impl Machine {
+    /// A machine at rest; it starts with [`Input::Start`].
+    pub fn new(settings: Settings) -> Self {
+        Self {
+            settings,
+            role: Role::Joining,
+            view: View::default(),
+            started: None,
+            observed: None,
+            heard: None,
+            reign: None,
+            flight: None,
+            retry_at: None,
+            numbers: 0,
+            claims: 0,
+            followed: 0,
+            stale: false,
+            recorded: 0,
+            committed: 0,
+            acknowledged: 0,
+            peer: None,
+            releasing: None,
+        }
+    }
+
+    pub fn role(&self) -> Role {
+        self.role
+    }
+
+    /// What is known of the leader.
+    pub fn view(&self) -> &View {
+        &self.view
+    }
+
+    /// The term in which this process leads.
+    pub fn term(&self) -> Option<u64> {
+        self.reign.map(|reign| reign.term)
+    }
+
+    /// The last record of this computer that is known to be in the journal.
+    pub fn committed(&self) -> u64 {
+        self.committed
+    }
+
+    /// Whether calls that write are to be recorded here. If not, they are for the leader, or wait.
+    pub fn takes_writes(&self) -> bool {
+        match self.role {
+            Role::Leading => self.releasing.is_none(),
+            Role::Alone => self.settings.alone == WhenAlone::Serve,
+            _ => false,
+        }
+    }
+
+    /// Whether nobody else can lead at `now`.
+    pub fn is_sole(&self, now: Instant) -> bool {
+        self.sole_until().is_some_and(|until| now < until)
+    }
+
+    fn sole_until(&self) -> Option<Instant> {
+        let ttl = self.settings.ttl;
+        Some(self.reign?.sent? + ttl - ttl / MARGIN)
+    }
+
+    /// Takes an input at `now`. Returns the actions, in order.
+    pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
+        let mut actions = Vec::new();
+        if self.started.is_none() && !matches!(input, Input::Start(_)) {
+            return actions;
+        }
+        match input {
+            Input::Start(seq) => {
+                self.started = Some(now);
+                self.follow_to(seq);
+            }
+            Input::Answer { number, answer } => self.answered(now, number, answer, &mut actions),
+            Input::View(view) => self.see(now, view, &mut actions),
+            Input::Followed(seq) => self.followed(seq),
+            Input::Recorded(seq) => {
+                self.recorded = self.recorded.max(seq);
+                self.acknowledge_early(now, &mut actions);
+            }
+            Input::Peer(leads) => self.peer(now, leads, &mut actions),
+            Input::HandOver(to) => {
+                self.releasing = Some(to).filter(|_| self.role == Role::Leading);
+            }
+            Input::Wake => {}
+        }
+        self.review(now, &mut actions);
+        actions
+    }
+
+    fn answered(&mut self, now: Instant, number: u64, answer: Answer, actions: &mut Vec<Action>) {
+        let Some(flight) = self.flight.take_if(|flight| flight.number == number) else {
+            return;
+        };
+        let view = match answer {
+            Answer::Silence => {
+                self.retry_at = Some(now + RETRY);
+                // Its effect is unknown, so it is sent again. A claim shows in the keys.
+                self.flight = matches!(flight.op, Op::Beat { .. }).then_some(Flight {
+                    silent: true,
+                    ..flight
+                });
+                return;
+            }
+            Answer::Is(view) => view,
+            Answer::Applied { revision, seq } => self.after(&flight.op, revision, seq),
+        };
+        self.retry_at = None;
+        self.flight = Some(flight);
+        self.see(now, view, actions);
+        self.flight.take_if(|flight| flight.number == number);
+    }
+
+    /// The keys after `op` was made.
+    fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
+        let (leader, beat, released) = match op {
+            Op::Read => return self.view.clone(),
+            Op::Claim { claim, .. } => {
+                let Settings {
+                    name,
+                    id,
+                    uri,
+                    version,
+                    ..
+                } = self.settings.clone();
+                let leader = Leader {
+                    term: revision,
+                    name,
+                    id,
+                    claim: *claim,
+                    uri,
+                    version,
+                };
+                (Some(leader), 0, None)
+            }
+            Op::Beat { beat, released, .. } => (self.view.leader.clone(), *beat, released.clone()),
+        };
+        let alive = Alive {
+            revision,
+            beat,
+            seq,
+            released,
+        };
+        View {
+            revision,
+            leader,
+            alive: Some(alive),
+        }
+    }
+
+    /// etcd shows the keys.
+    fn see(&mut self, now: Instant, view: View, actions: &mut Vec<Action>) {
+        self.heard = Some(now);
+        if view.revision < self.view.revision {
+            return;
+        }
+        if self.observed.is_none() || view.guard() != self.view.guard() {
+            self.observed = Some(now);
+        }
+        if view.guard().leader != self.view.guard().leader {
+            // Nothing is known of the next leader's rosrescue.
+            self.peer = None;
+        }
+        self.view = view;
+        let leader = self.view.leader.as_ref();
+        let mine = leader.filter(|leader| leader.id == self.settings.id);
+        let mine = mine.map(|leader| leader.term);
+        let alive = self.view.alive.as_ref();
+        match (self.reign, mine) {
+            (Some(reign), Some(term)) if reign.term == term => {
+                let beat = alive.map_or(0, |alive| alive.beat);
+                if let Some(flight) = self.flight.take_if(|flight| flight.is_beat(beat)) {
+                    self.beaten(now, reign, &flight, actions);
+                }
+            }
+            (Some(_), _) => self.deposed(actions),
+            (None, Some(term)) if alive.is_some_and(|alive| alive.released.is_none()) => {
+                self.claimed(term, actions);
+            }
+            (None, _) if self.role == Role::Joining && self.view.leader.is_some() => {
+                self.become_role(Role::Following, actions);
+                actions.push(Action::CatchUp(self.view.seq()));
+            }
+            (None, _) => {}
+        }
+    }
+
+    /// The beat in `flight` was made.
+    fn beaten(&mut self, now: Instant, reign: Reign, flight: &Flight, actions: &mut Vec<Action>) {
+        let Op::Beat {
+            beat,
+            released,
+            seq,
+            ..
+        } = &flight.op
+        else {
+            return;
+        };
+        self.retry_at = None;
+        if reign.caught_up {
+            self.committed = self.view.seq();
+        }
+        if released.is_some() {
+            // A write may have come in between.
+            self.deposed(actions);
+            actions.push(Action::Released);
+            return;
+        }
+        self.reign = Some(Reign {
+            sent: Some(flight.first),
+            beat: *beat,
+            full: *seq > self.view.seq(),
+            ..reign
+        });
+        let upto = self.committed;
+        self.acknowledge(upto, actions);
+        if self.role == Role::Alone && self.is_sole(now) {
+            match reign.caught_up {
+                true => self.become_role(Role::Leading, actions),
+                false => self.catch_up(actions),
+            }
+        }
+    }
+
+    /// A claim of this process was made.
+    fn claimed(&mut self, term: u64, actions: &mut Vec<Action>) {
+        let flight = self.flight.take();
+        let claim = self.view.leader.as_ref().map_or(0, |leader| leader.claim);
+        let sent = flight.filter(|flight| flight.is_claim(claim));
+        self.reign = Some(Reign {
+            term,
+            sent: sent.map(|flight| flight.first),
+            beat: 0,
+            caught_up: false,
+            full: false,
+        });
+        self.catch_up(actions);
+    }
+
+    fn catch_up(&mut self, actions: &mut Vec<Action>) {
+        if self.role == Role::Alone {
+            self.hand_back(actions);
+        }
+        self.become_role(Role::CatchingUp, actions);
+        if !self.has_caught_up() {
+            actions.push(Action::CatchUp(self.view.seq()));
+        }
+    }
+
+    fn has_caught_up(&self) -> bool {
+        !self.stale && self.followed >= self.view.seq()
+    }
+
+    /// Another one leads, or could.
+    fn deposed(&mut self, actions: &mut Vec<Action>) {
+        (self.reign, self.releasing) = (None, None);
+        self.flight.take_if(|flight| flight.op != Op::Read);
+        self.give_way(actions);
+    }
+
+    fn give_way(&mut self, actions: &mut Vec<Action>) {
+        match self.role {
+            Role::Leading | Role::Alone => self.hand_back(actions),
+            _ => {}
+        }
+        self.become_role(Role::Following, actions);
+        actions.push(Action::CatchUp(self.view.seq()));
+    }
+
+    /// Calls of this computer are in no journal.
+    fn hand_back(&mut self, actions: &mut Vec<Action>) {
+        let Self {
+            committed,
+            acknowledged,
+            ..
+        } = *self;
+        if self.recorded > committed {
+            actions.push(Action::Yield {
+                committed,
+                acknowledged,
+            });
+            self.stale = true;
+        }
+        self.follow_to(committed);
+    }
+
+    fn follow_to(&mut self, seq: u64) {
+        self.followed = seq;
+        (self.recorded, self.committed, self.acknowledged) = (seq, seq, seq);
+    }
+
+    fn followed(&mut self, seq: u64) {
+        match self.role {
+            Role::Leading | Role::Alone => return,
+            _ => self.follow_to(seq),
+        }
+        self.stale = false;
+    }
+
+    fn peer(&mut self, now: Instant, leads: bool, actions: &mut Vec<Action>) {
+        if self.peer.is_none_or(|(before, _)| before != leads) {
+            self.peer = Some((leads, now));
+        }
+        if leads && matches!(self.role, Role::Alone | Role::Joining) {
+            self.deposed(actions);
+        }
+    }
+
+    fn acknowledge_early(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        let may = match self.role {
+            Role::Leading => self.settings.commit == Commit::Interval && self.is_sole(now),
+            Role::Alone => self.settings.alone == WhenAlone::Serve,
+            _ => false,
+        };
+        if may {
+            self.acknowledge(self.recorded, actions);
+        }
+    }
+
+    fn acknowledge(&mut self, seq: u64, actions: &mut Vec<Action>) {
+        if seq > self.acknowledged {
+            self.acknowledged = seq;
+            actions.push(Action::Acknowledge(seq));
+        }
+    }
+
+    fn become_role(&mut self, role: Role, actions: &mut Vec<Action>) {
+        if self.role != role {
+            self.role = role;
+            actions.push(Action::Become(role));
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! What is due, and when.
+
+use std::time::{Duration, Instant};
+
+use super::{
+    Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, Reign, Role, Settings,
+};
+
+impl Machine {
+    /// When to pass in [`Input::Wake`](super::Input::Wake). Changes with every input.
+    pub fn deadline(&self) -> Option<Instant> {
+        let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
+        let send = self.send_at().filter(|_| !under_way);
+        let lapses = self.sole_until().filter(|_| self.role == Role::Leading);
+        [send, lapses, self.alone_at()].into_iter().flatten().min()
+    }
+
+    /// What is due at `now`.
+    pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
+        if self.role == Role::CatchingUp
+            && self.has_caught_up()
+            && self.is_sole(now)
+            && let Some(reign) = &mut self.reign
+        {
+            reign.caught_up = true;
+            self.follow_to(self.view.seq());
+            self.become_role(Role::Leading, actions);
+        }
+        let lapsed = self.role == Role::Leading && !self.is_sole(now);
+        if lapsed || self.alone_at().is_some_and(|at| at <= now) {
+            self.become_role(Role::Alone, actions);
+            self.acknowledge_early(now, actions);
+        }
+        let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
+        if !under_way && self.send_at().is_some_and(|at| at <= now) {
+            let flight = match self.flight.take() {
+                Some(flight) => flight,
+                None => self.next(now),
+            };
+            self.numbers += 1;
+            self.retry_at = None;
+            let (number, op) = (self.numbers, flight.op.clone());
+            self.flight = Some(Flight {
+                number,
+                silent: false,
+                ..flight
+            });
+            actions.push(Action::Send { number, op });
+        }
+    }
+
+    fn next(&mut self, now: Instant) -> Flight {
+        let guard = self.view.guard();
+        let op = match self.reign {
+            Some(reign) => {
+                let seq = match reign.caught_up {
+                    true => self.recorded,
+                    false => self.view.seq(),
+                };
+                let whole = seq == self.committed && self.role == Role::Leading;
+                Op::Beat {
+                    guard,
+                    beat: reign.beat + 1,
+                    seq,
+                    released: self.releasing.clone().filter(|_| whole),
+                }
+            }
+            None if self.observed.is_none() => Op::Read,
+            None => {
+                self.claims += 1;
+                let (claim, seq) = (self.claims, self.view.seq());
+                Op::Claim { guard, claim, seq }
+            }
+        };
+        Flight {
+            number: 0,
+            op,
+            first: now,
+            silent: false,
+        }
+    }
+
+    /// When the next request is due, unless one is under way.
+    fn send_at(&self) -> Option<Instant> {
+        let due = match self.reign {
+            Some(reign) => self.beat_at(reign)?,
+            None => match self.observed {
+                Some(observed) => observed + self.vacant_after(),
+                None => self.started?,
+            },
+        };
+        Some(self.retry_at.map_or(due, |at| at.max(due)))
+    }
+
+    fn beat_at(&self, reign: Reign) -> Option<Instant> {
+        let Some(sent) = reign.sent.filter(|_| self.releasing.is_none()) else {
+            return self.observed;
+        };
+        let pause = self.settings.ttl / BEATS;
+        let waiting = reign.caught_up && self.recorded > self.committed;
+        Some(match self.settings.commit {
+            Commit::Always if waiting => sent,
+            Commit::Interval if reign.full => sent,
+            Commit::Interval if waiting => sent + COMMIT_INTERVAL.min(pause),
+            _ => sent + pause,
+        })
+    }
+
+    /// How long after it was seen in its present state leading is open to this computer.
+    fn vacant_after(&self) -> Duration {
+        let Settings { name, id, ttl, .. } = &self.settings;
+        let Some(leader) = &self.view.leader else {
+            return Duration::ZERO;
+        };
+        let released = self
+            .view
+            .alive
+            .as_ref()
+            .and_then(|alive| alive.released.as_ref());
+        match released {
+            // It has just given up itself.
+            _ if leader.id == *id => *ttl,
+            Some(to) if to.is_empty() || to == name => Duration::ZERO,
+            Some(_) => *ttl / BEATS,
+            // An earlier process on this computer. It cannot live: there is one at a time.
+            None if leader.name == *name => Duration::ZERO,
+            None => *ttl,
+        }
+    }
+
+    /// When this computer is alone, unless it hears of etcd or of the leader.
+    fn alone_at(&self) -> Option<Instant> {
+        let patience = self.settings.ttl + PATIENCE;
+        let silent = self.heard.or(self.started)? + patience;
+        match self.role {
+            Role::Joining | Role::CatchingUp => Some(silent),
+            Role::Following => match self.peer {
+                Some((true, _)) => None,
+                Some((false, since)) => Some(silent.min(since + patience)),
+                None => Some(silent),
+            },
+            Role::Leading | Role::Alone => None,
+        }
+    }
+}
