@@ -8,7 +8,9 @@
 //! in `journal/`, and travel in the same transaction. See decision 28.
 //!
 //! * [`machine`]: who leads, and what may be acknowledged; pure.
+//! * [`journal`]: records and snapshots to and from keys and values; pure.
 
+pub mod journal;
 pub mod machine;
 #[cfg(test)]
 mod tests;
