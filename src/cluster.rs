@@ -10,7 +10,9 @@
 //! * [`machine`]: who leads, and what may be acknowledged; pure.
 //! * [`journal`]: records and snapshots to and from keys and values; pure.
 //! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
+//! * [`etcd`]: etcd's JSON gateway.
 
+pub mod etcd;
 pub mod journal;
 pub mod machine;
 pub mod merge;

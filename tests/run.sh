@@ -16,6 +16,7 @@ fi
 . tests/install_ros.sh
 . tests/install_robot.sh
 . tests/install_chromium.sh
+. tests/install_etcd.sh
 
 cargo fmt --all --check
 cargo clippy --locked --all-targets -- -D warnings

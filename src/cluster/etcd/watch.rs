@@ -1,0 +1,227 @@
+//! What changes in etcd, as it changes; across lost connections, members and restarts.
+
+use std::time::Duration;
+
+use base64::{Engine, engine::general_purpose::STANDARD};
+use bytes::{Bytes, BytesMut};
+use http_body_util::BodyExt;
+use hyper::body::Incoming;
+use serde_json::json;
+
+use super::{
+    Etcd, EtcdError, Kv,
+    wire::{self, Streamed, WatchAnswer},
+};
+use crate::cluster::{journal::Keys, machine::View};
+
+/// The longest message: etcd parts them at 2 MiB, which is 2.7 MiB in base64.
+const MESSAGE_BYTES_MAX: usize = 8 << 20;
+/// Pause before a watch is opened again.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// A key that has changed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Change {
+    pub key: String,
+    pub revision: u64,
+    /// None if it was deleted.
+    pub kv: Option<Kv>,
+}
+
+impl Change {
+    /// Brings a view up to date.
+    ///
+    /// # Errors
+    ///
+    /// If the key is not what rosrescue writes there.
+    pub fn absorb(&self, view: &mut View, keys: &Keys) -> Result<(), EtcdError> {
+        view.revision = view.revision.max(self.revision);
+        wire::absorb(view, keys, &self.key, self.kv.as_ref())
+    }
+}
+
+/// Why a watch has ended.
+#[derive(Debug)]
+#[non_exhaustive]
+pub enum WatchEnd {
+    /// What was to come next is forgotten: the state must be read anew.
+    Compacted,
+    /// It would not help to ask again.
+    Failed(EtcdError),
+}
+
+struct Open {
+    endpoint: usize,
+    body: Incoming,
+    buffer: BytesMut,
+}
+
+/// A watch. Changes come in their order; after a lost connection some may come twice.
+pub struct Watch {
+    client: Etcd,
+    prefix: String,
+    /// The next revision.
+    next: u64,
+    quiet: Duration,
+    open: Option<Open>,
+    failures: usize,
+}
+
+impl Watch {
+    pub(super) fn new(client: Etcd, prefix: String, next: u64, quiet: Duration) -> Self {
+        Self {
+            client,
+            prefix,
+            next,
+            quiet,
+            open: None,
+            failures: 0,
+        }
+    }
+
+    /// The next changes. May be cancelled.
+    ///
+    /// # Errors
+    ///
+    /// Why there will be none.
+    pub async fn next(&mut self) -> Result<Vec<Change>, WatchEnd> {
+        loop {
+            let read = match &mut self.open {
+                Some(open) => tokio::time::timeout(self.quiet, open.message()).await,
+                None => {
+                    self.open().await?;
+                    continue;
+                }
+            };
+            let answer = match read {
+                Ok(Ok(Some(line))) => wire::parse::<Streamed<WatchAnswer>>(&line),
+                Ok(Ok(None)) => {
+                    self.close("its stream has ended");
+                    continue;
+                }
+                Ok(Err(why)) => {
+                    self.close(&why);
+                    continue;
+                }
+                Err(_) => {
+                    self.close("nothing was heard");
+                    continue;
+                }
+            };
+            match answer {
+                Ok(Streamed { result }) if result.canceled => self.canceled(&result)?,
+                Ok(Streamed { result }) => {
+                    self.failures = 0;
+                    let changes = self.changes(&result).map_err(WatchEnd::Failed)?;
+                    if !changes.is_empty() {
+                        return Ok(changes);
+                    }
+                }
+                // An error in the stream: the member stops.
+                Err(error) => self.close(&error.to_string()),
+            }
+        }
+    }
+
+    fn close(&mut self, why: &str) {
+        tracing::debug!(why, prefix = self.prefix, "a watch of etcd has ended");
+        self.open = None;
+        self.failures += 1;
+    }
+
+    fn canceled(&mut self, answer: &WatchAnswer) -> Result<(), WatchEnd> {
+        if answer.compact_revision > 0 {
+            return Err(WatchEnd::Compacted);
+        }
+        let reason = &answer.cancel_reason;
+        let refused = ["user name is empty", "permission denied"];
+        if refused.iter().any(|text| reason.contains(text)) {
+            let code = if reason.contains("permission") { 7 } else { 3 };
+            return Err(WatchEnd::Failed(EtcdError::answered(
+                "the watch",
+                code,
+                reason,
+            )));
+        }
+        if let Some(endpoint) = self
+            .open
+            .as_ref()
+            .and_then(|open| self.client.endpoints.get(open.endpoint))
+        {
+            // Perhaps it is too old.
+            endpoint.forget_token();
+        }
+        self.close(reason);
+        Ok(())
+    }
+
+    async fn open(&mut self) -> Result<(), WatchEnd> {
+        if self.failures > 0 {
+            tokio::time::sleep(PAUSE).await;
+        }
+        let index = (self.client.preferred() + self.failures) % self.client.endpoints.len();
+        let Some(endpoint) = self.client.endpoints.get(index) else {
+            return Ok(());
+        };
+        // Keys after `v` are parts of values, which are read when they are whole.
+        let end = format!("{}v", self.prefix);
+        let request = json!({ "create_request": {
+            "key": STANDARD.encode(&self.prefix), "range_end": STANDARD.encode(end),
+            "start_revision": self.next.to_string(), "fragment": true,
+        }});
+        match endpoint
+            .stream("watch", request.to_string().into(), self.quiet)
+            .await
+        {
+            Ok(body) => {
+                self.open = Some(Open {
+                    endpoint: index,
+                    body,
+                    buffer: BytesMut::new(),
+                });
+            }
+            Err(error) if error.is_final() => return Err(WatchEnd::Failed(error)),
+            Err(error) => self.close(&error.to_string()),
+        }
+        Ok(())
+    }
+
+    fn changes(&mut self, answer: &WatchAnswer) -> Result<Vec<Change>, EtcdError> {
+        let mut changes = Vec::with_capacity(answer.events.len());
+        for event in &answer.events {
+            let kv = event.kv.read()?;
+            // The rest of this revision may be in the next message.
+            self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
+            changes.push(Change {
+                key: kv.key.clone(),
+                revision: kv.revision,
+                kv: (event.kind != "DELETE").then_some(kv),
+            });
+        }
+        Ok(changes)
+    }
+}
+
+impl Open {
+    /// The next line.
+    async fn message(&mut self) -> Result<Option<Bytes>, String> {
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
+                let line = self.buffer.split_to(end + 1);
+                return Ok(Some(line.freeze()));
+            }
+            if self.buffer.len() > MESSAGE_BYTES_MAX {
+                return Err("a message is too long".to_owned());
+            }
+            match self.body.frame().await {
+                None => return Ok(None),
+                Some(Err(error)) => return Err(error.to_string()),
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data() {
+                        self.buffer.extend_from_slice(&data);
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,197 @@
+//! Users, passwords and certificates.
+
+use std::{path::Path, process::Command, time::Duration};
+
+use rosrescue::cluster::etcd::{Access, Etcd, EtcdError, Options, Tls};
+use serde_json::json;
+
+use crate::{
+    servers::{LIMIT, Servers, keys, with_user},
+    support::Scratch,
+};
+
+#[tokio::test]
+async fn a_user_has_a_password_and_a_token_that_expires() {
+    let expires = ["--auth-token-ttl", "2"];
+    let servers = Servers::with(Scratch::new(), 1, "http", &expires).await;
+    for (path, body) in [
+        (
+            "auth/user/add",
+            json!({ "name": "root", "password": "secret" }),
+        ),
+        ("auth/role/add", json!({ "name": "root" })),
+        ("auth/user/grant", json!({ "user": "root", "role": "root" })),
+        (
+            "auth/user/add",
+            json!({ "name": "guest", "password": "guest" }),
+        ),
+        ("auth/enable", json!({})),
+    ] {
+        let answer = servers.post(path, &body);
+        assert!(answer.get("error").is_none(), "{path}: {answer}");
+    }
+    let keys = keys();
+    for (access, refused) in [
+        (Access::default(), "user name is empty"),
+        (with_user("root", "wrong"), "authentication failed"),
+        (with_user("guest", "guest"), "permission denied"),
+    ] {
+        let error = servers
+            .client_of(0, access)
+            .view(&keys, LIMIT)
+            .await
+            .unwrap_err();
+        assert!(matches!(error, EtcdError::Access { .. }), "{error}");
+        let said = error.to_string();
+        assert!(
+            said.contains(refused) && said.contains("check user, password"),
+            "{said}"
+        );
+    }
+    let client = servers.client_of(0, with_user("root", "secret"));
+    client.view(&keys, LIMIT).await.unwrap();
+    let mut watch = client.watch(keys.prefix(), 0, Duration::from_secs(1));
+    // Tokens go after 2 s without a use, and with their member's end.
+    let start = std::time::Instant::now();
+    while start.elapsed() < Duration::from_secs(4) {
+        let _ = tokio::time::timeout(Duration::from_secs(4), watch.next()).await;
+    }
+    client.view(&keys, LIMIT).await.unwrap();
+    assert!(!format!("{:?}", with_user("root", "secret")).contains("secret"));
+}
+
+/// Runs openssl in `folder`.
+fn openssl(folder: &Path, arguments: &str) {
+    let output = Command::new("openssl")
+        .current_dir(folder)
+        .args(arguments.split(' '))
+        .output();
+    let output = output.expect("there is no openssl");
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+/// A certificate `name` that is valid for so many days from now on, signed with that of `ca`.
+fn certificate(folder: &Path, name: &str, ca: &str, days: i32) {
+    let new = "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
+    openssl(
+        folder,
+        &format!("{new} -keyout {name}.key -out {name}.csr -subj /CN={name}"),
+    );
+    std::fs::write(folder.join("names"), "subjectAltName=IP:127.0.0.1\n").unwrap();
+    openssl(
+        folder,
+        &format!(
+            "x509 -req -in {name}.csr -CA {ca}.pem -CAkey {ca}.key -CAcreateserial -days {days} \
+             -extfile names -out {name}.pem"
+        ),
+    );
+}
+
+fn authority(folder: &Path, name: &str) {
+    let new = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 9";
+    openssl(
+        folder,
+        &format!("{new} -keyout {name}.key -out {name}.pem -subj /CN={name}"),
+    );
+}
+
+#[tokio::test]
+async fn certificates_are_checked_on_both_sides() {
+    let scratch = Scratch::new();
+    let folder = scratch.path("");
+    for name in ["ca", "other"] {
+        authority(&folder, name);
+    }
+    certificate(&folder, "server", "ca", 9);
+    certificate(&folder, "client", "ca", 9);
+    certificate(&folder, "expired", "ca", -1);
+    certificate(&folder, "stranger", "other", 9);
+    let file = |name: &str| folder.join(name).to_str().unwrap().to_owned();
+    let (cert, key, ca) = (file("server.pem"), file("server.key"), file("ca.pem"));
+    let arguments = [
+        "--cert-file",
+        &cert,
+        "--key-file",
+        &key,
+        "--client-cert-auth",
+        "--trusted-ca-file",
+        &ca,
+    ];
+    let servers = Servers::with(scratch, 1, "https", &arguments).await;
+    let access = |ca: &str, own: Option<&str>| Access {
+        tls: Tls {
+            ca: Some(folder.join(format!("{ca}.pem"))),
+            cert: own.map(|own| folder.join(format!("{own}.pem"))),
+            key: own.map(|own| folder.join(format!("{own}.key"))),
+        },
+        user: None,
+    };
+    let client = |access: Access| servers.client_of(0, access);
+    client(access("ca", Some("client")))
+        .view(&keys(), LIMIT)
+        .await
+        .unwrap();
+    let limit = Duration::from_secs(2);
+    for (ca, own) in [
+        ("other", Some("client")),
+        ("ca", None),
+        ("ca", Some("expired")),
+        ("ca", Some("stranger")),
+    ] {
+        let error = client(access(ca, own))
+            .view(&keys(), limit)
+            .await
+            .unwrap_err();
+        assert!(
+            matches!(error, EtcdError::Tls { .. }),
+            "{ca} {own:?}: {error}"
+        );
+        assert!(
+            error
+                .to_string()
+                .contains("check the certificates and their dates"),
+            "{error}"
+        );
+    }
+    let options = |access: Access, url: &str| Options {
+        endpoints: vec![url.to_owned()],
+        access,
+    };
+    let half = Access {
+        tls: Tls {
+            key: None,
+            ..access("ca", Some("client")).tls
+        },
+        user: None,
+    };
+    for (options, said) in [
+        (
+            options(Access::default(), "https://127.0.0.1:1"),
+            "needs the certificate of its authority",
+        ),
+        (options(half, "https://127.0.0.1:1"), "needs its key"),
+        (
+            options(access("nothing", None), "https://127.0.0.1:1"),
+            "nothing.pem cannot be used",
+        ),
+        (
+            options(access("names", None), "https://127.0.0.1:1"),
+            "cannot be used",
+        ),
+        (options(Access::default(), "127.0.0.1:1"), "is no endpoint"),
+        (
+            Options {
+                endpoints: Vec::new(),
+                access: Access::default(),
+            },
+            "no endpoint of etcd is given",
+        ),
+    ] {
+        let error = Etcd::new(&options).unwrap_err().to_string();
+        assert!(error.contains(said), "{error}");
+    }
+}

@@ -1,0 +1,278 @@
+//! Requests, when members die, hang, are full, or are no majority.
+
+use std::time::{Duration, Instant};
+
+use rosrescue::cluster::{
+    etcd::EtcdError,
+    journal::Put,
+    machine::{Answer, Guard, Op},
+};
+use serde_json::json;
+
+use crate::servers::{LIMIT, Servers, keys, settings};
+
+fn entry(seq: u64) -> Put {
+    Put {
+        key: keys().journal(seq),
+        value: format!("record {seq}").into_bytes(),
+    }
+}
+
+fn beat(guard: Guard, beat: u64, seq: u64) -> Op {
+    Op::Beat {
+        guard,
+        beat,
+        seq,
+        released: None,
+    }
+}
+
+#[tokio::test]
+async fn one_claims_and_what_is_sent_twice_is_made_once() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let claim = |claim| Op::Claim {
+        guard: Guard::default(),
+        claim,
+        seq: 0,
+    };
+    let a = settings("a");
+    let first = client.run(&keys, &a, &claim(1), None, LIMIT).await.unwrap();
+    let Answer::Applied {
+        revision: term,
+        seq: 0,
+    } = first
+    else {
+        panic!("{first:?}");
+    };
+    // The other one is told who leads.
+    let second = client
+        .run(&keys, &settings("b"), &claim(1), None, LIMIT)
+        .await
+        .unwrap();
+    let Answer::Is(view) = second else {
+        panic!("{second:?}");
+    };
+    let leader = view.leader.clone().unwrap();
+    assert_eq!(
+        (leader.term, leader.name.as_str(), leader.id.as_str()),
+        (term, "a", "a-1")
+    );
+    assert_eq!(
+        (leader.uri.as_str(), leader.version.as_str()),
+        ("http://a:11311", "0.1.0")
+    );
+    // A beat, and the same once more.
+    let op = beat(view.guard(), 1, 7);
+    let made = client
+        .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
+        .await
+        .unwrap();
+    assert!(matches!(made, Answer::Applied { seq: 7, .. }), "{made:?}");
+    let again = client
+        .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
+        .await
+        .unwrap();
+    let Answer::Is(view) = again else {
+        panic!("{again:?}");
+    };
+    assert_eq!(
+        view.alive.as_ref().map(|alive| (alive.beat, alive.seq)),
+        Some((1, 7))
+    );
+    assert_eq!(
+        client.run(&keys, &a, &Op::Read, None, LIMIT).await.unwrap(),
+        Answer::Is(view.clone())
+    );
+    // Parts and deletions are for the leader alone.
+    assert!(client.put(&keys, term, &[entry(3)], LIMIT).await.unwrap());
+    assert!(
+        !client
+            .put(&keys, term + 1, &[entry(4)], LIMIT)
+            .await
+            .unwrap()
+    );
+    let journal = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
+    let found: Vec<_> = journal
+        .kvs
+        .iter()
+        .map(|kv| keys.seq_of(&kv.key).unwrap())
+        .collect();
+    assert_eq!(found, [3, 7]);
+    assert!(
+        !client
+            .delete(&keys, term + 1, &keys.behind(7), LIMIT)
+            .await
+            .unwrap()
+    );
+    assert!(
+        client
+            .delete(&keys, term, &keys.behind(3), LIMIT)
+            .await
+            .unwrap()
+    );
+    assert_eq!(
+        client
+            .range(&keys.journal_after(0), LIMIT)
+            .await
+            .unwrap()
+            .kvs
+            .len(),
+        1
+    );
+}
+
+#[tokio::test]
+async fn a_range_is_read_in_pages_of_one_moment() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    // Nobody leads: the term is 0.
+    let puts: Vec<_> = (1..=100).map(entry).collect();
+    assert!(client.put(&keys, 0, &puts, LIMIT).await.unwrap());
+    let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
+    let written: Vec<_> = found
+        .kvs
+        .into_iter()
+        .map(|kv| Put {
+            key: kv.key,
+            value: kv.value,
+        })
+        .collect();
+    assert_eq!(written, puts);
+}
+
+#[tokio::test]
+async fn a_member_that_dies_or_hangs_is_passed_over() {
+    let mut servers = Servers::new(3).await;
+    let (client, keys) = (servers.client(), keys());
+    let mut seq = 0;
+    let mut longest = Duration::ZERO;
+    for member in 0..servers.count() {
+        for hangs in [false, true] {
+            if hangs {
+                servers.stop(member)
+            } else {
+                servers.kill(member)
+            }
+            for _ in 0..5 {
+                seq += 1;
+                let start = Instant::now();
+                let put = client.put(&keys, 0, &[entry(seq)], LIMIT).await;
+                longest = longest.max(start.elapsed());
+                assert!(put.unwrap(), "{seq}");
+            }
+            if hangs {
+                servers.go_on(member)
+            } else {
+                servers.start(member)
+            }
+        }
+    }
+    let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
+    assert_eq!(found.kvs.len() as u64, seq);
+    println!("the longest of {seq} writes took {longest:?}");
+}
+
+#[tokio::test]
+async fn without_a_majority_nothing_is_answered_and_it_is_said_why() {
+    let mut servers = Servers::new(3).await;
+    let (client, keys) = (servers.client(), keys());
+    servers.kill(1);
+    servers.kill(2);
+    let start = Instant::now();
+    let limit = Duration::from_secs(2);
+    let error = client.put(&keys, 0, &[entry(1)], limit).await.unwrap_err();
+    assert!(start.elapsed() >= limit, "{error}");
+    let said = error.to_string();
+    assert!(
+        said.contains("cannot connect to etcd at http://127.0.0.1:"),
+        "{said}"
+    );
+    let statuses = client.status(limit).await;
+    assert!(
+        statuses[0].as_ref().unwrap().errors[0].contains("no leader"),
+        "{statuses:?}"
+    );
+    assert!(statuses[1].is_err(), "{statuses:?}");
+    servers.start(2);
+    assert!(client.put(&keys, 0, &[entry(1)], LIMIT).await.unwrap());
+}
+
+#[tokio::test]
+async fn a_lease_goes_when_it_is_not_kept() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let lease = client.grant(Duration::from_secs(1), LIMIT).await.unwrap();
+    let put = Put {
+        key: keys.member("a"),
+        value: b"here".to_vec(),
+    };
+    client.put_with_lease(&put, lease, LIMIT).await.unwrap();
+    assert!(client.keep_alive(lease, LIMIT).await.unwrap());
+    let mut watch = client.watch(keys.prefix(), 0, LIMIT);
+    let there = watch.next().await.unwrap();
+    assert_eq!(there[0].kv.as_ref().unwrap().value, b"here");
+    let gone = watch.next().await.unwrap();
+    assert_eq!(
+        (gone[0].key.as_str(), gone[0].kv.is_none()),
+        (put.key.as_str(), true)
+    );
+    assert!(!client.keep_alive(lease, LIMIT).await.unwrap());
+}
+
+#[tokio::test]
+async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
+    let quota = ["--quota-backend-bytes", "8388608"];
+    let servers = Servers::with(crate::support::Scratch::new(), 1, "http", &quota).await;
+    let (client, keys) = (servers.client(), keys());
+    let large = |seq| Put {
+        key: keys.journal(seq),
+        value: vec![b'x'; 1 << 20],
+    };
+    let mut seq = 0;
+    let error = loop {
+        seq += 1;
+        assert!(seq < 20, "it is never full");
+        if let Err(error) = client.put(&keys, 0, &[large(seq)], LIMIT).await {
+            break error;
+        }
+    };
+    assert!(matches!(error, EtcdError::Full), "{error}");
+    assert!(
+        error.to_string().contains("etcdctl alarm disarm"),
+        "{error}"
+    );
+    let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
+    assert!(!found.kvs.is_empty());
+    // What can be done from here: less is kept. The rest is for a person.
+    assert!(
+        client
+            .delete(&keys, 0, &keys.behind(seq), LIMIT)
+            .await
+            .unwrap()
+    );
+    client.compact(found.revision + 1, LIMIT).await.unwrap();
+    // Twice is no error.
+    client.compact(found.revision + 1, LIMIT).await.unwrap();
+    servers.post("maintenance/defragment", &json!({}));
+    let alarms = servers.post("maintenance/alarm", &json!({ "action": "GET" }));
+    let member = alarms["alarms"][0]["memberID"].clone();
+    let disarm = json!({ "action": "DEACTIVATE", "memberID": member, "alarm": "NOSPACE" });
+    servers.post("maintenance/alarm", &disarm);
+    assert!(client.put(&keys, 0, &[large(seq)], LIMIT).await.unwrap());
+}
+
+#[tokio::test]
+async fn a_request_that_is_too_large_is_told_from_others() {
+    let servers = Servers::new(1).await;
+    let large = Put {
+        key: keys().journal(1),
+        value: vec![b'x'; 1600 << 10],
+    };
+    let error = servers
+        .client()
+        .put(&keys(), 0, &[large], LIMIT)
+        .await
+        .unwrap_err();
+    assert!(matches!(error, EtcdError::TooLarge), "{error}");
+}

@@ -1,0 +1,104 @@
+//! Changes, when members die, and when they are forgotten.
+
+use std::time::Duration;
+
+use rosrescue::cluster::{
+    etcd::{Access, Watch, WatchEnd},
+    journal::Put,
+};
+
+use crate::servers::{LIMIT, Servers, keys};
+
+/// Longer than a write takes, shorter than a test.
+const QUIET: Duration = Duration::from_secs(2);
+
+fn entry(seq: u64) -> Put {
+    Put {
+        key: keys().journal(seq),
+        value: format!("record {seq}").into_bytes(),
+    }
+}
+
+/// The numbers of the journal's entries as they come, until `last`, each once.
+async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
+    while *seen < last {
+        let changes = tokio::time::timeout(LIMIT, watch.next())
+            .await
+            .expect("it is silent");
+        for change in changes.unwrap() {
+            let seq = keys().seq_of(&change.key).unwrap();
+            // Twice is allowed, a gap is not.
+            assert!(seq <= *seen + 1, "{seq} after {seen}");
+            *seen = seq.max(*seen);
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_watch_goes_on_at_another_member_and_misses_nothing() {
+    let mut servers = Servers::new(3).await;
+    let (writer, keys) = (servers.client_of(1, Access::default()), keys());
+    let mut watch = servers.client().watch(keys.prefix(), 0, QUIET);
+    let (mut seen, mut seq) = (0, 0);
+    for (member, hangs) in [(0, false), (1, false), (0, true), (2, false), (1, true)] {
+        let write = async |upto: u64, seq: &mut u64| {
+            while *seq < upto {
+                *seq += 1;
+                assert!(writer.put(&keys, 0, &[entry(*seq)], LIMIT).await.unwrap());
+            }
+        };
+        write(seq + 10, &mut seq).await;
+        follow(&mut watch, &mut seen, seq).await;
+        if hangs {
+            servers.stop(member)
+        } else {
+            servers.kill(member)
+        }
+        write(seq + 10, &mut seq).await;
+        follow(&mut watch, &mut seen, seq).await;
+        if hangs {
+            servers.go_on(member)
+        } else {
+            servers.start(member)
+        }
+    }
+    assert_eq!(seen, 100);
+}
+
+#[tokio::test]
+async fn what_is_forgotten_is_told() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let puts: Vec<_> = (1..=10).map(entry).collect();
+    assert!(client.put(&keys, 0, &puts, LIMIT).await.unwrap());
+    let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
+    client.compact(found.revision, LIMIT).await.unwrap();
+    let mut watch = client.watch(keys.prefix(), 1, QUIET);
+    let end = watch.next().await.unwrap_err();
+    assert!(matches!(end, WatchEnd::Compacted), "{end:?}");
+    // From what was read it goes on.
+    let mut watch = client.watch(keys.prefix(), found.revision, QUIET);
+    assert!(client.put(&keys, 0, &[entry(11)], LIMIT).await.unwrap());
+    let mut seen = 10;
+    follow(&mut watch, &mut seen, 11).await;
+}
+
+#[tokio::test]
+async fn parts_of_values_are_not_watched_and_long_messages_come_whole() {
+    let servers = Servers::new(1).await;
+    let (client, keys) = (servers.client(), keys());
+    let value = vec![b'x'; 1 << 20];
+    let part = Put {
+        key: format!("{}values/blob/1", keys.prefix()),
+        value: value.clone(),
+    };
+    let large = |seq| Put {
+        key: keys.journal(seq),
+        value: value.clone(),
+    };
+    let all = [part, large(1), large(2), large(3), large(4), large(5)];
+    assert!(client.put(&keys, 0, &all, LIMIT).await.unwrap());
+    let mut watch = client.watch(keys.prefix(), 0, LIMIT);
+    let mut seen = 0;
+    follow(&mut watch, &mut seen, 5).await;
+}

@@ -1,0 +1,20 @@
+# Unpacks Debian's etcd for the tests, where there is none, and makes it known to this shell:
+#
+#     . tests/install_etcd.sh
+#
+# Not by installing it: that would start an etcd as a service of this computer.
+
+etcd_works() {
+    command -v etcd >/dev/null && etcd --version | grep -Eq '^etcd Version: (3\.([4-9]|[1-9][0-9])|[4-9])'
+}
+
+etcd_folder="$PWD/${CARGO_TARGET_DIR:-target}/etcd"
+PATH="$PATH:$etcd_folder/usr/bin"
+if ! etcd_works; then
+    mkdir -p "$etcd_folder"
+    if ! (cd "$etcd_folder" && apt-get download -qq etcd-server && dpkg -x etcd-server_*.deb .) ||
+        ! etcd_works; then
+        echo "there is no etcd 3.4 or later here, and apt-get cannot download one (etcd-server of Debian 12)" >&2
+        exit 1
+    fi
+fi
