@@ -5,7 +5,7 @@
 //! Whoever has seen no change of both for the time to live, by its own clock, may claim. Every transaction of
 //! the leader succeeds only if `leader` has its term and `alive` is as the previous one left it. So one that
 //! was cut off can commit nothing, and one that is sent twice has its effect once. The records of calls are
-//! in `journal/`, and travel in the same transaction. See decision 28.
+//! in `journal/`, and travel in the same transaction. See decision 29.
 //!
 //! * [`machine`]: who leads, and what may be acknowledged; pure.
 //! * [`journal`]: records and snapshots to and from keys and values; pure.
