@@ -11,10 +11,12 @@
 //! * [`journal`]: records and snapshots to and from keys and values; pure.
 //! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
 //! * [`etcd`]: etcd's JSON gateway.
+//! * [`replica`]: the robot's state in etcd.
 
 pub mod etcd;
 pub mod journal;
 pub mod machine;
 pub mod merge;
+pub mod replica;
 #[cfg(test)]
 mod tests;

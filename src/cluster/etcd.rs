@@ -268,10 +268,10 @@ impl Etcd {
         wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
     }
 
-    /// What changes below `prefix`, after revision `after`. Nothing for `quiet` means that the endpoint is cut
-    /// off, and another one is asked.
-    pub fn watch(&self, prefix: &str, after: u64, quiet: Duration) -> Watch {
-        Watch::new(self.clone(), prefix.to_owned(), after + 1, quiet)
+    /// What changes in `range`, after revision `after`. Nothing for `quiet` means that the endpoint is cut off,
+    /// and another one is asked.
+    pub fn watch(&self, range: Range<String>, after: u64, quiet: Duration) -> Watch {
+        Watch::new(self.clone(), range, after + 1, quiet)
     }
 
     fn preferred(&self) -> usize {

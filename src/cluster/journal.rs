@@ -84,6 +84,11 @@ impl Keys {
         format!("{}journal/{seq:020}", self.0)
     }
 
+    /// All keys but parts of values.
+    pub fn small(&self) -> Range<String> {
+        self.0.clone()..format!("{}v", self.0)
+    }
+
     /// The keys of the journal after record `seq`.
     pub fn journal_after(&self, seq: u64) -> Range<String> {
         self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)
@@ -229,8 +234,6 @@ impl Manifest {
 pub struct Batch {
     /// How many of the records are in it.
     pub count: usize,
-    /// To be written before, each on its own. Without the entry they mean nothing.
-    pub parts: Vec<Put>,
     pub entry: Option<Put>,
 }
 
@@ -251,23 +254,33 @@ pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
         }
         (seq, count) = (record.seq, count + 1);
     }
-    let Some(_) = records.first() else {
+    if count == 0 {
         return Ok(Batch::default());
-    };
+    }
     check_size(value.len())?;
-    let (value, parts) = if value.len() > BATCH_BYTES {
-        let (manifest, parts) = Manifest::split(keys, Kind::Blob, seq, &value);
-        (manifest.text(), parts)
-    } else {
-        (value, Vec::new())
-    };
+    if value.len() > BATCH_BYTES {
+        // It is alone.
+        value = Manifest::split(keys, Kind::Blob, seq, &value).0.text();
+    }
     let key = keys.journal(seq);
     let entry = Some(Put { key, value });
-    Ok(Batch {
-        count,
-        parts,
-        entry,
-    })
+    Ok(Batch { count, entry })
+}
+
+/// What has to be written before the transaction with this record, each on its own. Without the entry it means
+/// nothing.
+///
+/// # Errors
+///
+/// [`JournalError::TooLarge`].
+pub fn parts(keys: &Keys, record: &Record) -> Result<Vec<Put>, JournalError> {
+    let mut value = Vec::new();
+    format::push_record(&mut value, record)?;
+    check_size(value.len())?;
+    match value.len() > BATCH_BYTES {
+        true => Ok(Manifest::split(keys, Kind::Blob, record.seq, &value).1),
+        false => Ok(Vec::new()),
+    }
 }
 
 /// Whether a call whose record has so many bytes can be in the journal. To be asked before it is run.

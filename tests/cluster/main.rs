@@ -14,6 +14,8 @@ mod servers;
 
 /// Users, passwords and certificates.
 mod access;
+/// The robot's state in etcd, from one computer to the other.
+mod replica;
 /// Requests, when members die, hang, are full, or are no majority.
 mod requests;
 /// Two machines on a real etcd: who leads when one dies.

@@ -209,7 +209,7 @@ async fn a_lease_goes_when_it_is_not_kept() {
     };
     client.put_with_lease(&put, lease, LIMIT).await.unwrap();
     assert!(client.keep_alive(lease, LIMIT).await.unwrap());
-    let mut watch = client.watch(keys.prefix(), 0, LIMIT);
+    let mut watch = client.watch(keys.small(), 0, LIMIT);
     let there = watch.next().await.unwrap();
     assert_eq!(there[0].kv.as_ref().unwrap().value, b"here");
     let gone = watch.next().await.unwrap();

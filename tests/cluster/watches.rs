@@ -38,7 +38,7 @@ async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
 async fn a_watch_goes_on_at_another_member_and_misses_nothing() {
     let mut servers = Servers::new(3).await;
     let (writer, keys) = (servers.client_of(1, Access::default()), keys());
-    let mut watch = servers.client().watch(keys.prefix(), 0, QUIET);
+    let mut watch = servers.client().watch(keys.small(), 0, QUIET);
     let (mut seen, mut seq) = (0, 0);
     for (member, hangs) in [(0, false), (1, false), (0, true), (2, false), (1, true)] {
         let write = async |upto: u64, seq: &mut u64| {
@@ -73,11 +73,11 @@ async fn what_is_forgotten_is_told() {
     assert!(client.put(&keys, 0, &puts, LIMIT).await.unwrap());
     let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
     client.compact(found.revision, LIMIT).await.unwrap();
-    let mut watch = client.watch(keys.prefix(), 1, QUIET);
+    let mut watch = client.watch(keys.small(), 1, QUIET);
     let end = watch.next().await.unwrap_err();
     assert!(matches!(end, WatchEnd::Compacted), "{end:?}");
     // From what was read it goes on.
-    let mut watch = client.watch(keys.prefix(), found.revision, QUIET);
+    let mut watch = client.watch(keys.small(), found.revision, QUIET);
     assert!(client.put(&keys, 0, &[entry(11)], LIMIT).await.unwrap());
     let mut seen = 10;
     follow(&mut watch, &mut seen, 11).await;
@@ -98,7 +98,7 @@ async fn parts_of_values_are_not_watched_and_long_messages_come_whole() {
     };
     let all = [part, large(1), large(2), large(3), large(4), large(5)];
     assert!(client.put(&keys, 0, &all, LIMIT).await.unwrap());
-    let mut watch = client.watch(keys.prefix(), 0, LIMIT);
+    let mut watch = client.watch(keys.small(), 0, LIMIT);
     let mut seen = 0;
     follow(&mut watch, &mut seen, 5).await;
 }

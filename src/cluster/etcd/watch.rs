@@ -1,6 +1,6 @@
 //! What changes in etcd, as it changes; across lost connections, members and restarts.
 
-use std::time::Duration;
+use std::{ops::Range, time::Duration};
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 use bytes::{Bytes, BytesMut};
@@ -59,7 +59,7 @@ struct Open {
 /// A watch. Changes come in their order; after a lost connection some may come twice.
 pub struct Watch {
     client: Etcd,
-    prefix: String,
+    range: Range<String>,
     /// The next revision.
     next: u64,
     quiet: Duration,
@@ -68,10 +68,10 @@ pub struct Watch {
 }
 
 impl Watch {
-    pub(super) fn new(client: Etcd, prefix: String, next: u64, quiet: Duration) -> Self {
+    pub(super) fn new(client: Etcd, range: Range<String>, next: u64, quiet: Duration) -> Self {
         Self {
             client,
-            prefix,
+            range,
             next,
             quiet,
             open: None,
@@ -124,7 +124,7 @@ impl Watch {
     }
 
     fn close(&mut self, why: &str) {
-        tracing::debug!(why, prefix = self.prefix, "a watch of etcd has ended");
+        tracing::debug!(why, from = self.range.start, "a watch of etcd has ended");
         self.open = None;
         self.failures += 1;
     }
@@ -163,10 +163,8 @@ impl Watch {
         let Some(endpoint) = self.client.endpoints.get(index) else {
             return Ok(());
         };
-        // Keys after `v` are parts of values, which are read when they are whole.
-        let end = format!("{}v", self.prefix);
         let request = json!({ "create_request": {
-            "key": STANDARD.encode(&self.prefix), "range_end": STANDARD.encode(end),
+            "key": STANDARD.encode(&self.range.start), "range_end": STANDARD.encode(&self.range.end),
             "start_revision": self.next.to_string(), "fragment": true,
         }});
         match endpoint

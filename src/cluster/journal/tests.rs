@@ -34,7 +34,8 @@ fn through(records: &[Record]) -> (Vec<Record>, usize) {
             None => value,
             Some(manifest) => {
                 let range = keys.parts(&manifest);
-                let mut parts = batch.parts;
+                let mut parts = parts(&keys, &rest[0]).unwrap();
+                assert_eq!(batch.count, 1);
                 assert!(parts.is_sorted_by_key(|part| part.key.clone()));
                 assert!(parts.iter().all(|part| range.contains(&part.key)));
                 assert!(parts.iter().all(|part| part.value.len() < REQUEST_BYTES));

@@ -1,0 +1,222 @@
+//! The robot's state in etcd, from one computer to the other.
+
+use std::time::Instant;
+
+use rosrescue::{
+    checkpoint::format::{Checkpoint, Entry, Record, Session},
+    cluster::{
+        journal::Progress,
+        machine::{Answer, Guard, Op},
+        replica::{Replica, ReplicaError},
+    },
+    xmlrpc::Call,
+};
+
+use crate::servers::{LIMIT, Servers, keys, settings};
+
+fn replica(servers: &Servers) -> Replica {
+    Replica {
+        client: servers.client(),
+        keys: keys(),
+        limit: LIMIT,
+    }
+}
+
+fn record(seq: u64, bytes: usize) -> Record {
+    let key = format!("/p{seq}");
+    let value = "x".repeat(bytes);
+    let params = ["/n", key.as_str(), value.as_str()].map(Into::into);
+    let entry = Entry::call(Call::new("setParam", params.to_vec()));
+    Record { seq, entry }
+}
+
+/// A leader, as simple as it can be.
+struct Leader {
+    replica: Replica,
+    guard: Guard,
+    beat: u64,
+}
+
+impl Leader {
+    async fn new(servers: &Servers) -> Self {
+        let replica = replica(servers);
+        let view = replica.client.view(&keys(), LIMIT).await.unwrap();
+        let (guard, seq) = (view.guard(), view.seq());
+        let claim = Op::Claim {
+            guard,
+            claim: 1,
+            seq,
+        };
+        let answer = replica.run(&settings("a"), &claim, &[]).await.unwrap();
+        let Answer::Applied { revision, .. } = answer else {
+            panic!("{answer:?}");
+        };
+        let guard = Guard {
+            leader: revision,
+            alive: revision,
+        };
+        Self {
+            replica,
+            guard,
+            beat: 0,
+        }
+    }
+
+    /// Commits all, in as many beats as it takes.
+    async fn commit(&mut self, records: &[Record]) {
+        for record in records {
+            assert!(
+                self.replica
+                    .prepare(self.guard.leader, record)
+                    .await
+                    .unwrap()
+            );
+        }
+        let mut rest = records;
+        while let Some(last) = rest.last() {
+            self.beat += 1;
+            let beat = Op::Beat {
+                guard: self.guard,
+                beat: self.beat,
+                seq: last.seq,
+                released: None,
+            };
+            let answer = self.replica.run(&settings("a"), &beat, rest).await.unwrap();
+            let Answer::Applied { revision, seq } = answer else {
+                panic!("{answer:?}");
+            };
+            self.guard.alive = revision;
+            rest = &rest[rest.iter().take_while(|record| record.seq <= seq).count()..];
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_follower_reads_what_the_leader_has_committed_a_map_of_20_mb_too() {
+    let servers = Servers::new(3).await;
+    let mut leader = Leader::new(&servers).await;
+    let sizes = [10, 100, 300 << 10, 5, 20 << 20, 1];
+    let records: Vec<_> = (1..)
+        .zip(sizes)
+        .map(|(seq, bytes)| record(seq, bytes))
+        .collect();
+    let follower = replica(&servers);
+    let start = follower.load(Progress::default()).await.unwrap();
+    let range = follower.keys.small();
+    let mut watch = follower.client.watch(range, start.view.revision, LIMIT);
+    let began = Instant::now();
+    leader.commit(&records).await;
+    println!("20 MB are committed in {:?}", began.elapsed());
+    let loaded = follower.load(Progress::default()).await.unwrap();
+    assert!(loaded.records == records && loaded.checkpoint.is_none());
+    assert_eq!(loaded.view.guard(), leader.guard);
+    // The same, as it came.
+    let (mut progress, mut seen) = (Progress::default(), Vec::new());
+    while seen.len() < records.len() {
+        for change in watch.next().await.unwrap() {
+            if follower.keys.seq_of(&change.key).is_some() {
+                let kv = change.kv.unwrap();
+                let new = follower.records(&kv).await.unwrap();
+                seen.extend(progress.take(new, kv.value.len()).unwrap());
+            }
+        }
+    }
+    assert!(seen == records);
+    // A little more is little to read.
+    leader.commit(&[record(7, 1)]).await;
+    let more = follower.load(loaded.progress).await.unwrap();
+    assert_eq!(more.records, [record(7, 1)]);
+}
+
+#[tokio::test]
+async fn a_snapshot_takes_the_place_of_the_journal() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    let records: Vec<_> = (1..=50).map(|seq| record(seq, 30 << 10)).collect();
+    leader.commit(&records).await;
+    let follower = replica(&servers);
+    let before = follower.load(Progress::default()).await.unwrap();
+    assert!(before.progress.wants_snapshot());
+    let mut state = Checkpoint {
+        seq: 50,
+        session: Session {
+            id: "run".to_owned(),
+            ..Session::default()
+        },
+        ..Checkpoint::default()
+    };
+    for round in 0..2 {
+        let value = "y".repeat(3 << 20).as_str().into();
+        state.snapshot.params.insert("map".to_owned(), value);
+        state.seq = 50 + round;
+        let term = leader.guard.leader;
+        assert!(
+            !leader
+                .replica
+                .write_snapshot(term + 1, &state)
+                .await
+                .unwrap()
+        );
+        assert!(leader.replica.write_snapshot(term, &state).await.unwrap());
+        leader
+            .replica
+            .client
+            .compact(leader.guard.alive, LIMIT)
+            .await
+            .unwrap();
+        leader.commit(&[record(51 + round, 10)]).await;
+    }
+    let joined = follower.load(Progress::default()).await.unwrap();
+    assert_eq!(joined.checkpoint.as_ref().map(|state| state.seq), Some(51));
+    assert!(joined.checkpoint == Some(state));
+    assert_eq!(joined.records, [record(52, 10)]);
+    assert!(!joined.progress.wants_snapshot());
+    // Who had followed to the snapshot goes on from what it has.
+    let mut known = Progress::default();
+    known.seq = 51;
+    let on = follower.load(known).await.unwrap();
+    assert!(on.checkpoint.is_none() && on.records == [record(52, 10)]);
+    // Nothing old is left.
+    let all = format!("{}a", keys().prefix())..format!("{}z", keys().prefix());
+    let all = follower.client.range(&all, LIMIT).await.unwrap();
+    let sizes: usize = all.kvs.iter().map(|kv| kv.value.len()).sum();
+    assert!(sizes < 4 << 20, "{sizes}");
+}
+
+#[tokio::test]
+async fn a_journal_with_a_hole_is_not_taken_for_whole() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    for seq in 1..=4 {
+        leader.commit(&[record(seq, 1)]).await;
+    }
+    let follower = replica(&servers);
+    let (term, keys) = (leader.guard.leader, keys());
+    let hole = keys.journal(3)..keys.journal(4);
+    assert!(
+        follower
+            .client
+            .delete(&keys, term, &[hole], LIMIT)
+            .await
+            .unwrap()
+    );
+    let error = follower.load(Progress::default()).await.unwrap_err();
+    assert!(
+        error.to_string().contains("record 4 where 3 was expected"),
+        "{error}"
+    );
+    let end = keys.journal(4)..keys.journal(5);
+    assert!(
+        follower
+            .client
+            .delete(&keys, term, &[end], LIMIT)
+            .await
+            .unwrap()
+    );
+    let error = follower.load(Progress::default()).await.unwrap_err();
+    let short = ReplicaError::Short {
+        found: 2,
+        expected: 4,
+    };
+    assert_eq!(error.to_string(), short.to_string());
+}
