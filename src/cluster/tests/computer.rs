@@ -8,7 +8,7 @@ use super::etcd::{Write, name};
 /// Parameters that are written.
 pub(super) const KEYS: usize = 6;
 /// Most records of a beat. So small that beats are full now and then.
-pub(super) const RECORDS_MAX: u64 = 3;
+pub(super) const RECORDS_MAX: u64 = 20;
 
 /// For each parameter, the call that wrote it last, and one more.
 pub(super) type State = [usize; KEYS];
@@ -28,6 +28,8 @@ pub(super) struct Computer {
     pub(super) life: u64,
     /// It does nothing before this moment.
     pub(super) hangs_until: u64,
+    /// It has not hung since.
+    pub(super) undisturbed_since: u64,
     /// By how much its clock is too fast, in millionths.
     drift: i64,
     clock: Instant,
@@ -59,6 +61,7 @@ impl Computer {
             up: true,
             life: 0,
             hangs_until: 0,
+            undisturbed_since: 0,
             drift,
             clock: Instant::now(),
             wake: 0,

@@ -15,6 +15,8 @@ pub(super) struct Request {
     pub(super) number: u64,
     pub(super) op: Op,
     pub(super) records: Vec<Write>,
+    /// When its sender gives up.
+    pub(super) until: u64,
 }
 
 #[derive(Debug, Default)]

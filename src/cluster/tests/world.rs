@@ -44,6 +44,7 @@ enum Event {
 #[derive(Clone, Copy, Debug, Default)]
 struct Call {
     key: usize,
+    made: u64,
     /// Answered by a leader,
     led: bool,
     /// or by a computer that was alone.
@@ -204,6 +205,7 @@ impl World {
                     let key = self.dice.below(KEYS as u64) as usize;
                     self.calls.push(Call {
                         key,
+                        made: self.now,
                         ..Call::default()
                     });
                     self.computers[at].waiting.push(self.calls.len() - 1);
@@ -230,15 +232,12 @@ impl World {
     /// A request reaches etcd, or does not.
     fn request(&mut self, request: Request, awaited: bool) {
         let (at, life, number) = (request.from, request.life, request.number);
-        let late = ANSWER_LIMIT.as_micros() as u64;
         if !self.network.reaches_etcd(at) {
-            if awaited {
-                let delay = if self.dice.one_in(2) {
-                    late
-                } else {
-                    self.dice.below(50) * MS
-                };
-                self.after(delay, Event::Answer(at, life, number, Answer::Silence));
+            if awaited && self.now < request.until {
+                // The client asks another endpoint.
+                self.after(250 * MS, Event::Request(request, true));
+            } else if awaited {
+                self.after(0, Event::Answer(at, life, number, Answer::Silence));
             }
             return;
         }
@@ -354,6 +353,7 @@ impl World {
             number,
             op,
             records,
+            until: self.now + ANSWER_LIMIT.as_micros() as u64,
         };
         if self.plan.faults && self.dice.one_in(40) {
             // It arrives late, or twice.

@@ -1,6 +1,8 @@
 //! Calls that write: who records and answers them, and what becomes of those that were answered alone.
 
-use super::super::super::machine::{Commit, Input, Role};
+use std::time::Duration;
+
+use super::super::super::machine::{Commit, Input, Role, WhenAlone};
 use super::super::computer::Own;
 use super::super::etcd::Write;
 use super::{Event, World};
@@ -130,6 +132,12 @@ impl World {
     pub(super) fn done(&mut self, at: usize, write: Write) {
         let computer = &mut self.computers[at];
         if computer.up {
+            let waits = computer.waiting.contains(&write);
+            let made = self.calls[write].made;
+            if waits && self.plan.alone == WhenAlone::Serve && computer.undisturbed_since <= made {
+                let waited = Duration::from_micros(self.now - made);
+                self.counts.waited = self.counts.waited.max(waited);
+            }
             computer.waiting.retain(|waits| *waits != write);
             let before = computer.pending.len();
             computer.pending.retain(|waits| *waits != write);

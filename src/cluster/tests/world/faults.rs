@@ -23,6 +23,8 @@ pub(in super::super) struct Counts {
     pub(in super::super) acknowledged: u64,
     pub(in super::super) merged: u64,
     pub(in super::super) reported: u64,
+    /// The longest time that a call waited where nothing hung, while computers that are alone serve.
+    pub(in super::super) waited: Duration,
 }
 
 impl Counts {
@@ -32,6 +34,7 @@ impl Counts {
         self.acknowledged += other.acknowledged;
         self.merged += other.merged;
         self.reported += other.reported;
+        self.waited = self.waited.max(other.waited);
     }
 }
 
@@ -140,6 +143,7 @@ impl World {
                 let time = (20 + self.dice.below(5000)) * MS;
                 let computer = &mut self.computers[at];
                 computer.hangs_until = computer.hangs_until.max(self.now + time);
+                computer.undisturbed_since = computer.hangs_until;
                 return;
             }
             7 => {
@@ -152,12 +156,36 @@ impl World {
         if self.plan.traced {
             println!("{:>9} us: {fault:?}", self.now);
         }
+        let time = (20 + self.dice.below(4000)) * MS;
+        self.strike(fault, time);
+    }
+
+    fn strike(&mut self, fault: Fault, time: u64) {
         match fault {
             Fault::Kill(at) => self.kill(at),
             _ => self.network.cut(fault, 1),
         }
-        let time = (20 + self.dice.below(4000)) * MS;
         self.after(time, Event::End(fault));
+    }
+
+    /// One failure of some seconds.
+    pub(in super::super) fn fail_once(&mut self) -> String {
+        let leader = self.leaders()[0];
+        let follower = (leader + 1) % COMPUTERS;
+        let kinds = [
+            Fault::Kill(leader),
+            Fault::Kill(follower),
+            Fault::CutFromEtcd(leader),
+            Fault::CutFromEtcd(follower),
+            Fault::CutPair(leader, follower),
+            Fault::CutOff(leader),
+            Fault::CutOff(follower),
+            Fault::EtcdAway,
+        ];
+        let fault = kinds[self.dice.below(kinds.len() as u64) as usize];
+        let time = (20 + self.dice.below(6000)) * MS;
+        self.strike(fault, time);
+        format!("{fault:?} for {} ms", time / MS)
     }
 
     pub(super) fn end(&mut self, fault: Fault) {
