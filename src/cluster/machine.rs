@@ -392,3 +392,6 @@ impl Machine {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,277 @@
+//! One situation each. What happens when many come together is in `crate::cluster::tests`.
+
+use super::*;
+
+const TTL: Duration = Duration::from_secs(2);
+
+fn machine(alone: WhenAlone) -> (Machine, Instant) {
+    let machine = Machine::new(Settings {
+        name: "a".to_owned(),
+        id: "a-1".to_owned(),
+        uri: String::new(),
+        version: String::new(),
+        ttl: TTL,
+        commit: Commit::Always,
+        alone,
+    });
+    (machine, Instant::now())
+}
+
+fn ms(milliseconds: u64) -> Duration {
+    Duration::from_millis(milliseconds)
+}
+
+/// The keys when `name` leads since revision `term`, and has written `alive` at `revision`.
+fn led(name: &str, term: u64, revision: u64) -> View {
+    View {
+        revision,
+        leader: Some(Leader {
+            term,
+            name: name.to_owned(),
+            id: format!("{name}-1"),
+            claim: 1,
+            uri: String::new(),
+            version: String::new(),
+        }),
+        alive: Some(Alive {
+            revision,
+            beat: revision - term,
+            seq: 10,
+            released: None,
+        }),
+    }
+}
+
+/// The request among `actions`.
+fn sent(actions: &[Action]) -> (u64, Op) {
+    let mut sent = actions.iter().filter_map(|action| match action {
+        Action::Send { number, op } => Some((*number, op.clone())),
+        _ => None,
+    });
+    sent.next()
+        .unwrap_or_else(|| panic!("nothing is sent: {actions:?}"))
+}
+
+/// One that follows `b`, whose mirror is up to date.
+fn following(alone: WhenAlone) -> (Machine, Instant) {
+    let (mut machine, now) = machine(alone);
+    let (number, op) = sent(&machine.on(now, Input::Start(0)));
+    assert_eq!(op, Op::Read);
+    let answer = Answer::Is(led("b", 5, 6));
+    let actions = machine.on(now, Input::Answer { number, answer });
+    let follows = [Action::Become(Role::Following), Action::CatchUp(10)];
+    assert_eq!(actions, follows);
+    machine.on(now, Input::Followed(10));
+    (machine, now)
+}
+
+/// One that leads, and has sent nothing since `now`.
+fn leading(alone: WhenAlone) -> (Machine, Instant) {
+    let (mut machine, now) = machine(alone);
+    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let nobody = Answer::Is(View::default());
+    let claimed = machine.on(
+        now,
+        Input::Answer {
+            number,
+            answer: nobody,
+        },
+    );
+    let (number, op) = sent(&claimed);
+    let guard = Guard::default();
+    let (claim, seq) = (1, 0);
+    assert_eq!(op, Op::Claim { guard, claim, seq });
+    let (revision, seq) = (1, 0);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now, Input::Answer { number, answer });
+    assert_eq!(actions.last(), Some(&Action::Become(Role::Leading)));
+    assert_eq!(machine.deadline(), Some(now + TTL / BEATS));
+    (machine, now)
+}
+
+#[test]
+fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
+    let (mut machine, now) = following(WhenAlone::Serve);
+    let later = now + ms(1500);
+    assert_eq!(machine.on(later, Input::View(led("b", 5, 7))), []);
+    assert_eq!(machine.on(later + TTL - ms(1), Input::Wake), []);
+    let (_, op) = sent(&machine.on(later + TTL, Input::Wake));
+    let guard = Guard {
+        leader: 5,
+        alive: 7,
+    };
+    let (claim, seq) = (1, 10);
+    assert_eq!(op, Op::Claim { guard, claim, seq });
+}
+
+#[test]
+fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
+    let (mut machine, now) = machine(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let mut before = led("a", 5, 6);
+    before.leader.as_mut().unwrap().id = "a-0".to_owned();
+    let answer = Answer::Is(before);
+    let (_, op) = sent(&machine.on(now, Input::Answer { number, answer }));
+    assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+}
+
+#[test]
+fn who_is_named_by_a_leader_that_gives_up_goes_first() {
+    for (to, after) in [("a", ms(0)), ("", ms(0)), ("c", TTL / BEATS)] {
+        let (mut machine, now) = following(WhenAlone::Serve);
+        let mut view = led("b", 5, 7);
+        view.alive.as_mut().unwrap().released = Some(to.to_owned());
+        let actions = machine.on(now, Input::View(view));
+        assert_eq!(actions.is_empty(), after > ms(0), "{to}: {actions:?}");
+        if after > ms(0) {
+            sent(&machine.on(now + after, Input::Wake));
+        }
+    }
+}
+
+#[test]
+fn writes_travel_in_one_transaction_after_the_one_that_is_under_way() {
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    let (number, op) = sent(&machine.on(now, Input::Recorded(1)));
+    assert!(
+        matches!(
+            op,
+            Op::Beat {
+                beat: 1,
+                seq: 1,
+                ..
+            }
+        ),
+        "{op:?}"
+    );
+    assert_eq!(machine.on(now, Input::Recorded(2)), []);
+    assert_eq!(machine.on(now, Input::Recorded(3)), []);
+    let (revision, seq) = (2, 1);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now, Input::Answer { number, answer });
+    assert_eq!(actions[0], Action::Acknowledge(1));
+    let (_, op) = sent(&actions);
+    assert!(
+        matches!(
+            op,
+            Op::Beat {
+                beat: 2,
+                seq: 3,
+                ..
+            }
+        ),
+        "{op:?}"
+    );
+}
+
+#[test]
+fn an_answer_that_was_lost_is_seen_in_the_keys() {
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    let (number, first) = sent(&machine.on(now, Input::Recorded(1)));
+    let answer = Answer::Silence;
+    assert_eq!(machine.on(now, Input::Answer { number, answer }), []);
+    let (number, again) = sent(&machine.on(now + RETRY, Input::Wake));
+    assert_eq!(again, first);
+    let mut made = led("a", 1, 2);
+    made.alive.as_mut().unwrap().seq = 1;
+    let answer = Answer::Is(made);
+    let actions = machine.on(now + RETRY, Input::Answer { number, answer });
+    assert_eq!(actions, [Action::Acknowledge(1)]);
+}
+
+#[test]
+fn a_leader_that_hears_nothing_is_alone_before_another_may_lead() {
+    for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
+        let (mut machine, now) = leading(alone);
+        sent(&machine.on(now, Input::Recorded(1)));
+        let lapses = now + TTL - TTL / MARGIN;
+        assert_eq!(machine.deadline(), Some(lapses));
+        let actions = machine.on(lapses, Input::Wake);
+        assert_eq!(actions[0], Action::Become(Role::Alone));
+        assert_eq!(actions.contains(&Action::Acknowledge(1)), answers);
+        assert_eq!(machine.takes_writes(), answers);
+        // Another one leads: what was answered is handed back.
+        let actions = machine.on(lapses, Input::View(led("b", 5, 6)));
+        let hands_back = Action::Yield {
+            committed: 0,
+            acknowledged: u64::from(answers),
+        };
+        assert_eq!(actions[0], hands_back);
+        assert_eq!(actions[1], Action::Become(Role::Following));
+    }
+}
+
+#[test]
+fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
+    machine.on(now + TTL, Input::Wake);
+    assert_eq!(machine.role(), Role::Alone);
+    let answer = Answer::Silence;
+    machine.on(now + TTL, Input::Answer { number, answer });
+    let (number, _) = sent(&machine.on(now + TTL + RETRY, Input::Wake));
+    let (revision, seq) = (2, 1);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now + TTL + RETRY, Input::Answer { number, answer });
+    // What was made is older than the time to live: only the next one tells.
+    let (number, _) = sent(&actions);
+    assert_eq!(machine.role(), Role::Alone);
+    let (revision, seq) = (3, 1);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now + TTL + ms(200), Input::Answer { number, answer });
+    assert_eq!(actions, [Action::Become(Role::Leading)]);
+}
+
+#[test]
+fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
+    let (mut machine, now) = following(WhenAlone::Serve);
+    machine.on(now, Input::Peer(true));
+    let long = now + 10 * TTL;
+    machine.on(long, Input::Wake);
+    assert_eq!(machine.role(), Role::Following);
+    let actions = machine.on(long, Input::Peer(false));
+    assert_eq!(actions[0], Action::Become(Role::Alone));
+    assert!(machine.takes_writes());
+    machine.on(long, Input::Recorded(11));
+    let actions = machine.on(long + TTL, Input::Peer(true));
+    let hands_back = Action::Yield {
+        committed: 10,
+        acknowledged: 11,
+    };
+    assert_eq!(actions[0], hands_back);
+    assert_eq!(machine.role(), Role::Following);
+}
+
+#[test]
+fn a_follower_that_cannot_reach_a_leader_that_lives_is_alone_after_a_while() {
+    let (mut machine, now) = following(WhenAlone::Serve);
+    machine.on(now, Input::Peer(false));
+    let mut at = now;
+    for revision in 7..20 {
+        at += TTL / BEATS;
+        machine.on(at, Input::View(led("b", 5, revision)));
+    }
+    assert_eq!(machine.role(), Role::Alone);
+    // It does not claim: the leader lives.
+    assert!(machine.deadline().is_some_and(|deadline| deadline > at));
+}
+
+#[test]
+fn who_gives_up_commits_all_first_and_takes_no_more() {
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
+    machine.on(now, Input::HandOver(String::new()));
+    assert!(!machine.takes_writes());
+    let (revision, seq) = (2, 1);
+    let answer = Answer::Applied { revision, seq };
+    let (number, op) = sent(&machine.on(now, Input::Answer { number, answer }));
+    let released = Some(String::new());
+    assert!(matches!(op, Op::Beat { released: of, .. } if of == released));
+    let (revision, seq) = (3, 1);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now, Input::Answer { number, answer });
+    assert_eq!(actions[0], Action::Become(Role::Following));
+    assert_eq!(actions.last(), Some(&Action::Released));
+    // It does not take it back while another one may.
+    assert_eq!(machine.on(now + TTL - ms(1), Input::Wake), []);
+}
