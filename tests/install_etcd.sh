@@ -8,8 +8,8 @@ etcd_works() {
     command -v etcd >/dev/null && etcd --version | grep -Eq '^etcd Version: (3\.([4-9]|[1-9][0-9])|[4-9])'
 }
 
-etcd_folder="$PWD/${CARGO_TARGET_DIR:-target}/etcd"
-PATH="$PATH:$etcd_folder/usr/bin"
+etcd_folder="${CARGO_TARGET_DIR:-$PWD/target}/etcd"
+PATH="$etcd_folder/usr/bin:$PATH"
 if ! etcd_works; then
     mkdir -p "$etcd_folder"
     if ! (cd "$etcd_folder" && apt-get download -qq etcd-server && dpkg -x etcd-server_*.deb .) ||

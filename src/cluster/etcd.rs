@@ -308,8 +308,10 @@ impl Etcd {
                         let round = next % self.endpoints.len() == self.preferred();
                         let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
                         ask_at = ask_at.min(tokio::time::Instant::now() + pause);
-                        // What was found out first tells more.
-                        failure.get_or_insert(error);
+                        // One that answers knows more than one that does not.
+                        if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
+                            failure = Some(error);
+                        }
                     }
                     Err(_) => {}
                 },

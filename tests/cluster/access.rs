@@ -60,6 +60,31 @@ async fn a_user_has_a_password_and_a_token_that_expires() {
     assert!(!format!("{:?}", with_user("root", "secret")).contains("secret"));
 }
 
+/// etcd's gateway is a client of its own server.
+async fn for_servers_alone(access: Access, folder: &Path) {
+    std::fs::write(folder.join("usage"), "extendedKeyUsage=serverAuth\n").unwrap();
+    certificate(folder, "half", "ca", 9);
+    let file = |name: &str| folder.join(name).to_str().unwrap().to_owned();
+    let (cert, key, ca) = (file("half.pem"), file("half.key"), file("ca.pem"));
+    let arguments = [
+        "--cert-file",
+        &cert,
+        "--key-file",
+        &key,
+        "--client-cert-auth",
+        "--trusted-ca-file",
+        &ca,
+    ];
+    let servers = Servers::with(Scratch::new(), 1, "https", &arguments).await;
+    let client = servers.client_of(0, access);
+    let limit = Duration::from_secs(10);
+    let error = client.view(&keys(), limit).await.unwrap_err();
+    assert!(
+        error.to_string().contains("good for clients, too"),
+        "{error}"
+    );
+}
+
 /// Runs openssl in `folder`.
 fn openssl(folder: &Path, arguments: &str) {
     let output = Command::new("openssl")
@@ -81,7 +106,9 @@ fn certificate(folder: &Path, name: &str, ca: &str, days: i32) {
         folder,
         &format!("{new} -keyout {name}.key -out {name}.csr -subj /CN={name}"),
     );
-    std::fs::write(folder.join("names"), "subjectAltName=IP:127.0.0.1\n").unwrap();
+    let usage = std::fs::read_to_string(folder.join("usage")).unwrap_or_default();
+    let names = format!("subjectAltName=IP:127.0.0.1\n{usage}");
+    std::fs::write(folder.join("names"), names).unwrap();
     openssl(
         folder,
         &format!(
@@ -157,6 +184,7 @@ async fn certificates_are_checked_on_both_sides() {
             "{error}"
         );
     }
+    for_servers_alone(access("ca", Some("client")), &folder).await;
     let options = |access: Access, url: &str| Options {
         endpoints: vec![url.to_owned()],
         access,

@@ -8,6 +8,7 @@ use thiserror::Error;
 /// Codes of gRPC.
 const INVALID_ARGUMENT: i64 = 3;
 const PERMISSION_DENIED: i64 = 7;
+const UNAVAILABLE: i64 = 14;
 const UNAUTHENTICATED: i64 = 16;
 
 #[derive(Debug, Error)]
@@ -41,6 +42,11 @@ pub enum EtcdError {
     Access { endpoint: String, why: String },
     #[error("etcd at {endpoint} no longer accepts the token of this session")]
     Token { endpoint: String },
+    #[error(
+        "the gateway of etcd at {endpoint} cannot reach its own server: {why}; with --client-cert-auth \
+         etcd's certificate must be good for clients, too (extendedKeyUsage clientAuth)"
+    )]
+    Gateway { endpoint: String, why: String },
     #[error("{endpoint} does not answer as etcd 3.4 or later does: {why}")]
     NotEtcd { endpoint: String, why: String },
     #[error("etcd at {endpoint} says: {why}")]
@@ -60,6 +66,7 @@ impl EtcdError {
             _ if says("no leader") || says("request timed out") || says("leader changed") => {
                 Self::NoMajority { endpoint, why }
             }
+            UNAVAILABLE => Self::Gateway { endpoint, why },
             UNAUTHENTICATED => Self::Token { endpoint },
             PERMISSION_DENIED => Self::Access { endpoint, why },
             INVALID_ARGUMENT if says("user name is empty") || says("authentication failed") => {
@@ -67,6 +74,14 @@ impl EtcdError {
             }
             _ => Self::Other { endpoint, why },
         }
+    }
+
+    /// Whether the endpoint has not answered.
+    pub(super) fn is_unreachable(&self) -> bool {
+        matches!(
+            self,
+            Self::Connect { .. } | Self::Lost { .. } | Self::Silent { .. }
+        )
     }
 
     /// Whether no other member would answer otherwise.
