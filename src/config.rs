@@ -17,7 +17,10 @@ use crate::{
     ros_env::{self, Lookup, MasterUri, UriError},
 };
 
+mod cluster;
 mod files;
+
+pub use self::cluster::{ClusterConfig, ClusterSync, WhenCutOff};
 
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
@@ -107,6 +110,8 @@ pub struct Config {
     pub max_body: usize,
     /// Whose values the page does not show.
     pub hide: Hide,
+    /// Several computers, of which one leads; none for this one alone.
+    pub cluster: Option<ClusterConfig>,
 }
 
 /// Where the master is, or how to run it.
@@ -281,6 +286,7 @@ impl Config {
             max_connections: usize_of(args.max_connections),
             max_body: usize::try_from(args.max_body << 20).unwrap_or(usize::MAX),
             hide: args.hide.hide_values.clone(),
+            cluster: None,
         })
     }
 }

@@ -1,5 +1,6 @@
 //! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
 
+pub(crate) mod cluster;
 pub(crate) mod condition;
 pub(crate) mod metrics;
 pub(crate) mod report;
@@ -71,6 +72,8 @@ pub struct Facts {
     pub rescues: u64,
     pub guarded: Guarded,
     pub disk: Disk,
+    /// None without other computers.
+    pub cluster: Option<cluster::ClusterFacts>,
 }
 
 /// Who keeps the port and restarts rosrescue when it dies.
@@ -128,6 +131,7 @@ impl Facts {
                 compacted: None,
                 free: None,
             },
+            cluster: None,
         }
     }
 
