@@ -1,5 +1,6 @@
 //! The command line. Every option has an environment variable, a default and a unit in its help.
 
+pub(crate) mod cluster;
 mod files;
 mod live;
 mod serve;
@@ -9,6 +10,7 @@ mod tools;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use self::{
+    cluster::{ClusterArgs, ClusterSync, Members, WhenCutOff},
     files::{
         CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, RestoreArgs,
         VerifyArgs,
@@ -54,7 +56,7 @@ impl Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Stand in for roscore: start, supervise and restore a rosmaster and rosout
-    Core(CoreArgs),
+    Core(Box<CoreArgs>),
     /// Stand in front of a master that somebody else starts
     Proxy(ProxyArgs),
     /// What does not serve.

@@ -17,10 +17,12 @@ use crate::{
     ros_env::{self, Lookup, MasterUri, UriError},
 };
 
+mod addresses;
 mod cluster;
 mod files;
 
-pub use self::cluster::{ClusterConfig, ClusterSync, WhenCutOff};
+use self::addresses::{advertised_host, listen_addresses, parse_address};
+pub use self::cluster::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
 
 /// Name of the checkpoint in the log folder; the paper's tool uses it too.
 pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
@@ -65,6 +67,9 @@ pub enum UsageError {
         "--master-port {port} is the port that nodes use; the real master needs one of its own"
     )]
     SamePort { port: u16 },
+    /// Options of several computers do not fit together.
+    #[error(transparent)]
+    Cluster(#[from] ClusterError),
 }
 
 /// The configuration of rosrescue.
@@ -185,7 +190,10 @@ impl Config {
             log_dir: ros_env::log_dir(env),
         });
         let host = advertised_host(&listen, env, hostname, local_address);
-        Self::common(&args.common, env, listen, MasterUri { host, port }, master)
+        let advertised = MasterUri { host, port };
+        let cluster = ClusterConfig::new(&args.cluster, &advertised, hostname)?;
+        let config = Self::common(&args.common, env, listen, advertised, master)?;
+        Ok(Self { cluster, ..config })
     }
 
     /// As [`Self::core`], for `rosrescue proxy`.
@@ -220,6 +228,7 @@ impl Config {
 
     /// Serves `addresses` instead, which another process has bound.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
+        let before = self.advertised.clone();
         let single = addresses.first().filter(|address| {
             !address.ip().is_unspecified() && ros_env::address_override(env).is_none()
         });
@@ -228,6 +237,9 @@ impl Config {
         }
         if let Some(first) = addresses.first() {
             self.advertised.port = first.port();
+        }
+        if let Some(cluster) = &mut self.cluster {
+            cluster.follow(&before, &self.advertised);
         }
         self.listen = addresses;
     }
@@ -313,61 +325,6 @@ fn seconds(option: &'static str, given: f64, most: f64) -> Result<Duration, Usag
         return Err(error);
     }
     Duration::try_from_secs_f64(given).map_err(|_| error)
-}
-
-/// The host name or address for others. Unless the environment sets it, it is the served address, if there is
-/// only one: nothing listens at the others.
-fn advertised_host(
-    listen: &[SocketAddr],
-    env: Lookup<'_>,
-    hostname: &str,
-    local_address: Option<IpAddr>,
-) -> String {
-    match listen.first().map(SocketAddr::ip) {
-        Some(served) if !served.is_unspecified() && ros_env::address_override(env).is_none() => {
-            served.to_string()
-        }
-        _ => ros_env::advertised_host(env, hostname, local_address),
-    }
-}
-
-fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, UsageError> {
-    let bare = text.trim_start_matches('[').trim_end_matches(']');
-    match bare {
-        "localhost" => Ok(IpAddr::V4(std::net::Ipv4Addr::LOCALHOST)),
-        _ => bare.parse().map_err(|_| UsageError::Listen {
-            given: text.to_owned(),
-            form,
-        }),
-    }
-}
-
-/// `ADDR:PORT`, `ADDR`, `:PORT`, `PORT` or nothing.
-fn listen_addresses(given: Option<&str>, env: Lookup<'_>) -> Result<Vec<SocketAddr>, UsageError> {
-    const FORM: &str = "ADDR:PORT, ADDR, :PORT or PORT, as in 127.0.0.1:11311";
-    let usual_port = || ros_env::master_port(env).map_err(UsageError::MasterUri);
-    let usual_addresses = || ros_env::bind_addresses(env);
-    let (addresses, port) = match given.map(|text| (text, text.parse())) {
-        None => (usual_addresses(), usual_port()?),
-        // As for `core`: both may use the same environment.
-        Some((_, Ok(address))) => (vec![address], usual_port()?),
-        Some((text, Err(_))) => {
-            let (address, port) = text.rsplit_once(':').unwrap_or(("", text));
-            let port = port.parse().map_err(|_| UsageError::Listen {
-                given: text.to_owned(),
-                form: FORM,
-            })?;
-            let addresses = match address {
-                "" => usual_addresses(),
-                _ => vec![parse_address(address, FORM)?],
-            };
-            (addresses, port)
-        }
-    };
-    Ok(addresses
-        .into_iter()
-        .map(|address| SocketAddr::new(address, port))
-        .collect())
 }
 
 #[cfg(test)]

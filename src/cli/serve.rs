@@ -9,7 +9,7 @@ use clap::{
 
 use ipnet::IpNet;
 
-use super::tools::HideArgs;
+use super::{cluster::ClusterArgs, tools::HideArgs};
 use crate::checkpoint::session::Restore;
 
 /// Options of `rosrescue core`. The short ones are roscore's.
@@ -52,6 +52,9 @@ pub struct CoreArgs {
     /// Address to serve, instead of all addresses (loopback only if ROS_IP or ROS_HOSTNAME is)
     #[arg(long, env = "ROSRESCUE_LISTEN", value_name = "ADDR")]
     pub listen: Option<String>,
+    /// Of several computers.
+    #[command(flatten)]
+    pub cluster: ClusterArgs,
     /// What both commands have.
     #[command(flatten)]
     pub common: CommonArgs,

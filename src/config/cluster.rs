@@ -1,11 +1,22 @@
 //! The options of several computers.
 
-use std::{path::PathBuf, time::Duration};
+use std::{
+    fmt, fs, io,
+    net::Ipv6Addr,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
-use crate::ros_env::MasterUri;
+use thiserror::Error;
+
+pub use crate::cli::{ClusterSync, WhenCutOff};
+use crate::{
+    cli::{ClusterArgs, cluster::name},
+    ros_env::MasterUri,
+};
 
 /// How this computer takes part in a cluster of several.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq)]
 pub struct ClusterConfig {
     /// The members of etcd, `http://HOST:PORT` or `https://HOST:PORT` each.
     pub endpoints: Vec<String>,
@@ -17,7 +28,7 @@ pub struct ClusterConfig {
     pub advertised: MasterUri,
     /// How long the leader may be silent.
     pub ttl: Duration,
-    /// When a write is acknowledged.
+    /// When a write is answered.
     pub sync: ClusterSync,
     /// What happens to writes while this computer is cut off.
     pub alone: WhenCutOff,
@@ -29,20 +40,245 @@ pub struct ClusterConfig {
     pub user: Option<(String, String)>,
 }
 
-/// When a write is acknowledged.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ClusterSync {
-    /// When a majority of etcd has it.
-    Always,
-    /// At once; a majority has it 200 ms later.
-    Interval,
+/// Options of several computers that do not fit together.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ClusterError {
+    /// `--advertise` is not an address.
+    #[error("--advertise: `{given}` is no HOST or HOST:PORT, as in 10.0.0.7 or robot-7:11311")]
+    Advertise { given: String },
+    /// The host name is no name that tells this computer from the others.
+    #[error(
+        "the host name `{hostname}` does not tell this computer from the others; give it a name with \
+         --cluster-name"
+    )]
+    Name { hostname: String },
+    /// etcd's certificate cannot be checked.
+    #[error(
+        "--cluster {endpoint}: https needs the certificate of the authority that has signed etcd's; \
+         give its file with --cluster-ca"
+    )]
+    NoAuthority { endpoint: String },
+    /// The certificate would not be used.
+    #[error("--cluster-ca is for https, but --cluster says {endpoint}: write https://")]
+    NotHttps { endpoint: String },
+    /// The password cannot be read.
+    #[error("--cluster-password-file: {} cannot be used: {why}", path.display())]
+    Password { path: PathBuf, why: String },
 }
 
-/// What a computer does with writes while it is cut off from the others.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum WhenCutOff {
-    /// It answers them, and sends them to the leader when it can.
-    Serve,
-    /// It lets them wait.
-    Refuse,
+/// Without the password.
+impl fmt::Debug for ClusterConfig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ClusterConfig")
+            .field("endpoints", &self.endpoints)
+            .field("robot", &self.robot)
+            .field("name", &self.name)
+            .field("advertised", &self.advertised)
+            .field("user", &self.user.as_ref().map(|(name, _)| name))
+            .finish_non_exhaustive()
+    }
+}
+
+impl ClusterConfig {
+    /// What `args` say on the computer `hostname`, whose rosrescue others reach at `usual`; none without
+    /// `--cluster`. Reads the file of the password.
+    pub(super) fn new(
+        args: &ClusterArgs,
+        usual: &MasterUri,
+        hostname: &str,
+    ) -> Result<Option<Self>, ClusterError> {
+        let Some(members) = &args.cluster else {
+            return Ok(None);
+        };
+        let endpoint = || members.endpoints.first().cloned().unwrap_or_default();
+        match (&args.cluster_ca, endpoint().starts_with("https://")) {
+            (None, true) => {
+                return Err(ClusterError::NoAuthority {
+                    endpoint: endpoint(),
+                });
+            }
+            (Some(_), false) => {
+                return Err(ClusterError::NotHttps {
+                    endpoint: endpoint(),
+                });
+            }
+            _ => {}
+        }
+        let own_name = match &args.cluster_name {
+            Some(given) => given.clone(),
+            None => name(hostname)
+                .ok()
+                .filter(|name| name != "localhost")
+                .ok_or_else(|| ClusterError::Name {
+                    hostname: hostname.to_owned(),
+                })?,
+        };
+        let advertised = match &args.advertise {
+            Some(given) => advertised(given, usual.port)?,
+            None => usual.clone(),
+        };
+        let user = match (&args.cluster_user, &args.cluster_password_file) {
+            (Some(user), Some(file)) => Some((user.clone(), password(file)?)),
+            _ => None,
+        };
+        Ok(Some(Self {
+            endpoints: members.endpoints.clone(),
+            robot: members.robot.clone(),
+            name: own_name,
+            advertised,
+            ttl: args.cluster_ttl,
+            sync: args.cluster_sync,
+            alone: args.alone,
+            ca: args.cluster_ca.clone(),
+            cert: args.cluster_cert.clone(),
+            key: args.cluster_key.clone(),
+            user,
+        }))
+    }
+
+    /// What was as it usually is remains so: the usual address is `now`, and was `before`.
+    pub(super) fn follow(&mut self, before: &MasterUri, now: &MasterUri) {
+        if self.advertised.host == before.host {
+            self.advertised.host.clone_from(&now.host);
+        }
+        if self.advertised.port == before.port {
+            self.advertised.port = now.port;
+        }
+    }
+}
+
+/// `HOST`, which has `port`, or `HOST:PORT`.
+fn advertised(given: &str, port: u16) -> Result<MasterUri, ClusterError> {
+    let given_host = match given.parse::<Ipv6Addr>() {
+        Ok(address) => format!("[{address}]"),
+        Err(_) => given.to_owned(),
+    };
+    let uris = [
+        format!("http://{given_host}:{port}"),
+        format!("http://{given_host}"),
+    ];
+    let mut uris = uris.iter().filter(|_| !given.contains('/'));
+    uris.find_map(|uri| MasterUri::parse(uri).ok())
+        .ok_or_else(|| ClusterError::Advertise {
+            given: given.to_owned(),
+        })
+}
+
+fn password(file: &Path) -> Result<String, ClusterError> {
+    let read = fs::read_to_string(file).and_then(|text| match text.lines().next() {
+        None | Some("") => Err(io::Error::other("its first line is empty")),
+        Some(line) => Ok(line.to_owned()),
+    });
+    read.map_err(|error| ClusterError::Password {
+        path: file.to_owned(),
+        why: error.to_string(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::{
+        cli::Cli,
+        config::{Config, UsageError},
+    };
+
+    fn config(args: &[&str], hostname: &str) -> Result<Config, UsageError> {
+        let args = ["rosrescue", "-p", "12000"].iter().chain(args);
+        let env = |name: &str| (name == "ROS_IP").then(|| "10.0.0.7".to_owned());
+        Config::core(&Cli::parse_from(args).core, &env, hostname, None)
+    }
+
+    fn cluster(args: &[&str]) -> Result<ClusterConfig, String> {
+        let args = [&["--cluster", "http://a:2379,b:2379/r"], args].concat();
+        let config = config(&args, "pc-1").map_err(|error| error.to_string())?;
+        Ok(config.cluster.expect("a cluster"))
+    }
+
+    #[test]
+    fn a_computer_is_known_by_its_host_name_and_its_usual_address() {
+        assert_eq!(config(&[], "pc-1").unwrap().cluster, None);
+        let one = cluster(&[]).unwrap();
+        assert_eq!(one.endpoints, ["http://a:2379", "http://b:2379"]);
+        assert_eq!((one.robot.as_str(), one.name.as_str()), ("r", "pc-1"));
+        assert_eq!(one.advertised.to_string(), "http://10.0.0.7:12000/");
+        let named = cluster(&["--cluster-name", "left"]).unwrap();
+        assert_eq!(named.name, "left");
+        for hostname in ["", "localhost", "a b"] {
+            let error = config(&["--cluster", "http://a"], hostname).map(|_| ());
+            let error = error.expect_err("refused").to_string();
+            assert!(error.contains(&format!("`{hostname}`")) && error.contains("--cluster-name"));
+        }
+    }
+
+    #[test]
+    fn others_reach_it_where_it_is_told() {
+        for (given, uri) in [
+            ("pc-1.local", "http://pc-1.local:12000/"),
+            ("pc-1:5", "http://pc-1:5/"),
+            ("fd00::1", "http://[fd00::1]:12000/"),
+            ("[fd00::1]:5", "http://[fd00::1]:5/"),
+        ] {
+            let said = cluster(&["--advertise", given]).unwrap().advertised;
+            assert_eq!(said.to_string(), uri);
+        }
+        for given in ["", "http://a", "a/b", "a:b", "a:0", ":5", "a b"] {
+            let error = cluster(&["--advertise", given]).expect_err("refused");
+            assert!(error.contains(&format!("`{given}`")), "{error}");
+        }
+    }
+
+    #[test]
+    fn sockets_of_systemd_change_the_address_that_is_not_given() {
+        for (given, uri) in [
+            (&[][..], "http://10.0.0.7:4000/"),
+            (&["--advertise", "b"], "http://b:4000/"),
+            (&["--advertise", "b:5"], "http://b:5/"),
+        ] {
+            let args = [&["--cluster", "http://a"], given].concat();
+            let mut config = config(&args, "pc-1").unwrap();
+            config.serve_at(vec!["[::]:4000".parse().unwrap()], &|name| {
+                (name == "ROS_IP").then(|| "10.0.0.7".to_owned())
+            });
+            assert_eq!(config.cluster.unwrap().advertised.to_string(), uri);
+        }
+    }
+
+    #[test]
+    fn https_and_the_authority_go_together() {
+        let error = config(&["--cluster", "https://a"], "pc-1").map(|_| ());
+        let error = error.expect_err("refused").to_string();
+        assert!(error.contains("https://a") && error.contains("--cluster-ca"));
+        let error = cluster(&["--cluster-ca", "f"]).expect_err("refused");
+        assert!(error.contains("http://a:2379"), "{error}");
+        let both = ["--cluster", "https://a", "--cluster-ca", "f"];
+        let both = config(&both, "pc-1").unwrap().cluster.unwrap();
+        assert_eq!(both.ca, Some(PathBuf::from("f")));
+    }
+
+    #[test]
+    fn the_password_is_the_first_line_and_is_not_shown() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("password");
+        let path = file.to_str().unwrap();
+        let args = ["--cluster-user", "ros", "--cluster-password-file", path];
+        for (text, why) in [
+            (None, "No such file"),
+            (Some(""), "its first line is empty"),
+            (Some("\nx"), "empty"),
+        ] {
+            if let Some(text) = text {
+                fs::write(&file, text).unwrap();
+            }
+            let error = cluster(&args).expect_err("refused");
+            assert!(error.contains(path) && error.contains(why), "{error}");
+        }
+        fs::write(&file, "se cret\n").unwrap();
+        let one = cluster(&args).unwrap();
+        assert_eq!(one.user, Some(("ros".to_owned(), "se cret".to_owned())));
+        assert!(!format!("{one:?}").contains("cret"));
+    }
 }

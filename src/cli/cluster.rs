@@ -1,0 +1,284 @@
+//! Options of `core` for several computers.
+
+use std::{path::PathBuf, time::Duration};
+
+use clap::{Args, ValueEnum};
+use hyper::http::uri::Authority;
+
+/// The robot's name if none is given.
+const ROBOT: &str = "robot";
+/// Longest name of a robot or a computer. It is part of each key in etcd.
+const NAME_MOST: usize = 128;
+
+/// How this computer takes part in a cluster of several.
+#[derive(Args, Clone, Debug)]
+pub struct ClusterArgs {
+    /// Run on several computers, of which one leads and another one takes over when it dies: the members of
+    /// etcd that they share and, after the last one, the robot's name, as in
+    /// http://a:2379,http://b:2379,http://c:2379/ROBOT
+    #[arg(long, env = "ROSRESCUE_CLUSTER", value_name = "URLS")]
+    #[arg(value_parser = members)]
+    pub cluster: Option<Members>,
+    /// Where the other computers reach this rosrescue, HOST or HOST:PORT [default: as in the ROS_MASTER_URI that
+    /// it prints]
+    #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST")]
+    #[arg(requires = "cluster")]
+    pub advertise: Option<String>,
+    /// The name of this computer, which no other one has [default: the host name]
+    #[arg(long, env = "ROSRESCUE_CLUSTER_NAME", value_name = "NAME")]
+    #[arg(value_parser = name, requires = "cluster")]
+    pub cluster_name: Option<String>,
+    /// After how long a silence of the leading computer another one takes over, in seconds from 0.5 to 60. All
+    /// computers need the same
+    #[arg(long, env = "ROSRESCUE_CLUSTER_TTL", value_name = "SECONDS")]
+    #[arg(default_value = "2", value_parser = ttl, requires = "cluster")]
+    pub cluster_ttl: Duration,
+    /// When a write is answered while this computer leads
+    #[arg(long, env = "ROSRESCUE_CLUSTER_SYNC", value_enum, requires = "cluster")]
+    #[arg(default_value_t = ClusterSync::Always)]
+    pub cluster_sync: ClusterSync,
+    /// What happens to writes while this computer is cut off from the others. Reads are answered
+    #[arg(long, env = "ROSRESCUE_ALONE", value_enum, requires = "cluster")]
+    #[arg(default_value_t = WhenCutOff::Serve)]
+    pub alone: WhenCutOff,
+    /// The certificate of the authority that has signed those of etcd's members, in PEM form, for https
+    #[arg(long, env = "ROSRESCUE_CLUSTER_CA", value_name = "FILE")]
+    #[arg(requires = "cluster")]
+    pub cluster_ca: Option<PathBuf>,
+    /// This computer's certificate for etcd, in PEM form
+    #[arg(long, env = "ROSRESCUE_CLUSTER_CERT", value_name = "FILE")]
+    #[arg(requires_all = ["cluster_key", "cluster_ca"])]
+    pub cluster_cert: Option<PathBuf>,
+    /// Its key, in PEM form
+    #[arg(long, env = "ROSRESCUE_CLUSTER_KEY", value_name = "FILE")]
+    #[arg(requires = "cluster_cert")]
+    pub cluster_key: Option<PathBuf>,
+    /// The user of etcd
+    #[arg(long, env = "ROSRESCUE_CLUSTER_USER", value_name = "NAME")]
+    #[arg(requires_all = ["cluster_password_file", "cluster"])]
+    pub cluster_user: Option<String>,
+    /// A file whose first line is the user's password
+    #[arg(long, env = "ROSRESCUE_CLUSTER_PASSWORD_FILE", value_name = "FILE")]
+    #[arg(requires = "cluster_user")]
+    pub cluster_password_file: Option<PathBuf>,
+}
+
+/// When a write is answered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ClusterSync {
+    /// When a majority of etcd has it: no computer's death costs an answered write
+    Always,
+    /// At once; a majority has it 200 ms later, which is what a death may cost
+    Interval,
+}
+
+/// What a computer does with writes while it is cut off from the others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum WhenCutOff {
+    /// They are answered, and sent to the leader afterwards; what others have changed meanwhile wins
+    Serve,
+    /// They wait, and are closed after --hold
+    Refuse,
+}
+
+/// What `--cluster` says.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Members {
+    /// `http://HOST:PORT` or `https://HOST:PORT` each; all of them the same of both.
+    pub endpoints: Vec<String>,
+    pub robot: String,
+}
+
+/// `http://A:2379,http://B:2379,http://C:2379/ROBOT`. Those without `http://` are as the first one.
+fn members(text: &str) -> Result<Members, String> {
+    let mut first = None;
+    let mut robot = ROBOT;
+    let mut endpoints = Vec::new();
+    let mut given = text.split(',').map(str::trim).peekable();
+    while let Some(one) = given.next() {
+        let (scheme, rest) = match one.split_once("://") {
+            Some((scheme, rest)) => (scheme, rest),
+            None => (first.unwrap_or_default(), one),
+        };
+        if !["http", "https"].contains(&scheme) {
+            return Err(format!(
+                "`{one}` is no endpoint of etcd: it begins with neither http:// nor https://"
+            ));
+        }
+        let first = *first.get_or_insert(scheme);
+        if scheme != first {
+            return Err(format!(
+                "`{one}` begins with {scheme}://, the first one with {first}://; all need the same"
+            ));
+        }
+        let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
+        if !is_authority(authority) {
+            return Err(format!(
+                "`{one}` is no endpoint of etcd; write {scheme}://HOST:PORT, as in \
+                 {scheme}://10.0.0.7:2379"
+            ));
+        }
+        if !path.is_empty() {
+            if given.peek().is_some() {
+                return Err(format!(
+                    "`{one}`: the robot's name comes after the last endpoint, and after no other one"
+                ));
+            }
+            robot = path.trim_end_matches('/');
+        }
+        endpoints.push(format!("{scheme}://{authority}"));
+    }
+    Ok(Members {
+        endpoints,
+        robot: name(robot).map_err(|why| format!("`{robot}` is no name of a robot: {why}"))?,
+    })
+}
+
+/// `HOST` or `HOST:PORT`, and nothing else.
+fn is_authority(text: &str) -> bool {
+    let Ok(authority) = text.parse::<Authority>() else {
+        return false;
+    };
+    let host = authority.host();
+    !host.is_empty()
+        && match authority.port_u16() {
+            Some(port) => port != 0 && text == format!("{host}:{port}"),
+            None => text == host,
+        }
+}
+
+/// A robot's or a computer's name. A slash would put one robot's keys among another's.
+pub(crate) fn name(text: &str) -> Result<String, &'static str> {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    match !text.is_empty() && text.len() <= NAME_MOST && text.chars().all(is_plain) {
+        true => Ok(text.to_owned()),
+        false => Err("write 1 to 128 letters, digits, `-`, `_` and `.`, as in robot-7"),
+    }
+}
+
+fn ttl(text: &str) -> Result<Duration, &'static str> {
+    let seconds = text.parse().ok();
+    let seconds = seconds.filter(|seconds| (0.5..=60.0).contains(seconds));
+    let ttl = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    ttl.ok_or("write a number of seconds from 0.5 to 60")
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::{Cli, Command};
+
+    #[test]
+    fn members_and_the_name_of_the_robot() {
+        for (text, endpoints, robot) in [
+            ("http://a:2379", &["http://a:2379"][..], "robot"),
+            ("http://a:2379/", &["http://a:2379"], "robot"),
+            (
+                "http://a:2379,http://b:2379,http://c:2379/r-7",
+                &["http://a:2379", "http://b:2379", "http://c:2379"],
+                "r-7",
+            ),
+            (
+                "https://a:2379, b , [fd00::1]:2380/r/",
+                &["https://a:2379", "https://b", "https://[fd00::1]:2380"],
+                "r",
+            ),
+        ] {
+            let expected = Members {
+                endpoints: endpoints.iter().map(|url| (*url).to_owned()).collect(),
+                robot: robot.to_owned(),
+            };
+            assert_eq!(members(text), Ok(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn what_are_no_members_is_said_with_the_operand() {
+        for (text, said) in [
+            ("", "`` is no endpoint of etcd: it begins with neither"),
+            ("a:2379,http://b:2379", "`a:2379` is no endpoint"),
+            ("ftp://a:2379", "`ftp://a:2379` is no endpoint"),
+            (
+                "http://",
+                "`http://` is no endpoint of etcd; write http://HOST:PORT",
+            ),
+            ("http://:2379", "`http://:2379` is no endpoint"),
+            ("http://a:0", "`http://a:0` is no endpoint"),
+            ("http://a:70000", "`http://a:70000` is no endpoint"),
+            ("http://u:p@a:2379", "is no endpoint"),
+            ("http://::1:2379", "is no endpoint"),
+            ("http://a:2379,", "`` is no endpoint"),
+            (
+                "https://a:1,http://b:1",
+                "`http://b:1` begins with http://, the first one with https://",
+            ),
+            (
+                "http://a:1/r,http://b:1",
+                "`http://a:1/r`: the robot's name comes after the last",
+            ),
+            ("http://a:1/fleet/r", "`fleet/r` is no name of a robot"),
+            ("http://a:1/r 7", "`r 7` is no name of a robot"),
+            ("http://a:1/r?x", "`r?x` is no name of a robot"),
+        ] {
+            let error = members(text).expect_err(text);
+            assert!(error.contains(said), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_time_to_live_is_long_enough_for_etcd_and_short_enough_for_a_robot() {
+        assert_eq!(ttl("0.5"), Ok(Duration::from_millis(500)));
+        assert_eq!(ttl("60"), Ok(Duration::from_secs(60)));
+        for text in ["", "0.4", "60.1", "-1", "nan", "inf", "2s"] {
+            assert!(ttl(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn options_that_need_others_say_so() {
+        let said = |args: &[&str]| {
+            let args = [&["rosrescue", "core"], args].concat();
+            Cli::try_parse_from(args).expect_err("refused").to_string()
+        };
+        let with = |args: &[&'static str]| [&["--cluster", "https://a"], args].concat();
+        for (option, value) in [
+            ("--advertise", "a"),
+            ("--cluster-name", "a"),
+            ("--cluster-ttl", "2"),
+            ("--cluster-sync", "always"),
+            ("--alone", "serve"),
+            ("--cluster-ca", "f"),
+        ] {
+            let error = said(&[option, value]);
+            assert!(error.contains("--cluster <URLS>"), "{error}");
+        }
+        for (args, missing) in [
+            (&["--cluster-cert", "f"][..], "--cluster-key <FILE>"),
+            (&["--cluster-key", "f"], "--cluster-cert <FILE>"),
+            (
+                &["--cluster-cert", "f", "--cluster-key", "f"],
+                "--cluster-ca <FILE>",
+            ),
+            (&["--cluster-user", "u"], "--cluster-password-file <FILE>"),
+            (&["--cluster-password-file", "f"], "--cluster-user <NAME>"),
+        ] {
+            let error = said(&with(args));
+            assert!(error.contains(missing), "{error}");
+        }
+        let error = said(&with(&["--cluster-name", "a/b"]));
+        assert!(error.contains("'a/b'"), "{error}");
+    }
+
+    #[test]
+    fn without_a_word_it_is_as_safe_and_as_useful_as_it_can_be() {
+        let cli = Cli::parse_from(["rosrescue", "core", "--cluster", "http://a"]);
+        let Some(Command::Core(args)) = cli.command else {
+            panic!("{cli:?}");
+        };
+        assert_eq!(args.cluster.cluster_ttl, Duration::from_secs(2));
+        assert_eq!(args.cluster.cluster_sync, ClusterSync::Always);
+        assert_eq!(args.cluster.alone, WhenCutOff::Serve);
+    }
+}

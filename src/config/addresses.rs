@@ -1,0 +1,64 @@
+//! Addresses that are served, and the one that others are told.
+
+use std::net::{IpAddr, SocketAddr};
+
+use super::UsageError;
+use crate::ros_env::{self, Lookup};
+
+/// The host name or address for others. Unless the environment sets it, it is the served address, if there is
+/// only one: nothing listens at the others.
+pub(super) fn advertised_host(
+    listen: &[SocketAddr],
+    env: Lookup<'_>,
+    hostname: &str,
+    local_address: Option<IpAddr>,
+) -> String {
+    match listen.first().map(SocketAddr::ip) {
+        Some(served) if !served.is_unspecified() && ros_env::address_override(env).is_none() => {
+            served.to_string()
+        }
+        _ => ros_env::advertised_host(env, hostname, local_address),
+    }
+}
+
+pub(super) fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, UsageError> {
+    let bare = text.trim_start_matches('[').trim_end_matches(']');
+    match bare {
+        "localhost" => Ok(IpAddr::V4(std::net::Ipv4Addr::LOCALHOST)),
+        _ => bare.parse().map_err(|_| UsageError::Listen {
+            given: text.to_owned(),
+            form,
+        }),
+    }
+}
+
+/// `ADDR:PORT`, `ADDR`, `:PORT`, `PORT` or nothing.
+pub(super) fn listen_addresses(
+    given: Option<&str>,
+    env: Lookup<'_>,
+) -> Result<Vec<SocketAddr>, UsageError> {
+    const FORM: &str = "ADDR:PORT, ADDR, :PORT or PORT, as in 127.0.0.1:11311";
+    let usual_port = || ros_env::master_port(env).map_err(UsageError::MasterUri);
+    let usual_addresses = || ros_env::bind_addresses(env);
+    let (addresses, port) = match given.map(|text| (text, text.parse())) {
+        None => (usual_addresses(), usual_port()?),
+        // As for `core`: both may use the same environment.
+        Some((_, Ok(address))) => (vec![address], usual_port()?),
+        Some((text, Err(_))) => {
+            let (address, port) = text.rsplit_once(':').unwrap_or(("", text));
+            let port = port.parse().map_err(|_| UsageError::Listen {
+                given: text.to_owned(),
+                form: FORM,
+            })?;
+            let addresses = match address {
+                "" => usual_addresses(),
+                _ => vec![parse_address(address, FORM)?],
+            };
+            (addresses, port)
+        }
+    };
+    Ok(addresses
+        .into_iter()
+        .map(|address| SocketAddr::new(address, port))
+        .collect())
+}
