@@ -20,6 +20,8 @@ pub enum State {
     /// The mirror answers reads, and writes that change nothing. Other writes wait: an injection is under
     /// way.
     Injecting,
+    /// Another computer has the master, or is about to: calls go there.
+    Elsewhere,
     /// Nowhere: no master has been seen yet, so its state is unknown.
     Unknown,
 }

@@ -1,6 +1,7 @@
 //! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
 
 pub(crate) mod cluster;
+pub(crate) mod computers;
 pub(crate) mod condition;
 pub(crate) mod metrics;
 pub(crate) mod report;
@@ -17,6 +18,7 @@ use std::{
 use serde::{Deserialize, Serialize};
 
 use self::report::{HealthCheck, Report};
+use crate::{cluster::machine::Role, gate::State};
 
 /// Reports that are kept.
 const REPORTS: usize = 20;
@@ -138,6 +140,18 @@ impl Facts {
     /// Since when there is nothing to complain of, if there is nothing now and calls pass.
     fn settled_since(&self) -> Instant {
         self.disk.since.max(self.calm_since.unwrap_or(self.started))
+    }
+
+    /// Whether calls are answered: by the master, the mirror, or another computer.
+    pub(crate) fn answers(&self, gate: State) -> bool {
+        match gate {
+            State::Open { .. } | State::StandingIn | State::Injecting => true,
+            State::Elsewhere => {
+                let cluster = self.cluster.as_ref();
+                cluster.is_some_and(|cluster| cluster.role != Role::Joining)
+            }
+            State::Unknown => false,
+        }
     }
 
     /// Adds a report and returns it with its number.

@@ -7,7 +7,7 @@ use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::UnixStream,
     task::JoinHandle,
-    time::{MissedTickBehavior, interval},
+    time::{MissedTickBehavior, interval, sleep},
 };
 use tokio_util::sync::CancellationToken;
 
@@ -24,6 +24,9 @@ use crate::{
 
 /// Shortest time between two status messages to systemd.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Pause between two looks whether other computers have been joined.
+const JOINING: Duration = Duration::from_millis(20);
 
 /// Starts reporting. The task that is returned reports `stop` and ends.
 pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> JoinHandle<()> {
@@ -72,10 +75,17 @@ impl Source {
             .line()
     }
 
-    /// Returns when calls are answered, by the master or the mirror.
+    /// Returns when calls are answered, by the master, the mirror, or another computer.
     async fn answers(&self) {
         let mut gate = self.gate.clone();
-        gate.wait_for(|state| state != State::Unknown).await;
+        loop {
+            let state = gate.wait_for(|state| state != State::Unknown).await;
+            if self.board.update(|facts| facts.answers(state)) {
+                return;
+            }
+            // It joins other computers; what it has found out wakes nobody.
+            sleep(JOINING).await;
+        }
     }
 }
 

@@ -22,6 +22,7 @@ use crate::{
     clock,
     master::Counts,
     status::{
+        computers::Computers,
         condition::Condition,
         report::Report,
         summary::{Caller, Status},
@@ -56,6 +57,7 @@ struct Top {
     calls_unanswered: u64,
     state: Counts,
     unreachable: Vec<String>,
+    cluster: Option<Computers>,
     /// The busiest first, then the slowest.
     callers: Vec<Row>,
     rescues: u64,
@@ -140,6 +142,7 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
         condition: status.condition,
         state: status.state,
         unreachable: status.unreachable,
+        cluster: status.cluster,
         callers,
         rescues: status.rescues,
         last_rescues: status.last_rescues,
@@ -192,6 +195,9 @@ impl fmt::Display for Top {
         )?;
         if !self.unreachable.is_empty() {
             writeln!(head, "no answer from {}", self.unreachable.join(", "))?;
+        }
+        if let Some(cluster) = &self.cluster {
+            writeln!(head, "computers: {}", cluster.line())?;
         }
         let mut foot = format!("\nrescues so far: {}\n", self.rescues);
         for report in self.last_rescues.iter().rev().take(RESCUES) {

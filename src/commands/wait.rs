@@ -108,8 +108,8 @@ async fn missing(
 async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
     match wanted {
         For::Answered => status.ready,
-        For::Master => status.open,
-        For::Protected => status.condition.name == Name::Protected,
+        For::Master => status.open || status.condition.name == Name::Following,
+        For::Protected => status.condition.is_protected(),
         For::Node(name) => {
             let params = ["/rosrescue_wait", name].map(Value::from);
             let reply = running.call(Method::LookupNode, params.into()).await;

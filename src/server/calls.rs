@@ -220,7 +220,7 @@ impl Calls {
                         return Ok(reply);
                     }
                 }
-                State::Unknown => {}
+                State::Elsewhere | State::Unknown => {}
             }
             tokio::select! {
                 () = gate.changed() => {}

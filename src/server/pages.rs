@@ -44,7 +44,7 @@ use super::{
     replies::{HttpReply, page as reply, text},
 };
 use crate::{
-    gate::{self, State},
+    gate,
     hide::Hide,
     ledger::Ledger,
     master::Master,
@@ -155,7 +155,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
             metrics(pages.stats, &pages.status()),
         ),
         "/live" => text(StatusCode::OK, "live\n".to_owned()),
-        "/ready" if pages.gate.state() != State::Unknown => {
+        "/ready" if pages.board.read().answers(pages.gate.state()) => {
             text(StatusCode::OK, "ready\n".to_owned())
         }
         "/ready" => text(

@@ -14,6 +14,8 @@ pub struct ClusterFacts {
     pub since: Instant,
     /// Who leads, as far as is known; the last one while there is none.
     pub leader: Option<LeaderFacts>,
+    /// Since when nobody leads, as far as is known: the last leader gave up, or is silent. None while somebody does.
+    pub leaderless: Option<Instant>,
     /// The journal's last record that is known.
     pub seq: u64,
     /// How many records of it this computer's mirror lacks.
@@ -62,6 +64,11 @@ impl MemberFacts {
     pub const SAYS_EVERY: Duration = Duration::from_secs(5);
     /// A computer that has said nothing for this time is away.
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
+
+    pub(crate) fn is_away(&self) -> bool {
+        self.heard
+            .is_none_or(|heard| heard.elapsed() > Self::AWAY_AFTER)
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -74,4 +81,46 @@ pub struct Takeover {
     pub from: Option<String>,
     /// Whether the previous leader gave up leading by itself.
     pub in_order: bool,
+}
+
+#[cfg(test)]
+impl ClusterFacts {
+    /// pc-2 as it follows pc-1, of which it was told a minute ago; pc-3 is away.
+    pub(crate) fn of_three() -> Self {
+        let minute = Duration::from_secs(60);
+        let before = Instant::now().checked_sub(minute).unwrap();
+        let member = |name: &str, role, seq, heard| MemberFacts {
+            name: name.to_owned(),
+            uri: format!("http://{name}:11311/"),
+            version: "0.2.0".to_owned(),
+            role,
+            seq,
+            heard,
+        };
+        Self {
+            name: "pc-2".to_owned(),
+            role: Role::Following,
+            since: before,
+            leader: Some(LeaderFacts {
+                name: "pc-1".to_owned(),
+                uri: "http://pc-1:11311/".to_owned(),
+                version: "0.2.0".to_owned(),
+                term: 7,
+                since: before,
+            }),
+            leaderless: None,
+            seq: 100,
+            behind: 2,
+            uncommitted: 0,
+            etcd: None,
+            members: vec![
+                member("pc-3", Role::Following, 40, Some(before)),
+                member("pc-1", Role::Leading, 100, Some(Instant::now())),
+                member("pc-2", Role::Following, 90, Some(Instant::now())),
+            ],
+            takeovers: 0,
+            last_takeover: None,
+            lost_writes: 0,
+        }
+    }
 }

@@ -1,5 +1,7 @@
 //! How the robot is, in words for a tired person: one name, what nodes notice now, and what to do.
 
+mod computers;
+
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
@@ -13,22 +15,31 @@ use crate::{clock, gate::State};
 pub(crate) enum Name {
     /// Calls pass to the master and every change is recorded.
     Protected,
+    /// Another computer leads, and calls are forwarded to it.
+    Following,
     /// The master is away, and the mirror answers in its place.
     StandingIn,
+    /// Of several computers none leads, as far as this one knows: the mirror answers reads, writes wait.
+    NoLeader,
     /// The master dies again and again. Between two deaths calls may pass.
     CrashLoop,
     /// Calls are answered, but changes are not recorded.
     Unprotected,
+    /// This computer is cut off from the others.
+    Alone,
     /// Nobody knows the state: no master was ever seen, and calls wait for one.
     Waiting,
 }
 
 impl Name {
-    pub(crate) const ALL: [Self; 5] = [
+    pub(crate) const ALL: [Self; 8] = [
         Self::Protected,
+        Self::Following,
         Self::StandingIn,
+        Self::NoLeader,
         Self::CrashLoop,
         Self::Unprotected,
+        Self::Alone,
         Self::Waiting,
     ];
 
@@ -36,9 +47,12 @@ impl Name {
     pub(crate) fn as_str(self) -> &'static str {
         match self {
             Self::Protected => "protected",
+            Self::Following => "following",
             Self::StandingIn => "standing_in",
+            Self::NoLeader => "no_leader",
             Self::CrashLoop => "crash_loop",
             Self::Unprotected => "unprotected",
+            Self::Alone => "alone",
             Self::Waiting => "waiting",
         }
     }
@@ -46,9 +60,12 @@ impl Name {
     fn title(self) -> &'static str {
         match self {
             Self::Protected => "protected",
+            Self::Following => "following the leader",
             Self::StandingIn => "standing in for the master",
+            Self::NoLeader => "no computer leads",
             Self::CrashLoop => "crash loop of the master",
             Self::Unprotected => "UNPROTECTED",
+            Self::Alone => "ALONE",
             Self::Waiting => "waiting for a first master",
         }
     }
@@ -70,7 +87,12 @@ pub(crate) struct Condition {
 impl Condition {
     /// Whether nobody needs to look.
     pub(crate) fn is_good(&self) -> bool {
-        self.name == Name::Protected && self.action.is_none()
+        self.is_protected() && self.action.is_none()
+    }
+
+    /// Whether calls pass to a master, here or on the leading computer, and changes are recorded.
+    pub(crate) fn is_protected(&self) -> bool {
+        matches!(self.name, Name::Protected | Name::Following)
     }
 
     /// In a line, as systemd shows it.
@@ -108,8 +130,22 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let (mut name, mut since) = match now.gate {
         State::Unknown => (Name::Waiting, now.gate_since),
         State::StandingIn | State::Injecting => (Name::StandingIn, now.gate_since),
+        State::Elsewhere => (Name::NoLeader, now.gate_since),
         State::Open { .. } => (Name::Protected, now.gate_since.max(facts.settled_since())),
     };
+    if let Some(cluster) = &facts.cluster {
+        match computers::notice(now.gate, cluster) {
+            Some(notice) => {
+                (name, since) = (notice.name, notice.since);
+                (text, action) = (notice.text, notice.action);
+            }
+            None => {
+                let (more, to_do) = computers::leads(cluster);
+                text += &more;
+                action = action.or(to_do);
+            }
+        }
+    }
     if let Some(since_loop) = facts.crash_loop
         && name < Name::CrashLoop
     {
@@ -132,7 +168,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
         );
         action.get_or_insert_with(|| "start rosrescue anew when the robot is at rest.".to_owned());
     }
-    if name == Name::Protected {
+    if matches!(name, Name::Protected | Name::Following) {
         text += " Every change is recorded.";
     }
     Condition {
@@ -160,6 +196,7 @@ fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
                 "start the master at {master}, or correct --master."
             )),
         ),
+        (State::Elsewhere, _) => ("Nodes wait for another computer.".to_owned(), None),
         _ if facts.crash_loop.is_some() => {
             let text = match open {
                 true => "Nodes run as usual: the master answers, but it keeps dying",

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Mode, condition::Condition, report::Report};
+use super::{Mode, computers::Computers, condition::Condition, report::Report};
 use crate::{clock, master::Counts};
 
 /// The version of the format. It changes when a field goes away or gets another meaning; new fields do not
@@ -72,6 +72,9 @@ pub(crate) struct Status {
     pub(crate) open: bool,
     /// Whether calls are answered, by the master or the mirror.
     pub(crate) ready: bool,
+    /// Whether calls go to another computer, which has the master.
+    #[serde(default)]
+    pub(crate) elsewhere: bool,
     /// Since when the mirror stands in; none while calls pass.
     pub(crate) standing_in_since: Option<f64>,
     /// Writes that the mirror has answered and the master has not run yet.
@@ -106,6 +109,9 @@ pub(crate) struct Status {
     pub(crate) clients: Vec<Client>,
     /// Counters since the start.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
+    /// The computers of the robot; none if it is this one alone.
+    #[serde(default)]
+    pub(crate) cluster: Option<Computers>,
 }
 
 impl Status {
@@ -113,6 +119,18 @@ impl Status {
     pub(crate) fn counter(&self, name: &str) -> u64 {
         let value = self.counters.get(name);
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)
+    }
+
+    fn master_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "master      {}", self.master)?;
+        if let Some(pid) = self.master_pid {
+            write!(f, ", process {pid}")?;
+        }
+        match self.deaths {
+            0 => writeln!(f),
+            1 => writeln!(f, ", died once"),
+            deaths => writeln!(f, ", died {deaths} times"),
+        }
     }
 }
 
@@ -150,14 +168,13 @@ impl fmt::Display for Status {
             self.guarded_by
         )?;
         writeln!(f, "serves      {}", self.uri)?;
-        write!(f, "master      {}", self.master)?;
-        if let Some(pid) = self.master_pid {
-            write!(f, ", process {pid}")?;
+        if self.elsewhere {
+            writeln!(f, "master      none on this computer")?;
+        } else {
+            self.master_line(f)?;
         }
-        match self.deaths {
-            0 => writeln!(f)?,
-            1 => writeln!(f, ", died once")?,
-            deaths => writeln!(f, ", died {deaths} times")?,
+        if let Some(cluster) = &self.cluster {
+            cluster.lines(until, f)?;
         }
         writeln!(f, "state       {}", self.state)?;
         writeln!(

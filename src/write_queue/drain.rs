@@ -148,7 +148,7 @@ impl Drain {
             match state {
                 State::Open { incarnation } => self.send(incarnation),
                 State::StandingIn => self.stand_in(),
-                State::Injecting | State::Unknown => self.grace = None,
+                State::Injecting | State::Elsewhere | State::Unknown => self.grace = None,
             }
             self.tell_sent
                 .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));

@@ -289,6 +289,7 @@ fn only_the_clock_reads_the_wall_clock() {
         "server/clients.rs",
         "server/pages/robot.rs",
         "server/pages/status.rs",
+        "status/computers.rs",
         "status/condition.rs",
     ];
     assert_eq!(users, expected.map(|name| root().join("src").join(name)));

@@ -36,7 +36,7 @@ const SILENCE: Duration = Duration::from_secs(15);
 const BEGIN: &[u8] = b"retry: 1000\n\n";
 
 /// Members of the status that change all the time, and are sent apart from the rest.
-const LIVELY: [&str; 3] = ["counters", "pending_writes", "journal"];
+const LIVELY: [&str; 4] = ["counters", "pending_writes", "journal", "cluster"];
 /// Members of the status that are left out: there may be many.
 const LEFT_OUT: [&str; 4] = ["clients", "slowest_callers", "calls_per_second", "uptime"];
 
@@ -50,7 +50,7 @@ struct Latest {
 /// Members of `now` beside those of [`LIVELY`].
 #[derive(Debug, Serialize)]
 struct Now {
-    /// Where calls go: `open`, `standing_in`, `injecting` or `unknown`.
+    /// Where calls go: `open`, `standing_in`, `injecting`, `elsewhere` or `unknown`.
     gate: &'static str,
     /// Grows with every change of the state, parameters included.
     version: u64,
@@ -221,6 +221,7 @@ impl Known {
                 State::Open { .. } => "open",
                 State::StandingIn => "standing_in",
                 State::Injecting => "injecting",
+                State::Elsewhere => "elsewhere",
                 State::Unknown => "unknown",
             },
             version,

@@ -12,6 +12,7 @@ use crate::{
     master::Master,
     status::{
         Disk,
+        computers::Computers,
         condition::{Situation, condition},
         summary::{Journal, SCHEMA, Status},
     },
@@ -88,7 +89,8 @@ impl Pages {
             master,
             master_pid: last.map(|report| report.master_pid),
             open: gate.is_open(),
-            ready: gate != State::Unknown,
+            ready: facts.answers(gate),
+            elsewhere: gate == State::Elsewhere,
             standing_in_since: stands_in.then(|| clock::wall_time_of(gate_since)),
             pending_writes: self.ledger.pending(),
             crash_loop: facts.crash_loop.is_some(),
@@ -108,6 +110,7 @@ impl Pages {
             slowest_callers: self.clients.slowest(SLOWEST),
             clients: self.clients.list(),
             counters: counters.collect(),
+            cluster: facts.cluster.as_ref().map(Computers::from),
         }
     }
 

@@ -1,0 +1,261 @@
+//! How a robot of several computers is, as one of them sees it.
+
+use std::time::{Duration, Instant};
+
+use super::Name;
+use crate::{
+    cluster::machine::Role,
+    gate::State,
+    status::cluster::{ClusterFacts, LeaderFacts, MemberFacts},
+};
+
+/// The next leader is there after the time to live and 300 ms; a starting computer knows in a second.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// What is so because of the other computers.
+pub(super) struct Notice {
+    pub(super) name: Name,
+    pub(super) since: Instant,
+    pub(super) text: String,
+    pub(super) action: Option<String>,
+}
+
+/// None while this computer leads: then it is as with a single one.
+pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
+    let leader = of.leader.as_ref();
+    let notice = match (of.role, leader, of.leaderless) {
+        (Role::Leading, ..) => return None,
+        (Role::Alone, ..) => alone(gate, of),
+        (Role::Following, Some(leader), None) => following(of, leader),
+        (Role::CatchingUp, ..) => Notice {
+            name: Name::NoLeader,
+            since: of.leaderless.unwrap_or(of.since),
+            text: "Nodes go on: this computer takes over, and reads the rest of the journal from etcd. \
+                   Reads are answered, writes wait for that."
+                .to_owned(),
+            action: None,
+        },
+        (Role::Following, ..) => no_leader(of),
+        (Role::Joining, ..) => Notice {
+            name: Name::NoLeader,
+            since: of.since,
+            text: format!(
+                "Nodes wait: this computer does not know the others yet{}.",
+                etcd(of)
+            ),
+            action: look_at_etcd(of, of.since),
+        },
+    };
+    Some(notice)
+}
+
+fn following(of: &ClusterFacts, leader: &LeaderFacts) -> Notice {
+    let LeaderFacts { name, uri, .. } = leader;
+    let trouble = match of.etcd {
+        Some(_) => format!(" This computer could not take over now{}.", etcd(of)),
+        None => String::new(),
+    };
+    Notice {
+        name: Name::Following,
+        since: of.since.max(leader.since),
+        text: format!(
+            "Nodes run as usual: calls are forwarded to the leader, {name} at {uri}.{trouble}"
+        ),
+        action: None,
+    }
+}
+
+fn no_leader(of: &ClusterFacts) -> Notice {
+    let last = of.leader.as_ref();
+    let last = last.map(|leader| format!(" The last leader was {}.", leader.name));
+    let since = of.leaderless.unwrap_or(of.since);
+    Notice {
+        name: Name::NoLeader,
+        since,
+        text: format!(
+            "Nodes go on: reads are answered, writes wait for the next leader{}.{}",
+            etcd(of),
+            last.unwrap_or_default()
+        ),
+        action: look_at_etcd(of, since),
+    }
+}
+
+fn alone(gate: State, of: &ClusterFacts) -> Notice {
+    let kept = match of.uncommitted {
+        0 => "nothing so far".to_owned(),
+        1 => "1 change so far".to_owned(),
+        changes => format!("{changes} changes so far"),
+    };
+    let why = match (&of.etcd, &of.leader) {
+        (None, Some(leader)) => format!(" (the leader, {}, does not answer)", leader.name),
+        _ => etcd(of),
+    };
+    let notice = match gate {
+        State::Elsewhere | State::Unknown => {
+            "Reads are answered, writes wait and are closed (--alone refuse)".to_owned()
+        }
+        _ => format!(
+            "Nodes of this computer go on: calls are answered here, and what they change is kept \
+             ({kept}) for the leader, but for what others change meanwhile"
+        ),
+    };
+    Notice {
+        name: Name::Alone,
+        since: of.since,
+        text: format!("{notice}. This computer is cut off from the others{why}."),
+        action: Some(
+            "bring back the network between the computers, and a majority of etcd; the rest goes by \
+             itself."
+                .to_owned(),
+        ),
+    }
+}
+
+/// What the leader says besides, and what is to be done.
+pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
+    let others = of.members.iter().filter(|member| member.name != of.name);
+    let (away, here): (Vec<_>, Vec<_>) = others.partition(|member| member.is_away());
+    let names = |members: &[&MemberFacts]| {
+        let names: Vec<_> = members.iter().map(|member| &*member.name).collect();
+        names.join(", ")
+    };
+    let mut text = " This computer leads".to_owned();
+    if !here.is_empty() {
+        text += &format!("; in its place could {}", names(&here));
+    }
+    text.push('.');
+    let mut action = None;
+    if here.is_empty() {
+        text += " No other one could take over";
+        if !away.is_empty() {
+            text += &format!(": nothing is heard of {}", names(&away));
+            action = Some(format!("bring back {}.", names(&away)));
+        }
+        text.push('.');
+    }
+    if of.etcd.is_some() {
+        text += &format!(" Writes may have to wait{}.", etcd(of));
+    }
+    (text, action)
+}
+
+/// Why etcd does not answer, for the end of a sentence; empty if it does.
+fn etcd(of: &ClusterFacts) -> String {
+    let why = of.etcd.as_ref().map(|(_, why)| format!(" ({why})"));
+    why.unwrap_or_default()
+}
+
+fn look_at_etcd(of: &ClusterFacts, since: Instant) -> Option<String> {
+    (of.etcd.is_some() || since.elapsed() > PATIENCE).then(|| {
+        "see that a majority of etcd runs and that this computer reaches it where --cluster says."
+            .to_owned()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Condition, Situation, condition};
+    use super::*;
+    use crate::status::{Facts, Mode};
+
+    const OPEN: State = State::Open { incarnation: 1 };
+
+    fn of(gate: State, cluster: &ClusterFacts) -> Condition {
+        let mut facts = Facts::new(Mode::Core);
+        facts.cluster = Some(cluster.clone());
+        let situation = Situation {
+            gate,
+            gate_since: facts.started,
+            unprotected: None,
+            master: "http://127.0.0.1:5/".to_owned(),
+        };
+        condition(&situation, &facts)
+    }
+
+    fn trouble() -> Option<(Instant, String)> {
+        Some((Instant::now(), "etcd has no majority".to_owned()))
+    }
+
+    #[test]
+    fn one_that_follows_is_well_and_names_the_leader() {
+        let mut cluster = ClusterFacts::of_three();
+        let well = of(State::Elsewhere, &cluster);
+        assert!(well.is_good(), "{well:?}");
+        assert_eq!(
+            well.line(),
+            "following the leader: Nodes run as usual: calls are forwarded to the leader, pc-1 at \
+             http://pc-1:11311/. Every change is recorded."
+        );
+        cluster.etcd = trouble();
+        let line = of(State::Elsewhere, &cluster).line();
+        assert!(
+            line.contains("could not take over now (etcd has no majority)"),
+            "{line}"
+        );
+    }
+
+    #[test]
+    fn without_a_leader_writes_wait_and_after_a_while_somebody_has_to_look() {
+        let mut cluster = ClusterFacts::of_three();
+        cluster.leaderless = Some(Instant::now());
+        let short = of(State::Elsewhere, &cluster);
+        assert_eq!((short.name, &short.action), (Name::NoLeader, &None));
+        assert!(
+            short.text.contains("writes wait") && short.text.contains("pc-1"),
+            "{short:?}"
+        );
+        cluster.leaderless = Instant::now().checked_sub(2 * PATIENCE);
+        assert!(of(State::Elsewhere, &cluster).action.is_some());
+        cluster.role = Role::CatchingUp;
+        assert_eq!(of(State::Elsewhere, &cluster).name, Name::NoLeader);
+        cluster.role = Role::Joining;
+        for gate in [State::Elsewhere, State::Unknown] {
+            assert_eq!(of(gate, &cluster).name, Name::NoLeader);
+        }
+    }
+
+    #[test]
+    fn one_that_is_cut_off_says_so_loudly() {
+        let mut cluster = ClusterFacts::of_three();
+        cluster.role = Role::Alone;
+        cluster.uncommitted = 3;
+        let serving = of(OPEN, &cluster);
+        assert_eq!(serving.name, Name::Alone);
+        assert!(
+            serving
+                .line()
+                .starts_with("ALONE: Nodes of this computer go on")
+        );
+        assert!(serving.text.contains("3 changes"), "{serving:?}");
+        assert!(
+            serving.text.contains("(the leader, pc-1, does not answer)"),
+            "{serving:?}"
+        );
+        assert!(serving.action.is_some());
+        cluster.etcd = trouble();
+        let refusing = of(State::Elsewhere, &cluster);
+        assert_eq!(refusing.name, Name::Alone);
+        assert!(refusing.text.contains("--alone refuse"), "{refusing:?}");
+        assert!(
+            refusing.text.contains("(etcd has no majority)"),
+            "{refusing:?}"
+        );
+    }
+
+    #[test]
+    fn one_that_leads_is_as_a_single_one_and_says_who_could_take_over() {
+        let mut cluster = ClusterFacts::of_three();
+        cluster.role = Role::Leading;
+        let well = of(OPEN, &cluster);
+        assert!(well.is_good(), "{well:?}");
+        assert!(well.text.contains("in its place could pc-1."), "{well:?}");
+        assert_eq!(of(State::StandingIn, &cluster).name, Name::StandingIn);
+        cluster.members.retain(|member| member.name != "pc-1");
+        let last = of(OPEN, &cluster);
+        assert!(!last.is_good() && last.action.unwrap().contains("pc-3"));
+        cluster.members.retain(|member| member.name == "pc-2");
+        let first = of(OPEN, &cluster);
+        assert!(first.is_good() && first.text.contains("No other one could take over."));
+    }
+}
