@@ -2,7 +2,7 @@
 
 use std::{
     io,
-    sync::{Arc, atomic::AtomicU32},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -13,16 +13,16 @@ use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
     checkpoint::store::OpenError,
+    cluster::etcd::EtcdError,
     config::{Config, MasterConfig},
     gate::{self, State},
     guardian::handover::Sockets,
-    ledger::{Ledger, checkpointer::Checkpointer, history::Rescues},
+    ledger::{Ledger, checkpointer::Checkpointer},
     lifecycle::Supervision,
     nodes::{self, Nodes},
     process::{ProcessError, Rosmaster},
-    recovery::{Driver, examine::Examiner, master_process::MasterProcess},
+    recovery::{Driver, master_process::MasterProcess},
     ros_env::MasterUri,
-    roscore::{self, Roscore},
     server::{
         Server,
         access::Access,
@@ -39,11 +39,15 @@ use crate::{
     write_queue,
 };
 
+mod cluster;
+mod duty;
 mod life;
 mod notify;
 mod startup;
 
 use self::{
+    cluster::Conductor,
+    duty::Post,
     notify::Source,
     startup::{Beginning, begin, kernel_id},
 };
@@ -69,6 +73,9 @@ pub enum RunError {
          serve another one with --listen"
     )]
     Loop { master: MasterUri },
+    /// Several computers: etcd's options cannot be used.
+    #[error(transparent)]
+    Cluster(#[from] EtcdError),
     /// Cannot happen with the kernel's ids.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),
@@ -115,7 +122,10 @@ pub async fn run(
     };
     let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
     let port = last.map(|uri| uri.port);
-    let process = supervised.map(|(_, rosmaster)| MasterProcess::new(rosmaster, port));
+    let rosmaster = supervised.map(|(_, rosmaster)| rosmaster);
+    let among = config.cluster.is_some();
+    let process = rosmaster.clone().filter(|_| !among);
+    let process = process.map(|rosmaster| MasterProcess::new(rosmaster, port));
     let left = process.as_ref().is_some_and(MasterProcess::is_left);
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let Beginning {
@@ -129,9 +139,9 @@ pub async fn run(
     // Lives as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
     let (gate_tx, gate) = gate::gate();
-    let mode = match process {
-        Some(_) => Mode::Core,
-        None => Mode::Proxy,
+    let (mode, supervision) = match rosmaster {
+        Some(_) => (Mode::Core, Supervision::Ours),
+        None => (Mode::Proxy, Supervision::Theirs),
     };
     let (board, slow, looped) = (Arc::new(Board::new(mode)), Arc::default(), Arc::default());
     let ledger = Arc::new(Ledger::new(
@@ -165,27 +175,24 @@ pub async fn run(
         stats,
         config.node_timeout,
     ));
-    let supervision = match process {
-        Some(_) => Supervision::Ours,
-        None => Supervision::Theirs,
+    let post = Post {
+        ledger: ledger.clone(),
+        upstream: upstream.clone(),
+        gate_tx,
+        gate: gate.clone(),
+        write_queue: write_queue.clone(),
+        slow: Arc::clone(&slow),
+        nodes: nodes.clone(),
+        board: board.clone(),
+        stats,
+        supervision,
+        probing: config.probing,
+        probe_timeout: config.probe_timeout,
+        history: config.history,
+        uri: uri.clone(),
+        checkpoint: config.checkpoint.clone(),
+        node_timeout: config.node_timeout,
     };
-    let mut driver = Driver::new(
-        Examiner {
-            ledger: ledger.clone(),
-            upstream: upstream.clone(),
-            gate: gate_tx,
-            supervision,
-            probing: config.probing,
-            probe_timeout: config.probe_timeout,
-            stats,
-        },
-        write_queue.clone(),
-        Arc::clone(&slow),
-        nodes.clone(),
-        board.clone(),
-        process,
-        Rescues::new(ledger.clone(), config.history),
-    );
     let told = Source {
         board: board.clone(),
         ledger: ledger.clone(),
@@ -194,32 +201,37 @@ pub async fn run(
     };
     let notified = notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
-    let duties = rosout.map(|rosout| {
-        let roscore = Roscore {
-            ledger: ledger.clone(),
-            write_queue: write_queue.clone(),
-            gate: gate.clone(),
-            uri: uri.clone(),
-            checkpoint: config.checkpoint.clone(),
-            node_timeout: config.node_timeout,
-            rosout: AtomicU32::new(0),
-        };
-        if !left {
-            roscore::seed_run_id(&roscore);
+    let (others, seat) = match (config.cluster.clone(), rosmaster, rosout) {
+        (Some(cluster), Some(rosmaster), Some(rosout)) => {
+            let given = cluster::Given {
+                config: cluster,
+                post,
+                rosmaster,
+                rosout,
+                instance: HeaderValue::from_str(&instance)?,
+                restore: config.restore,
+                restored,
+                halt: halt.clone(),
+            };
+            let (others, conductor) = cluster::join(given).await?;
+            (Some(others), Seat::Among(Box::new(conductor)))
         }
-        tokio::spawn(roscore::run(roscore, rosout, stop.clone()))
-    });
-    tokio::spawn({
-        let halt = halt.clone();
-        async move {
-            stop.cancelled().await;
-            if let Some(duties) = duties {
-                // A panic there must not prevent the stop.
-                let _ = duties.await;
-            }
-            halt.cancel();
+        _ => {
+            let duties = rosout.map(|rosout| post.roscore(rosout, !left, stop.clone()));
+            tokio::spawn({
+                let (stop, halt) = (stop.clone(), halt.clone());
+                async move {
+                    stop.cancelled().await;
+                    if let Some(duties) = duties {
+                        // A panic there must not prevent the stop.
+                        let _ = duties.await;
+                    }
+                    halt.cancel();
+                }
+            });
+            (None, Seat::Alone(Box::new(post.driver(process))))
         }
-    });
+    };
     let clients = Arc::new(Clients::default());
     let pool = Pool::new(
         config.master_connections,
@@ -254,6 +266,7 @@ pub async fn run(
             stats,
             uri: uri.clone(),
             hold: config.hold,
+            others,
         },
         pages: Pages {
             uri,
@@ -285,7 +298,10 @@ pub async fn run(
     }
     drop(server);
     // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
-    let first = driver.start(restored);
+    let (first, seat) = match seat {
+        Seat::Alone(mut driver) => (driver.start(restored), Seat::Alone(driver)),
+        among => (Vec::new(), among),
+    };
     let checkpointer = Checkpointer::begin(
         ledger.clone(),
         board,
@@ -297,11 +313,16 @@ pub async fn run(
     tasks.spawn(drain.run());
     tasks.spawn(nodes::watch(nodes, config.reap_interval));
     let announce = async {
-        gate.clone().wait_for(State::is_open).await;
+        gate.clone()
+            .wait_for(|state| state.is_open() || state == State::Elsewhere)
+            .await;
         say("ROS Rescue enabled. Master is now fault tolerant!!");
         std::future::pending().await
     };
-    let mut driver = tokio::spawn(driver.run(first, halt));
+    let mut driver = match seat {
+        Seat::Alone(driver) => tokio::spawn(driver.run(first, halt)),
+        Seat::Among(conductor) => tokio::spawn(conductor.run(stop)),
+    };
     let process = tokio::select! {
         process = &mut driver => match process {
             Ok(process) => process?,
@@ -321,6 +342,14 @@ pub async fn run(
     // systemd may read nothing.
     let _ = tokio::time::timeout(DRAIN, notified).await;
     Ok(())
+}
+
+/// Who sees to the master.
+enum Seat {
+    /// This computer.
+    Alone(Box<Driver>),
+    /// One of several.
+    Among(Box<Conductor>),
 }
 
 /// Writes the closing checkpoint.

@@ -12,6 +12,7 @@
 //! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
 //! * [`etcd`]: etcd's JSON gateway.
 //! * [`replica`]: the robot's state in etcd.
+//! * [`way`]: where calls go.
 
 pub mod etcd;
 pub mod journal;
@@ -20,3 +21,4 @@ pub mod merge;
 pub mod replica;
 #[cfg(test)]
 mod tests;
+pub mod way;

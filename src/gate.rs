@@ -1,7 +1,8 @@
 //! Whether calls pass to the master. Any task may read and wait; the only [`Tx`] is the recovery's.
 //!
 //! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], `Examiner::inject` sets
-//! [`State::Injecting`], and `Examiner::open_gate` sets [`State::Open`].
+//! [`State::Injecting`], `Examiner::open_gate` sets [`State::Open`], and `app::cluster`, between the recoveries of
+//! two reigns, [`State::Elsewhere`].
 
 use std::time::Duration;
 

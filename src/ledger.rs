@@ -10,6 +10,7 @@ mod durability;
 pub(crate) mod history;
 mod injection;
 mod pending;
+mod shared;
 mod summary;
 
 use std::{
@@ -21,7 +22,12 @@ use std::{
 use tokio::sync::{Notify, watch};
 
 use self::activity::{Activity, Noticed};
-use self::{durability::Whole, pending::PendingWrites};
+pub(crate) use self::{durability::Mark, shared::Change};
+use self::{
+    durability::Whole,
+    pending::PendingWrites,
+    shared::{Agreed, Shared},
+};
 use crate::{
     checkpoint::{
         format::{Entry, Session},
@@ -42,8 +48,8 @@ pub struct Superseded;
 /// The result of recording answered calls.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Recorded {
-    /// The journal's last record of them; none if nothing had to be recorded.
-    pub seq: Option<u64>,
+    /// Where their last record is.
+    pub mark: Mark,
     /// Whether the mirror is no longer known to equal the master.
     pub doubtful: bool,
 }
@@ -63,10 +69,14 @@ pub struct Ledger {
     sync: SyncPolicy,
     stats: &'static Stats,
     durable: watch::Sender<u64>,
+    /// What other computers have of our writes.
+    agreed: watch::Sender<Agreed>,
     /// The mirror's version in the last whole checkpoint that was attempted.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
+    /// Wakes the task that gives our writes to other computers.
+    pub shared: Notify,
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
 }
@@ -78,6 +88,7 @@ struct Inner {
     session: Session,
     /// None if no checkpoint could be opened: the state is unprotected.
     store: Option<Store>,
+    shared: Shared,
     /// Changes whenever the mirror changes.
     version: u64,
     whole: Whole,
@@ -110,6 +121,7 @@ impl Ledger {
             identity: (-1, String::new()),
             session,
             store,
+            shared: Shared::Nobody,
             version: 0,
             whole: Whole::default(),
             pending: PendingWrites::default(),
@@ -126,8 +138,10 @@ impl Ledger {
             sync,
             stats,
             durable: watch::channel(0).0,
+            agreed: watch::channel(Agreed::default()).0,
             attempted: watch::channel(0).0,
             work: Notify::new(),
+            shared: Notify::new(),
             outbox_changed: Notify::new(),
         }
     }
@@ -181,7 +195,7 @@ impl Ledger {
         batch: &[(&Request, &Reply)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
-        if inner.session.incarnation != incarnation || inner.injecting {
+        if inner.session.incarnation != incarnation || inner.injecting || inner.is_elsewhere() {
             return Err(Superseded);
         }
         let mut recorded = Recorded::default();
@@ -195,6 +209,7 @@ impl Ledger {
             |of: &Answered<'_>| matches!(of.call.method(), Method::SetParam | Method::DeleteParam);
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
+        let mut unrecorded = false;
         for (index, answered) in answered.into_iter().enumerate() {
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
@@ -203,7 +218,7 @@ impl Ledger {
                 recorded.doubtful = true;
                 if !answered.executed {
                     // A refused call is in no journal.
-                    inner.changed_unrecorded();
+                    unrecorded = true;
                 }
             }
             if answered.executed {
@@ -213,9 +228,15 @@ impl Ledger {
         inner.doubted |= recorded.doubtful;
         if !entries.is_empty() {
             self.stats.writes_recorded.add(entries.len() as u64);
-            recorded.seq = inner.append(&entries);
+            inner.append(&entries);
+        }
+        if unrecorded {
+            inner.changed_unrecorded();
+        }
+        if unrecorded || !entries.is_empty() {
+            recorded.mark = inner.mark();
             drop(inner);
-            self.work.notify_one();
+            self.recorded();
         }
         Ok(recorded)
     }
@@ -225,6 +246,12 @@ impl Ledger {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
         inner.append(&[Entry::call(call.clone().into())]);
+    }
+
+    /// Wakes those who take records further.
+    fn recorded(&self) {
+        self.work.notify_one();
+        self.shared.notify_one();
     }
 
     /// Number of writes that the present incarnation may not have run.
@@ -260,7 +287,7 @@ impl Ledger {
     /// without values.
     pub fn adopt(&self, state: Master) -> Vec<String> {
         let difference = self.lock().adopt(state);
-        self.work.notify_one();
+        self.recorded();
         difference
     }
 
@@ -273,13 +300,13 @@ impl Ledger {
         state: Master,
     ) -> Result<Vec<String>, Superseded> {
         let mut inner = self.lock();
-        if inner.injecting || (inner.session.incarnation, inner.version) != (incarnation, version) {
+        if inner.injecting || inner.is_elsewhere() || (inner.session.incarnation, inner.version) != (incarnation, version) {
             return Err(Superseded);
         }
         let difference = inner.adopt(state);
         inner.doubted = false;
         drop(inner);
-        self.work.notify_one();
+        self.recorded();
         Ok(difference)
     }
 
@@ -320,13 +347,16 @@ impl Inner {
 
     fn adopt(&mut self, state: Master) -> Vec<String> {
         let mut difference = Vec::new();
-        if self.mirror != state {
+        let differs = self.mirror != state;
+        if differs {
             difference = replay::difference(&self.mirror, &state);
             self.version += 1;
-            self.changed_unrecorded();
         }
         // Also if it is equal: it may be known more exactly.
         self.mirror = state;
+        if differs {
+            self.changed_unrecorded();
+        }
         self.set_identity(self.identity.clone());
         difference
     }
@@ -360,6 +390,7 @@ impl Inner {
     /// The mirror has changed without a journaled call: a whole checkpoint is due.
     fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
+        self.share_state();
     }
 
     /// Number of the journal's last record.
@@ -372,18 +403,21 @@ impl Inner {
         self.store.as_ref().map(Store::seq)
     }
 
-    /// Appends to the journal. A failure is kept by the store and does not fail the call.
-    fn append(&mut self, entries: &[Entry]) -> Option<u64> {
-        let store = self.store.as_mut()?;
-        if entries.is_empty() {
-            return None;
+    /// Where the last record is.
+    fn mark(&self) -> Mark {
+        Mark {
+            disk: self.last_seq(),
+            shared: self.shared.last(),
         }
-        match store.append(entries) {
-            Ok(seq) => Some(seq),
-            Err(error) => {
-                tracing::debug!(%error, "append");
-                None
-            }
+    }
+
+    /// Appends to the journal. A failure is kept by the store and does not fail the call.
+    fn append(&mut self, entries: &[Entry]) {
+        self.share(entries);
+        if let Some(store) = self.store.as_mut().filter(|_| !entries.is_empty())
+            && let Err(error) = store.append(entries)
+        {
+            tracing::debug!(%error, "append");
         }
     }
 }

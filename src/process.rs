@@ -79,7 +79,7 @@ pub enum ProcessError {
     Spawn { program: PathBuf, source: io::Error },
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Rosmaster {
     program: PathBuf,
     config: SupervisedConfig,

@@ -9,6 +9,7 @@ pub(crate) mod clients;
 pub(crate) mod deadlines;
 pub(crate) mod idle;
 pub mod listener;
+pub(crate) mod others;
 pub(crate) mod pages;
 pub(crate) mod replies;
 pub(crate) mod service;

@@ -73,7 +73,7 @@ impl WriteQueue {
         match answered.await.ok()? {
             Answer::Made(reply) => Some(reply),
             Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
-            Answer::Close => None,
+            Answer::Close | Answer::Elsewhere => None,
         }
     }
 

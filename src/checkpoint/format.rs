@@ -53,6 +53,8 @@ pub struct Session {
     /// All pending writes up to this record have reached the master. A snapshot's pending writes have the
     /// number of its last record.
     pub delivered: u64,
+    /// The last term in which this computer led several; 0 if it never did.
+    pub term: u64,
 }
 
 /// The content of a record.

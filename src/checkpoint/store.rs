@@ -114,6 +114,11 @@ impl Store<Disk> {
     }
 }
 
+/// The name of the generation before the file at `path`.
+pub(crate) fn previous_of(path: &Path) -> PathBuf {
+    names::previous(path)
+}
+
 fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> OpenError {
     let path = path.to_owned();
     move |source| OpenError::Io {

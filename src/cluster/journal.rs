@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! ROBOT/leader, ROBOT/alive           see `machine`
-//! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large
+//! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large; or
+//!                                     that of a snapshot, if the state was replaced by record N
 //! ROBOT/values/blob/N/PART            such records, in parts, written before the journal names them
 //! ROBOT/snapshot                      the name of the snapshot that is whole, and what it stands for
 //! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
@@ -164,6 +165,11 @@ pub struct Manifest {
 }
 
 impl Manifest {
+    /// Whether it names a whole state, and not records.
+    pub fn is_state(&self) -> bool {
+        self.kind == Kind::Snapshot
+    }
+
     /// The parts of `bytes`, and the manifest that is to be written after them.
     fn split(keys: &Keys, kind: Kind, seq: u64, bytes: &[u8]) -> (Self, Vec<Put>) {
         let manifest = Self {
@@ -307,6 +313,13 @@ pub fn snapshot(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
     (parts, Put { key, value })
 }
 
+/// The parts of a state that replaces the present one as record `seq`, and the journal's entry that names them.
+pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
+    let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
+    let (key, value) = (keys.journal(seq), manifest.text());
+    (parts, Put { key, value })
+}
+
 /// How far a mirror has followed the journal, and how large that is.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Progress {
@@ -355,6 +368,20 @@ impl Progress {
             self.seq = expected - 1;
         }
         Ok(new)
+    }
+
+    /// Takes a state that replaces the present one as record `seq`.
+    pub fn take_state(&mut self, seq: u64, bytes: usize) {
+        self.entries += 1;
+        self.bytes += bytes;
+        self.seq = seq;
+    }
+
+    /// A snapshot of `bytes` has been written, of the state when the progress was `then`.
+    pub fn snapshot_written(&mut self, then: Self, bytes: usize) {
+        self.entries = self.entries.saturating_sub(then.entries);
+        self.bytes = self.bytes.saturating_sub(then.bytes);
+        self.snapshot_bytes = bytes;
     }
 
     /// Whether the leader is to write a snapshot.

@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use super::{
     etcd::{Etcd, EtcdError, Kv},
-    journal::{self, JournalError, Keys, Manifest, Progress},
+    journal::{self, JournalError, Keys, Manifest, Progress, Put},
     machine::{Answer, Op, Settings, View},
 };
 use crate::checkpoint::format::{self, Checkpoint, Record};
@@ -88,11 +88,16 @@ impl Replica {
             loaded.checkpoint = Some(checkpoint(&bytes)?);
         }
         for kv in &found.kvs {
-            let new = self
-                .keys
-                .seq_of(&kv.key)
-                .is_some_and(|seq| seq > loaded.progress.seq);
-            if new {
+            let seq = self.keys.seq_of(&kv.key);
+            let Some(seq) = seq.filter(|seq| *seq > loaded.progress.seq) else {
+                continue;
+            };
+            if let Some(manifest) = Manifest::read(&kv.value).filter(Manifest::is_state) {
+                let bytes = self.assemble(&manifest).await?;
+                loaded.progress.take_state(seq, bytes.len());
+                loaded.checkpoint = Some(checkpoint(&bytes)?);
+                loaded.records.clear();
+            } else {
                 let records = self.records(kv).await?;
                 loaded
                     .records
@@ -106,7 +111,7 @@ impl Replica {
         }
     }
 
-    /// The records of an entry of the journal, as a watch shows it.
+    /// The records of an entry of the journal.
     ///
     /// # Errors
     ///
@@ -135,21 +140,17 @@ impl Replica {
         Ok(manifest.assemble(&self.keys, &parts)?)
     }
 
-    /// Writes what is large in a record, which may take seconds: before the machine is told that there is the
+    /// Writes the parts of a record, which may take seconds: before the machine is told that there is the
     /// record, so that no beat waits for it. Returns whether this process still leads.
     ///
     /// # Errors
     ///
     /// Why it is not known whether it was written.
-    pub async fn prepare(&self, term: u64, record: &Record) -> Result<bool, ReplicaError> {
-        let parts = journal::parts(&self.keys, record)?;
-        Ok(self
-            .client
-            .put(&self.keys, term, &parts, self.limit)
-            .await?)
+    pub async fn prepare(&self, term: u64, parts: &[Put]) -> Result<bool, ReplicaError> {
+        Ok(self.client.put(&self.keys, term, parts, self.limit).await?)
     }
 
-    /// Carries out a request of the machine. `records`: those after the last beat, all of them prepared.
+    /// Carries out a request of the machine. `entry`: what a beat adds to the journal, its parts prepared.
     ///
     /// # Errors
     ///
@@ -158,13 +159,8 @@ impl Replica {
         &self,
         settings: &Settings,
         op: &Op,
-        records: &[Record],
+        entry: Option<&Put>,
     ) -> Result<Answer, ReplicaError> {
-        let batch = match op {
-            Op::Beat { .. } => journal::pack(&self.keys, records)?,
-            _ => journal::Batch::default(),
-        };
-        let entry = batch.entry.as_ref();
         Ok(self
             .client
             .run(&self.keys, settings, op, entry, self.limit)
@@ -172,7 +168,7 @@ impl Replica {
     }
 
     /// Writes a snapshot, and deletes what it replaces. `seq` of the checkpoint is the journal's record that
-    /// it holds last. Returns whether this process still leads.
+    /// it holds last. Returns its size; none if this process no longer leads.
     ///
     /// # Errors
     ///
@@ -181,21 +177,22 @@ impl Replica {
         &self,
         term: u64,
         checkpoint: &Checkpoint,
-    ) -> Result<bool, ReplicaError> {
+    ) -> Result<Option<usize>, ReplicaError> {
         let seq = checkpoint.seq;
         let encoded = format::encode_checkpoint(checkpoint, 1).map_err(JournalError::Encode)?;
         let (mut puts, manifest) = journal::snapshot(&self.keys, seq, &encoded.bytes);
         // Last: it says that all the others are there.
         puts.push(manifest);
         if !self.client.put(&self.keys, term, &puts, self.limit).await? {
-            return Ok(false);
+            return Ok(None);
         }
         let [journal, blobs] = self.keys.behind(seq);
         let replaced = [journal, blobs, self.keys.snapshots_before(seq)];
-        Ok(self
+        let leads = self
             .client
             .delete(&self.keys, term, &replaced, self.limit)
-            .await?)
+            .await?;
+        Ok(leads.then_some(encoded.bytes.len()))
     }
 }
 

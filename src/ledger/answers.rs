@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::Ledger;
+use super::{Ledger, Mark};
 use crate::{
     checkpoint::format::Entry,
     master::{Kind, Method, Request},
@@ -45,16 +45,17 @@ impl Ledger {
     }
 
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
-    /// Nodes are notified as by a master. Returns the journal's last record too: the earlier write that made
+    /// Nodes are notified as by a master. Returns where the last record is, too: the earlier write that made
     /// this one redundant may be as new as that.
     pub fn answer_if_unchanged(
         &self,
         now: Instant,
         write: &Request,
-    ) -> Option<(Reply, Option<u64>)> {
+    ) -> Option<(Reply, Mark)> {
         let mut inner = self.lock();
         // An unregistration may concern a registration that is still on its way to the master.
         let idle = !inner.doubted
+            && !inner.is_elsewhere()
             && !write.calls().into_iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
@@ -70,7 +71,7 @@ impl Ledger {
             }
             Reply::Fault { .. } => true,
         };
-        (!refused).then(|| (reply, inner.last_seq()))
+        (!refused).then(|| (reply, inner.mark()))
     }
 
     /// The master's predicted answer to this call.
@@ -80,13 +81,13 @@ impl Ledger {
     }
 
     /// Answers a call of the Master API as an absent master would: records its changes as pending, applies
-    /// them, and has nodes notified. Returns the journal's last record too: that of the call or, if it
+    /// them, and has nodes notified. Returns where the last record is, too: that of the call or, if it
     /// changes nothing, of what made it redundant.
     ///
-    /// None during an injection, or if the call also reads too much: it has to wait.
-    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Option<u64>)> {
+    /// None during an injection, if another computer has the master, or if the call also reads too much: it has to wait.
+    pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let mut inner = self.lock();
-        if inner.injecting || !inner.mirror.fits(call, ANSWER_MOST) {
+        if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
         let changes = inner.mirror.would_change(call);
@@ -110,7 +111,7 @@ impl Ledger {
             writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
         }
         if writes.is_empty() {
-            return Some((reply, inner.last_seq()));
+            return Some((reply, inner.mark()));
         }
         // Makes an inspection under way outdated: it could bring back what this call takes away.
         inner.version += u64::from(!changes);
@@ -119,11 +120,12 @@ impl Ledger {
             call: call.clone().into(),
             pending: true,
         });
-        let seq = inner.append(&entries.collect::<Vec<_>>());
+        inner.append(&entries.collect::<Vec<_>>());
+        let mark = inner.mark();
         inner.add_pending(writes.into_iter().cloned());
         drop(inner);
-        self.work.notify_one();
-        Some((reply, seq))
+        self.recorded();
+        Some((reply, mark))
     }
 }
 

@@ -1,11 +1,30 @@
 //! The ledger's side of the checkpointer, and how calls wait for it.
 
-use super::{Inner, Ledger};
+use super::{Inner, Ledger, shared::Agreed};
 use crate::checkpoint::{
     format::Checkpoint,
     store::{Store, StoreError},
 };
 use crate::cli::SyncPolicy;
+
+/// Where a record is: what an answer may have to wait for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Mark {
+    /// Its number in our own journal; none without one.
+    pub(super) disk: Option<u64>,
+    /// Its place among the writes that other computers are given.
+    pub(super) shared: Option<Agreed>,
+}
+
+impl Mark {
+    /// The later one of two.
+    pub fn max(self, other: Self) -> Self {
+        Self {
+            disk: self.disk.max(other.disk),
+            shared: self.shared.max(other.shared),
+        }
+    }
+}
 
 /// Progress of whole checkpoints, in versions of the mirror.
 #[derive(Debug, Default)]
@@ -27,17 +46,32 @@ impl Whole {
 }
 
 impl Ledger {
-    /// The record that must be on the disk before a call whose last record is `seq` is answered; none if the
-    /// policy requires none.
-    pub fn to_await(&self, seq: Option<u64>) -> Option<u64> {
-        seq.filter(|_| self.sync == SyncPolicy::Always)
+    /// Where the last record is.
+    pub fn mark(&self) -> Mark {
+        self.lock().mark()
     }
 
-    /// Returns when the journal up to `seq` is on the disk, or the disk has failed.
-    pub async fn durable(&self, seq: u64) {
-        let mut durable = self.durable.subscribe();
-        // We own the sender.
-        let _ = durable.wait_for(|reached| *reached >= seq).await;
+    /// What must be safe before a call whose last record is at `mark` is answered; none if nothing must.
+    pub fn to_await(&self, mark: Mark) -> Option<Mark> {
+        let mark = Mark {
+            disk: mark.disk.filter(|_| self.sync == SyncPolicy::Always),
+            ..mark
+        };
+        (mark != Mark::default()).then_some(mark)
+    }
+
+    /// Returns when the records up to `mark` are safe: on the disk, or the disk has failed; and where other
+    /// computers find them. False if another one leads by now and may not have them.
+    pub async fn durable(&self, mark: Mark) -> bool {
+        if let Some(seq) = mark.disk {
+            let mut durable = self.durable.subscribe();
+            // We own the sender.
+            let _ = durable.wait_for(|reached| *reached >= seq).await;
+        }
+        match mark.shared {
+            Some(place) => self.agreed(place).await,
+            None => true,
+        }
     }
 
     /// The journal up to `seq` is on the disk, or the disk has failed.

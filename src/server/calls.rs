@@ -12,6 +12,7 @@ use tokio::sync::{Mutex, Notify, oneshot};
 
 use super::{
     admission,
+    others::Others,
     replies::{HttpReply, encoded, forwarded, made, no_shutdown, xml},
 };
 use crate::{
@@ -38,15 +39,40 @@ pub(crate) struct Closed(pub(super) &'static str);
 
 /// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
 /// millisecond, and within some ten behind a call that keeps its interpreter busy.
-const PATIENCE: Duration = Duration::from_millis(100);
+pub(super) const PATIENCE: Duration = Duration::from_millis(100);
 /// Values that take a millisecond to encode, in bytes of memory.
 const LARGE: usize = 64 << 10;
 /// Largest answer that is kept, in bytes.
 const KEPT_MOST: usize = 16 << 20;
 /// Why a write is not answered.
 const UNANSWERED: &str = "the master gave no answer";
+/// Why a call that only a master can answer is not answered.
+pub(super) const NOT_IN_TIME: &str = "the master did not come back in time, see --hold";
 /// Why a multicall of reads is not answered while the master is away.
 const UNANSWERABLE: &str = "so many answers at once are left to the master";
+
+/// Why a call is not answered here.
+#[derive(Debug)]
+pub(super) enum Unanswered {
+    Closed(Closed),
+    /// Another computer has the master.
+    Elsewhere,
+}
+
+impl From<Closed> for Unanswered {
+    fn from(closed: Closed) -> Self {
+        Self::Closed(closed)
+    }
+}
+
+impl From<Unanswered> for Closed {
+    fn from(unanswered: Unanswered) -> Self {
+        match unanswered {
+            Unanswered::Closed(closed) => closed,
+            Unanswered::Elsewhere => Self("another computer has the master"),
+        }
+    }
+}
 
 pub struct Calls {
     /// Whether calls pass to the master.
@@ -66,6 +92,8 @@ pub struct Calls {
     pub uri: String,
     /// How long a call waits if only a master can answer it.
     pub hold: Duration,
+    /// None without other computers.
+    pub(crate) others: Option<Others>,
 }
 
 /// An answer of the mirror, and its encoding.
@@ -83,13 +111,26 @@ impl Calls {
         body: Bytes,
         call: Option<Request>,
     ) -> Result<HttpReply, Closed> {
+        match &self.others {
+            None => Ok(self.answer_here(peer, head, body, call).await?),
+            Some(others) => others.answer(self, peer, head, body, call).await,
+        }
+    }
+
+    /// As [`Self::answer`], if this computer has the master.
+    pub(super) async fn answer_here(
+        &self,
+        peer: SocketAddr,
+        head: Head,
+        body: Bytes,
+        call: Option<Request>,
+    ) -> Result<HttpReply, Unanswered> {
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         match (&call, kind) {
             (Some(call), Kind::Identity)
                 if *call.method() == Method::GetUri || !self.gate.is_open() =>
             {
-                let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
-                Ok(xml(&reply))
+                Ok(self.identity(call)?)
             }
             (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
                 rarely!(warn, %peer, "refused to shut the master down for another computer");
@@ -110,6 +151,12 @@ impl Calls {
         }
     }
 
+    /// The answer to a getPid or a getUri while there is no master, and always to a getUri.
+    pub(super) fn identity(&self, call: &Request) -> Result<HttpReply, Closed> {
+        let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
+        Ok(xml(&reply))
+    }
+
     /// The mirror's answer to a read while there is a master; none if the master's may differ.
     async fn exact_answer(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call.filter(|_| self.reads == Reads::Mirror)?;
@@ -120,7 +167,7 @@ impl Calls {
     }
 
     /// The mirror's answer to a read instead of that of a master that is away, or late.
-    async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
+    pub(super) async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call?;
         let reply = self.encode(|| self.ledger.answer(read)).await?;
         self.stats.calls_without_master.count();
@@ -169,7 +216,7 @@ impl Calls {
         body: Bytes,
         call: Option<&Request>,
         kind: Kind,
-    ) -> Result<HttpReply, Closed> {
+    ) -> Result<HttpReply, Unanswered> {
         let known = call.filter(|_| kind != Kind::Unknown);
         let mut gate = self.gate.clone();
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
@@ -220,13 +267,14 @@ impl Calls {
                         return Ok(reply);
                     }
                 }
-                State::Elsewhere | State::Unknown => {}
+                State::Unknown => {}
+                State::Elsewhere => return Err(Unanswered::Elsewhere),
             }
             tokio::select! {
                 () = gate.changed() => {}
                 () = &mut hold => {
                     self.stats.calls_unanswered.count();
-                    return Err(Closed("the master did not come back in time, see --hold"));
+                    return Err(Closed(NOT_IN_TIME).into());
                 }
             }
         }
@@ -238,7 +286,7 @@ impl Calls {
         head: Head,
         body: Bytes,
         mut call: Option<Request>,
-    ) -> Result<HttpReply, Closed> {
+    ) -> Result<HttpReply, Unanswered> {
         if let Some(parts) = Parts::of(&mut call, body.len()) {
             drop(body);
             return self.write_parts(&head, parts).await;
@@ -249,7 +297,7 @@ impl Calls {
     }
 
     /// Makes one part after the other. If one gets no result for each entry, its answer is that to the whole.
-    async fn write_parts(&self, head: &Head, parts: Parts) -> Result<HttpReply, Closed> {
+    async fn write_parts(&self, head: &Head, parts: Parts) -> Result<HttpReply, Unanswered> {
         let mut whole = ListWriter::answer();
         for part in parts {
             let part = Arc::new(part);
@@ -260,7 +308,7 @@ impl Calls {
             let reply = match &answer {
                 Answer::Made(reply) => Some(reply.clone()),
                 Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
-                Answer::Close => None,
+                Answer::Close | Answer::Elsewhere => None,
             };
             match reply.map(|reply| batch::with_uri(&part, reply, &self.uri)) {
                 Some(Reply::Value(Value::Array(results)))
@@ -274,11 +322,12 @@ impl Calls {
         Ok(encoded(whole.finish()))
     }
 
-    fn http(&self, call: Option<&Request>, answer: Answer) -> Result<HttpReply, Closed> {
+    fn http(&self, call: Option<&Request>, answer: Answer) -> Result<HttpReply, Unanswered> {
         match answer {
             Answer::Raw(raw) => Ok(forwarded(&self.uri, call, raw)),
             Answer::Made(reply) => Ok(made(&self.uri, call, &reply)),
-            Answer::Close => Err(Closed(UNANSWERED)),
+            Answer::Close => Err(Closed(UNANSWERED).into()),
+            Answer::Elsewhere => Err(Unanswered::Elsewhere),
         }
     }
 
@@ -289,7 +338,7 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Arc<Request>>,
-    ) -> Result<Answer, Closed> {
+    ) -> Result<Answer, Unanswered> {
         if self.gate.state() == State::Injecting
             && let Some(reply) = self.answer_if_unchanged(call.as_deref()).await
         {
@@ -320,10 +369,10 @@ impl Calls {
         let mut patient = true;
         loop {
             tokio::select! {
-                answer = &mut answered => return answer.map_err(|_| Closed(UNANSWERED)),
+                answer = &mut answered => return answer.map_err(|_| Closed(UNANSWERED).into()),
                 () = &mut held => {
                     self.stats.calls_unanswered.count();
-                    return Err(Closed("the master did not come back in time, see --hold"));
+                    return Err(Closed(NOT_IN_TIME).into());
                 }
                 () = &mut patience, if patient => {
                     if !self.gate.is_open() {
@@ -354,10 +403,12 @@ impl Calls {
     /// The mirror's answer to a write that changes nothing; none if it does.
     async fn answer_if_unchanged(&self, call: Option<&Request>) -> Option<Reply> {
         let call = call.filter(|call| call.is_answerable())?;
-        let (reply, seq) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
-        // The write that made this one redundant may not be on the disk yet.
-        if let Some(seq) = self.ledger.to_await(seq) {
-            self.ledger.durable(seq).await;
+        let (reply, mark) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
+        // The write that made this one redundant may not be safe yet.
+        if let Some(mark) = self.ledger.to_await(mark)
+            && !self.ledger.durable(mark).await
+        {
+            return None;
         }
         self.stats.calls_without_master.count();
         Some(reply)

@@ -28,6 +28,8 @@ pub(crate) enum Answer {
     Made(Reply),
     /// No answer: closes the connection, so that the client retries.
     Close,
+    /// Another computer has the master, and is to be given the call.
+    Elsewhere,
 }
 
 #[derive(Debug)]

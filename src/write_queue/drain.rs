@@ -19,6 +19,7 @@ use super::{
 };
 use crate::{
     gate::{self, State},
+    ledger::Mark,
     limit::rarely,
     master::{Master, Method, Request},
     status::stats::Stats,
@@ -73,7 +74,7 @@ pub(crate) struct Drain {
 struct Opaque {
     incarnation: u64,
     answers: Vec<(Item, Answer)>,
-    seq: Option<u64>,
+    mark: Mark,
 }
 
 impl Drain {
@@ -148,7 +149,8 @@ impl Drain {
             match state {
                 State::Open { incarnation } => self.send(incarnation),
                 State::StandingIn => self.stand_in(),
-                State::Injecting | State::Elsewhere | State::Unknown => self.grace = None,
+                State::Injecting | State::Unknown => self.grace = None,
+                State::Elsewhere => self.send_elsewhere(),
             }
             self.tell_sent
                 .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));
@@ -249,8 +251,9 @@ impl Drain {
     }
 
     fn answer_opaque(&mut self) {
-        let Opaque { answers, seq, .. } = std::mem::take(&mut self.opaque);
-        self.answer(seq, self.link.ledger.unwritten(), answers);
+        let Opaque { answers, mark, .. } = std::mem::take(&mut self.opaque);
+        let mark = mark.max(self.link.ledger.mark());
+        self.answer(mark, self.link.ledger.unwritten(), answers);
     }
 
     fn failed(&mut self, items: Vec<Item>, error: &RoundTripError) {
@@ -328,7 +331,7 @@ impl Drain {
             self.link.ledger.doubt();
             // Answers may be waiting already: after a failed read, calls are sent before the next one.
             self.opaque.incarnation = incarnation;
-            self.opaque.seq = self.opaque.seq.max(recorded.seq);
+            self.opaque.mark = self.opaque.mark.max(recorded.mark);
             let answers = items
                 .into_iter()
                 .map(|item| (item, Answer::Raw(raw.clone())));
@@ -345,7 +348,7 @@ impl Drain {
                 .zip(replies.into_iter().map(Answer::Made))
                 .collect(),
         };
-        self.answer(recorded.seq, None, answers);
+        self.answer(recorded.mark, None, answers);
     }
 
     /// A batch got one answer as a whole instead of its results.
@@ -388,7 +391,7 @@ impl Drain {
             );
             self.take_back(batch.items);
         }
-        let (mut last, mut answers) = (None, Vec::new());
+        let (mut last, mut answers) = (Mark::default(), Vec::new());
         let mut waiting = VecDeque::new();
         for item in self.queue.drain(..) {
             if is_outdated(&self.link.ledger, &item) {
@@ -400,9 +403,9 @@ impl Drain {
                 evict::while_standing_in(&self.link.ledger, call);
             }
             match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
-                Some((reply, seq)) => {
+                Some((reply, mark)) => {
                     self.stats.calls_without_master.count();
-                    last = last.max(seq);
+                    last = last.max(mark);
                     answers.push((item, Answer::Made(reply)));
                 }
                 None => waiting.push_back(item),
@@ -412,27 +415,43 @@ impl Drain {
         self.answer(last, None, answers);
     }
 
-    /// Sends answers once their effects are safe: the journal up to `seq` is on the disk, if `--sync`
-    /// requires it, and this `version` of the mirror is in a whole checkpoint.
-    fn answer(&self, seq: Option<u64>, version: Option<u64>, answers: Vec<(Item, Answer)>) {
-        let seq = self.link.ledger.to_await(seq);
-        let send = move || {
+    /// Another computer has the master: all calls are to go there.
+    fn send_elsewhere(&mut self) {
+        (self.grace, self.connection) = (None, None);
+        let in_flight = self.in_flight.take().map(|batch| batch.items);
+        let opaque = std::mem::take(&mut self.opaque).answers;
+        let items = in_flight.into_iter().flatten();
+        let items = items.chain(opaque.into_iter().map(|(item, _)| item));
+        for item in items.chain(self.queue.drain(..)) {
+            let _ = item.answer.send(Answer::Elsewhere);
+        }
+    }
+
+    /// Sends answers once their effects are safe, see [`Ledger::durable`](crate::ledger::Ledger::durable), and this `version` of the mirror
+    /// is in a whole checkpoint.
+    fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, Answer)>) {
+        let mark = self.link.ledger.to_await(mark);
+        let send = move |is_safe: bool| {
             for (item, answer) in answers {
-                let _ = item.answer.send(answer);
+                let _ = item.answer.send(match is_safe {
+                    true => answer,
+                    false => Answer::Elsewhere,
+                });
             }
         };
-        if (seq, version) == (None, None) {
-            return send();
+        if (mark, version) == (None, None) {
+            return send(true);
         }
         let ledger = self.link.ledger.clone();
         tokio::spawn(async move {
-            if let Some(seq) = seq {
-                ledger.durable(seq).await;
-            }
+            let is_safe = match mark {
+                Some(mark) => ledger.durable(mark).await,
+                None => true,
+            };
             if let Some(version) = version {
                 ledger.attempted(version).await;
             }
-            send();
+            send(is_safe);
         });
     }
 }

@@ -3,9 +3,9 @@
 use std::time::Instant;
 
 use rosrescue::{
-    checkpoint::format::{Checkpoint, Entry, Record, Session},
+    checkpoint::format::{self, Checkpoint, Entry, Record, Session},
     cluster::{
-        journal::Progress,
+        journal::{self, Progress},
         machine::{Answer, Guard, Op},
         replica::{Replica, ReplicaError},
     },
@@ -47,7 +47,7 @@ impl Leader {
             claim: 1,
             seq,
         };
-        let answer = replica.run(&settings("a"), &claim, &[]).await.unwrap();
+        let answer = replica.run(&settings("a"), &claim, None).await.unwrap();
         let Answer::Applied { revision, .. } = answer else {
             panic!("{answer:?}");
         };
@@ -65,12 +65,9 @@ impl Leader {
     /// Commits all, in as many beats as it takes.
     async fn commit(&mut self, records: &[Record]) {
         for record in records {
-            assert!(
-                self.replica
-                    .prepare(self.guard.leader, record)
-                    .await
-                    .unwrap()
-            );
+            let parts = journal::parts(&self.replica.keys, record).unwrap();
+            let leads = self.replica.prepare(self.guard.leader, &parts).await;
+            assert!(leads.unwrap());
         }
         let mut rest = records;
         while let Some(last) = rest.last() {
@@ -81,7 +78,10 @@ impl Leader {
                 seq: last.seq,
                 released: None,
             };
-            let answer = self.replica.run(&settings("a"), &beat, rest).await.unwrap();
+            let entry = journal::pack(&self.replica.keys, rest).unwrap().entry;
+            let settings = settings("a");
+            let answer = self.replica.run(&settings, &beat, entry.as_ref());
+            let answer = answer.await.unwrap();
             let Answer::Applied { revision, seq } = answer else {
                 panic!("{answer:?}");
             };
@@ -150,14 +150,11 @@ async fn a_snapshot_takes_the_place_of_the_journal() {
         state.snapshot.params.insert("map".to_owned(), value);
         state.seq = 50 + round;
         let term = leader.guard.leader;
-        assert!(
-            !leader
-                .replica
-                .write_snapshot(term + 1, &state)
-                .await
-                .unwrap()
-        );
-        assert!(leader.replica.write_snapshot(term, &state).await.unwrap());
+        let replica = &leader.replica;
+        let refused = replica.write_snapshot(term + 1, &state).await.unwrap();
+        assert_eq!(refused, None);
+        let bytes = replica.write_snapshot(term, &state).await.unwrap();
+        assert!(bytes.is_some_and(|bytes| bytes > 3 << 20));
         leader
             .replica
             .client
@@ -219,4 +216,42 @@ async fn a_journal_with_a_hole_is_not_taken_for_whole() {
         expected: 4,
     };
     assert_eq!(error.to_string(), short.to_string());
+}
+
+#[tokio::test]
+async fn a_state_can_replace_the_one_before_in_the_middle_of_the_journal() {
+    let servers = Servers::new(1).await;
+    let mut leader = Leader::new(&servers).await;
+    leader.commit(&[record(1, 10), record(2, 10)]).await;
+    let mut state = Checkpoint {
+        seq: 3,
+        ..Checkpoint::default()
+    };
+    let value = "z".repeat(1 << 20).as_str().into();
+    state.snapshot.params.insert("map".to_owned(), value);
+    let encoded = format::encode_checkpoint(&state, 1).unwrap();
+    let keys = &leader.replica.keys;
+    let (parts, entry) = journal::state(keys, 3, &encoded.bytes);
+    let replica = leader.replica.clone();
+    assert!(replica.prepare(leader.guard.leader, &parts).await.unwrap());
+    leader.beat += 1;
+    let beat = Op::Beat {
+        guard: leader.guard,
+        beat: leader.beat,
+        seq: 3,
+        released: None,
+    };
+    let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
+    let Answer::Applied { revision, seq: 3 } = answer.unwrap() else {
+        panic!("the state is in no journal");
+    };
+    leader.guard.alive = revision;
+    leader.commit(&[record(4, 10)]).await;
+    for known in [0, 2] {
+        let progress = Progress::after_snapshot(known, 0);
+        let loaded = replica.load(progress).await.unwrap();
+        assert!(loaded.checkpoint.as_ref() == Some(&state), "{known}");
+        assert_eq!(loaded.records, [record(4, 10)]);
+        assert_eq!(loaded.progress.seq, 4);
+    }
 }

@@ -155,6 +155,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
     let counts = [
         ("incarnation", session.incarnation),
         ("delivered", session.delivered),
+        ("term", session.term),
     ];
     // A missing count is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
@@ -280,6 +281,7 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         started: text(session, "started")?,
         incarnation: count(session, "incarnation")?.unwrap_or(0),
         delivered: count(session, "delivered")?.unwrap_or(0),
+        term: count(session, "term")?.unwrap_or(0),
     })
 }
 

@@ -157,6 +157,28 @@ pub enum Role {
     Alone,
 }
 
+impl Role {
+    /// All of them.
+    pub const ALL: [Self; 5] = [
+        Self::Joining,
+        Self::Following,
+        Self::CatchingUp,
+        Self::Leading,
+        Self::Alone,
+    ];
+
+    /// As in JSON and in metrics.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Joining => "joining",
+            Self::Following => "following",
+            Self::CatchingUp => "catching_up",
+            Self::Leading => "leading",
+            Self::Alone => "alone",
+        }
+    }
+}
+
 /// What the shell must do, in order.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Action {

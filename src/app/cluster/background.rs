@@ -1,0 +1,165 @@
+//! What is done beside: saying how this computer is, snapshots, and having etcd forget.
+
+use std::{
+    sync::{Mutex, PoisonError},
+    time::{Duration, Instant},
+};
+
+use tokio::task::JoinSet;
+
+use super::{Conductor, Role};
+use crate::{
+    checkpoint::format::Checkpoint,
+    cluster::{
+        journal::{Progress, Put},
+        replica::ReplicaError,
+    },
+    limit::rarely,
+    status::cluster::MemberFacts,
+};
+
+/// How often the leader has etcd forget what is older than this.
+const FORGET: Duration = Duration::from_secs(300);
+/// How long etcd may take for what nobody waits for.
+const LIMIT: Duration = Duration::from_secs(5);
+
+/// Why etcd does not give what is asked.
+#[derive(Debug, Default)]
+pub(super) struct Trouble(Mutex<Option<(Instant, String)>>);
+
+impl Trouble {
+    pub(super) fn set(&self, error: &ReplicaError) {
+        let mut trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let text = error.to_string();
+        match &mut *trouble {
+            Some((_, said)) => *said = text,
+            None => {
+                rarely!(warn, error = text, "etcd does not give what is asked; it is asked again");
+                *trouble = Some((Instant::now(), text));
+            }
+        }
+    }
+
+    pub(super) fn clear(&self) {
+        let mut trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((since, _)) = trouble.take() {
+            rarely!(info, after = ?since.elapsed(), "etcd answers again");
+        }
+    }
+
+    pub(super) fn get(&self) -> Option<(Instant, String)> {
+        let trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        trouble.clone()
+    }
+}
+
+/// What was done beside.
+pub(super) enum Done {
+    /// A snapshot of so many bytes, of the state at this progress.
+    Snapshot(Progress, usize),
+    Nothing,
+}
+
+/// See the [module](self).
+#[derive(Default)]
+pub(super) struct Background {
+    pub(super) tasks: JoinSet<Option<Done>>,
+    /// When to say how this computer is.
+    say_at: Option<Instant>,
+    /// A snapshot is being written, or none before this moment.
+    snapshot: bool,
+    /// The revision of etcd at the last look, and when to have it forget what is older.
+    forget: Option<(Instant, u64)>,
+}
+
+impl Background {
+    pub(super) fn due(&self) -> Option<Instant> {
+        let forget = self.forget.map(|(at, _)| at);
+        [self.say_at, forget].into_iter().flatten().min()
+    }
+
+    /// Says how this computer is as soon as possible.
+    pub(super) fn say_now(&mut self) {
+        self.say_at = Some(Instant::now());
+    }
+}
+
+impl Conductor {
+    /// Begins what is due.
+    pub(super) fn work_beside(&mut self, now: Instant) {
+        if self.background.say_at.is_none_or(|at| at <= now) {
+            self.background.say_at = Some(now + MemberFacts::SAYS_EVERY);
+            self.say();
+        }
+        let term = self.machine.term();
+        let leading = term.filter(|_| self.machine.role() == Role::Leading);
+        let Some(term) = leading else {
+            self.background.forget = None;
+            return;
+        };
+        if !self.background.snapshot && self.progress.wants_snapshot() {
+            self.background.snapshot = true;
+            let (replica, progress) = (self.replica.clone(), self.progress);
+            let checkpoint = Checkpoint {
+                seq: progress.seq,
+                snapshot: self.held.snapshot(),
+                ..Checkpoint::default()
+            };
+            self.background.tasks.spawn(async move {
+                match replica.write_snapshot(term, &checkpoint).await {
+                    Ok(bytes) => bytes.map(|bytes| Done::Snapshot(progress, bytes)),
+                    Err(error) => {
+                        rarely!(warn, %error, "the snapshot in etcd could not be written; it is tried again");
+                        None
+                    }
+                }
+            });
+        }
+        match self.background.forget {
+            Some((at, revision)) if at <= now => {
+                self.background.forget = Some((now + FORGET, self.view.revision));
+                let client = self.replica.client.clone();
+                self.background.tasks.spawn(async move {
+                    if let Err(error) = client.compact(revision, LIMIT).await {
+                        tracing::debug!(%error, "compaction of etcd");
+                    }
+                    Some(Done::Nothing)
+                });
+            }
+            None => self.background.forget = Some((now + FORGET, self.view.revision)),
+            Some(_) => {}
+        }
+    }
+
+    pub(super) fn done(&mut self, done: Option<Done>) {
+        match done {
+            Some(Done::Snapshot(then, bytes)) => {
+                self.background.snapshot = false;
+                self.progress.snapshot_written(then, bytes);
+            }
+            Some(Done::Nothing) => {}
+            // A snapshot that failed is due again with the next say.
+            None => self.background.snapshot = false,
+        }
+    }
+
+    /// Says in etcd how this computer is.
+    fn say(&mut self) {
+        let value = self.known.own(self.machine.role(), self.progress.seq);
+        let put = Put {
+            key: self.replica.keys.member(&self.settings.name),
+            value,
+        };
+        let client = self.replica.client.clone();
+        self.background.tasks.spawn(async move {
+            let said = async {
+                let lease = client.grant(MemberFacts::AWAY_AFTER, LIMIT).await?;
+                client.put_with_lease(&put, lease, LIMIT).await
+            };
+            if let Err(error) = said.await {
+                tracing::debug!(%error, "saying how this computer is");
+            }
+            Some(Done::Nothing)
+        });
+    }
+}

@@ -1,0 +1,337 @@
+//! What changes when this computer begins to have the master, and when it no longer has it.
+
+use std::time::Instant;
+
+use super::{Conductor, CutOff, Input, Role, cut_off};
+use crate::{
+    app::life,
+    checkpoint::session::{self, Decision, Evidence},
+    cluster::{machine::WhenAlone, way::Way},
+    gate::State,
+    ledger::Change,
+    limit::rarely,
+    master::Master,
+    recovery::master_process::MasterProcess,
+    ros_env::MasterUri,
+};
+
+/// How often the leader's rosrescue is asked within the time to live.
+const PROBES: u32 = 4;
+
+impl Conductor {
+    /// Whether calls pass to a master of this computer, or are answered for it.
+    pub(super) fn has_master(&self) -> bool {
+        self.duty.is_some()
+    }
+
+    /// Whether the ledger holds what the journal does.
+    pub(super) fn follows(&self) -> bool {
+        self.loaded && !self.ours && !self.has_master()
+    }
+
+    /// Brings the ledger to the journal's state, if it follows it.
+    pub(super) fn adopt_held(&mut self) {
+        let ledger = &self.given.post.ledger;
+        if self.follows() && ledger.with_mirror(|mirror| *mirror != self.held) {
+            // Only if this computer has the master by now.
+            let _ = ledger.follow_state(self.held.clone());
+        }
+    }
+
+    pub(super) async fn become_role(&mut self, now: Instant, role: Role) {
+        self.known.set_role(role);
+        match role {
+            Role::Leading => self.lead(now).await,
+            Role::Alone => self.be_alone().await,
+            Role::Joining | Role::Following | Role::CatchingUp => {
+                if self.has_master() {
+                    tracing::warn!("this computer does not lead any more: another one does, or may");
+                }
+                self.give_up_duty().await;
+            }
+        }
+        self.background.say_now();
+    }
+
+    async fn lead(&mut self, _now: Instant) {
+        let term = self.machine.term().unwrap_or_default();
+        let released = self.known_release();
+        if !self.has_master() {
+            let (ledger, fresh) = (&self.given.post.ledger, self.goes_on == Some(false));
+            if fresh {
+                let _ = ledger.follow_state(Master::default());
+            }
+            self.known.taken_over(self.before.take(), released);
+            self.ours = false;
+            let seq = self.machine.committed();
+            self.outgoing.start(seq);
+            self.given.post.ledger.lead(seq, &self.held);
+            self.begin_duty(Some(self.given.rosout));
+        } else {
+            tracing::warn!("this computer leads again: etcd has answered");
+            self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
+            if self.cut_off.is_none() {
+                cut_off::remove(&self.given.post.checkpoint);
+            }
+        }
+        let ledger = &self.given.post.ledger;
+        ledger.update_session(|session| session.term = term);
+        self.set_way(Way::Here { term: Some(term) });
+    }
+
+    async fn be_alone(&mut self) {
+        let serves = self.settings.alone == WhenAlone::Serve;
+        rarely!(
+            error,
+            serves,
+            "ALONE: this computer is cut off from the others or from etcd's majority; with --alone serve its own \
+             nodes are served and what they write is sent to the leader later, else writes wait. Repair the \
+             network, or etcd"
+        );
+        if !serves {
+            self.give_up_duty().await;
+            return self.set_way(Way::Nobody { known: true });
+        }
+        let base = match self.has_master() {
+            true => self.held.clone(),
+            false => self.given.post.ledger.with_mirror(Clone::clone),
+        };
+        match &mut self.cut_off {
+            Some(cut_off) => cut_off.again(),
+            None => self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base.clone()).await),
+        }
+        if self.has_master() {
+            if let Some(cut_off) = &mut self.cut_off {
+                cut_off.add(self.outgoing.changes());
+            }
+        } else {
+            let seq = self.machine.committed();
+            self.outgoing.start(seq);
+            self.given.post.ledger.lead(seq, &base);
+            self.begin_duty(None);
+        }
+        self.set_way(Way::Here { term: None });
+        self.outgoing.all_ready();
+        self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
+    }
+
+    /// `rosout`: see [`Post::begin`](crate::app::duty::Post::begin).
+    fn begin_duty(&mut self, rosout: Option<bool>) {
+        let process = MasterProcess::new(self.given.rosmaster.clone(), None);
+        self.duty = Some(self.given.post.begin(process, rosout));
+    }
+
+    /// Whatever is recorded or answered here from now on is not for the others.
+    pub(super) async fn give_up_duty(&mut self) {
+        let post = &self.given.post;
+        post.ledger.leave();
+        let known = self.loaded || self.given.restored;
+        self.set_way(Way::Nobody { known });
+        if let Some(duty) = self.duty.take() {
+            let ending = duty.end().await;
+            self.endings.spawn(ending);
+        }
+        let post = &self.given.post;
+        post.ledger.end_injection();
+        post.gate_tx.set(match self.machine.role() {
+            Role::Joining => State::Unknown,
+            _ => State::Elsewhere,
+        });
+        self.adopt_held();
+    }
+
+    /// Calls of this computer after record `committed` are in no journal, and were answered up to
+    /// `acknowledged`.
+    pub(super) async fn give_back(&mut self, committed: u64, acknowledged: u64) {
+        let lost: Vec<Change> = self.outgoing.take_all();
+        if self.cut_off.is_none() {
+            let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
+            let answered: Vec<_> = lost.iter().filter(answered).collect();
+            if !answered.is_empty() {
+                let mut cut_off =
+                    CutOff::new(&self.given.post.checkpoint, self.held.clone()).await;
+                cut_off.add(answered);
+                self.cut_off = Some(cut_off);
+            }
+        }
+    }
+
+    /// A change is in the journal.
+    pub(super) fn hold(&mut self, change: Change) {
+        if change.seq() <= self.progress.seq {
+            return;
+        }
+        match change {
+            Change::Call(record) => {
+                if let Ok(new) = self.progress.take(vec![record], 0) {
+                    super::apply(&mut self.held, &new);
+                }
+            }
+            Change::State { seq, state } => {
+                self.held = *state;
+                self.progress.take_state(seq, 0);
+            }
+        }
+    }
+
+    /// The ledger has changed.
+    pub(super) fn take_changes(&mut self) {
+        let changes = self.given.post.ledger.take_changes();
+        let is_alone = self.machine.role() == Role::Alone;
+        if let Some(cut_off) = self.cut_off.as_mut().filter(|_| is_alone) {
+            cut_off.add(&changes);
+        }
+        self.outgoing.add(changes);
+        if is_alone {
+            self.outgoing.all_ready();
+            self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
+        } else {
+            self.prepare();
+        }
+    }
+
+    fn prepare(&mut self) {
+        let Some(term) = self.machine.term().filter(|_| self.has_master()) else {
+            return;
+        };
+        match self.outgoing.prepare(&self.replica.keys) {
+            Ok(Some(parts)) => {
+                let replica = self.replica.clone();
+                self.outgoing.preparing = Some(Box::pin(async move {
+                    match replica.prepare(term, &parts).await {
+                        Ok(leads) => Some(leads),
+                        Err(error) => {
+                            rarely!(warn, %error, "a large write is not in etcd yet, and is tried again");
+                            tokio::time::sleep(super::AGAIN).await;
+                            None
+                        }
+                    }
+                }));
+            }
+            Ok(None) => {}
+            Err(error) => {
+                rarely!(error, %error, "a change cannot be given to the other computers; please report this line");
+            }
+        }
+        self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
+    }
+
+    pub(super) fn prepared(&mut self, leads: Option<bool>) {
+        self.outgoing.preparing = None;
+        if leads == Some(true) {
+            self.outgoing.prepared();
+        }
+        // If another one leads, the keys show it.
+        self.prepare();
+    }
+
+    /// Whether it must be found out first if the session in etcd goes on: nobody was seen leading it.
+    pub(super) fn must_decide(&mut self) -> bool {
+        let needs = self.machine.role() == Role::CatchingUp && !self.seen_leading && !self.ours;
+        if !needs || self.goes_on.is_some() || self.held == Master::default() {
+            return false;
+        }
+        if self.deciding.is_none() {
+            let (restore, state) = (self.given.restore, self.held.clone());
+            let evidence = Evidence {
+                same_boot: self.given.restored,
+                closed: self.known_release(),
+                node_alive: false,
+            };
+            self.deciding = Some(Box::pin(async move {
+                let node_alive = session::depends_on_nodes(restore, evidence)
+                    && life::any_alive(&state, evidence.same_boot).await;
+                let evidence = Evidence {
+                    node_alive,
+                    ..evidence
+                };
+                match session::decide(restore, evidence) {
+                    Decision::Restore(why) => {
+                        tracing::info!(why, "the session in etcd goes on: {}", state.counts());
+                        true
+                    }
+                    Decision::Fresh(why) => {
+                        tracing::info!(why, "a new session begins; the one in etcd is over");
+                        false
+                    }
+                }
+            }));
+        }
+        true
+    }
+
+    /// Whether the leader before this one has given up by itself, as far as is known.
+    fn known_release(&self) -> bool {
+        self.was_released
+    }
+
+    /// What follows from all that has happened.
+    pub(super) fn tend(&mut self) {
+        let now = Instant::now();
+        let role = self.machine.role();
+        let alive = self.view.alive.as_ref();
+        let other = self
+            .view
+            .leader
+            .as_ref()
+            .filter(|leader| leader.id != self.settings.id);
+        let released = alive.is_some_and(|alive| alive.released.is_some());
+        if other.is_some() {
+            self.was_released = released;
+            self.before = self.known.before();
+        }
+        let leader = other.filter(|_| !released);
+        let leader = leader.and_then(|of| Some((MasterUri::parse(&of.uri).ok()?, of.term)));
+        if role == Role::Following {
+            self.set_way(match leader.clone() {
+                Some((uri, term)) => Way::Leader { uri, term },
+                None => Way::Nobody { known: self.loaded },
+            });
+        }
+        self.ask_leader(now, leader.filter(|_| matches!(role, Role::Following | Role::Alone)));
+        let settled = match role {
+            Role::Following => self.wanted.is_none() && self.loaded,
+            Role::Leading => self.has_master(),
+            _ => false,
+        };
+        if settled
+            && self.merging.is_none()
+            && let Some(cut_off) = self.cut_off.take()
+        {
+            let uri = MasterUri::parse(&self.given.post.uri);
+            match uri {
+                Ok(uri) => self.merging = Some(Box::pin(cut_off.send(&self.held, uri))),
+                Err(error) => tracing::error!(%error, "please report this"),
+            }
+        }
+        self.work_beside(now);
+        self.show();
+    }
+
+    /// Asks the leader's rosrescue whether it leads, now and then.
+    fn ask_leader(&mut self, now: Instant, leader: Option<(MasterUri, u64)>) {
+        let Some((uri, term)) = leader else {
+            (self.probe, self.probe_at) = (None, None);
+            return;
+        };
+        let pause = self.settings.ttl / PROBES;
+        let at = *self.probe_at.get_or_insert(now);
+        if self.probe.is_none() && at <= now {
+            self.probe_at = Some(now + pause);
+            let peer = self.peers.at(&uri);
+            self.probe = Some(Box::pin(async move {
+                let leads = tokio::time::timeout(pause, peer.leads(term)).await;
+                leads.unwrap_or(false)
+            }));
+        }
+    }
+
+    /// The writes of a time alone have been sent; so many did not hold.
+    pub(super) fn merged(&mut self, lost: u64) {
+        self.merging = None;
+        self.known.lost_writes += lost;
+        if self.cut_off.is_none() {
+            cut_off::remove(&self.given.post.checkpoint);
+        }
+    }
+}

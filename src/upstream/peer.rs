@@ -1,0 +1,159 @@
+//! Calls to the rosrescue of another computer.
+
+use std::sync::{
+    Arc, Mutex, MutexGuard, PoisonError,
+    atomic::{AtomicBool, Ordering},
+};
+
+use bytes::Bytes;
+use hyper::{StatusCode, header::HeaderValue};
+use thiserror::Error;
+
+use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
+use crate::{
+    master,
+    ros_env::MasterUri,
+    xmlrpc::{self, Call},
+};
+
+/// Most idle connections that are kept.
+const IDLE_MOST: usize = 64;
+/// The path of calls that are for the leader of a term: this, and the term.
+const PATH: &str = "/cluster/";
+/// Its probes find out sooner whether it lives.
+const SILENT_PROBES: u32 = 3;
+
+/// The term, if a request with this path is for the leader of one.
+pub(crate) fn term_of(path: &str) -> Option<u64> {
+    path.strip_prefix(PATH)?.parse().ok()
+}
+
+/// The status of an answer by one that does not lead in the term.
+pub(crate) const NOT_LEADING: StatusCode = StatusCode::MISDIRECTED_REQUEST;
+
+/// Why another computer has not answered.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub(crate) enum PeerError {
+    #[error(transparent)]
+    Connect(#[from] ConnectError),
+    #[error(transparent)]
+    Call(#[from] CallError),
+    #[error("it does not lead in term {term}")]
+    NotLeading { term: u64 },
+}
+
+/// The rosrescue of another computer.
+#[derive(Debug)]
+pub(crate) struct Peer {
+    pub(crate) uri: MasterUri,
+    upstream: Upstream,
+    idle: Mutex<Vec<Connection>>,
+    late: AtomicBool,
+}
+
+impl Peer {
+    fn idle(&self) -> MutexGuard<'_, Vec<Connection>> {
+        self.idle.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether its last answer has not come in time.
+    pub(crate) fn is_late(&self) -> bool {
+        self.late.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn set_late(&self, late: bool) {
+        self.late.store(late, Ordering::Relaxed);
+    }
+
+    /// Sends a call to it as the leader of `term`. It may have been run even if there is no answer.
+    pub(crate) async fn forward(
+        &self,
+        term: u64,
+        head: &Head,
+        body: &Bytes,
+    ) -> Result<RawReply, PeerError> {
+        let head = Head {
+            path: format!("{PATH}{term}"),
+            encoding: head.encoding.clone(),
+        };
+        let idle = {
+            let mut idle = self.idle();
+            idle.retain_mut(|connection| !connection.is_closed());
+            idle.pop()
+        };
+        if let Some(mut connection) = idle
+            && let Ok(reply) = connection.forward(&head, body.clone()).await
+        {
+            return self.answered(term, connection, reply);
+        }
+        let mut connection = self.upstream.connect().await?;
+        let reply = connection.forward(&head, body.clone()).await?;
+        self.answered(term, connection, reply)
+    }
+
+    fn answered(
+        &self,
+        term: u64,
+        connection: Connection,
+        reply: RawReply,
+    ) -> Result<RawReply, PeerError> {
+        self.set_late(false);
+        let usable = reply.leaves_connection_usable();
+        if reply.status == NOT_LEADING {
+            return Err(PeerError::NotLeading { term });
+        }
+        let mut idle = self.idle();
+        if usable && idle.len() < IDLE_MOST {
+            idle.push(connection);
+        }
+        Ok(reply)
+    }
+
+    /// Whether it leads in `term`, as it says itself.
+    pub(crate) async fn leads(&self, term: u64) -> bool {
+        let call = Call::from(master::get_pid());
+        let body = Bytes::from(xmlrpc::encode_call(&call));
+        self.forward(term, &Head::default(), &body).await.is_ok()
+    }
+}
+
+/// Finds the rosrescue of the computer that leads now.
+#[derive(Debug)]
+pub(crate) struct Peers {
+    instance: HeaderValue,
+    probe_timeout: std::time::Duration,
+    present: Mutex<Option<Arc<Peer>>>,
+}
+
+impl Peers {
+    /// `instance` identifies this process, see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
+    pub(crate) fn new(instance: HeaderValue, probe_timeout: std::time::Duration) -> Self {
+        Self {
+            instance,
+            probe_timeout,
+            present: Mutex::default(),
+        }
+    }
+
+    /// The one at `uri`. Connections to another one are dropped.
+    pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
+        let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {
+            return peer.clone();
+        }
+        let peer = Arc::new(Peer {
+            uri: uri.clone(),
+            upstream: Upstream::new(
+                uri.clone(),
+                self.instance.clone(),
+                self.probe_timeout,
+                SILENT_PROBES,
+            ),
+            idle: Mutex::default(),
+            late: AtomicBool::new(false),
+        });
+        *present = Some(peer.clone());
+        peer
+    }
+}
