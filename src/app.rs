@@ -46,7 +46,7 @@ mod notify;
 mod startup;
 
 use self::{
-    cluster::Conductor,
+    cluster::Member,
     duty::Post,
     notify::Source,
     startup::{Beginning, begin, kernel_id},
@@ -73,6 +73,12 @@ pub enum RunError {
          serve another one with --listen"
     )]
     Loop { master: MasterUri },
+    /// Two computers would depose each other for ever.
+    #[error(
+        "another rosrescue has the same name in the cluster, `{name}`, and leads at {uri}: give each computer a \
+         name of its own with --cluster-name"
+    )]
+    Namesake { name: String, uri: String },
     /// Several computers: etcd's options cannot be used.
     #[error(transparent)]
     Cluster(#[from] EtcdError),
@@ -123,9 +129,12 @@ pub async fn run(
     let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
     let port = last.map(|uri| uri.port);
     let rosmaster = supervised.map(|(_, rosmaster)| rosmaster);
-    let among = config.cluster.is_some();
-    let process = rosmaster.clone().filter(|_| !among);
-    let process = process.map(|rosmaster| MasterProcess::new(rosmaster, port));
+    let is_member = config.cluster.is_some();
+    let process = rosmaster.clone().filter(|_| !is_member);
+    let process = process.map(|rosmaster| {
+        let left = rosmaster.left_behind(port);
+        MasterProcess::new(rosmaster, port, left)
+    });
     let left = process.as_ref().is_some_and(MasterProcess::is_left);
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let Beginning {
@@ -201,7 +210,7 @@ pub async fn run(
     };
     let notified = notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
-    let (others, seat) = match (config.cluster.clone(), rosmaster, rosout) {
+    let (others, runs) = match (config.cluster.clone(), rosmaster, rosout) {
         (Some(cluster), Some(rosmaster), Some(rosout)) => {
             let given = cluster::Given {
                 config: cluster,
@@ -210,11 +219,12 @@ pub async fn run(
                 rosout,
                 instance: HeaderValue::from_str(&instance)?,
                 restore: config.restore,
+                hold: config.hold,
                 restored,
                 halt: halt.clone(),
             };
-            let (others, conductor) = cluster::join(given).await?;
-            (Some(others), Seat::Among(Box::new(conductor)))
+            let (others, member) = cluster::join(given).await?;
+            (Some(others), Runs::Member(Box::new(member)))
         }
         _ => {
             let duties = rosout.map(|rosout| post.roscore(rosout, !left, stop.clone()));
@@ -229,7 +239,7 @@ pub async fn run(
                     halt.cancel();
                 }
             });
-            (None, Seat::Alone(Box::new(post.driver(process))))
+            (None, Runs::Single(Box::new(post.driver(process))))
         }
     };
     let clients = Arc::new(Clients::default());
@@ -298,9 +308,9 @@ pub async fn run(
     }
     drop(server);
     // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
-    let (first, seat) = match seat {
-        Seat::Alone(mut driver) => (driver.start(restored), Seat::Alone(driver)),
-        among => (Vec::new(), among),
+    let (first, runs) = match runs {
+        Runs::Single(mut driver) => (driver.start(restored), Runs::Single(driver)),
+        member => (Vec::new(), member),
     };
     let checkpointer = Checkpointer::begin(
         ledger.clone(),
@@ -319,9 +329,11 @@ pub async fn run(
         say("ROS Rescue enabled. Master is now fault tolerant!!");
         std::future::pending().await
     };
-    let mut driver = match seat {
-        Seat::Alone(driver) => tokio::spawn(driver.run(first, halt)),
-        Seat::Among(conductor) => tokio::spawn(conductor.run(stop)),
+    let mut driver = match runs {
+        Runs::Single(driver) => {
+            tokio::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
+        }
+        Runs::Member(member) => tokio::spawn(member.run(stop)),
     };
     let process = tokio::select! {
         process = &mut driver => match process {
@@ -345,11 +357,11 @@ pub async fn run(
 }
 
 /// Who sees to the master.
-enum Seat {
+enum Runs {
     /// This computer.
-    Alone(Box<Driver>),
+    Single(Box<Driver>),
     /// One of several.
-    Among(Box<Conductor>),
+    Member(Box<Member>),
 }
 
 /// Writes the closing checkpoint.

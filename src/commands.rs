@@ -6,6 +6,7 @@ mod completions;
 mod diff;
 mod drill;
 mod files;
+mod handover;
 mod history;
 mod inspect;
 mod install;
@@ -80,6 +81,7 @@ pub fn run(tool: &Tool) -> ExitCode {
                 Tool::Completions(args) => completions::run(args).await,
                 Tool::Diff(args) => diff::run(args).await,
                 Tool::Drill(args) => drill::run(args).await,
+                Tool::Handover(args) => handover::run(args).await,
                 Tool::History(args) => history::run(args).await,
                 Tool::Inspect(args) => inspect::run(args).await,
                 Tool::Install(args) => install::run(args).await,

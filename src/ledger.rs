@@ -300,7 +300,10 @@ impl Ledger {
         state: Master,
     ) -> Result<Vec<String>, Superseded> {
         let mut inner = self.lock();
-        if inner.injecting || inner.is_elsewhere() || (inner.session.incarnation, inner.version) != (incarnation, version) {
+        if inner.injecting
+            || inner.is_elsewhere()
+            || (inner.session.incarnation, inner.version) != (incarnation, version)
+        {
             return Err(Superseded);
         }
         let difference = inner.adopt(state);

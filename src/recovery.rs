@@ -112,6 +112,12 @@ impl Driver {
         }
     }
 
+    /// As [`Self::start`], after another computer has had the master. `cause`: why this one has it now.
+    pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
+        self.outage.cause = cause;
+        self.start(true)
+    }
+
     /// Lets the mirror stand in, if it may, and returns what is to be done first. `restored`: the mirror is
     /// from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {

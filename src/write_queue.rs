@@ -12,6 +12,7 @@ mod round_trip;
 
 use std::{sync::Arc, time::Duration};
 
+use bytes::Bytes;
 use tokio::{
     sync::{Notify, mpsc, oneshot, watch},
     time::Instant,
@@ -24,7 +25,7 @@ use crate::{
     ledger::Ledger,
     master::Request,
     status::stats::Stats,
-    upstream::Upstream,
+    upstream::{Head, Upstream},
     xmlrpc::{self, Reply},
 };
 
@@ -60,10 +61,26 @@ impl WriteQueue {
         self.call_own(call, Some(condition)).await
     }
 
+    /// Makes a call of a client that has its answer already. None if there is no answer.
+    pub(crate) async fn call_of_client(&self, call: Request) -> Option<Reply> {
+        let body = xmlrpc::encode_call(&call.clone().into());
+        self.answer_to(Some((Head::default(), body.into())), call, None)
+            .await
+    }
+
     async fn call_own(&self, call: Request, condition: Option<Condition>) -> Option<Reply> {
+        self.answer_to(None, call, condition).await
+    }
+
+    async fn answer_to(
+        &self,
+        raw: Option<(Head, Bytes)>,
+        call: Request,
+        condition: Option<Condition>,
+    ) -> Option<Reply> {
         let (answer, answered) = oneshot::channel();
         let item = Item {
-            raw: None,
+            raw,
             call: Some(Arc::new(call)),
             answer,
             condition,

@@ -1,4 +1,4 @@
-//! Several computers: the shell around [`Machine`], which decides who leads.
+//! This computer as one of several: the shell around [`Machine`], which decides who leads.
 //!
 //! One task holds what the journal in etcd says, and brings the ledger there while another computer leads. While
 //! this one has the master, it gives the ledger's changes to the journal.
@@ -6,7 +6,11 @@
 mod background;
 mod cut_off;
 mod facts;
+mod handover;
+mod join;
+mod merging;
 mod outgoing;
+mod reading;
 mod turns;
 
 use std::{
@@ -16,80 +20,58 @@ use std::{
     time::{Duration, Instant},
 };
 
-use hyper::header::HeaderValue;
 use tokio::{
     sync::{mpsc, watch},
     task::JoinSet,
 };
 use tokio_util::sync::CancellationToken;
 
+pub(super) use self::join::{Given, join};
 use self::{
     background::{Background, Trouble},
     cut_off::CutOff,
     facts::Known,
     outgoing::Outgoing,
 };
-use super::duty::{Duty, Post};
+use super::{RunError, duty::Duty};
 use crate::{
-    checkpoint::{
-        format::{Entry, Record},
-        session::Restore,
-    },
+    checkpoint::format::{Entry, Record},
     cluster::{
-        etcd::{Access, Change, Etcd, EtcdError, Options, Tls, Watch, WatchEnd},
-        journal::{self, Keys, Manifest, Progress},
-        machine::{
-            ANSWER_LIMIT, Action, Answer, Commit, Input, Leader, Machine, Op, Role, Settings, View,
-            WhenAlone,
-        },
+        etcd::{Change, Watch, WatchEnd},
+        journal::Progress,
+        machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
         replica::{Loaded, Replica, ReplicaError},
         way::Way,
     },
-    config::{ClusterConfig, ClusterSync, WhenCutOff},
     limit::rarely,
     master::{Master, Request},
-    process::{ProcessError, Rosmaster},
+    process::ProcessError,
     recovery::master_process::MasterProcess,
-    server::others::{Handover, Others},
+    server::others::Handover,
     upstream::peer::Peers,
     wait,
 };
 
 /// Pause before etcd is asked again for what it did not give.
 const AGAIN: Duration = Duration::from_millis(200);
-/// How long a leader may take to give up leading.
-const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
-/// The same when it stops.
-const STOP_LIMIT: Duration = Duration::from_secs(2);
-
-/// What a computer among several is given.
-pub(super) struct Given {
-    pub(super) config: ClusterConfig,
-    pub(super) post: Post,
-    pub(super) rosmaster: Rosmaster,
-    pub(super) rosout: bool,
-    /// Identifies this process.
-    pub(super) instance: HeaderValue,
-    pub(super) restore: Restore,
-    /// Whether the mirror is from a checkpoint whose session continues.
-    pub(super) restored: bool,
-    /// Cancelled when calls are no longer taken.
-    pub(super) halt: CancellationToken,
-}
 
 type Loading = Pin<Box<dyn Future<Output = Result<Loaded, ReplicaError>> + Send>>;
 type Flag = Pin<Box<dyn Future<Output = bool> + Send>>;
 type Merging = Pin<Box<dyn Future<Output = u64> + Send>>;
 
 /// See the [module](self).
-pub(super) struct Conductor {
+pub(super) struct Member {
     given: Given,
     settings: Settings,
     machine: Machine,
     replica: Replica,
     way: watch::Sender<Way>,
+    /// Who leads, also while calls wait.
+    leads: watch::Sender<Way>,
     peers: Arc<Peers>,
     handovers: mpsc::Receiver<Handover>,
+    /// When the machine is started, even if etcd's state has not been read.
+    start_by: Option<Instant>,
     /// Inputs that are to be taken next.
     inbox: VecDeque<Input>,
     /// Requests of the machine.
@@ -102,6 +84,8 @@ pub(super) struct Conductor {
     loaded: bool,
     /// The machine waits for the journal up to here.
     wanted: Option<u64>,
+    /// How far the machine knows that it has been read.
+    reported: u64,
     /// The journal's state, and how far it has been read.
     held: Master,
     progress: Progress,
@@ -118,6 +102,10 @@ pub(super) struct Conductor {
     before: Option<(String, Instant)>,
     /// It has given up leading by itself.
     was_released: bool,
+    /// This process has led.
+    led: bool,
+    /// Where another computer of this name is.
+    namesake: Option<String>,
     /// Another computer was seen leading, so the session goes on.
     seen_leading: bool,
     /// Whether the session in etcd goes on, while that is found out.
@@ -129,108 +117,23 @@ pub(super) struct Conductor {
     /// Who waits for this computer to give up leading, and until when.
     released: Option<Handover>,
     release_by: Option<Instant>,
+    /// rosrescue stops, and rosout first.
+    ending_roscore: Option<Pin<Box<dyn Future<Output = ()> + Send>>>,
     trouble: Arc<Trouble>,
     known: Known,
     background: Background,
 }
 
-/// Where the other computers are asked, and the task to run.
-pub(super) async fn join(given: Given) -> Result<(Others, Conductor), EtcdError> {
-    let config = &given.config;
-    let client = Etcd::new(&Options {
-        endpoints: config.endpoints.clone(),
-        access: Access {
-            tls: Tls {
-                ca: config.ca.clone(),
-                cert: config.cert.clone(),
-                key: config.key.clone(),
-            },
-            user: config.user.clone(),
-        },
-    })?;
-    let settings = Settings {
-        name: config.name.clone(),
-        id: super::startup::kernel_id("/proc/sys/kernel/random/uuid"),
-        uri: config.advertised.to_string(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        ttl: config.ttl,
-        commit: match config.sync {
-            ClusterSync::Always => Commit::Always,
-            ClusterSync::Interval => Commit::Interval,
-        },
-        alone: match config.alone {
-            WhenCutOff::Serve => WhenAlone::Serve,
-            WhenCutOff::Refuse => WhenAlone::Refuse,
-        },
-    };
-    let post = &given.post;
-    post.ledger.leave();
-    // One that an earlier process left may hold what others have changed since.
-    given.rosmaster.left_behind(None);
-    let known = given.restored;
-    let (way, way_rx) = watch::channel(Way::Nobody { known });
-    let (handovers_tx, handovers) = mpsc::channel(1);
-    let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
-    let others = Others {
-        way: way_rx,
-        peers: peers.clone(),
-        handovers: handovers_tx,
-    };
-    let cut_off = CutOff::left(&post.checkpoint, given.restored).await;
-    let conductor = Conductor {
-        machine: Machine::new(settings.clone()),
-        replica: Replica {
-            client,
-            keys: Keys::new(&config.robot),
-            limit: ANSWER_LIMIT,
-        },
-        known: Known::new(&settings),
-        trouble: Arc::default(),
-        background: Background::default(),
-        settings,
-        given,
-        way,
-        peers,
-        handovers,
-        inbox: VecDeque::from([Input::Start(0)]),
-        requests: JoinSet::new(),
-        view: View::default(),
-        watch: None,
-        loading: None,
-        load_at: Some(Instant::now()),
-        loaded: false,
-        wanted: None,
-        held: Master::default(),
-        progress: Progress::default(),
-        outgoing: Outgoing::default(),
-        duty: None,
-        endings: JoinSet::new(),
-        cut_off,
-        merging: None,
-        ours: true,
-        before: None,
-        was_released: false,
-        seen_leading: false,
-        deciding: None,
-        goes_on: None,
-        probe: None,
-        probe_at: None,
-        released: None,
-        release_by: None,
-    };
-    Ok((others, conductor))
-}
-
-impl Conductor {
+impl Member {
     /// Takes part until `stop`.
     ///
     /// # Errors
     ///
-    /// If no master can be started.
+    /// If no master can be started, or another computer has the same name.
     pub(super) async fn run(
         mut self: Box<Self>,
         stop: CancellationToken,
-    ) -> Result<Option<MasterProcess>, ProcessError> {
+    ) -> Result<Option<MasterProcess>, RunError> {
         loop {
             while let Some(input) = self.inbox.pop_front() {
                 self.take(input).await;
@@ -240,7 +143,14 @@ impl Conductor {
             if !self.inbox.is_empty() {
                 continue;
             }
-            if let Some(result) = self.next(&stop).await {
+            let end = match self.namesake.take() {
+                Some(uri) => Some(Some(RunError::Namesake {
+                    name: self.settings.name.clone(),
+                    uri,
+                })),
+                None => self.next(&stop).await,
+            };
+            if let Some(result) = end {
                 self.give_up_duty().await;
                 self.given.halt.cancel();
                 while self.endings.join_next().await.is_some() {}
@@ -259,18 +169,18 @@ impl Conductor {
             if !matches!(action, Action::Send { .. } | Action::Acknowledge(_)) {
                 tracing::debug!(?action, "cluster");
             }
-            self.carry_out(now, action).await;
+            self.carry_out(action).await;
         }
         for change in self.outgoing.committed(self.machine.committed()) {
             self.hold(change);
         }
     }
 
-    async fn carry_out(&mut self, now: Instant, action: Action) {
+    async fn carry_out(&mut self, action: Action) {
         match action {
             Action::Send { number, op } => self.send(number, op),
             Action::CatchUp(seq) => self.wanted = Some(seq),
-            Action::Become(role) => self.become_role(now, role).await,
+            Action::Become(role) => self.become_role(role).await,
             Action::Acknowledge(seq) => self.given.post.ledger.agree(seq),
             Action::Yield {
                 committed,
@@ -299,8 +209,18 @@ impl Conductor {
         };
         let (replica, settings) = (self.replica.clone(), self.settings.clone());
         let trouble = self.trouble.clone();
+        let parts = match (&entry, self.machine.term()) {
+            (Some(_), Some(term)) => Some((term, self.outgoing.missing_parts(&replica.keys))),
+            _ => None,
+        };
         self.requests.spawn(async move {
-            let answer = match replica.run(&settings, &op, entry.as_ref()).await {
+            let run = async {
+                if let Some((term, parts)) = parts.filter(|(_, parts)| !parts.is_empty()) {
+                    replica.prepare(term, &parts).await?;
+                }
+                replica.run(&settings, &op, entry.as_ref()).await
+            };
+            let answer = match run.await {
                 Ok(answer) => {
                     trouble.clear();
                     answer
@@ -314,45 +234,25 @@ impl Conductor {
         });
     }
 
-    /// Has the journal read if it is not known as far as it must be.
-    fn catch_up(&mut self) {
-        if let Some(wanted) = self.wanted
-            && self.loaded
-            && self.progress.seq >= wanted
-            && !self.must_decide()
-        {
-            self.wanted = None;
-            self.inbox.push_back(Input::Followed(self.progress.seq));
-        }
-        if self.wanted.is_some() && self.progress.seq < self.wanted.unwrap_or(0) {
-            self.load_at.get_or_insert_with(Instant::now);
-        }
-        let due = self.load_at.is_some_and(|at| at <= Instant::now());
-        if due && self.loading.is_none() {
-            self.load_at = None;
-            let (replica, known) = (self.replica.clone(), self.progress);
-            self.loading = Some(Box::pin(async move { replica.load(known).await }));
-        }
-    }
-
     /// The next event; an end if there is one.
-    async fn next(&mut self, stop: &CancellationToken) -> Option<Option<ProcessError>> {
+    async fn next(&mut self, stop: &CancellationToken) -> Option<Option<RunError>> {
         let stopping = self.release_by.is_some() && self.released.is_none();
         let wake = [
             self.machine.deadline(),
             self.load_at.filter(|_| self.loading.is_none()),
             self.probe_at.filter(|_| self.probe.is_none()),
             self.release_by,
+            self.start_by,
             self.background.due(),
         ];
         let wake = wake.into_iter().flatten().min().map(Into::into);
         tokio::select! {
             biased;
             () = stop.cancelled(), if !stopping => return self.begin_stop(),
-            error = failed(&mut self.duty) => return Some(Some(error)),
+            error = failed(&mut self.duty) => return Some(Some(error.into())),
             Some(done) = self.requests.join_next() => match done {
                 Ok(input) => self.inbox.push_back(input),
-                Err(error) => tracing::error!(%error, "please report this"),
+                Err(error) => tracing::error!(%error, "a request to etcd was not finished; please report this line"),
             },
             () = self.given.post.ledger.shared.notified() => self.take_changes(),
             done = wait::for_some(self.outgoing.preparing.as_mut()) => self.prepared(done),
@@ -373,6 +273,13 @@ impl Conductor {
             lost = wait::for_some(self.merging.as_mut()) => self.merged(lost),
             Some(done) = self.background.tasks.join_next() => self.done(done.ok().flatten()),
             Some(_) = self.endings.join_next() => {}
+            () = wait::for_some(self.ending_roscore.as_mut()) => {
+                self.ending_roscore = None;
+                if self.machine.role() != Role::Leading {
+                    return Some(None);
+                }
+                self.begin_release(String::new());
+            }
             () = wait::until(wake) => {
                 if self.release_by.is_some_and(|by| by <= Instant::now()) {
                     self.release_by = None;
@@ -384,6 +291,9 @@ impl Conductor {
                         None => {}
                     }
                 }
+                if self.start_by.is_some_and(|by| by <= Instant::now()) {
+                    self.start();
+                }
                 self.inbox.push_back(Input::Wake);
             }
         }
@@ -391,44 +301,15 @@ impl Conductor {
         stopped.then_some(None)
     }
 
-    /// Whether nobody waits for this computer to give up leading.
-    fn duty_is_free(&self) -> bool {
-        self.machine.role() != Role::Leading && self.inbox.is_empty()
-    }
-
-    fn begin_stop(&mut self) -> Option<Option<ProcessError>> {
-        if self.machine.role() != Role::Leading {
-            return Some(None);
-        }
-        self.release_by = Some(Instant::now() + STOP_LIMIT);
-        self.begin_release(String::new());
-        None
-    }
-
-    fn hand_over(&mut self, handover: Handover) {
-        let (to, tell) = handover;
-        let refused = match self.machine.role() {
-            Role::Leading if self.released.is_some() => Some("it is being done already".to_owned()),
-            Role::Leading => self.known.successor(&to).err(),
-            _ => Some("this computer does not lead".to_owned()),
-        };
-        if let Some(why) = refused {
-            let _ = tell.send(Err(why));
-            return;
-        }
-        tracing::info!(to, "giving up leading, as asked");
-        self.begin_release(to.clone());
-        self.release_by = Some(Instant::now() + HANDOVER_LIMIT);
-        self.released = Some((to, tell));
-    }
-
-    /// Calls that write wait from now on for whoever leads next.
-    fn begin_release(&mut self, to: String) {
-        self.set_way(Way::Nobody { known: true });
-        self.inbox.push_back(Input::HandOver(to));
-    }
-
+    /// Says who leads. Calls of nodes wait as long as what was answered before them, alone, is on its way.
     fn set_way(&self, way: Way) {
+        let leads = matches!(way, Way::Leader { .. } | Way::Here { term: Some(_) });
+        let owes = self.cut_off.is_some() || self.merging.is_some();
+        self.leads.send_replace(way.clone());
+        let way = match leads && owes {
+            true => Way::Nobody { known: true },
+            false => way,
+        };
         self.way.send_if_modified(|now| {
             let changes = *now != way;
             if changes {
@@ -437,118 +318,6 @@ impl Conductor {
             }
             changes
         });
-    }
-
-    /// The journal has changed.
-    fn changed(&mut self, changes: Result<Vec<Change>, WatchEnd>) {
-        let changes = match changes {
-            Ok(changes) => changes,
-            Err(end) => {
-                if let WatchEnd::Failed(error) = end {
-                    self.trouble.set(&error.into());
-                }
-                self.watch = None;
-                self.load_at = Some(Instant::now() + AGAIN);
-                return;
-            }
-        };
-        self.trouble.clear();
-        let keys = self.replica.keys.clone();
-        for change in &changes {
-            if let Err(error) = change.absorb(&mut self.view, &keys) {
-                self.trouble.set(&error.into());
-            }
-            self.known.member(&keys, &change.key, change.kv.as_ref());
-        }
-        self.look_at_view();
-        for change in changes {
-            let Some(kv) = change.kv.filter(|kv| keys.seq_of(&kv.key).is_some()) else {
-                continue;
-            };
-            if keys.seq_of(&kv.key).is_some_and(|seq| seq <= self.progress.seq) {
-                continue;
-            }
-            // What is large is read apart, and so is what does not follow.
-            let records = match Manifest::read(&kv.value) {
-                Some(_) => None,
-                None => journal::records(&kv.key, &kv.value).ok(),
-            };
-            let new = records.and_then(|of| self.progress.take(of, kv.value.len()).ok());
-            match new {
-                Some(new) => self.follow(&new),
-                None => {
-                    self.load_at.get_or_insert_with(Instant::now);
-                    break;
-                }
-            }
-        }
-    }
-
-    fn look_at_view(&mut self) {
-        let leader = self.view.leader.as_ref();
-        let other = leader.filter(|leader| leader.id != self.settings.id);
-        self.seen_leading |= self.known.look(&self.view) && other.is_some();
-        let term = self.given.post.ledger.session().term;
-        // An earlier process of this computer has led, and nobody since.
-        let before = |leader: &Leader| leader.name == self.settings.name && leader.term == term;
-        if self.ours && self.loaded && other.is_some_and(|leader| !before(leader)) {
-            self.ours = false;
-            self.adopt_held();
-        }
-        self.inbox.push_back(Input::View(self.view.clone()));
-    }
-
-    /// New records of the journal.
-    fn follow(&mut self, records: &[Record]) {
-        apply(&mut self.held, records);
-        if self.follows() {
-            // Only if this computer has the master by now.
-            let _ = self.given.post.ledger.follow(records);
-        }
-        if !self.has_master() {
-            self.inbox.push_back(Input::Followed(self.progress.seq));
-        }
-    }
-
-    fn have_loaded(&mut self, loaded: Result<Loaded, ReplicaError>) {
-        let loaded = match loaded {
-            Ok(loaded) => loaded,
-            Err(error) => {
-                self.trouble.set(&error);
-                self.load_at = Some(Instant::now() + AGAIN);
-                return;
-            }
-        };
-        self.trouble.clear();
-        if self.watch.is_none() {
-            let range = self.replica.keys.small();
-            let client = &self.replica.client;
-            self.watch = Some(client.watch(range, loaded.view.revision, self.settings.ttl));
-        }
-        if loaded.view.revision >= self.view.revision {
-            self.view = loaded.view;
-        }
-        self.loaded = true;
-        if let Some(checkpoint) = loaded.checkpoint
-            && loaded.progress.seq >= self.progress.seq
-        {
-            match Master::from_snapshot(checkpoint.snapshot) {
-                Ok(state) => self.held = state,
-                Err(error) => {
-                    tracing::error!(%error, "the state in etcd is no state of a master; please report this");
-                    return;
-                }
-            }
-            apply(&mut self.held, &loaded.records);
-            self.progress = loaded.progress;
-            self.adopt_held();
-        } else if let Ok(new) = self.progress.take(loaded.records, 0) {
-            self.follow(&new);
-        }
-        self.look_at_view();
-        if !self.has_master() {
-            self.inbox.push_back(Input::Followed(self.progress.seq));
-        }
     }
 }
 

@@ -90,15 +90,23 @@ impl Post {
     }
 
     /// Begins the duty of one computer among several, with a master of its own that is given the mirror's
-    /// state. `rosout`: whether it runs rosout, too; none for nothing of what roscore does.
-    pub(super) fn begin(&self, process: MasterProcess, rosout: Option<bool>) -> Duty {
+    /// state. `rosout`: whether it runs rosout, too; none for nothing of what roscore does. `cause`: why it
+    /// begins.
+    pub(super) fn begin(
+        &self,
+        process: MasterProcess,
+        rosout: Option<bool>,
+        cause: &'static str,
+    ) -> Duty {
         let stop = CancellationToken::new();
-        let roscore = rosout.map(|rosout| self.roscore(rosout, true, stop.clone()));
+        let roscore_stop = stop.child_token();
+        let roscore = rosout.map(|rosout| self.roscore(rosout, true, roscore_stop.clone()));
         let mut driver = self.driver(Some(process));
-        let first = driver.start(true);
+        let first = driver.take_over(cause);
         Duty {
             driver: tokio::spawn(driver.run(first, stop.clone())),
             roscore,
+            roscore_stop,
             stop,
         }
     }
@@ -108,6 +116,7 @@ impl Post {
 pub(super) struct Duty {
     driver: JoinHandle<Result<Option<MasterProcess>, ProcessError>>,
     roscore: Option<JoinHandle<()>>,
+    roscore_stop: CancellationToken,
     stop: CancellationToken,
 }
 
@@ -119,6 +128,18 @@ impl Duty {
             // It ends only by `stop` otherwise.
             Ok(Ok(_)) => std::future::pending().await,
             Err(panic) => resume(panic),
+        }
+    }
+
+    /// Ends what roscore does besides, while calls still pass to the master: rosout unregisters itself there.
+    pub(super) fn end_roscore(&mut self) -> impl Future<Output = ()> + Send + 'static {
+        self.roscore_stop.cancel();
+        let roscore = self.roscore.take();
+        async move {
+            if let Some(roscore) = roscore {
+                // A panic there must not prevent the rest.
+                let _ = roscore.await;
+            }
         }
     }
 

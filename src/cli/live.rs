@@ -4,7 +4,7 @@ use std::{fmt, str::FromStr};
 
 use clap::{Args, builder::FalseyValueParser};
 
-use super::{OutputArgs, TargetArgs};
+use super::{OutputArgs, TargetArgs, cluster::name};
 
 /// Options of `rosrescue top`.
 #[derive(Args, Clone, Debug)]
@@ -20,6 +20,29 @@ pub struct TopArgs {
     #[arg(long, env = "ROSRESCUE_JSON")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub json: bool,
+}
+
+/// Options of `rosrescue handover`.
+#[derive(Args, Clone, Debug)]
+pub struct HandoverArgs {
+    /// Which one; any of the robot's computers will do.
+    #[command(flatten)]
+    pub target: TargetArgs,
+    /// The computer that should lead [default: any that follows]
+    #[arg(long, env = "ROSRESCUE_HANDOVER_TO", value_name = "NAME", value_parser = name)]
+    pub to: Option<String>,
+    /// How long to wait until another computer leads, in seconds
+    #[arg(
+        long,
+        env = "ROSRESCUE_HANDOVER_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "30"
+    )]
+    #[arg(value_parser = seconds)]
+    pub timeout: f64,
+    /// In which form.
+    #[command(flatten)]
+    pub output: OutputArgs,
 }
 
 /// Options of `rosrescue wait`.

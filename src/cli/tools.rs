@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 use super::{
-    DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
+    DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, RestoreArgs, TopArgs, VerifyArgs,
+    WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
 use crate::hide::{self, Hide};
@@ -21,6 +22,8 @@ pub enum Tool {
     Diff(DiffArgs),
     /// Kill the master on purpose while watching calls, topics and nodes, and give a verdict
     Drill(DrillArgs),
+    /// With --cluster: let another computer lead, and wait until it does
+    Handover(HandoverArgs),
     /// List the checkpoints that are kept: of the last sessions, and of rescues
     History(HistoryArgs),
     /// Say what a checkpoint holds, also beside a running rosrescue

@@ -5,6 +5,7 @@
 
 mod connection;
 mod error;
+mod tls;
 mod watch;
 mod wire;
 
@@ -23,8 +24,9 @@ use tokio::task::JoinSet;
 
 use self::connection::Endpoint;
 pub use self::{
-    connection::{Access, Tls},
+    connection::Access,
     error::EtcdError,
+    tls::Tls,
     watch::{Change, Watch, WatchEnd},
     wire::Kv,
 };
@@ -82,7 +84,7 @@ impl Etcd {
     /// If an endpoint is no URL, or certificates cannot be read.
     pub fn new(options: &Options) -> Result<Self, EtcdError> {
         let access = Arc::new(options.access.clone());
-        let tls = access.tls_config()?;
+        let tls = access.tls.settings()?;
         let endpoints = options.endpoints.iter();
         let endpoints = endpoints.map(|url| Endpoint::new(url, &access, tls.as_ref()));
         let endpoints: Vec<_> = endpoints.collect::<Result<_, _>>()?;

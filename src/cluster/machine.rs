@@ -25,8 +25,9 @@ const BEATS: u32 = 4;
 /// The part of the time to live by which a leader stops before another one may begin: a tenth each for a
 /// clock that is slow and one that is fast.
 const MARGIN: u32 = 5;
-/// How long after the time to live a next leader is waited for. A claim takes three delays of the network.
-const PATIENCE: Duration = Duration::from_millis(300);
+/// How long after the time to live a next leader is waited for. A claim takes three delays of the network, but
+/// etcd may have to choose a leader of its own first: that takes up to 2.6 s from the death of the last one.
+const PATIENCE: Duration = Duration::from_millis(1500);
 /// How long an acknowledged write may be uncommitted with [`Commit::Interval`].
 const COMMIT_INTERVAL: Duration = Duration::from_millis(200);
 

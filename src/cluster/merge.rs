@@ -1,8 +1,9 @@
 //! What of the writes that a computer has answered while it was alone still holds: all but those about
 //! something that was changed meanwhile, where the others are. What was changed is seen by comparing the
-//! state at which the computer was cut off with the present one.
+//! state at which the computer was cut off with the present one. A parameter that has a value which was written
+//! alone, too, was not changed by others: that write had reached them before.
 
-use std::fmt;
+use std::{collections::HashMap, fmt};
 
 use crate::{
     master::{Master, Method, Request, names},
@@ -25,7 +26,7 @@ pub struct Lost {
 }
 
 /// What was changed meanwhile by others.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conflict {
     Parameter(String),
     /// Another node has this name.
@@ -72,9 +73,28 @@ impl fmt::Display for Conflict {
 /// where the others are.
 pub fn merge(base: &Master, now: &Master, pending: &[Request]) -> Merged {
     let mut merged = Merged::default();
+    // The first write of each parameter: it may have been on its way when this computer was cut off.
+    let mut written: HashMap<String, Value> = HashMap::new();
+    for call in pending.iter().flat_map(Request::calls) {
+        if let (Method::SetParam, Some(caller), [_, key, value, ..]) =
+            (call.method(), call.caller(), call.params())
+            && let Some(key) = key.as_str()
+        {
+            let key = names::resolve(key, caller);
+            written.entry(key).or_insert_with(|| value.clone());
+        }
+    }
+    let has_arrived = |why: &Conflict| {
+        let Conflict::Parameter(key) = why else {
+            return false;
+        };
+        let path: Vec<&str> = names::parts(key).collect();
+        let present = value_at(now.params(), &path);
+        written.get(key).is_some_and(|value| Some(value) == present)
+    };
     for call in pending.iter().flat_map(Request::calls) {
         let call = call.clone();
-        match conflict(base, now, &call) {
+        match conflict(base, now, &call).filter(|why| !has_arrived(why)) {
             Some(why) => merged.lost.push(Lost { call, why }),
             None => merged.send.push(call),
         }
@@ -134,6 +154,15 @@ fn service(base: &Master, now: &Master, name: &str, api: &str) -> Option<Conflic
         name: name.to_owned(),
         node: provider.node.clone(),
     })
+}
+
+fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
+    let (first, rest) = path.split_first()?;
+    match (tree.get(*first)?, rest) {
+        (value, []) => Some(value),
+        (Value::Struct(below), rest) => value_at(below, rest),
+        _ => None,
+    }
 }
 
 /// Whether anything at or below `path` differs, or a namespace above it has become a value.

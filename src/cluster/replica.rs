@@ -38,6 +38,8 @@ pub struct Loaded {
     /// The state that the records go on from; none if they go on from what was known.
     pub checkpoint: Option<Checkpoint>,
     pub records: Vec<Record>,
+    /// What the computers say of themselves.
+    pub members: Vec<Kv>,
     pub progress: Progress,
 }
 
@@ -77,8 +79,12 @@ impl Replica {
             view: found.view(&self.keys)?,
             checkpoint: None,
             records: Vec::new(),
+            members: Vec::new(),
             progress: known,
         };
+        let members = self.keys.member("");
+        let said = found.kvs.iter().filter(|kv| kv.key.starts_with(&members));
+        loaded.members = said.cloned().collect();
         let snapshot = self.keys.snapshot();
         let snapshot = found.kvs.iter().find(|kv| kv.key == snapshot);
         let manifest = snapshot.map(|kv| self.manifest(kv)).transpose()?;

@@ -16,7 +16,6 @@ use tokio::{net::TcpStream, time::timeout};
 use super::Failure;
 use crate::{
     cli::TargetArgs,
-    master::Method,
     resolver,
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
     status::summary::{SCHEMA, Status},
@@ -24,7 +23,7 @@ use crate::{
 };
 
 /// How long it may take to answer. It answers in milliseconds, and waits for nobody.
-const ANSWER_LIMIT: Duration = Duration::from_secs(5);
+pub(super) const ANSWER_LIMIT: Duration = Duration::from_secs(5);
 /// Largest page that is read, in bytes.
 const MAX_PAGE: usize = 64 << 20;
 
@@ -56,7 +55,8 @@ impl Running {
         let request = Request::get(path)
             .header(HOST, self.address.authority())
             .header(ACCEPT, "text/plain, application/json");
-        self.exchange(request.body(Full::default())).await
+        self.exchange(request.body(Full::default()), ANSWER_LIMIT)
+            .await
     }
 
     /// How it is.
@@ -86,13 +86,20 @@ impl Running {
         })
     }
 
-    /// Its answer to a call of the Master API.
-    pub(super) async fn call(&self, method: Method, params: Vec<Value>) -> Result<Reply, Failure> {
-        let body = xmlrpc::encode_call(&Call::new(method.name(), params));
+    /// Its answer to a call, within `limit`.
+    pub(super) async fn call(
+        &self,
+        method: &str,
+        params: Vec<Value>,
+        limit: Duration,
+    ) -> Result<Reply, Failure> {
+        let body = xmlrpc::encode_call(&Call::new(method, params));
         let request = Request::post("/RPC2")
             .header(CONTENT_TYPE, "text/xml")
             .header(HOST, self.address.authority());
-        let answer = self.exchange(request.body(Full::new(body.into()))).await?;
+        let answer = self
+            .exchange(request.body(Full::new(body.into())), limit)
+            .await?;
         xmlrpc::decode_reply(&answer.1)
             .map_err(|error| self.nobody(format!("it gives no answer to calls: {error}")))
     }
@@ -107,11 +114,12 @@ impl Running {
     async fn exchange(
         &self,
         request: hyper::http::Result<Request<Full<Bytes>>>,
+        limit: Duration,
     ) -> Result<(StatusCode, Bytes), Failure> {
-        match timeout(ANSWER_LIMIT, self.try_exchange(request)).await {
+        match timeout(limit, self.try_exchange(request)).await {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(error)) => Err(self.nobody(error.to_string())),
-            Err(_) => Err(self.nobody(format!("no answer in {} s", ANSWER_LIMIT.as_secs()))),
+            Err(_) => Err(self.nobody(format!("no answer in {} s", limit.as_secs()))),
         }
     }
 

@@ -5,7 +5,10 @@ use std::{fmt, time::Duration};
 use serde::Serialize;
 use tokio::time::{Instant, sleep_until};
 
-use super::{Exit, Failure, print, running::Running};
+use super::{
+    Exit, Failure, print,
+    running::{ANSWER_LIMIT, Running},
+};
 use crate::{
     cli::{For, WaitArgs},
     master::Method,
@@ -112,7 +115,9 @@ async fn is_so(running: &Running, wanted: &For, status: &Status) -> bool {
         For::Protected => status.condition.is_protected(),
         For::Node(name) => {
             let params = ["/rosrescue_wait", name].map(Value::from);
-            let reply = running.call(Method::LookupNode, params.into()).await;
+            let reply = running
+                .call(Method::LookupNode.name(), params.into(), ANSWER_LIMIT)
+                .await;
             matches!(reply, Ok(Reply::Value(Value::Array(answer))) if answer.first() == Some(&Value::Int(1)))
         }
     }

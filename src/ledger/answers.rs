@@ -47,11 +47,7 @@ impl Ledger {
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
     /// Nodes are notified as by a master. Returns where the last record is, too: the earlier write that made
     /// this one redundant may be as new as that.
-    pub fn answer_if_unchanged(
-        &self,
-        now: Instant,
-        write: &Request,
-    ) -> Option<(Reply, Mark)> {
+    pub fn answer_if_unchanged(&self, now: Instant, write: &Request) -> Option<(Reply, Mark)> {
         let mut inner = self.lock();
         // An unregistration may concern a registration that is still on its way to the master.
         let idle = !inner.doubted

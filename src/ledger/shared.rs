@@ -85,6 +85,8 @@ impl Ledger {
             inner.share_state();
         }
         drop(inner);
+        // They have these. A write that changes nothing waits for the last of them only.
+        self.agree(seq);
         self.shared.notify_one();
     }
 
@@ -191,5 +193,179 @@ impl Inner {
             let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
             changes.push(Change::State { seq, state });
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+    use crate::{
+        checkpoint::format::Session,
+        cli::SyncPolicy,
+        ledger::durability::Mark,
+        master::Method,
+        xmlrpc::{Reply, Value},
+    };
+
+    fn ledger() -> Ledger {
+        let (mirror, session) = (Master::default(), Session::default());
+        let stats = Box::leak(Box::default());
+        Ledger::new(
+            mirror,
+            session,
+            Vec::new(),
+            None,
+            SyncPolicy::Interval,
+            stats,
+        )
+    }
+
+    fn set(value: i32) -> Request {
+        let params = [Value::from("/n"), "/a".into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    fn record(seq: u64, call: Request) -> Record {
+        let entry = Entry::call(call.into());
+        Record { seq, entry }
+    }
+
+    fn state_of(calls: impl IntoIterator<Item = Request>) -> Master {
+        let mut state = Master::default();
+        for call in calls {
+            state.apply(&call);
+        }
+        state
+    }
+
+    /// Answers `call` in place of a master; gives what must be safe before the answer counts.
+    fn answer(ledger: &Ledger, call: &Request) -> Mark {
+        ledger.stand_in(Instant::now(), call).unwrap().1
+    }
+
+    fn seqs(ledger: &Ledger) -> Vec<u64> {
+        let changes = ledger.take_changes();
+        changes.iter().map(Change::seq).collect()
+    }
+
+    /// Whether a call with this mark is acknowledged, or that it waits.
+    async fn acknowledged(ledger: &Ledger, mark: Mark) -> Option<bool> {
+        let Some(mark) = ledger.to_await(mark) else {
+            return Some(true);
+        };
+        tokio::select! {
+            biased;
+            safe = ledger.durable(mark) => Some(safe),
+            () = tokio::task::yield_now() => None,
+        }
+    }
+
+    #[tokio::test]
+    async fn without_other_computers_nothing_is_collected_and_no_answer_waits_for_them() {
+        let ledger = ledger();
+        let mark = answer(&ledger, &set(1));
+        assert_eq!(acknowledged(&ledger, mark).await, Some(true));
+        assert!(seqs(&ledger).is_empty());
+        assert!(ledger.follow(&[record(1, set(2))]).is_err());
+        assert!(ledger.follow_state(Master::default()).is_err());
+    }
+
+    #[test]
+    fn while_another_computer_has_the_master_its_records_are_followed_and_nothing_else_is_taken() {
+        let ledger = ledger();
+        ledger.leave();
+        assert!(ledger.stand_in(Instant::now(), &set(1)).is_none());
+        let reply = Reply::Value(vec![Value::from(1), "".into(), 0.into()].into());
+        let recorded = ledger.record(Instant::now(), 0, &[(&set(1), &reply)]);
+        assert!(recorded.is_err());
+        let before = ledger.version();
+        assert!(ledger.adopt_if(0, before, state_of([set(1)])).is_err());
+        ledger
+            .follow(&[record(1, set(2)), record(2, set(3))])
+            .unwrap();
+        assert!(ledger.with_mirror(|mirror| *mirror == state_of([set(3)])));
+        assert_ne!(ledger.version(), before);
+        ledger.follow_state(state_of([set(4)])).unwrap();
+        assert!(ledger.with_mirror(|mirror| *mirror == state_of([set(4)])));
+        assert!(seqs(&ledger).is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_leaders_records_have_the_next_numbers_and_are_acknowledged_when_the_others_have_them()
+     {
+        let ledger = ledger();
+        ledger.leave();
+        ledger.lead(7, &Master::default());
+        let marks = [set(1), set(2)].map(|call| answer(&ledger, &call));
+        assert_eq!(seqs(&ledger), [8, 9]);
+        assert!(seqs(&ledger).is_empty());
+        assert_eq!(acknowledged(&ledger, marks[0]).await, None);
+        ledger.agree(8);
+        assert_eq!(acknowledged(&ledger, marks[0]).await, Some(true));
+        assert_eq!(acknowledged(&ledger, marks[1]).await, None);
+        ledger.agree(9);
+        // Late news takes nothing back.
+        ledger.agree(8);
+        assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
+    }
+
+    #[tokio::test]
+    async fn a_first_write_that_changes_nothing_waits_for_nobody() {
+        let ledger = ledger();
+        ledger.leave();
+        ledger.follow(&[record(7, set(1))]).unwrap();
+        ledger.lead(7, &state_of([set(1)]));
+        let mark = answer(&ledger, &set(1));
+        assert_eq!(acknowledged(&ledger, mark).await, Some(true));
+        assert!(seqs(&ledger).is_empty());
+    }
+
+    #[tokio::test]
+    async fn what_the_others_lack_when_another_computer_leads_is_not_acknowledged() {
+        let ledger = ledger();
+        ledger.leave();
+        ledger.lead(0, &Master::default());
+        let marks = [set(1), set(2)].map(|call| answer(&ledger, &call));
+        ledger.agree(1);
+        ledger.leave();
+        assert!(seqs(&ledger).is_empty());
+        assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
+        // Nor when this one leads again, and the numbers are used for other calls.
+        ledger.follow_state(state_of([set(1)])).unwrap();
+        ledger.lead(1, &state_of([set(1)]));
+        let again = answer(&ledger, &set(3));
+        ledger.agree(2);
+        assert_eq!(acknowledged(&ledger, again).await, Some(true));
+        assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
+    }
+
+    #[tokio::test]
+    async fn a_state_that_the_others_lack_is_given_to_them_as_a_whole() {
+        let ledger = ledger();
+        answer(&ledger, &set(1));
+        ledger.leave();
+        ledger.lead(7, &Master::default());
+        let mark = answer(&ledger, &set(2));
+        ledger.adopt(state_of([set(3)]));
+        let changes = ledger.take_changes();
+        let [
+            Change::State {
+                seq: 8,
+                state: first,
+            },
+            Change::Call(Record { seq: 9, .. }),
+            Change::State {
+                seq: 10,
+                state: last,
+            },
+        ] = changes.as_slice()
+        else {
+            panic!("{changes:?}");
+        };
+        assert!(**first == state_of([set(1)]) && **last == state_of([set(3)]));
+        ledger.agree(8);
+        assert_eq!(acknowledged(&ledger, mark).await, None);
     }
 }

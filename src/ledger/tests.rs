@@ -203,7 +203,7 @@ fn what_changes_nothing_leaves_no_trace() {
     ledger.stand_in(now, &watch);
     let (version, pending_before) = (ledger.version(), pending(&ledger));
     // There is no journal that it could have a place in.
-    let expected = Some((answered(&watch, &mut Master::default()), None));
+    let expected = Some((answered(&watch, &mut Master::default()), Mark::default()));
     assert_eq!(ledger.answer_if_unchanged(now, &watch), expected);
     assert_eq!(ledger.stand_in(now, &watch), expected);
     assert_eq!(
@@ -331,6 +331,22 @@ fn a_look_counts_if_nothing_came_between() {
 }
 
 /// What is in no journal is waited for only while there is a file to write it to.
+#[tokio::test]
+async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
+    let ledger = ledger();
+    let publish = publish("/t");
+    ledger.leave();
+    let mut held = Master::default();
+    held.apply(&publish);
+    ledger.follow_state(held.clone()).unwrap();
+    ledger.lead(7, &held);
+    // A node sends it again: the computer that led before has recorded it, and died before the answer.
+    let (_, mark) = ledger.stand_in(Instant::now(), &publish).unwrap();
+    let safe = ledger.durable(ledger.to_await(mark).unwrap());
+    let safe = tokio::time::timeout(std::time::Duration::from_secs(5), safe).await;
+    assert_eq!(safe, Ok(true), "it waits for a record that nobody makes");
+}
+
 #[tokio::test]
 async fn what_was_adopted_is_waited_for_until_a_checkpoint_was_attempted() {
     let folder = tempfile::tempdir().unwrap();

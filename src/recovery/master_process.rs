@@ -38,9 +38,9 @@ pub(crate) struct MasterProcess {
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`. The last one was at `port`, and may still run.
-    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>) -> Self {
-        let left = rosmaster.left_behind(port);
+    /// Starts masters with `rosmaster`. The last one was at `port`, and still runs as process `left`, if that is
+    /// given.
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<u32>) -> Self {
         let this = Self {
             rosmaster,
             port,

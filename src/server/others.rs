@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     cluster::{journal::RECORD_BYTES_MAX, way::Way},
-    master::{Kind, Method, Request},
+    master::{Kind, Method, Request, names},
     upstream::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
@@ -36,6 +36,8 @@ pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
+    /// How long a call waits for a leader.
+    pub(crate) hold: Duration,
 }
 
 /// A call on its way.
@@ -87,8 +89,14 @@ impl Others {
         way: &mut watch::Receiver<Way>,
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
-        let mut hold = std::pin::pin!(tokio::time::sleep(call.calls.hold));
+        let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
+        let deletes = call.deletes();
+        let mut sent = false;
         loop {
+            // The leader that ran it died before it could answer; the next one would refuse it.
+            if sent && deletes.is_some() && call.deletes().is_none() {
+                return Ok(deleted(deletes.as_deref().unwrap_or_default()));
+            }
             let now = way.borrow_and_update().clone();
             if let Some(term) = asked_term
                 && now != (Way::Here { term: Some(term) })
@@ -104,13 +112,27 @@ impl Others {
                         calls, head, body, ..
                     } = call;
                     let (head, body, request) = (head.clone(), body.clone(), call.call.clone());
-                    match calls.answer_here(from, head, body, request).await {
+                    let mut leads = self.way.clone();
+                    let answered = tokio::select! {
+                        biased;
+                        // What is answered alone holds only if nobody else changes it: the computer that has
+                        // asked need not be cut off, and may be about to lead itself.
+                        _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
+                        answered = calls.answer_here(from, head, body, request) => answered,
+                    };
+                    match answered {
                         Err(Unanswered::Elsewhere) => None,
                         answered => return Ok(answered?),
                     }
                 }
                 Way::Leader { uri, term } => {
                     let leader = self.peers.at(&uri);
+                    if call.hands_over().is_some() {
+                        // Once: the next leader would give up, too.
+                        let silent = || handed_over(Err("the leader does not answer".to_owned()));
+                        return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
+                    }
+                    sent = true;
                     tokio::select! {
                         answered = call.forward(&leader, term) => match answered {
                             Some(reply) => return Ok(reply),
@@ -121,7 +143,7 @@ impl Others {
                     }
                 }
                 Way::Nobody { known } => {
-                    if known && let Some(reply) = call.from_mirror().await {
+                    if known && let Some(reply) = call.by_mirror().await {
                         return Ok(reply);
                     }
                     None
@@ -148,14 +170,21 @@ impl Others {
         let (tell, told) = oneshot::channel();
         // It ends only when rosrescue stops.
         let _ = self.handovers.send((to.to_owned(), tell)).await;
-        let (code, text, who) = match told.await {
-            Ok(Ok(who)) => (1, "another computer may lead now".to_owned(), who),
-            Ok(Err(why)) => (0, why, String::new()),
-            Err(_) => (0, "rosrescue stops".to_owned(), String::new()),
-        };
-        let reply: [Value; 3] = [code.into(), text.as_str().into(), who.as_str().into()];
-        xml(&Reply::Value(reply.to_vec().into()))
+        handed_over(
+            told.await
+                .unwrap_or_else(|_| Err("rosrescue stops".to_owned())),
+        )
     }
+}
+
+/// The answer to a handover: who has led, or why it still does.
+fn handed_over(result: Result<String, String>) -> HttpReply {
+    let (code, text, who) = match result {
+        Ok(who) => (1, "another computer may lead now".to_owned(), who),
+        Err(why) => (0, why, String::new()),
+    };
+    let reply: [Value; 3] = [code.into(), text.as_str().into(), who.as_str().into()];
+    xml(&Reply::Value(reply.to_vec().into()))
 }
 
 impl Call<'_> {
@@ -184,7 +213,7 @@ impl Call<'_> {
             };
         }
         if leader.is_late()
-            && let Some(reply) = self.from_mirror().await
+            && let Some(reply) = self.by_mirror().await
         {
             return Some(reply);
         }
@@ -198,7 +227,7 @@ impl Call<'_> {
                 Ok(reply) => reply.ok()?,
                 Err(_) => {
                     leader.set_late(true);
-                    if let Some(reply) = self.from_mirror().await {
+                    if let Some(reply) = self.by_mirror().await {
                         return Some(reply);
                     }
                     asked.await.ok()?
@@ -208,16 +237,38 @@ impl Call<'_> {
             Ok(raw) => Some(forwarded(&calls.uri, call.as_ref(), raw)),
             Err(error) => {
                 tracing::debug!(%error, "a read from the leader");
-                self.from_mirror().await
+                self.by_mirror().await
             }
         }
     }
 
+    /// The parameter that is deleted, if it is one that the mirror has.
+    fn deletes(&self) -> Option<String> {
+        let call = self.call.as_ref()?;
+        let (caller, key) = (call.caller()?, call.text(1)?);
+        if *call.method() != Method::DeleteParam {
+            return None;
+        }
+        let has = Request::new(Method::HasParam, [caller, key]);
+        let Some(Reply::Value(Value::Array(answer))) = self.calls.ledger.answer(&has) else {
+            return None;
+        };
+        let there = answer.get(2) == Some(&Value::Bool(true));
+        there.then(|| names::resolve(key, caller))
+    }
+
     /// The mirror's answer to a read; none to any other call.
-    async fn from_mirror(&self) -> Option<HttpReply> {
+    async fn by_mirror(&self) -> Option<HttpReply> {
         let read = self.call.as_ref().filter(|_| self.kind == Kind::Read);
         self.calls.stand_in(read).await
     }
+}
+
+/// A master's answer to the deletion of `key`.
+fn deleted(key: &str) -> HttpReply {
+    let text = format!("parameter {key} deleted");
+    let reply: [Value; 3] = [1.into(), text.as_str().into(), 0.into()];
+    xml(&Reply::Value(reply.to_vec().into()))
 }
 
 fn not_leading(term: u64) -> HttpReply {
@@ -236,3 +287,6 @@ fn too_large(bytes: usize) -> HttpReply {
         ),
     })
 }
+
+#[cfg(test)]
+mod tests;

@@ -9,7 +9,7 @@
 //! | `/events` | what changes, as it happens |
 //! | `/metrics` | counters in Prometheus' text format |
 //! | `/live` | 200 while rosrescue runs |
-//! | `/ready` | 200 while calls are answered, by the master or by the mirror, else 503 |
+//! | `/ready` | 200 while calls are answered, by the master, the mirror or another computer, else 503 |
 
 mod events;
 mod graph;
@@ -160,7 +160,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         }
         "/ready" => text(
             StatusCode::SERVICE_UNAVAILABLE,
-            "no master was ever seen: calls wait for one\n".to_owned(),
+            "no master was ever seen, here or on another computer: calls wait for one\n".to_owned(),
         ),
         _ => text(
             StatusCode::NOT_FOUND,

@@ -91,6 +91,9 @@ impl From<&ClusterFacts> for Computers {
             .map(|of| Computer::new(of, facts))
             .collect();
         computers.sort_by(|a, b| a.name.cmp(&b.name));
+        // The first leader took over from nobody.
+        let last = facts.last_takeover.as_ref();
+        let last = last.filter(|takeover| takeover.from.is_some());
         Self {
             name: facts.name.clone(),
             role: facts.role,
@@ -106,7 +109,7 @@ impl From<&ClusterFacts> for Computers {
             }),
             computers,
             takeovers: facts.takeovers,
-            last_takeover: facts.last_takeover.as_ref().map(Taken::from),
+            last_takeover: last.map(Taken::from),
             lost_writes: facts.lost_writes,
         }
     }
@@ -189,12 +192,12 @@ impl Computers {
             let head = if number == 0 { "computers" } else { "" };
             write!(f, "{head:<12}{}", computer.name)?;
             match (computer.name == self.name, computer.heard) {
-                (true, _) => writeln!(f, " (this one) {}", computer.doing())?,
+                (true, _) => writeln!(f, " (this one) {}", computer.doing(self.leads()))?,
                 (false, None) => writeln!(f, " is AWAY, and was not heard of since the start")?,
                 (false, Some(heard)) if computer.away => {
                     writeln!(f, " is AWAY, last heard of {}", ago(heard))?;
                 }
-                (false, Some(_)) => writeln!(f, " {}", computer.doing())?,
+                (false, Some(_)) => writeln!(f, " {}", computer.doing(self.leads()))?,
             }
         }
         if let Some(Trouble { since, why }) = &self.etcd_trouble {
@@ -218,9 +221,13 @@ impl Computers {
             let order = if *in_order { ", in order" } else { "" };
             writeln!(
                 f,
-                "takeover    {}{}{order}: in {seconds:.2} s; {} by this computer so far",
+                "takeover    {}{}{order}: in {}; {} by this computer so far",
                 ago(*at),
                 from.unwrap_or_default(),
+                match *seconds < 1.0 {
+                    true => format!("{:.0} ms", seconds * 1e3),
+                    false => format!("{seconds:.2} s"),
+                },
                 self.takeovers
             )?;
         }
@@ -238,19 +245,23 @@ impl Computers {
     pub(crate) fn line(&self) -> String {
         let each = self.computers.iter().map(|computer| match computer.away {
             true => format!("{} is AWAY", computer.name),
-            false => format!("{} {}", computer.name, computer.doing()),
+            false => format!("{} {}", computer.name, computer.doing(self.leads())),
         });
         each.collect::<Vec<_>>().join("; ")
     }
 }
 
 impl Computer {
-    fn doing(&self) -> String {
+    /// A computer that is cut off may have heard last that another one leads.
+    fn doing(&self, leader: Option<&Leader>) -> String {
         let doing = match self.role {
             Role::Joining => "joins",
             Role::Following => "follows",
             Role::CatchingUp => "takes over",
-            Role::Leading => return "leads".to_owned(),
+            Role::Leading => {
+                let leads = leader.is_some_and(|leader| leader.name == self.name);
+                return if leads { "leads" } else { "led" }.to_owned();
+            }
             Role::Alone => "is ALONE",
         };
         match self.behind {

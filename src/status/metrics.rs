@@ -4,7 +4,8 @@
 
 use std::fmt::{Display, Write};
 
-use super::{condition::Name, stats::Stats, summary::Status};
+use super::{computers::Computers, condition::Name, stats::Stats, summary::Status};
+use crate::cluster::machine::Role;
 
 /// What `/metrics` answers.
 pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
@@ -44,19 +45,52 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
             add(&mut text, name, help, value);
         }
     }
-    head(
-        &mut text,
-        "condition",
-        "1 for what is so, as in /status.json",
-        "gauge",
-    );
-    for name in Name::ALL {
-        let value = u8::from(status.condition.name == name);
-        let name = name.as_str();
-        // Writing to a string does not fail.
-        let _ = writeln!(text, "rosrescue_condition{{name=\"{name}\"}} {value}");
+    let names = Name::ALL.map(|name| (name.as_str(), status.condition.name == name));
+    let help = "1 for what is so, as in /status.json";
+    add_one_of(&mut text, "condition", help, "name", &names);
+    if let Some(cluster) = &status.cluster {
+        add_cluster(&mut text, cluster);
     }
     text
+}
+
+fn add_cluster(text: &mut String, of: &Computers) {
+    let away = of.computers.iter().filter(|computer| computer.away).count();
+    let term = of.leader.as_ref().map_or(0, |leader| leader.term);
+    let last = of.last_takeover.as_ref();
+    #[rustfmt::skip]
+    let values: [(&str, &str, Option<f64>); 10] = [
+        ("cluster_leader", "whether any computer leads, as far as this one knows", Some(u8::from(of.leads().is_some()).into())),
+        ("cluster_term", "grows with each leader", Some(term as f64)),
+        ("cluster_behind_records", "records of the journal that this computer's mirror lacks", Some(of.behind as f64)),
+        ("cluster_uncommitted_records", "writes made here that etcd does not have yet", Some(of.uncommitted as f64)),
+        ("cluster_etcd_up", "whether etcd answers", Some(u8::from(of.etcd_trouble.is_none()).into())),
+        ("cluster_computers", "computers that have ever taken part, this one included", Some(of.computers.len() as f64)),
+        ("cluster_computers_away", "those of them that are not heard of", Some(away as f64)),
+        ("cluster_takeovers_total", "times that this computer has taken over", Some(of.takeovers as f64)),
+        ("cluster_last_takeover_seconds", "from the last sign of the previous leader to the first answered write here, the last time", last.map(|last| last.seconds)),
+        ("cluster_lost_writes_total", "changes made alone that did not hold, because others had changed the same", Some(of.lost_writes as f64)),
+    ];
+    for (name, help, value) in values {
+        if let Some(value) = value {
+            add(text, name, help, value);
+        }
+    }
+    let roles = [
+        Role::Joining,
+        Role::Following,
+        Role::CatchingUp,
+        Role::Leading,
+        Role::Alone,
+    ];
+    let roles = roles.map(|role| (role_name(role), of.role == role));
+    add_one_of(
+        text,
+        "cluster_role",
+        "1 for what this computer does",
+        "role",
+        &roles,
+    );
 }
 
 fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
@@ -68,9 +102,66 @@ fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
     let _ = writeln!(text, "rosrescue_{name} {value}");
 }
 
+/// As in JSON.
+fn role_name(role: Role) -> &'static str {
+    match role {
+        Role::Joining => "joining",
+        Role::Following => "following",
+        Role::CatchingUp => "catching_up",
+        Role::Leading => "leading",
+        Role::Alone => "alone",
+    }
+}
+
+/// 1 for the one of `names` that is so.
+fn add_one_of(text: &mut String, name: &str, help: &str, label: &str, names: &[(&str, bool)]) {
+    head(text, name, help, "gauge");
+    for (is, so) in names {
+        let value = u8::from(*so);
+        // Writing to a string does not fail.
+        let _ = writeln!(text, "rosrescue_{name}{{{label}=\"{is}\"}} {value}");
+    }
+}
+
 fn head(text: &mut String, name: &str, help: &str, kind: &str) {
     let _ = write!(
         text,
         "# HELP rosrescue_{name} {help}\n# TYPE rosrescue_{name} {kind}\n"
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::cluster::ClusterFacts;
+
+    #[test]
+    fn a_cluster_has_its_own() {
+        let mut facts = ClusterFacts::of_three();
+        let of = |facts: &ClusterFacts| {
+            let mut text = String::new();
+            add_cluster(&mut text, &Computers::from(facts));
+            text
+        };
+        let text = of(&facts);
+        for line in [
+            "# TYPE rosrescue_cluster_takeovers_total counter",
+            "rosrescue_cluster_leader 1",
+            "rosrescue_cluster_term 7",
+            "rosrescue_cluster_behind_records 2",
+            "rosrescue_cluster_etcd_up 1",
+            "rosrescue_cluster_computers 3",
+            "rosrescue_cluster_computers_away 1",
+            "rosrescue_cluster_role{role=\"following\"} 1",
+            "rosrescue_cluster_role{role=\"leading\"} 0",
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line}\n{text}");
+        }
+        assert!(!text.contains("last_takeover"), "there was none");
+        facts.leaderless = Some(facts.since);
+        facts.etcd = Some((facts.since, String::new()));
+        let text = of(&facts);
+        assert!(text.contains("rosrescue_cluster_leader 0\n"), "{text}");
+        assert!(text.contains("rosrescue_cluster_etcd_up 0\n"), "{text}");
+    }
 }

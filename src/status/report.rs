@@ -9,6 +9,10 @@ use crate::{clock, master::Counts};
 
 /// The cause of a report when rosrescue itself was started.
 pub(crate) const STARTED: &str = "rosrescue was started";
+/// The cause of the first one after another computer has led.
+pub(crate) const TAKEN_OVER: &str = "this computer took over";
+/// The cause of the first one of a computer that was cut off from the leader.
+pub(crate) const CUT_OFF: &str = "this computer was cut off from the others";
 
 /// How the present master got its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -10,11 +10,7 @@ use hyper::{StatusCode, header::HeaderValue};
 use thiserror::Error;
 
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
-use crate::{
-    master,
-    ros_env::MasterUri,
-    xmlrpc::{self, Call},
-};
+use crate::{master, ros_env::MasterUri, xmlrpc};
 
 /// Most idle connections that are kept.
 const IDLE_MOST: usize = 64;
@@ -112,7 +108,7 @@ impl Peer {
 
     /// Whether it leads in `term`, as it says itself.
     pub(crate) async fn leads(&self, term: u64) -> bool {
-        let call = Call::from(master::get_pid());
+        let call = master::get_pid();
         let body = Bytes::from(xmlrpc::encode_call(&call));
         self.forward(term, &Head::default(), &body).await.is_ok()
     }

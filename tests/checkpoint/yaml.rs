@@ -51,6 +51,7 @@ fn with_params(params: Struct) -> Checkpoint {
             started: "2024-01-31 12:00:00".to_owned(),
             incarnation: 3,
             delivered: 4_999_999_999,
+            term: 1_800_000,
         },
         snapshot: Snapshot {
             nodes: IndexMap::from([

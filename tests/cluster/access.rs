@@ -184,6 +184,11 @@ async fn certificates_are_checked_on_both_sides() {
             "{error}"
         );
     }
+    // One that has expired is replaced while rosrescue runs.
+    let renewed = client(access("ca", Some("expired")));
+    assert!(renewed.view(&keys(), limit).await.is_err());
+    certificate(&folder, "expired", "ca", 9);
+    renewed.view(&keys(), LIMIT).await.unwrap();
     for_servers_alone(access("ca", Some("client")), &folder).await;
     let options = |access: Access, url: &str| Options {
         endpoints: vec![url.to_owned()],

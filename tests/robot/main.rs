@@ -94,6 +94,7 @@ mod cli {
 mod page {
     mod answers;
     mod browser;
+    mod computers;
 }
 
 /// The commands that do not serve.
@@ -101,6 +102,7 @@ mod commands {
     mod check;
     mod checkpoints;
     mod drill;
+    mod handover;
     mod history;
     mod params;
     mod restore;

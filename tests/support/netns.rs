@@ -16,7 +16,7 @@ pub(crate) struct Netns {
 
 /// Runs `ip`; panics with what it says.
 #[track_caller]
-fn ip(words: &str) {
+pub(crate) fn ip(words: &str) {
     let output = Command::new("ip").args(words.split(' ')).output();
     let output = output.expect("`ip`: tests/run.sh installs iproute2");
     assert!(

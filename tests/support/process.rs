@@ -203,7 +203,7 @@ impl Process {
             line.text
                 .split(' ')
                 .next()
-                .map(|word| ["got", "sent"].contains(&word))
+                .map(|word| ["got", "pause", "sent"].contains(&word))
         };
         for (number, line) in lines.iter().enumerate() {
             let around = [number.wrapping_sub(1), number, number + 1];

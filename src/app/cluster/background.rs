@@ -1,13 +1,13 @@
 //! What is done beside: saying how this computer is, snapshots, and having etcd forget.
 
 use std::{
-    sync::{Mutex, PoisonError},
+    sync::{Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
 use tokio::task::JoinSet;
 
-use super::{Conductor, Role};
+use super::{Member, Role};
 use crate::{
     checkpoint::format::Checkpoint,
     cluster::{
@@ -23,33 +23,63 @@ const FORGET: Duration = Duration::from_secs(300);
 /// How long etcd may take for what nobody waits for.
 const LIMIT: Duration = Duration::from_secs(5);
 
-/// Why etcd does not give what is asked.
-#[derive(Debug, Default)]
-pub(super) struct Trouble(Mutex<Option<(Instant, String)>>);
+/// Why etcd does not give what is asked, and when it has given anything last.
+#[derive(Debug)]
+pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
+
+impl Default for Trouble {
+    fn default() -> Self {
+        Self(Mutex::new((None, Instant::now())))
+    }
+}
 
 impl Trouble {
+    fn lock(&self) -> MutexGuard<'_, (Option<(Instant, String)>, Instant)> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     pub(super) fn set(&self, error: &ReplicaError) {
-        let mut trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let text = error.to_string();
-        match &mut *trouble {
+        self.say(error.to_string());
+    }
+
+    fn say(&self, text: String) {
+        let (trouble, _) = &mut *self.lock();
+        match trouble {
             Some((_, said)) => *said = text,
             None => {
-                rarely!(warn, error = text, "etcd does not give what is asked; it is asked again");
+                rarely!(
+                    warn,
+                    error = text,
+                    "etcd does not give what is asked; it is asked again"
+                );
                 *trouble = Some((Instant::now(), text));
             }
         }
     }
 
+    /// Whether etcd has given nothing for longer than `limit`. Says so: a request may go on for longer.
+    pub(super) fn is_silent(&self, limit: Duration) -> bool {
+        let (known, heard) = self.lock().clone();
+        let silent = heard.elapsed();
+        if silent > limit && known.is_none() {
+            self.say(format!(
+                "it has not answered for {:.1} s",
+                silent.as_secs_f64()
+            ));
+        }
+        silent > limit
+    }
+
     pub(super) fn clear(&self) {
-        let mut trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (trouble, heard) = &mut *self.lock();
+        *heard = Instant::now();
         if let Some((since, _)) = trouble.take() {
             rarely!(info, after = ?since.elapsed(), "etcd answers again");
         }
     }
 
     pub(super) fn get(&self) -> Option<(Instant, String)> {
-        let trouble = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        trouble.clone()
+        self.lock().0.clone()
     }
 }
 
@@ -84,7 +114,7 @@ impl Background {
     }
 }
 
-impl Conductor {
+impl Member {
     /// Begins what is due.
     pub(super) fn work_beside(&mut self, now: Instant) {
         if self.background.say_at.is_none_or(|at| at <= now) {

@@ -1,12 +1,7 @@
 //! Writes that were answered while this computer was alone: kept beside the checkpoint until they have been
 //! sent to whoever leads.
 
-use std::{
-    path::{Path, PathBuf},
-    time::Duration,
-};
-
-use hyper::header::HeaderValue;
+use std::path::{Path, PathBuf};
 
 use crate::{
     checkpoint::{
@@ -14,18 +9,10 @@ use crate::{
         session,
         store::Store,
     },
-    cluster::merge,
     ledger::Change,
     limit::rarely,
-    master::{Master, Request, is_success},
-    ros_env::MasterUri,
-    upstream::Upstream,
+    master::{Master, Request},
 };
-
-/// Pause before a write that was not answered is sent again.
-const AGAIN: Duration = Duration::from_millis(200);
-/// Longest time for a connection.
-const PROBE_TIMEOUT: Duration = Duration::from_secs(1);
 
 pub(super) struct CutOff {
     /// The state when this computer was cut off.
@@ -150,7 +137,11 @@ impl CutOff {
     }
 
     fn append(&mut self, calls: Vec<Request>) {
-        let entries: Vec<_> = calls.iter().cloned().map(|call| Entry::call(call.into())).collect();
+        let entries: Vec<_> = calls
+            .iter()
+            .cloned()
+            .map(|call| Entry::call(call.into()))
+            .collect();
         if let Some(store) = self.store.as_mut().filter(|_| !entries.is_empty())
             && let Err(error) = store.append(&entries)
         {
@@ -163,59 +154,6 @@ impl CutOff {
     pub(super) fn resumed(mut self) -> Option<Self> {
         self.calls.truncate(self.earlier);
         Some(self).filter(|left| !left.calls.is_empty())
-    }
-
-    /// Sends what still holds to `uri`, which is our own, in order. `now`: the state that the others have.
-    /// Returns how many did not hold. Until [`remove`] the file stays.
-    pub(super) fn send(
-        self,
-        now: &Master,
-        uri: MasterUri,
-    ) -> impl Future<Output = u64> + Send + 'static {
-        let merged = merge::merge(&self.base, now, &self.calls);
-        async move {
-            let lost = merged.lost.len() as u64;
-            for merge::Lost { call, why } in merged.lost {
-                tracing::warn!(
-                    method = call.method().name(),
-                    node = call.caller().unwrap_or_default(),
-                    %why,
-                    "a write that was answered while this computer was alone does not hold"
-                );
-            }
-            let sent = merged.send.len();
-            let upstream = Upstream::new(
-                uri,
-                HeaderValue::from_static("writes-of-a-time-alone"),
-                PROBE_TIMEOUT,
-                1,
-            );
-            let mut connection = None;
-            for call in merged.send {
-                let wire = call.clone().into();
-                let reply = loop {
-                    if connection.is_none() {
-                        connection = upstream.connect().await.ok();
-                    }
-                    if let Some(open) = &mut connection
-                        && let Ok(reply) = open.call(&wire).await
-                    {
-                        break reply;
-                    }
-                    connection = None;
-                    tokio::time::sleep(AGAIN).await;
-                };
-                if !is_success(&reply) {
-                    tracing::warn!(
-                        method = call.method().name(),
-                        node = call.caller().unwrap_or_default(),
-                        "a write that was answered while this computer was alone is refused by the leader"
-                    );
-                }
-            }
-            tracing::info!(sent, lost, "the writes of a time alone were sent to the leader");
-            lost
-        }
     }
 }
 
@@ -240,7 +178,100 @@ fn say_unkept(error: &dyn std::fmt::Display) {
     rarely!(
         error,
         %error,
-        "writes that are answered alone cannot be kept on the disk: a crash of rosrescue itself would lose \
-         them; free or repair the disk"
+        "writes that are answered alone cannot be kept on the disk; a crash of rosrescue itself would lose \
+         them. Free or repair the disk"
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{checkpoint::format::Record, master::Method, xmlrpc::Value};
+
+    fn set(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    fn change(seq: u64, call: Request) -> Change {
+        let entry = Entry::call(call.into());
+        Change::Call(Record { seq, entry })
+    }
+
+    fn base() -> Master {
+        let mut base = Master::default();
+        base.apply(&set("/before", 1));
+        base
+    }
+
+    /// The files in the folder of `checkpoint`.
+    fn files(checkpoint: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(checkpoint.parent().unwrap()).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.filter(|name| !name.ends_with(".lock")).collect();
+        names.sort();
+        names
+    }
+
+    #[tokio::test]
+    async fn what_was_answered_alone_is_read_back_by_the_next_process_and_by_the_one_after_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let calls = [set("/a", 1), set("/b", 2)];
+        let mut cut_off = CutOff::new(&checkpoint, base()).await;
+        cut_off.add(&[change(5, calls[0].clone())]);
+        // It was read from a master.
+        let state = Box::new(Master::default());
+        cut_off.add(&[Change::State { seq: 6, state }, change(7, calls[1].clone())]);
+        drop(cut_off);
+        for _ in 0..2 {
+            let left = CutOff::left(&checkpoint, true).await.unwrap();
+            assert!(left.base == base());
+            assert_eq!(left.calls, calls);
+        }
+        remove(&checkpoint);
+        assert_eq!(files(&checkpoint), [""; 0]);
+        assert!(CutOff::left(&checkpoint, true).await.is_none());
+    }
+
+    #[tokio::test]
+    async fn of_a_session_that_is_over_the_writes_are_kept_under_another_name_and_not_sent() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut cut_off = CutOff::new(&checkpoint, base()).await;
+        cut_off.add(&[change(5, set("/a", 1))]);
+        drop(cut_off);
+        assert!(CutOff::left(&checkpoint, false).await.is_none());
+        let kept = files(&checkpoint);
+        assert!(!kept.is_empty() && !kept.contains(&"chkpt.yaml.alone".to_owned()));
+        let text = std::fs::read_to_string(folder.path().join(&kept[0])).unwrap();
+        assert!(
+            text.contains("/before") || text.contains("before"),
+            "{text}"
+        );
+        assert!(CutOff::left(&checkpoint, true).await.is_none());
+    }
+
+    #[tokio::test]
+    async fn a_time_alone_that_was_none_leaves_the_writes_of_the_one_before() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let mut cut_off = CutOff::new(&checkpoint, base()).await;
+        cut_off.add(&[change(5, set("/a", 1))]);
+        cut_off.again();
+        cut_off.add(&[change(6, set("/b", 2))]);
+        // etcd has the second after all.
+        let left = cut_off.resumed().unwrap();
+        assert_eq!(left.calls, [set("/a", 1)]);
+        let only = CutOff::new(&folder.path().join("other.yaml"), base()).await;
+        assert!(only.resumed().is_none());
+    }
+
+    #[tokio::test]
+    async fn what_cannot_be_kept_is_still_sent() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut cut_off = CutOff::new(&folder.path().join("no/folder.yaml"), base()).await;
+        cut_off.add(&[change(5, set("/a", 1))]);
+        assert_eq!(cut_off.calls, [set("/a", 1)]);
+    }
 }

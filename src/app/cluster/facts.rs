@@ -7,7 +7,7 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use super::{Conductor, Role, Settings, View};
+use super::{Member, Role, Settings, View};
 use crate::{
     cluster::{etcd::Kv, journal::Keys},
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
@@ -86,7 +86,9 @@ impl Known {
         };
         let said = kv.and_then(|kv| serde_json::from_slice::<Said>(&kv.value).ok());
         if let Some(said) = said {
-            let role = Role::ALL.into_iter().find(|role| role.as_str() == said.role);
+            let role = Role::ALL
+                .into_iter()
+                .find(|role| role.as_str() == said.role);
             let member = MemberFacts {
                 name: name.to_owned(),
                 uri: said.uri,
@@ -112,21 +114,38 @@ impl Known {
 
     /// Whether `name`, or any other computer if it is empty, can take over; if not, why.
     pub(super) fn successor(&self, name: &str) -> Result<(), String> {
-        let others = self.members.values().filter(|of| of.name != self.settings.name);
-        let there = others.filter(|of| of.heard.is_some_and(|at| at.elapsed() < MemberFacts::AWAY_AFTER));
+        let others = self
+            .members
+            .values()
+            .filter(|of| of.name != self.settings.name);
+        let there = others.filter(|of| {
+            of.heard
+                .is_some_and(|at| at.elapsed() < MemberFacts::AWAY_AFTER)
+        });
         let names: Vec<&str> = there.map(|of| of.name.as_str()).collect();
+        if name == self.settings.name {
+            return Err(format!("`{name}` leads already"));
+        }
         match names.as_slice() {
             [] => Err("no other computer is there".to_owned()),
             names if name.is_empty() || names.contains(&name) => Ok(()),
-            names => Err(format!("`{name}` is not there; there are {}", names.join(", "))),
+            names => Err(format!(
+                "`{name}` is not there; there are {}",
+                names.join(", ")
+            )),
         }
     }
 
-    /// This computer leads now. `released`: the one before has given up leading by itself.
-    pub(super) fn taken_over(&mut self, before: Option<(String, Instant)>, released: bool) {
+    /// This computer leads now. `released`: the one before has given up leading by itself. Returns whether that
+    /// was another computer.
+    pub(super) fn taken_over(&mut self, before: Option<(String, Instant)>, released: bool) -> bool {
         let now = Instant::now();
-        let took = before.as_ref().map_or(Duration::ZERO, |(_, sign)| now.duration_since(*sign));
-        let from = before.map(|(name, _)| name).filter(|name| *name != self.settings.name);
+        let took = before
+            .as_ref()
+            .map_or(Duration::ZERO, |(_, sign)| now.duration_since(*sign));
+        let from = before
+            .map(|(name, _)| name)
+            .filter(|name| *name != self.settings.name);
         self.takeovers += u64::from(from.is_some());
         let takeover = Takeover {
             at: now,
@@ -143,7 +162,9 @@ impl Known {
             ),
             None => tracing::info!("this computer leads now"),
         }
+        let from_another = takeover.from.is_some();
         self.last_takeover = Some(takeover);
+        from_another
     }
 
     /// Who led last, and when it was heard of last.
@@ -157,7 +178,7 @@ impl Known {
     }
 }
 
-impl Conductor {
+impl Member {
     /// Since when nobody leads, as far as is known.
     fn leaderless(&self) -> Option<Instant> {
         let (role, since) = self.known.role;
@@ -201,6 +222,9 @@ impl Conductor {
             last_takeover: known.last_takeover.clone(),
             lost_writes: known.lost_writes,
         };
-        self.given.post.board.update(|board| board.cluster = Some(facts));
+        self.given
+            .post
+            .board
+            .update(|board| board.cluster = Some(facts));
     }
 }

@@ -3,9 +3,10 @@
 use std::{collections::VecDeque, pin::Pin};
 
 use crate::{
-    checkpoint::format::{self, Checkpoint},
+    checkpoint::format::{self, Checkpoint, Entry, Record},
     cluster::journal::{self, JournalError, Keys, Put},
     ledger::Change,
+    master,
 };
 
 /// Writes the parts of a change. Gives whether this process still leads, if that is known.
@@ -15,8 +16,10 @@ pub(super) type Preparing = Pin<Box<dyn Future<Output = Option<bool>> + Send>>;
 #[derive(Default)]
 pub(super) struct Outgoing {
     changes: VecDeque<Change>,
-    /// The last one that is ready: its parts, if it has any, are in etcd.
+    /// The last one that may be given to the journal,
     ready: u64,
+    /// and the last one of which all parts are in etcd.
+    written: u64,
     /// The parts of the one after that are being written.
     pub(super) preparing: Option<Preparing>,
 }
@@ -26,6 +29,7 @@ impl Outgoing {
     pub(super) fn start(&mut self, seq: u64) {
         *self = Self {
             ready: seq,
+            written: seq,
             ..Self::default()
         };
     }
@@ -62,14 +66,12 @@ impl Outgoing {
             if change.seq() <= self.ready {
                 continue;
             }
-            let parts = match change {
-                Change::Call(record) => journal::parts(keys, record)?,
-                Change::State { .. } => state(keys, change)?.0,
-            };
+            let parts = parts(keys, change)?;
             if !parts.is_empty() {
                 return Ok(Some(parts));
             }
             self.ready = change.seq();
+            self.written = self.ready;
         }
         Ok(None)
     }
@@ -78,6 +80,23 @@ impl Outgoing {
     pub(super) fn prepared(&mut self) {
         let next = self.changes.iter().find(|of| of.seq() > self.ready);
         self.ready = next.map_or(self.ready, Change::seq);
+        self.written = self.ready;
+    }
+
+    /// The next one cannot be written: a call that changes nothing takes its number.
+    pub(super) fn leave_out_next(&mut self) {
+        let ready = self.ready;
+        if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
+            let (seq, entry) = (next.seq(), Entry::call(master::get_pid()));
+            *next = Change::Call(Record { seq, entry });
+        }
+    }
+
+    /// The parts of the next beat's entry that are not in etcd: it was made while this computer was alone.
+    pub(super) fn missing_parts(&self, keys: &Keys) -> Vec<Put> {
+        let first = self.changes.front().filter(|of| of.seq() > self.written);
+        let parts = first.map(|change| parts(keys, change));
+        parts.and_then(Result::ok).unwrap_or_default()
     }
 
     /// What the next beat adds to the journal, up to `seq`.
@@ -102,13 +121,17 @@ impl Outgoing {
 
     /// Takes out those that are in the journal, up to `seq`.
     pub(super) fn committed(&mut self, seq: u64) -> Vec<Change> {
-        let count = self
-            .changes
-            .iter()
-            .take_while(|of| of.seq() <= seq)
-            .count();
+        let count = self.changes.iter().take_while(|of| of.seq() <= seq).count();
         self.ready = self.ready.max(seq);
+        self.written = self.written.max(seq);
         self.changes.drain(..count).collect()
+    }
+}
+
+fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
+    match change {
+        Change::Call(record) => journal::parts(keys, record),
+        Change::State { .. } => Ok(state(keys, change)?.0),
     }
 }
 
@@ -125,4 +148,128 @@ fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> 
     };
     let encoded = format::encode_checkpoint(&checkpoint, 1)?;
     Ok(journal::state(keys, change.seq(), &encoded.bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{cluster::journal::Manifest, master::Master, xmlrpc::Call};
+
+    fn call(seq: u64, bytes: usize) -> Change {
+        let value = "x".repeat(bytes).as_str().into();
+        let call = Call::new("setParam", vec!["/n".into(), "/p".into(), value]);
+        let entry = Entry::call(call);
+        Change::Call(Record { seq, entry })
+    }
+
+    fn state(seq: u64) -> Change {
+        let state = Box::new(Master::default());
+        Change::State { seq, state }
+    }
+
+    fn outgoing(changes: impl IntoIterator<Item = Change>) -> (Outgoing, Keys) {
+        let mut outgoing = Outgoing::default();
+        outgoing.start(4);
+        outgoing.add(changes);
+        (outgoing, Keys::new("robot"))
+    }
+
+    fn seqs(changes: &[Change]) -> Vec<u64> {
+        changes.iter().map(Change::seq).collect()
+    }
+
+    /// The numbers of the records in what the next beat adds.
+    fn added(outgoing: &Outgoing, keys: &Keys, seq: u64) -> Vec<u64> {
+        let entry = outgoing.entry(keys, seq).unwrap();
+        let records = entry.map(|put| journal::records(&put.key, &put.value).unwrap());
+        let records = records.into_iter().flatten();
+        records.map(|record| record.seq).collect()
+    }
+
+    const LARGE: usize = journal::BATCH_BYTES + 1;
+
+    #[test]
+    fn small_calls_are_ready_at_once_and_leave_when_they_are_in_the_journal() {
+        let (mut outgoing, keys) = outgoing([5, 6, 7].map(|seq| call(seq, 1)));
+        assert_eq!(outgoing.ready(), 4);
+        assert!(outgoing.prepare(&keys).unwrap().is_none());
+        assert_eq!(outgoing.ready(), 7);
+        assert_eq!(added(&outgoing, &keys, 6), [5, 6]);
+        assert_eq!(seqs(&outgoing.committed(6)), [5, 6]);
+        assert_eq!(added(&outgoing, &keys, 7), [7]);
+        assert_eq!(seqs(&outgoing.take_all()), [7]);
+        assert_eq!(outgoing.len(), 0);
+    }
+
+    #[test]
+    fn a_large_call_is_ready_when_its_parts_are_in_etcd_and_holds_up_those_behind_it() {
+        let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
+        let parts = outgoing.prepare(&keys).unwrap().unwrap();
+        assert_eq!((outgoing.ready(), parts.len()), (5, 1));
+        outgoing.preparing = Some(Box::pin(std::future::pending()));
+        // Once at a time.
+        assert!(outgoing.prepare(&keys).unwrap().is_none());
+        assert_eq!(outgoing.ready(), 5);
+        outgoing.preparing = None;
+        // They were not written, and are given again.
+        assert_eq!(outgoing.prepare(&keys).unwrap(), Some(parts));
+        outgoing.prepared();
+        assert_eq!(outgoing.ready(), 6);
+        assert!(outgoing.prepare(&keys).unwrap().is_none());
+        assert_eq!(outgoing.ready(), 7);
+        outgoing.committed(5);
+        let entry = outgoing.entry(&keys, 7).unwrap().unwrap();
+        assert_eq!(entry.key, keys.journal(6));
+        assert!(Manifest::read(&entry.value).is_some());
+        assert_eq!(outgoing.missing_parts(&keys), []);
+    }
+
+    #[test]
+    fn what_became_ready_alone_has_its_parts_written_with_the_beat() {
+        let (mut outgoing, keys) = outgoing([call(5, 1), call(6, LARGE), call(7, 1)]);
+        outgoing.preparing = Some(Box::pin(std::future::pending()));
+        outgoing.all_ready();
+        assert!(outgoing.preparing.is_none());
+        assert_eq!(outgoing.ready(), 7);
+        assert_eq!(outgoing.missing_parts(&keys), []);
+        outgoing.committed(5);
+        assert_eq!(outgoing.missing_parts(&keys).len(), 1);
+        outgoing.committed(6);
+        assert_eq!(outgoing.missing_parts(&keys), []);
+    }
+
+    #[test]
+    fn a_state_goes_by_itself() {
+        let (mut outgoing, keys) = outgoing([call(5, 1), state(6), call(7, 1)]);
+        assert!(!outgoing.prepare(&keys).unwrap().unwrap().is_empty());
+        assert_eq!(outgoing.ready(), 5);
+        outgoing.prepared();
+        outgoing.prepare(&keys).unwrap();
+        assert_eq!(outgoing.ready(), 7);
+        // Calls go before it and after it.
+        assert_eq!(added(&outgoing, &keys, 7), [5]);
+        outgoing.committed(5);
+        let entry = outgoing.entry(&keys, 7).unwrap().unwrap();
+        assert_eq!(entry.key, keys.journal(6));
+        assert!(Manifest::read(&entry.value).is_some());
+        outgoing.committed(6);
+        assert_eq!(added(&outgoing, &keys, 7), [7]);
+    }
+
+    #[test]
+    fn what_cannot_be_written_leaves_its_number_to_a_call_that_changes_nothing() {
+        let most = journal::RECORD_BYTES_MAX;
+        let (mut outgoing, keys) = outgoing([call(5, 1), call(6, most), call(7, 1)]);
+        assert!(outgoing.prepare(&keys).is_err());
+        assert_eq!(outgoing.ready(), 5);
+        outgoing.leave_out_next();
+        assert!(outgoing.prepare(&keys).unwrap().is_none());
+        assert_eq!(outgoing.ready(), 7);
+        let instead: Vec<_> = outgoing.changes().skip(1).take(1).collect();
+        let [Change::Call(Record { seq: 6, entry })] = instead.as_slice() else {
+            panic!("{instead:?}");
+        };
+        assert_eq!(*entry, Entry::call(master::get_pid()));
+        assert_eq!(added(&outgoing, &keys, 7), [5, 6, 7]);
+    }
 }

@@ -2,23 +2,30 @@
 
 use std::time::Instant;
 
-use super::{Conductor, CutOff, Input, Role, cut_off};
+use super::{
+    CutOff, Input, Member, Role, cut_off,
+    merging::{self, Route},
+};
 use crate::{
     app::life,
     checkpoint::session::{self, Decision, Evidence},
-    cluster::{machine::WhenAlone, way::Way},
+    cluster::{
+        machine::{Leader, WhenAlone},
+        way::Way,
+    },
     gate::State,
     ledger::Change,
     limit::rarely,
     master::Master,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
+    status::report::{CUT_OFF, STARTED, TAKEN_OVER},
 };
 
 /// How often the leader's rosrescue is asked within the time to live.
 const PROBES: u32 = 4;
 
-impl Conductor {
+impl Member {
     /// Whether calls pass to a master of this computer, or are answered for it.
     pub(super) fn has_master(&self) -> bool {
         self.duty.is_some()
@@ -38,14 +45,16 @@ impl Conductor {
         }
     }
 
-    pub(super) async fn become_role(&mut self, now: Instant, role: Role) {
+    pub(super) async fn become_role(&mut self, role: Role) {
         self.known.set_role(role);
         match role {
-            Role::Leading => self.lead(now).await,
+            Role::Leading => self.lead(),
             Role::Alone => self.be_alone().await,
             Role::Joining | Role::Following | Role::CatchingUp => {
                 if self.has_master() {
-                    tracing::warn!("this computer does not lead any more: another one does, or may");
+                    tracing::warn!(
+                        "this computer does not lead any more; another one does, or may"
+                    );
                 }
                 self.give_up_duty().await;
             }
@@ -53,20 +62,22 @@ impl Conductor {
         self.background.say_now();
     }
 
-    async fn lead(&mut self, _now: Instant) {
+    fn lead(&mut self) {
         let term = self.machine.term().unwrap_or_default();
-        let released = self.known_release();
         if !self.has_master() {
             let (ledger, fresh) = (&self.given.post.ledger, self.goes_on == Some(false));
             if fresh {
                 let _ = ledger.follow_state(Master::default());
             }
-            self.known.taken_over(self.before.take(), released);
+            let cause = match self.known.taken_over(self.before.take(), self.was_released) {
+                true => TAKEN_OVER,
+                false => STARTED,
+            };
             self.ours = false;
             let seq = self.machine.committed();
             self.outgoing.start(seq);
             self.given.post.ledger.lead(seq, &self.held);
-            self.begin_duty(Some(self.given.rosout));
+            self.begin_duty(Some(self.given.rosout), cause);
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
@@ -81,8 +92,20 @@ impl Conductor {
 
     async fn be_alone(&mut self) {
         let serves = self.settings.alone == WhenAlone::Serve;
+        let silent = self.trouble.is_silent(self.settings.ttl / 2);
+        let why = match (&self.view.leader, self.trouble.get()) {
+            (Some(leader), _) if !silent && leader.id != self.settings.id => {
+                format!(
+                    "{} leads, and cannot be reached at {}",
+                    leader.name, leader.uri
+                )
+            }
+            (_, Some((_, why))) => format!("etcd: {why}"),
+            (_, None) => "etcd has answered too late".to_owned(),
+        };
         rarely!(
             error,
+            why,
             serves,
             "ALONE: this computer is cut off from the others or from etcd's majority; with --alone serve its own \
              nodes are served and what they write is sent to the leader later, else writes wait. Repair the \
@@ -98,7 +121,9 @@ impl Conductor {
         };
         match &mut self.cut_off {
             Some(cut_off) => cut_off.again(),
-            None => self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base.clone()).await),
+            None => {
+                self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base.clone()).await)
+            }
         }
         if self.has_master() {
             if let Some(cut_off) = &mut self.cut_off {
@@ -108,7 +133,7 @@ impl Conductor {
             let seq = self.machine.committed();
             self.outgoing.start(seq);
             self.given.post.ledger.lead(seq, &base);
-            self.begin_duty(None);
+            self.begin_duty(None, CUT_OFF);
         }
         self.set_way(Way::Here { term: None });
         self.outgoing.all_ready();
@@ -116,9 +141,9 @@ impl Conductor {
     }
 
     /// `rosout`: see [`Post::begin`](crate::app::duty::Post::begin).
-    fn begin_duty(&mut self, rosout: Option<bool>) {
-        let process = MasterProcess::new(self.given.rosmaster.clone(), None);
-        self.duty = Some(self.given.post.begin(process, rosout));
+    fn begin_duty(&mut self, rosout: Option<bool>, cause: &'static str) {
+        let process = MasterProcess::new(self.given.rosmaster.clone(), None, None);
+        self.duty = Some(self.given.post.begin(process, rosout, cause));
     }
 
     /// Whatever is recorded or answered here from now on is not for the others.
@@ -148,8 +173,7 @@ impl Conductor {
             let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
             let answered: Vec<_> = lost.iter().filter(answered).collect();
             if !answered.is_empty() {
-                let mut cut_off =
-                    CutOff::new(&self.given.post.checkpoint, self.held.clone()).await;
+                let mut cut_off = CutOff::new(&self.given.post.checkpoint, self.held.clone()).await;
                 cut_off.add(answered);
                 self.cut_off = Some(cut_off);
             }
@@ -210,7 +234,13 @@ impl Conductor {
             }
             Ok(None) => {}
             Err(error) => {
-                rarely!(error, %error, "a change cannot be given to the other computers; please report this line");
+                rarely!(
+                    error,
+                    %error,
+                    "a change of the state cannot be given to the other computers; they go on without it"
+                );
+                self.outgoing.leave_out_next();
+                return self.prepare();
             }
         }
         self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
@@ -227,15 +257,19 @@ impl Conductor {
 
     /// Whether it must be found out first if the session in etcd goes on: nobody was seen leading it.
     pub(super) fn must_decide(&mut self) -> bool {
-        let needs = self.machine.role() == Role::CatchingUp && !self.seen_leading && !self.ours;
-        if !needs || self.goes_on.is_some() || self.held == Master::default() {
+        if self.seen_leading
+            || self.ours
+            || self.goes_on.is_some()
+            || self.progress.seq == 0
+            || self.led
+        {
             return false;
         }
-        if self.deciding.is_none() {
+        if self.deciding.is_none() && self.machine.role() == Role::CatchingUp {
             let (restore, state) = (self.given.restore, self.held.clone());
             let evidence = Evidence {
                 same_boot: self.given.restored,
-                closed: self.known_release(),
+                closed: self.was_released,
                 node_alive: false,
             };
             self.deciding = Some(Box::pin(async move {
@@ -260,15 +294,11 @@ impl Conductor {
         true
     }
 
-    /// Whether the leader before this one has given up by itself, as far as is known.
-    fn known_release(&self) -> bool {
-        self.was_released
-    }
-
     /// What follows from all that has happened.
     pub(super) fn tend(&mut self) {
         let now = Instant::now();
         let role = self.machine.role();
+        self.look_for_namesake();
         let alive = self.view.alive.as_ref();
         let other = self
             .view
@@ -280,7 +310,9 @@ impl Conductor {
             self.was_released = released;
             self.before = self.known.before();
         }
-        let leader = other.filter(|_| !released);
+        // An earlier process of this computer answers nobody any more, and its address is our own.
+        let is_own = |of: &&Leader| of.name == self.settings.name && of.uri == self.settings.uri;
+        let leader = other.filter(|of| !released && !is_own(of));
         let leader = leader.and_then(|of| Some((MasterUri::parse(&of.uri).ok()?, of.term)));
         if role == Role::Following {
             self.set_way(match leader.clone() {
@@ -288,7 +320,10 @@ impl Conductor {
                 None => Way::Nobody { known: self.loaded },
             });
         }
-        self.ask_leader(now, leader.filter(|_| matches!(role, Role::Following | Role::Alone)));
+        self.ask_leader(
+            now,
+            leader.filter(|_| matches!(role, Role::Following | Role::Alone)),
+        );
         let settled = match role {
             Role::Following => self.wanted.is_none() && self.loaded,
             Role::Leading => self.has_master(),
@@ -298,14 +333,31 @@ impl Conductor {
             && self.merging.is_none()
             && let Some(cut_off) = self.cut_off.take()
         {
-            let uri = MasterUri::parse(&self.given.post.uri);
-            match uri {
-                Ok(uri) => self.merging = Some(Box::pin(cut_off.send(&self.held, uri))),
-                Err(error) => tracing::error!(%error, "please report this"),
-            }
+            let now = self.present();
+            let route = Route {
+                leads: self.leads.subscribe(),
+                peers: self.peers.clone(),
+                write_queue: self.given.post.write_queue.clone(),
+            };
+            self.merging = Some(Box::pin(async move {
+                merging::send(cut_off, &now.await, route).await
+            }));
         }
         self.work_beside(now);
         self.show();
+    }
+
+    /// Notices another process of this computer's name: there is one at a time on a computer, so it is another
+    /// computer's, and the two would depose each other for ever.
+    fn look_for_namesake(&mut self) {
+        let Some(leader) = &self.view.leader else {
+            return;
+        };
+        if leader.id == self.settings.id {
+            self.led = true;
+        } else if self.led && leader.name == self.settings.name {
+            self.namesake = Some(leader.uri.clone());
+        }
     }
 
     /// Asks the leader's rosrescue whether it leads, now and then.
@@ -329,6 +381,8 @@ impl Conductor {
     /// The writes of a time alone have been sent; so many did not hold.
     pub(super) fn merged(&mut self, lost: u64) {
         self.merging = None;
+        let leads = self.leads.borrow().clone();
+        self.set_way(leads);
         self.known.lost_writes += lost;
         if self.cut_off.is_none() {
             cut_off::remove(&self.given.post.checkpoint);

@@ -1,7 +1,6 @@
 //! One endpoint of etcd: connections, TLS, and the token of a session.
 
 use std::{
-    path::PathBuf,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
@@ -9,7 +8,7 @@ use std::{
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full, Limited};
 use hyper::{
-    Request, Response, StatusCode,
+    Request, Response,
     body::Incoming,
     client::conn::http1::{self, SendRequest},
     header::{AUTHORIZATION, CONTENT_TYPE, HOST},
@@ -19,15 +18,12 @@ use tokio::{
     io::{AsyncRead, AsyncWrite},
     net::TcpStream,
 };
-use tokio_rustls::{
-    TlsConnector,
-    rustls::{
-        ClientConfig, RootCertStore,
-        pki_types::{CertificateDer, PrivateKeyDer, ServerName, pem::PemObject},
-    },
-};
 
-use super::{EtcdError, error::ErrorAnswer, wire};
+use super::{
+    EtcdError, Tls,
+    tls::{Secured, TlsSettings},
+    wire,
+};
 use crate::resolver;
 
 /// How long a connect may take, for each address. On one network it takes a millisecond.
@@ -36,16 +32,6 @@ const CONNECT_LIMIT: Duration = Duration::from_secs(1);
 const ANSWER_BYTES_MAX: usize = 64 << 20;
 /// Most idle connections that are kept.
 const IDLE_MOST: usize = 4;
-
-/// Certificates, as files in PEM form.
-#[derive(Clone, Debug, Default)]
-pub struct Tls {
-    /// Those that etcd's certificate is signed with.
-    pub ca: Option<PathBuf>,
-    /// The certificate of this computer and its key.
-    pub cert: Option<PathBuf>,
-    pub key: Option<PathBuf>,
-}
 
 /// How etcd knows this computer.
 #[derive(Clone, Default)]
@@ -66,53 +52,6 @@ impl std::fmt::Debug for Access {
     }
 }
 
-impl Access {
-    /// None without certificates.
-    pub(super) fn tls_config(&self) -> Result<Option<Arc<ClientConfig>>, EtcdError> {
-        let Some(ca) = &self.tls.ca else {
-            return Ok(None);
-        };
-        let refused = |path: &PathBuf, why: String| {
-            EtcdError::Options(format!(
-                "the certificate file {} cannot be used: {why}",
-                path.display()
-            ))
-        };
-        let certificates = |path: &PathBuf| {
-            let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
-            let read: Vec<CertificateDer<'static>> =
-                read.map_err(|error| refused(path, error.to_string()))?;
-            match read.is_empty() {
-                true => Err(refused(path, "there is no certificate in it".to_owned())),
-                false => Ok(read),
-            }
-        };
-        let mut roots = RootCertStore::empty();
-        for certificate in certificates(ca)? {
-            roots
-                .add(certificate)
-                .map_err(|error| refused(ca, error.to_string()))?;
-        }
-        let builder = ClientConfig::builder().with_root_certificates(roots);
-        let config = match (&self.tls.cert, &self.tls.key) {
-            (None, None) => builder.with_no_client_auth(),
-            (Some(cert), Some(key)) => {
-                let private = PrivateKeyDer::from_pem_file(key)
-                    .map_err(|error| refused(key, error.to_string()))?;
-                builder
-                    .with_client_auth_cert(certificates(cert)?, private)
-                    .map_err(|error| refused(cert, error.to_string()))?
-            }
-            _ => {
-                let why =
-                    "a certificate for this computer needs its key, and a key its certificate";
-                return Err(EtcdError::Options(why.to_owned()));
-            }
-        };
-        Ok(Some(Arc::new(config)))
-    }
-}
-
 type Connection = SendRequest<Full<Bytes>>;
 
 #[derive(Debug)]
@@ -120,13 +59,11 @@ pub(super) struct Endpoint {
     url: String,
     host: String,
     port: u16,
-    tls: Option<(TlsSettings, ServerName<'static>)>,
+    tls: Option<Secured>,
     access: Arc<Access>,
     idle: Mutex<Vec<Connection>>,
     token: Mutex<Option<String>>,
 }
-
-type TlsSettings = Arc<ClientConfig>;
 
 fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
     of.lock().unwrap_or_else(PoisonError::into_inner)
@@ -149,11 +86,8 @@ impl Endpoint {
         let tls = match (uri.scheme_str(), config) {
             (Some("http"), _) => None,
             (Some("https"), Some(config)) => {
-                let name = ServerName::try_from(host.clone());
-                Some((
-                    config.clone(),
-                    name.map_err(|_| refused("its host is no name of a host"))?,
-                ))
+                let secured = Secured::new(config, &host);
+                Some(secured.ok_or_else(|| refused("its host is no name of a host"))?)
             }
             (Some("https"), None) => {
                 return Err(refused("https needs the certificate of its authority"));
@@ -261,19 +195,7 @@ impl Endpoint {
         if status.is_success() {
             return Ok(body);
         }
-        Err(self.refusal(status, &body))
-    }
-
-    fn refusal(&self, status: StatusCode, body: &[u8]) -> EtcdError {
-        match serde_json::from_slice::<ErrorAnswer>(body) {
-            Ok(answer) if answer.code != 0 => {
-                EtcdError::answered(&self.url, answer.code, &answer.message)
-            }
-            _ => EtcdError::NotEtcd {
-                endpoint: self.url.clone(),
-                why: format!("its status is {status}; is the gateway off (--enable-grpc-gateway)?"),
-            },
-        }
+        Err(EtcdError::refused(&self.url, status, &body))
     }
 
     /// A stream of answers, on a connection of its own.
@@ -296,7 +218,8 @@ impl Endpoint {
             let body = Limited::new(response.into_body(), ANSWER_BYTES_MAX)
                 .collect()
                 .await;
-            Err(self.refusal(
+            Err(EtcdError::refused(
+                &self.url,
                 status,
                 &body.map_err(|error| self.lost(&*error))?.to_bytes(),
             ))
@@ -334,11 +257,10 @@ impl Endpoint {
 
     async fn connect(&self) -> Result<Connection, EtcdError> {
         let stream = self.connect_tcp().await?;
-        let Some((config, name)) = &self.tls else {
+        let Some(secured) = &self.tls else {
             return self.open(stream).await;
         };
-        let connector = TlsConnector::from(config.clone());
-        let stream = connector.connect(name.clone(), stream).await;
+        let stream = secured.connect(stream).await;
         self.open(stream.map_err(|error| self.lost(&error))?).await
     }
 

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use hyper::StatusCode;
 use serde::Deserialize;
 use thiserror::Error;
 
@@ -40,6 +41,11 @@ pub enum EtcdError {
     Compacted { revision: Option<u64> },
     #[error("etcd at {endpoint} refuses access: {why}; check user, password and role")]
     Access { endpoint: String, why: String },
+    #[error(
+        "etcd at {endpoint} has users, and then its gateway refuses every certificate with a CommonName: \
+         give this computer one without (openssl: -subj /O=NAME)"
+    )]
+    CommonName { endpoint: String },
     #[error("etcd at {endpoint} no longer accepts the token of this session")]
     Token { endpoint: String },
     #[error(
@@ -54,6 +60,22 @@ pub enum EtcdError {
 }
 
 impl EtcdError {
+    /// Of an answer that is no success.
+    pub(super) fn refused(endpoint: &str, status: StatusCode, body: &[u8]) -> Self {
+        if let Ok(answer) = serde_json::from_slice::<ErrorAnswer>(body)
+            && answer.code != 0
+        {
+            return Self::answered(endpoint, answer.code, &answer.message);
+        }
+        let endpoint = endpoint.to_owned();
+        // Plain text, and the one error of the gateway's own.
+        if body.starts_with(b"CommonName of client") {
+            return Self::CommonName { endpoint };
+        }
+        let why = format!("its status is {status}; is the gateway off (--enable-grpc-gateway)?");
+        Self::NotEtcd { endpoint, why }
+    }
+
     /// Of an answer that is an error.
     pub(super) fn answered(endpoint: &str, code: i64, message: &str) -> Self {
         let endpoint = endpoint.to_owned();
@@ -93,6 +115,7 @@ impl EtcdError {
                 | Self::TooLarge
                 | Self::Compacted { .. }
                 | Self::Access { .. }
+                | Self::CommonName { .. }
         )
     }
 }
@@ -100,7 +123,26 @@ impl EtcdError {
 /// The body of an answer that is no success.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct ErrorAnswer {
-    pub(super) code: i64,
-    pub(super) message: String,
+struct ErrorAnswer {
+    code: i64,
+    message: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gateway_that_refuses_a_name_in_a_certificate_is_explained() {
+        // Of etcd 3.4.23 with `--client-cert-auth`, after `etcdctl auth enable`.
+        let body = b"CommonName of client sending a request against gateway will be ignored and not used as expected\n";
+        let error = EtcdError::refused("https://a:2379", StatusCode::BAD_REQUEST, body);
+        assert!(error.to_string().contains("one without"), "{error}");
+        let other = EtcdError::refused(
+            "https://a:2379",
+            StatusCode::NOT_FOUND,
+            b"404 page not found\n",
+        );
+        assert!(matches!(other, EtcdError::NotEtcd { .. }), "{other}");
+    }
 }

@@ -1,12 +1,13 @@
 //! What changes in etcd, as it changes; across lost connections, members and restarts.
 
-use std::{ops::Range, time::Duration};
+use std::{ops::Range, pin::Pin, time::Duration};
 
 use base64::{Engine, engine::general_purpose::STANDARD};
 use bytes::{Bytes, BytesMut};
 use http_body_util::BodyExt;
 use hyper::body::Incoming;
 use serde_json::json;
+use tokio::time::Instant;
 
 use super::{
     Etcd, EtcdError, Kv,
@@ -54,7 +55,11 @@ struct Open {
     endpoint: usize,
     body: Incoming,
     buffer: BytesMut,
+    /// When it is given up if nothing is heard.
+    until: Instant,
 }
+
+type Opening = Pin<Box<dyn Future<Output = Result<Incoming, EtcdError>> + Send>>;
 
 /// A watch. Changes come in their order; after a lost connection some may come twice.
 pub struct Watch {
@@ -64,6 +69,9 @@ pub struct Watch {
     next: u64,
     quiet: Duration,
     open: Option<Open>,
+    /// Which endpoint is being opened. Kept here, as [`Open::until`] is: whoever waits for changes may give up at
+    /// any time and wait anew, and a member that is silent must be noticed all the same.
+    opening: Option<(usize, Opening)>,
     failures: usize,
 }
 
@@ -75,6 +83,7 @@ impl Watch {
             next,
             quiet,
             open: None,
+            opening: None,
             failures: 0,
         }
     }
@@ -87,12 +96,15 @@ impl Watch {
     pub async fn next(&mut self) -> Result<Vec<Change>, WatchEnd> {
         loop {
             let read = match &mut self.open {
-                Some(open) => tokio::time::timeout(self.quiet, open.message()).await,
+                Some(open) => tokio::time::timeout_at(open.until, open.message()).await,
                 None => {
                     self.open().await?;
                     continue;
                 }
             };
+            if let (Ok(Ok(Some(_))), Some(open)) = (&read, &mut self.open) {
+                open.until = Instant::now() + self.quiet;
+            }
             let answer = match read {
                 Ok(Ok(Some(line))) => wire::parse::<Streamed<WatchAnswer>>(&line),
                 Ok(Ok(None)) => {
@@ -156,32 +168,48 @@ impl Watch {
     }
 
     async fn open(&mut self) -> Result<(), WatchEnd> {
-        if self.failures > 0 {
-            tokio::time::sleep(PAUSE).await;
+        let next = (self.client.preferred() + self.failures) % self.client.endpoints.len();
+        if self.opening.is_none() {
+            self.opening = Some((next, self.opening_of(next)));
         }
-        let index = (self.client.preferred() + self.failures) % self.client.endpoints.len();
-        let Some(endpoint) = self.client.endpoints.get(index) else {
+        let Some((index, opening)) = &mut self.opening else {
             return Ok(());
         };
-        let request = json!({ "create_request": {
-            "key": STANDARD.encode(&self.range.start), "range_end": STANDARD.encode(&self.range.end),
-            "start_revision": self.next.to_string(), "fragment": true,
-        }});
-        match endpoint
-            .stream("watch", request.to_string().into(), self.quiet)
-            .await
-        {
+        let (index, opened) = (*index, opening.await);
+        self.opening = None;
+        match opened {
             Ok(body) => {
                 self.open = Some(Open {
                     endpoint: index,
                     body,
                     buffer: BytesMut::new(),
+                    until: Instant::now() + self.quiet,
                 });
             }
             Err(error) if error.is_final() => return Err(WatchEnd::Failed(error)),
             Err(error) => self.close(&error.to_string()),
         }
         Ok(())
+    }
+
+    fn opening_of(&self, index: usize) -> Opening {
+        let request = json!({ "create_request": {
+            "key": STANDARD.encode(&self.range.start), "range_end": STANDARD.encode(&self.range.end),
+            "start_revision": self.next.to_string(), "fragment": true,
+        }});
+        let (client, quiet) = (self.client.clone(), self.quiet);
+        let pause = PAUSE.saturating_mul(u32::from(self.failures > 0));
+        Box::pin(async move {
+            tokio::time::sleep(pause).await;
+            match client.endpoints.get(index) {
+                Some(endpoint) => {
+                    endpoint
+                        .stream("watch", request.to_string().into(), quiet)
+                        .await
+                }
+                None => std::future::pending().await,
+            }
+        })
     }
 
     fn changes(&mut self, answer: &WatchAnswer) -> Result<Vec<Change>, EtcdError> {

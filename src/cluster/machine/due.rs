@@ -11,8 +11,7 @@ impl Machine {
     pub fn deadline(&self) -> Option<Instant> {
         let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
         let send = self.send_at().filter(|_| !under_way);
-        let lapses = self.sole_until().filter(|_| self.role == Role::Leading);
-        [send, lapses, self.alone_at()].into_iter().flatten().min()
+        [send, self.alone_at()].into_iter().flatten().min()
     }
 
     /// What is due at `now`.
@@ -26,8 +25,7 @@ impl Machine {
             self.follow_to(self.view.seq());
             self.become_role(Role::Leading, actions);
         }
-        let lapsed = self.role == Role::Leading && !self.is_sole(now);
-        if lapsed || self.alone_at().is_some_and(|at| at <= now) {
+        if self.alone_at().is_some_and(|at| at <= now) {
             self.become_role(Role::Alone, actions);
             self.acknowledge_early(now, actions);
         }
@@ -139,7 +137,9 @@ impl Machine {
                 Some((false, since)) => Some(silent.min(since + patience)),
                 None => Some(silent),
             },
-            Role::Leading | Role::Alone => None,
+            // Until then nothing is acknowledged that is not committed, unless nobody else can lead.
+            Role::Leading => Some(self.reign?.sent? + patience),
+            Role::Alone => None,
         }
     }
 }

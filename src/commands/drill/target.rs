@@ -39,6 +39,13 @@ impl Target {
 
     /// The master's process. It says its id itself, and it must listen where rosrescue calls it.
     async fn master(&self, status: &Status) -> Result<u32, Failure> {
+        if status.elsewhere {
+            return Err(Failure::Usage(
+                "another computer has the master: run the drill there (`rosrescue status` says which \
+                 one), or with --no-kill"
+                    .to_owned(),
+            ));
+        }
         let address =
             MasterUri::parse(&status.master).map_err(|error| Failure::Failed(error.to_string()))?;
         if !is_here(&address).await {

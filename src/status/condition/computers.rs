@@ -88,7 +88,9 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
         changes => format!("{changes} changes so far"),
     };
     let why = match (&of.etcd, &of.leader) {
-        (None, Some(leader)) => format!(" (the leader, {}, does not answer)", leader.name),
+        (None, Some(leader)) if leader.name != of.name => {
+            format!(" (the leader, {}, does not answer)", leader.name)
+        }
         _ => etcd(of),
     };
     let notice = match gate {

@@ -12,11 +12,15 @@ const PAUSE = 2000;
 
 const CONDITIONS = {
   protected: ["good", "Protected"],
+  following: ["good", "Following the leader"],
   standing_in: ["warn", "Standing in for the master"],
+  no_leader: ["warn", "No computer leads"],
   crash_loop: ["bad", "Crash loop of the master"],
   unprotected: ["bad", "UNPROTECTED"],
+  alone: ["bad", "ALONE: cut off from the other computers"],
   waiting: ["warn", "Waiting for a first master"],
 };
+const ROLES = { joining: "joins", following: "follows", catching_up: "takes over", leading: "leads", alone: "ALONE" };
 const OUTCOMES = {
   begun: "a new session was begun",
   injected: "a new master was given the whole state",
@@ -138,7 +142,7 @@ async function refused() {
     if (answer.ok) {
       status = await answer.json();
       setLink("waiting", "many pages are open: every 2 s");
-      now = { ...status, gate: status.open ? "open" : "standing_in" };
+      now = { ...status, gate: status.open ? "open" : status.elsewhere ? "elsewhere" : "standing_in" };
       showStatus();
       showNow();
       readState();
@@ -218,13 +222,44 @@ function showStatus() {
 
 function showNow() {
   const away = now.gate !== "open";
-  const texts = { open: "up", standing_in: "away", injecting: "coming back", unknown: "not seen yet" };
+  const texts = { open: "up", standing_in: "away", injecting: "coming back", elsewhere: "elsewhere", unknown: "not seen yet" };
   say("master", texts[now.gate] ?? now.gate);
   const journal = now.journal ?? {};
   say("journal", plural(journal.records ?? 0, "record"));
   say("journal-more", size((journal.bytes ?? 0) + (journal.snapshot_bytes ?? 0)));
   say("disk", size(journal.disk_free_bytes));
   if (away || document.querySelector("#rescues .now")) showRescues();
+  showComputers(now.cluster);
+}
+
+/** The computers of the robot, if there are several. */
+function showComputers(cluster) {
+  $("computers").hidden = !cluster;
+  if (!cluster) return;
+  const { leader, leaderless_since: leaderless, etcd_trouble: trouble, last_takeover: last } = cluster;
+  const led = leader && `${leader.name} since ${moment(leader.since)}, term ${leader.term}`;
+  const isWell = cluster.role !== "alone" && leader && !leaderless;
+  $("computers").dataset.is = isWell ? "" : "bad";
+  const leads = !leader ? "no leader is known" : leaderless ? `NO LEADER since ${moment(leaderless)}; the last was ${leader.name}` : `leader: ${led}`;
+  say("computers-leader", cluster.role === "alone" ? `${cluster.name} is CUT OFF since ${moment(cluster.since)}; ${leads}` : leads);
+  const notes = [
+    trouble && `etcd has not answered since ${moment(trouble.since)}: ${trouble.why}`,
+    cluster.uncommitted > 0 && `${plural(cluster.uncommitted, "change")} of ${cluster.name} not in etcd yet`,
+    last && `last takeover by ${cluster.name}: ${moment(last.at)}${last.from ? ` from ${last.from}` : ""}${last.in_order ? ", in order" : ""}, in ${ms(1000 * last.seconds)}`,
+    cluster.lost_writes > 0 && `${plural(cluster.lost_writes, "change")} made while it was cut off did not hold: the log names each`,
+  ].filter(Boolean);
+  say("computers-notes", notes.join("; "));
+  const rows = cluster.computers.map((of) => {
+    const isThis = of.name === cluster.name;
+    const is = of.away ? "dead" : of.role === "leading" || of.role === "following" ? "alive" : "unreachable";
+    const led = of.role === "leading" && (leaderless || leader?.name !== of.name);
+    const role = of.away ? "AWAY" : led ? "led" : ROLES[of.role] ?? of.role;
+    const behind = of.away || of.role === "leading" ? "" : of.behind ? `${plural(of.behind, "record")} behind` : "has every record";
+    const heard = isThis ? "this computer" : of.heard ? `heard of at ${moment(of.heard)}` : "not heard of since the start";
+    const link = /^https?:/.test(of.uri) ? el("a", { href: of.uri }, of.name) : of.name;
+    return el("tr", {}, ...[link, el("span", { class: "health", "data-is": is }, role), behind, heard, of.version].map((cell) => el("td", {}, cell)));
+  });
+  $("computers-list").replaceChildren(...rows);
 }
 
 function showTimes() {
@@ -239,7 +274,7 @@ function showTimes() {
 function showCounts() {
   if (!status) return;
   const deaths = status.deaths ? `, died ${status.deaths === 1 ? "once" : `${status.deaths} times`}` : "";
-  say("master-more", `${status.master_pid ? `process ${status.master_pid}` : ""}${deaths}`);
+  say("master-more", status.elsewhere ? "on the leading computer" : `${status.master_pid ? `process ${status.master_pid}` : ""}${deaths}`);
   const sick = robot ? robot.nodes.filter((node) => node.health === "unreachable").length : 0;
   const dead = robot ? robot.nodes.filter((node) => node.health === "dead").length : 0;
   say("count-nodes", robot ? String(robot.totals.nodes - dead) : "–");

@@ -1,0 +1,147 @@
+//! A computer begins to take part.
+
+use std::{
+    collections::VecDeque,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use hyper::header::HeaderValue;
+use tokio::{
+    sync::{mpsc, watch},
+    task::JoinSet,
+};
+use tokio_util::sync::CancellationToken;
+
+use super::{Background, CutOff, Known, Member, Outgoing};
+use crate::{
+    app::{duty::Post, startup},
+    checkpoint::session::Restore,
+    cluster::{
+        etcd::{Access, Etcd, EtcdError, Options, Tls},
+        journal::{Keys, Progress},
+        machine::{ANSWER_LIMIT, Commit, Machine, Settings, View, WhenAlone},
+        replica::Replica,
+        way::Way,
+    },
+    config::{ClusterConfig, ClusterSync, WhenCutOff},
+    master::Master,
+    process::Rosmaster,
+    server::others::Others,
+    upstream::peer::Peers,
+};
+
+/// It is best to know what was before one claims; but not for longer.
+const START_BY: Duration = Duration::from_secs(1);
+
+/// What a computer among several is given.
+pub(in crate::app) struct Given {
+    pub(in crate::app) config: ClusterConfig,
+    pub(in crate::app) post: Post,
+    pub(in crate::app) rosmaster: Rosmaster,
+    pub(in crate::app) rosout: bool,
+    /// Identifies this process.
+    pub(in crate::app) instance: HeaderValue,
+    pub(in crate::app) restore: Restore,
+    /// How long a call waits that nobody can answer.
+    pub(in crate::app) hold: Duration,
+    /// Whether the mirror is from a checkpoint whose session continues.
+    pub(in crate::app) restored: bool,
+    /// Cancelled when calls are no longer taken.
+    pub(in crate::app) halt: CancellationToken,
+}
+
+/// Where the other computers are asked, and the task to run.
+pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdError> {
+    let config = &given.config;
+    let client = Etcd::new(&Options {
+        endpoints: config.endpoints.clone(),
+        access: Access {
+            tls: Tls {
+                ca: config.ca.clone(),
+                cert: config.cert.clone(),
+                key: config.key.clone(),
+            },
+            user: config.user.clone(),
+        },
+    })?;
+    let settings = Settings {
+        name: config.name.clone(),
+        id: startup::kernel_id("/proc/sys/kernel/random/uuid"),
+        uri: config.advertised.to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        ttl: config.ttl,
+        commit: match config.sync {
+            ClusterSync::Always => Commit::Always,
+            ClusterSync::Interval => Commit::Interval,
+        },
+        alone: match config.alone {
+            WhenCutOff::Serve => WhenAlone::Serve,
+            WhenCutOff::Refuse => WhenAlone::Refuse,
+        },
+    };
+    let post = &given.post;
+    post.ledger.leave();
+    // One that an earlier process left may hold what others have changed since.
+    given.rosmaster.left_behind(None);
+    let known = given.restored;
+    let (way, way_rx) = watch::channel(Way::Nobody { known });
+    let (handovers_tx, handovers) = mpsc::channel(1);
+    let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
+    let others = Others {
+        way: way_rx,
+        peers: peers.clone(),
+        handovers: handovers_tx,
+        // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
+        hold: given.hold.max(2 * config.ttl),
+    };
+    let cut_off = CutOff::left(&post.checkpoint, given.restored).await;
+    let member = Member {
+        machine: Machine::new(settings.clone()),
+        replica: Replica {
+            client,
+            keys: Keys::new(&config.robot),
+            limit: ANSWER_LIMIT,
+        },
+        known: Known::new(&settings),
+        trouble: Arc::default(),
+        background: Background::default(),
+        settings,
+        given,
+        leads: watch::Sender::new(Way::Nobody { known }),
+        way,
+        peers,
+        handovers,
+        inbox: VecDeque::new(),
+        start_by: Some(Instant::now() + START_BY),
+        requests: JoinSet::new(),
+        view: View::default(),
+        watch: None,
+        loading: None,
+        load_at: Some(Instant::now()),
+        loaded: false,
+        wanted: None,
+        reported: 0,
+        held: Master::default(),
+        progress: Progress::default(),
+        outgoing: Outgoing::default(),
+        duty: None,
+        endings: JoinSet::new(),
+        cut_off,
+        merging: None,
+        ours: false,
+        before: None,
+        was_released: false,
+        led: false,
+        namesake: None,
+        seen_leading: false,
+        deciding: None,
+        goes_on: None,
+        probe: None,
+        probe_at: None,
+        released: None,
+        release_by: None,
+        ending_roscore: None,
+    };
+    Ok((others, member))
+}

@@ -1,0 +1,193 @@
+//! Reads the journal, and brings the ledger there while another computer leads.
+
+use std::time::Instant;
+
+use super::{AGAIN, Member, apply};
+use crate::{
+    checkpoint::format::Record,
+    cluster::{
+        etcd::{Change, WatchEnd},
+        journal::{self, Manifest},
+        machine::{Input, Leader},
+        replica::{Loaded, ReplicaError},
+    },
+    master::Master,
+};
+
+impl Member {
+    /// Has the journal read if it is not known as far as it must be.
+    pub(super) fn catch_up(&mut self) {
+        let wanted = self.wanted.unwrap_or_default();
+        let news = self.wanted.is_some() || self.reported != self.progress.seq;
+        if news
+            && self.loaded
+            && !self.has_master()
+            && self.progress.seq >= wanted
+            && !self.must_decide()
+        {
+            (self.wanted, self.reported) = (None, self.progress.seq);
+            self.inbox.push_back(Input::Followed(self.progress.seq));
+        }
+        if self.wanted.is_some() && self.progress.seq < self.wanted.unwrap_or(0) {
+            self.load_at.get_or_insert_with(Instant::now);
+        }
+        let due = self.load_at.is_some_and(|at| at <= Instant::now());
+        if due && self.loading.is_none() {
+            self.load_at = None;
+            let (replica, known) = (self.replica.clone(), self.progress);
+            self.loading = Some(Box::pin(async move { replica.load(known).await }));
+        }
+    }
+
+    /// The state in etcd at a moment after this. What the watch has told may be of long before.
+    pub(super) fn present(&self) -> impl Future<Output = Master> + Send + 'static {
+        let (replica, known, held) = (self.replica.clone(), self.progress, self.held.clone());
+        async move {
+            loop {
+                if let Ok(loaded) = replica.load(known).await {
+                    let state = loaded
+                        .checkpoint
+                        .map(|of| Master::from_snapshot(of.snapshot));
+                    if let Ok(mut state) = state.unwrap_or_else(|| Ok(held.clone())) {
+                        apply(&mut state, &loaded.records);
+                        return state;
+                    }
+                }
+                tokio::time::sleep(AGAIN).await;
+            }
+        }
+    }
+
+    /// The journal has changed.
+    pub(super) fn changed(&mut self, changes: Result<Vec<Change>, WatchEnd>) {
+        let changes = match changes {
+            Ok(changes) => changes,
+            Err(end) => {
+                if let WatchEnd::Failed(error) = end {
+                    self.trouble.set(&error.into());
+                }
+                self.watch = None;
+                self.load_at = Some(Instant::now() + AGAIN);
+                return;
+            }
+        };
+        self.trouble.clear();
+        let keys = self.replica.keys.clone();
+        for change in &changes {
+            if let Err(error) = change.absorb(&mut self.view, &keys) {
+                self.trouble.set(&error.into());
+            }
+            self.known.member(&keys, &change.key, change.kv.as_ref());
+        }
+        self.look_at_view();
+        for change in changes {
+            let Some(kv) = change.kv.filter(|kv| keys.seq_of(&kv.key).is_some()) else {
+                continue;
+            };
+            if keys
+                .seq_of(&kv.key)
+                .is_some_and(|seq| seq <= self.progress.seq)
+            {
+                continue;
+            }
+            // What is large is read apart, and so is what does not follow.
+            let records = match Manifest::read(&kv.value) {
+                Some(_) => None,
+                None => journal::records(&kv.key, &kv.value).ok(),
+            };
+            let new = records.and_then(|of| self.progress.take(of, kv.value.len()).ok());
+            match new {
+                Some(new) => self.follow(&new),
+                None => {
+                    self.load_at.get_or_insert_with(Instant::now);
+                    break;
+                }
+            }
+        }
+    }
+
+    pub(super) fn look_at_view(&mut self) {
+        let leader = self.view.leader.as_ref();
+        let other = leader.filter(|leader| leader.id != self.settings.id);
+        self.seen_leading |= self.known.look(&self.view) && other.is_some();
+        if self.ours && other.is_some_and(|leader| !self.was_self(leader)) {
+            self.ours = false;
+            self.adopt_held();
+        }
+        self.inbox.push_back(Input::View(self.view.clone()));
+    }
+
+    /// New records of the journal.
+    pub(super) fn follow(&mut self, records: &[Record]) {
+        apply(&mut self.held, records);
+        if self.follows() {
+            // Only if this computer has the master by now.
+            let _ = self.given.post.ledger.follow(records);
+        }
+    }
+
+    pub(super) fn have_loaded(&mut self, loaded: Result<Loaded, ReplicaError>) {
+        let loaded = match loaded {
+            Ok(loaded) => loaded,
+            Err(error) => {
+                self.trouble.set(&error);
+                self.load_at = Some(Instant::now() + AGAIN);
+                return;
+            }
+        };
+        self.trouble.clear();
+        if self.watch.is_none() {
+            let range = self.replica.keys.small();
+            let client = &self.replica.client;
+            self.watch = Some(client.watch(range, loaded.view.revision, self.settings.ttl));
+        }
+        for kv in &loaded.members {
+            self.known.member(&self.replica.keys, &kv.key, Some(kv));
+        }
+        if loaded.view.revision >= self.view.revision {
+            self.view = loaded.view;
+        }
+        let first = !std::mem::replace(&mut self.loaded, true);
+        let leader = self.view.leader.as_ref();
+        if first {
+            self.ours = leader.is_none_or(|leader| self.was_self(leader));
+        }
+        if let Some(checkpoint) = loaded.checkpoint
+            && loaded.progress.seq >= self.progress.seq
+        {
+            match Master::from_snapshot(checkpoint.snapshot) {
+                Ok(state) => self.held = state,
+                Err(error) => {
+                    tracing::error!(%error, "the state in etcd is no state of a master; please report this");
+                    return;
+                }
+            }
+            apply(&mut self.held, &loaded.records);
+            self.progress = loaded.progress;
+            self.adopt_held();
+        } else if let Ok(new) = self.progress.take(loaded.records, 0) {
+            match first {
+                // The ledger may hold something else.
+                true => {
+                    apply(&mut self.held, &new);
+                    self.adopt_held();
+                }
+                false => self.follow(&new),
+            }
+        }
+        self.start();
+        self.look_at_view();
+    }
+
+    pub(super) fn start(&mut self) {
+        if self.start_by.take().is_some() {
+            self.inbox.push_back(Input::Start(0));
+        }
+    }
+
+    /// Whether an earlier process of this computer leads, and nobody has since the ledger was recorded.
+    pub(super) fn was_self(&self, leader: &Leader) -> bool {
+        let term = self.given.post.ledger.session().term;
+        leader.id != self.settings.id && leader.name == self.settings.name && leader.term == term
+    }
+}

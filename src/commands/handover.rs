@@ -1,0 +1,237 @@
+//! `rosrescue handover`: lets another computer lead.
+
+use std::{fmt, time::Duration};
+
+use serde::Serialize;
+use tokio::time::{Instant, sleep};
+
+use super::{
+    Exit, Failure, print,
+    running::{ANSWER_LIMIT, Running},
+};
+use crate::{
+    cli::HandoverArgs,
+    cluster::machine::Role,
+    status::computers::{Computers, Leader},
+    xmlrpc::{Reply, Value},
+};
+
+/// The method of rosrescue that gives up leading: its parameters are the caller's id and who should lead,
+/// empty for anybody.
+const METHOD: &str = "rosrescue/handover";
+/// Who calls it.
+const CALLER: &str = "/rosrescue_handover";
+/// Pause between two looks at who leads.
+const PAUSE: Duration = Duration::from_millis(20);
+/// How often the wait is explained.
+const SAY_EVERY: Duration = Duration::from_secs(1);
+
+/// How it ended.
+#[derive(Debug, Serialize)]
+struct Outcome {
+    uri: String,
+    /// Whether another computer leads now: the one that was asked for, if one was.
+    handed_over: bool,
+    /// Who led before.
+    from: String,
+    /// Who leads now; none if nobody does.
+    to: Option<String>,
+    /// Who was asked for.
+    wanted: Option<String>,
+    /// From the request until it was seen.
+    seconds: f64,
+}
+
+impl Outcome {
+    fn new(running: &Running, from: &Leader, to: Option<&Leader>, wanted: Option<&str>) -> Self {
+        let to = to.map(|to| to.name.clone());
+        let is_meant = |to: &String| wanted.map_or(*to != from.name, |wanted| to == wanted);
+        Self {
+            uri: running.address.to_string(),
+            handed_over: to.as_ref().is_some_and(is_meant),
+            from: from.name.clone(),
+            to,
+            wanted: wanted.map(str::to_owned),
+            seconds: 0.0,
+        }
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { from, seconds, .. } = self;
+        match (&self.to, &self.wanted) {
+            (Some(to), _) if self.handed_over && to == from => write!(f, "{to} leads already"),
+            (Some(to), _) if self.handed_over => {
+                write!(f, "{from} led, {to} leads now, after {seconds:.2} s")
+            }
+            (Some(to), Some(wanted)) if to != from => write!(
+                f,
+                "{from} led, {to} leads now, and not {wanted}, after {seconds:.2} s"
+            ),
+            (Some(_), _) => write!(
+                f,
+                "nobody has taken over: {from} leads as before, after {seconds:.2} s"
+            ),
+            (None, _) => write!(
+                f,
+                "nobody has taken over: {from} led, and nobody leads now, after {seconds:.2} s; \
+                 `rosrescue status` says more"
+            ),
+        }
+    }
+}
+
+pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, Failure> {
+    let running = Running::find(&args.target)?;
+    let wanted = args.to.as_deref();
+    let before = computers(&running).await?;
+    let from = leader(&before, wanted)?;
+    let mut to = Some(from.clone());
+    let start = Instant::now();
+    if wanted != Some(&from.name) {
+        ask(&running, wanted, args.timeout).await?;
+        to = next_leader(&running, from, start, args.timeout).await?;
+    }
+    let outcome = Outcome {
+        seconds: start.elapsed().as_secs_f64(),
+        ..Outcome::new(&running, from, to.as_ref(), wanted)
+    };
+    print(&outcome, &args.output)?;
+    Ok(match outcome.handed_over {
+        true => Exit::Good,
+        false => Exit::Bad,
+    })
+}
+
+async fn computers(running: &Running) -> Result<Computers, Failure> {
+    running.status().await?.cluster.ok_or_else(|| {
+        Failure::Failed(format!(
+            "the rosrescue at {} is not one of several computers, it runs without --cluster: there is \
+             nobody to hand over to",
+            running.address
+        ))
+    })
+}
+
+/// Who leads, and would give it up.
+fn leader<'a>(now: &'a Computers, wanted: Option<&str>) -> Result<&'a Leader, Failure> {
+    let mut names = now.computers.iter().map(|computer| &*computer.name);
+    if let Some(wanted) = wanted
+        && !names.any(|name| name == wanted)
+    {
+        let names: Vec<_> = now.computers.iter().map(|of| &*of.name).collect();
+        return Err(Failure::Usage(format!(
+            "--to: no computer of this robot is called `{wanted}`; there are {}",
+            names.join(", ")
+        )));
+    }
+    if now.role == Role::Alone {
+        return Err(Failure::Failed(format!(
+            "{} is cut off from the others: ask another computer, with --uri",
+            now.name
+        )));
+    }
+    now.leads().ok_or_else(|| {
+        Failure::Failed(
+            "no computer leads now, so none can hand over; `rosrescue status` says more".to_owned(),
+        )
+    })
+}
+
+/// Asks the leader to give up.
+async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<(), Failure> {
+    let limit =
+        Duration::try_from_secs_f64(timeout).map_or(ANSWER_LIMIT, |limit| limit.max(ANSWER_LIMIT));
+    let params = [CALLER, wanted.unwrap_or_default()].map(Value::from);
+    let refused = |why: &str| Failure::Failed(format!("the leader does not hand over: {why}"));
+    match running.call(METHOD, params.into(), limit).await? {
+        Reply::Value(Value::Array(answer)) => match answer.as_slice() {
+            [Value::Int(1), ..] => Ok(()),
+            [_, why, ..] => Err(refused(why.as_str().unwrap_or("it gives no reason"))),
+            _ => Err(refused("its answer is not understood")),
+        },
+        Reply::Value(_) => Err(refused("its answer is not understood")),
+        Reply::Fault { text, .. } => Err(refused(&text)),
+    }
+}
+
+/// Who leads after `from`, or at the end of the time.
+async fn next_leader(
+    running: &Running,
+    from: &Leader,
+    start: Instant,
+    timeout: f64,
+) -> Result<Option<Leader>, Failure> {
+    let mut said = start;
+    loop {
+        let now = computers(running).await?;
+        let is_next = now.leads().is_some_and(|leader| leader.term > from.term);
+        if is_next || start.elapsed().as_secs_f64() >= timeout {
+            return Ok(now.leads().cloned());
+        }
+        if said.elapsed() >= SAY_EVERY {
+            said = Instant::now();
+            let leads = now.leads().map_or("nobody", |leader| &*leader.name);
+            let seconds = start.elapsed().as_secs();
+            eprintln!("rosrescue: {leads} leads after {seconds} s, waiting for another computer");
+        }
+        sleep(PAUSE).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::cluster::ClusterFacts;
+
+    fn said(from: &str, to: Option<&str>, wanted: Option<&str>) -> (bool, String) {
+        let running = Running {
+            address: crate::ros_env::MasterUri::parse("http://pc-2:1").unwrap(),
+        };
+        let of = |name: &str| Leader {
+            name: name.to_owned(),
+            uri: String::new(),
+            version: String::new(),
+            term: 1,
+            since: 0.0,
+        };
+        let to = to.map(of);
+        let outcome = Outcome::new(&running, &of(from), to.as_ref(), wanted);
+        (outcome.handed_over, outcome.to_string())
+    }
+
+    #[test]
+    fn the_outcome_is_what_was_asked_for_or_not() {
+        for (from, to, wanted, handed_over, text) in [
+            ("a", Some("b"), None, true, "a led, b leads now, after"),
+            ("a", Some("b"), Some("b"), true, "a led, b leads now, after"),
+            ("a", Some("a"), Some("a"), true, "a leads already"),
+            ("a", Some("c"), Some("b"), false, "c leads now, and not b,"),
+            ("a", Some("a"), None, false, "a leads as before"),
+            ("a", Some("a"), Some("b"), false, "a leads as before"),
+            ("a", None, None, false, "nobody leads now"),
+        ] {
+            let (good, said) = said(from, to, wanted);
+            assert_eq!(good, handed_over, "{said}");
+            assert!(said.contains(text), "{said}");
+        }
+    }
+
+    #[test]
+    fn a_leader_is_asked_only_if_there_is_one_and_the_name_is_known() {
+        let mut facts = ClusterFacts::of_three();
+        let with = |facts: &ClusterFacts, wanted| {
+            let now = Computers::from(facts);
+            leader(&now, wanted).cloned()
+        };
+        assert_eq!(with(&facts, Some("pc-3")).unwrap().name, "pc-1");
+        let unknown = with(&facts, Some("pc-4")).expect_err("unknown");
+        assert!(matches!(&unknown, Failure::Usage(why) if why.contains("pc-1, pc-2, pc-3")));
+        facts.role = Role::Alone;
+        assert!(matches!(with(&facts, None), Err(Failure::Failed(_))));
+        facts.role = Role::Following;
+        facts.leaderless = Some(std::time::Instant::now());
+        assert!(matches!(with(&facts, None), Err(Failure::Failed(_))));
+    }
+}

@@ -1,0 +1,253 @@
+//! Calls to a computer that leads, follows, or knows nobody who leads.
+
+use http_body_util::BodyExt;
+use hyper::{StatusCode, header::HeaderValue};
+use tokio::{io::AsyncWriteExt, net::TcpListener};
+
+use super::*;
+use crate::{
+    checkpoint::format::Session,
+    cli::{Reads, SyncPolicy},
+    gate,
+    ledger::Ledger,
+    master::Master,
+    ros_env::MasterUri,
+    upstream::{Upstream, pool::Pool},
+    write_queue::write_queue,
+    xmlrpc::{decode_reply, encode_call},
+};
+
+const OWN: &str = "http://127.0.0.1:11311/";
+const TERM: u64 = 7;
+
+/// A computer that follows, and what its conductor holds.
+struct Computer {
+    calls: Calls,
+    way: watch::Sender<Way>,
+    handovers: mpsc::Receiver<Handover>,
+}
+
+fn set(value: i32) -> Request {
+    let params = [Value::from("/n"), "/a".into(), value.into()];
+    Request::new(Method::SetParam, params)
+}
+
+fn get() -> Request {
+    Request::new(Method::GetParam, ["/n", "/a"])
+}
+
+fn handover() -> Request {
+    Request::new(Method::named(HANDOVER), ["/n", "pc-2"])
+}
+
+impl Computer {
+    /// Its mirror holds one parameter.
+    fn new(way: Way) -> Self {
+        let (gate_tx, gate) = gate::gate();
+        gate_tx.set(gate::State::Elsewhere);
+        let stats = Box::leak(Box::default());
+        let mut mirror = Master::default();
+        mirror.apply(&set(1));
+        let (session, sync) = (Session::default(), SyncPolicy::Interval);
+        let ledger = Ledger::new(mirror, session, Vec::new(), None, sync, stats);
+        let ledger = Arc::new(ledger);
+        ledger.set_identity(42, OWN.to_owned());
+        ledger.leave();
+        let instance = || HeaderValue::from_static("test");
+        let second = Duration::from_secs(1);
+        let nobody = MasterUri::parse("http://127.0.0.1:1/").unwrap();
+        let upstream = Arc::new(Upstream::new(nobody, instance(), second, 3));
+        let (write_queue, _) = write_queue(
+            ledger.clone(),
+            upstream.clone(),
+            gate.clone(),
+            stats,
+            None,
+            false,
+        );
+        let (way, way_rx) = watch::channel(way);
+        let (handovers_tx, handovers) = mpsc::channel(1);
+        let calls = Calls {
+            pool: Arc::new(Pool::new(1, upstream, ledger.clone(), gate.clone())),
+            gate,
+            ledger,
+            reads: Reads::Mirror,
+            last_large: Default::default(),
+            write_queue,
+            slow: Arc::default(),
+            stats,
+            uri: OWN.to_owned(),
+            hold: second,
+            others: Some(Others {
+                way: way_rx,
+                peers: Arc::new(Peers::new(instance(), second)),
+                handovers: handovers_tx,
+                hold: second,
+            }),
+        };
+        Self {
+            calls,
+            way,
+            handovers,
+        }
+    }
+
+    async fn ask(&self, path: &str, call: &Request) -> Result<HttpReply, Closed> {
+        let head = Head {
+            path: path.to_owned(),
+            ..Head::default()
+        };
+        let body = encode_call(&call.clone().into()).into();
+        let from = "127.0.0.1:4000".parse().unwrap();
+        self.calls
+            .answer(from, head, body, Some(call.clone()))
+            .await
+    }
+}
+
+async fn reply(answer: HttpReply) -> Reply {
+    let body = answer.into_body().collect().await.unwrap().to_bytes();
+    decode_reply(&body).unwrap()
+}
+
+fn made_by(call: &Request) -> Reply {
+    let mut model = Master::default();
+    model.apply(&set(1));
+    model.apply(call).reply
+}
+
+/// A leader that says 421 to each call, or nothing at all.
+async fn leader(says: Option<StatusCode>) -> Way {
+    let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    tokio::spawn(async move {
+        let mut open = Vec::new();
+        while let Ok((mut stream, _)) = listener.accept().await {
+            if let Some(code) = says {
+                let answer = format!("HTTP/1.1 {code}\r\nContent-Length: 0\r\n\r\n");
+                stream.write_all(answer.as_bytes()).await.unwrap();
+            }
+            open.push(stream);
+        }
+    });
+    let uri = MasterUri::parse(&format!("http://127.0.0.1:{port}/")).unwrap();
+    Way::Leader { uri, term: TERM }
+}
+
+#[tokio::test]
+async fn a_call_for_a_term_in_which_this_computer_does_not_lead_gets_421() {
+    for way in [
+        Way::Here { term: None },
+        Way::Here { term: Some(8) },
+        Way::Nobody { known: true },
+        leader(None).await,
+    ] {
+        let computer = Computer::new(way);
+        for call in [get(), set(2), handover()] {
+            let answer = computer.ask("/cluster/7", &call).await.unwrap();
+            assert_eq!(answer.status(), StatusCode::MISDIRECTED_REQUEST);
+        }
+    }
+}
+
+#[tokio::test]
+async fn while_nobody_leads_reads_are_the_mirrors_and_a_write_waits_for_the_next_leader() {
+    let computer = Computer::new(Way::Nobody { known: true });
+    let answer = computer.ask("/RPC2", &get()).await.unwrap();
+    assert_eq!(reply(answer).await, made_by(&get()));
+    assert!(computer.ask("/RPC2", &set(2)).await.is_err());
+    // Before the state is known there is nothing to answer with.
+    computer.way.send_replace(Way::Nobody { known: false });
+    assert!(computer.ask("/RPC2", &get()).await.is_err());
+}
+
+#[tokio::test]
+async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lead() {
+    for says in [None, Some(StatusCode::MISDIRECTED_REQUEST)] {
+        let computer = Computer::new(leader(says).await);
+        let answer = computer.ask("/RPC2", &get()).await.unwrap();
+        assert_eq!(reply(answer).await, made_by(&get()), "{says:?}");
+        // A write waits for what becomes of the leader.
+        let write = set(2);
+        let waits = computer.ask("/RPC2", &write);
+        assert!(
+            tokio::time::timeout(Duration::from_millis(100), waits)
+                .await
+                .is_err()
+        );
+    }
+    let gone = MasterUri::parse("http://127.0.0.1:1/").unwrap();
+    let computer = Computer::new(Way::Leader {
+        uri: gone,
+        term: TERM,
+    });
+    let answer = computer.ask("/RPC2", &get()).await.unwrap();
+    assert_eq!(reply(answer).await, made_by(&get()));
+}
+
+#[tokio::test]
+async fn who_and_where_the_master_is_each_computer_says_of_itself() {
+    let computer = Computer::new(Way::Nobody { known: false });
+    let uri = Request::new(Method::GetUri, ["/n"]);
+    let answer = reply(computer.ask("/RPC2", &uri).await.unwrap()).await;
+    let Reply::Value(answer) = answer else {
+        panic!("{answer:?}");
+    };
+    assert_eq!(answer.as_array().unwrap()[2], OWN.into());
+}
+
+#[tokio::test]
+async fn a_write_that_no_record_holds_is_refused_before_it_is_run() {
+    let computer = Computer::new(Way::Here { term: Some(TERM) });
+    let body = Bytes::from(vec![b' '; RECORD_BYTES_MAX + 1]);
+    let from = "127.0.0.1:4000".parse().unwrap();
+    let ask = |call| {
+        computer
+            .calls
+            .answer(from, Head::default(), body.clone(), call)
+    };
+    for call in [Some(set(2)), None] {
+        let answer = reply(ask(call).await.unwrap()).await;
+        let Reply::Fault { text, .. } = answer else {
+            panic!("{answer:?}");
+        };
+        assert!(text.contains("67108865 bytes"), "{text}");
+    }
+}
+
+#[tokio::test]
+async fn a_handover_is_asked_for_where_this_computer_leads_and_is_done_or_refused() {
+    let mut computer = Computer::new(Way::Here { term: Some(TERM) });
+    for told in [Ok("pc-1".to_owned()), Err("no other computer".to_owned())] {
+        let call = handover();
+        let mut handovers = std::mem::replace(&mut computer.handovers, mpsc::channel(1).1);
+        let (answer, ()) = tokio::join!(computer.ask("/RPC2", &call), async {
+            let (to, tell) = handovers.recv().await.unwrap();
+            assert_eq!(to, "pc-2");
+            tell.send(told.clone()).unwrap();
+        });
+        computer.handovers = handovers;
+        let expected: Value = match &told {
+            Ok(who) => vec![
+                1.into(),
+                "another computer may lead now".into(),
+                who.as_str().into(),
+            ],
+            Err(why) => vec![Value::from(0), why.as_str().into(), "".into()],
+        }
+        .into();
+        assert_eq!(reply(answer.unwrap()).await, Reply::Value(expected));
+    }
+}
+
+#[tokio::test]
+async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
+    let computer = Computer::new(leader(Some(StatusCode::MISDIRECTED_REQUEST)).await);
+    let answer = reply(computer.ask("/RPC2", &handover()).await.unwrap()).await;
+    let Reply::Value(answer) = answer else {
+        panic!("{answer:?}");
+    };
+    let answer = answer.as_array().unwrap();
+    assert_eq!(answer[0], 0.into());
+    assert_eq!(answer[1], "the leader does not answer".into());
+}
