@@ -68,6 +68,7 @@ ros_missing() {
     need libpam-systemd has_pam_systemd
     need procps command -v pgrep
     need dpkg-dev command -v dpkg-shlibdeps
+    need keepalived command -v keepalived
 }
 
 install_missing() { # PACKAGES...

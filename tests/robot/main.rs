@@ -132,6 +132,7 @@ mod restart {
 mod service {
     mod booted;
     mod catkin;
+    mod containers;
     mod install;
     mod package;
 }
@@ -141,3 +142,6 @@ mod clock;
 
 /// The commands that the documents show.
 mod documents;
+
+/// What the document on several computers tells people to do.
+mod computers;

@@ -9,7 +9,7 @@ use std::{
 /// What the test of the documents does not run, why, and what tests it otherwise. A block that has one of these
 /// words is left out.
 #[rustfmt::skip]
-pub(crate) const NOT_RUN: [(&str, &str); 15] = [
+pub(crate) const NOT_RUN: [(&str, &str); 20] = [
     ("sudo ", "changes this computer: `tests/robot/service/booted.rs` and `tests/robot/service/package.rs` have their own"),
     ("rosrescue install", "changes this computer: `tests/robot/service/install.rs`"),
     ("systemctl ", "needs systemd: `tests/robot/service/booted.rs`"),
@@ -25,6 +25,11 @@ pub(crate) const NOT_RUN: [(&str, &str); 15] = [
     ("ROSRESCUE_SCRIPT=failed.txt", "wants a failure's output: `tests/differential/script.rs`"),
     ("examples/robot/", "takes minutes: `tests/robot/nodes/example.rs`"),
     ("ROSRESCUE_CHECKPOINT=", "settings of a unit: `tests/robot/service/install.rs`"),
+    ("ROSRESCUE_CLUSTER=", "settings of a unit: `tests/robot/service/install.rs`"),
+    ("etcdctl ", "needs several computers: `tests/robot/computers.rs` has them"),
+    ("openssl ", "needs several computers: `tests/robot/computers.rs` has them"),
+    ("core --cluster ", "needs several computers: `tests/robot/computers.rs` has them"),
+    ("rosrescue handover", "needs several computers: `tests/robot/computers.rs` has them"),
 ];
 
 /// A block of commands as a document has it, without its indentation.

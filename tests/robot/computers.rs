@@ -1,0 +1,210 @@
+//! What `docs/several-computers.md` tells people to do works on three computers: `tests/support/computers.sh` makes
+//! them, with real etcd servers and a real keepalived.
+
+use std::{fs, path::Path, process::Command};
+
+use super::support::{Scratch, blocks};
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+const COMPUTERS: [(&str, &str); 3] = [
+    ("base", "10.0.0.1"),
+    ("arm", "10.0.0.2"),
+    ("head", "10.0.0.3"),
+];
+const ALL: [&str; 3] = ["base", "arm", "head"];
+
+/// The commands of the document, section by section.
+struct Document(String);
+
+impl Document {
+    fn new() -> Self {
+        Self(fs::read_to_string(Path::new(ROOT).join("docs/several-computers.md")).unwrap())
+    }
+
+    /// What is in the fence of text whose first line begins so.
+    fn text(&self, first: &str) -> String {
+        let (_, rest) = self.0.split_once(&format!("```text\n{first}")).unwrap();
+        format!("{first}{}", rest.split("```").next().unwrap())
+    }
+
+    /// The blocks of `section`, of which there are as many as expected.
+    fn section<const COUNT: usize>(&self, section: &str) -> [String; COUNT] {
+        let blocks = blocks(&self.0);
+        let blocks = blocks.into_iter().filter(|block| block.section == section);
+        let texts: Vec<_> = blocks.map(|block| block.text).collect();
+        texts.try_into().unwrap_or_else(|texts: Vec<_>| {
+            panic!("`{section}` has {} blocks, not {COUNT}", texts.len())
+        })
+    }
+}
+
+/// `text`, done on each of `computers` by a person who changes the first line as the document says.
+fn on(computers: &[&str], text: &str) -> String {
+    let own = COMPUTERS
+        .iter()
+        .filter(|(name, _)| computers.contains(name));
+    let scripts = own.map(|(name, address)| {
+        let text = text
+            .replace(
+                "name=base address=10.0.0.1",
+                &format!("name={name} address={address}"),
+            )
+            .replace("name=base\n", &format!("name={name}\n"));
+        format!("on {name} <<'SCRIPT'\n{text}\nSCRIPT\n")
+    });
+    scripts.collect()
+}
+
+/// In namespaces of its own, which end with the shell and all that it has started.
+#[track_caller]
+fn run(script: &str) -> String {
+    let scratch = Scratch::new();
+    let mut command = Command::new("unshare");
+    scratch.prepare(&mut command);
+    let output = command
+        .args([
+            "--net",
+            "--mount",
+            "--pid",
+            "--fork",
+            "--mount-proc",
+            "--kill-child",
+        ])
+        .args(["timeout", "--kill-after=5", "100", "bash", "-euc"])
+        .arg(format!("exec 2>&1\n. tests/support/computers.sh\n{script}"))
+        .env("REPOSITORY", ROOT)
+        .env("ROSRESCUE", env!("CARGO_BIN_EXE_rosrescue"))
+        .current_dir(ROOT)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        output.status.success(),
+        "{} (namespaces need root; tests/run.sh installs etcd and keepalived):\n{script}\n{said}",
+        output.status,
+    );
+    said
+}
+
+/// Steps 1 to 3, and then until a majority has formed.
+fn three_etcd(document: &Document) -> String {
+    let [install, settings, start, _] = document.section("etcd on three computers");
+    let steps = [install, settings, start]
+        .map(|step| on(&ALL, &step))
+        .concat();
+    steps + "within 30 all_healthy http\n"
+}
+
+#[test]
+fn etcd_runs_as_the_document_says_and_a_member_is_replaced() {
+    let document = Document::new();
+    let [_, settings, start, look] = document.section("etcd on three computers");
+    let [replace] = document.section("One etcd is replaced");
+    let new = settings.replace("STATE=new", "STATE=existing");
+    assert_ne!(new, settings, "the document says what to change");
+    let said = run(&[
+        three_etcd(&document),
+        on(&["arm"], &look),
+        // The disk is gone, too.
+        on(
+            &["head"],
+            "sudo systemctl stop etcd\nrm -r /var/lib/etcd/robot",
+        ),
+        on(&["base"], &replace),
+        on(&["head"], &(new + &start)),
+        "within 30 all_healthy http\n".to_owned(),
+        on(&["head"], &look),
+    ]
+    .concat());
+    assert_eq!(said.matches("is healthy").count(), 6, "{said}");
+    assert_eq!(said.matches(", started, ").count(), 6, "{said}");
+}
+
+#[test]
+fn a_full_etcd_is_emptied_as_the_document_says() {
+    let document = Document::new();
+    let [_, settings, ..] = document.section::<4>("etcd on three computers");
+    let small = settings.replace(
+        "ETCD_ELECTION",
+        "ETCD_QUOTA_BACKEND_BYTES=8000000\nETCD_ELECTION",
+    );
+    let [install, _, start, _] = document.section("etcd on three computers");
+    let [make_room] = document.section("etcd's settings");
+    let put = "head -c 1000000 /dev/zero | tr '\\0' x | ETCDCTL_API=3 etcdctl --endpoints=10.0.0.2:2379 put /robot/big\n";
+    let fill = format!(
+        "for _ in $(seq 40); do {} done\nexit 1",
+        put.replace('\n', " || exit 0;")
+    );
+    let said = run(&[
+        [install, small, start].map(|step| on(&ALL, &step)).concat(),
+        "within 30 all_healthy http\n".to_owned(),
+        on(&["base"], &fill),
+        on(&["base"], &make_room),
+        on(&["base"], put),
+    ]
+    .concat());
+    assert!(said.contains("alarm:NOSPACE"), "{said}");
+}
+
+#[test]
+fn certificates_and_users_are_made_as_the_document_says() {
+    let document = Document::new();
+    let [authority, bring, look] = document.section("TLS");
+    let [users] = document.section("Users");
+    let [install, settings, _, _] = document.section("etcd on three computers");
+    let as_robot = "etcdctl --user robot:ANOTHER put /robot/x 1\n\
+                    if etcdctl --user robot:ANOTHER put /other/x 1; then exit 1; fi\n";
+    let options = document.text("ROSRESCUE_CLUSTER=https://");
+    let start = format!(
+        "echo ANOTHER >password\nset -a\n{options}ROSRESCUE_CLUSTER_USER=robot\n\
+         ROSRESCUE_CLUSTER_PASSWORD_FILE=$PWD/password\nset +a\nrosrescue core"
+    );
+    let said = run(&[
+        [install, settings].map(|step| on(&ALL, &step)).concat(),
+        on(&["base"], &authority),
+        "for name in arm head; do cp \"$scratch\"/base/*.{pem,key} \"$scratch/$name\"; done\n"
+            .to_owned(),
+        on(&ALL, &bring),
+        "within 30 all_healthy https\n".to_owned(),
+        on(&["head"], &(look + &users + as_robot)),
+        on(&ALL, &start),
+        on(&["head"], "rosrescue handover"),
+    ]
+    .concat());
+    assert_eq!(said.matches("is healthy").count(), 3, "{said}");
+    assert!(said.contains("base led, "), "{said}");
+    assert!(said.contains("Authentication Enabled"), "{said}");
+}
+
+#[test]
+fn rosrescue_runs_as_the_document_says_and_hands_over() {
+    let document = Document::new();
+    let [core, _, _] = document.section("rosrescue");
+    let [look] = document.section("Seeing it, and trying it");
+    let said = run(&[
+        three_etcd(&document),
+        on(&ALL, &core),
+        on(&["head"], &look),
+        // Its exit status says whether the next master is there yet.
+        on(&["base"], "rosrescue status || true"),
+    ]
+    .concat());
+    assert!(
+        said.contains("base led, ") && said.contains("leads now, after"),
+        "{said}"
+    );
+    assert!(said.contains("base (this one) follows"), "{said}");
+}
+
+#[test]
+fn the_virtual_address_leaves_a_computer_that_is_cut_off_or_without_rosrescue() {
+    let document = Document::new();
+    let said = run(&[
+        three_etcd(&document),
+        "cluster=http://10.0.0.1:2379,http://10.0.0.2:2379,http://10.0.0.3:2379/robot\n".to_owned(),
+        ". tests/support/virtual_address.sh\n".to_owned(),
+    ]
+    .concat());
+    println!("{said}");
+    assert_eq!(said.matches(" ms\n").count(), 2, "{said}");
+}

@@ -1,0 +1,146 @@
+//! The files for Docker and Kubernetes. Nothing here runs them: they are read as their tools would, and what they
+//! name has to exist.
+
+use std::process::Command;
+
+use serde_json::Value;
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+const READ: &str =
+    "import json, sys, yaml; print(json.dumps(list(yaml.safe_load_all(open(sys.argv[1])))))";
+
+/// The documents of a YAML file.
+fn read(name: &str) -> Vec<Value> {
+    let output = Command::new("/usr/bin/python3")
+        .args(["-c", READ, &format!("{ROOT}/packaging/{name}")])
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{name}: {errors}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn texts(list: &Value) -> Vec<&str> {
+    let list = list.as_array().into_iter().flatten();
+    list.map(|text| text.as_str().unwrap()).collect()
+}
+
+/// The program takes this command line.
+#[track_caller]
+fn is_understood(command: &[&str]) {
+    let ["rosrescue", arguments @ ..] = command else {
+        return;
+    };
+    let mut program = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+    let output = program.args(arguments).arg("--help").output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}: {errors}");
+}
+
+/// Hosts of `http://HOST:PORT` in a list of them, each maybe as `NAME=…`.
+fn hosts(list: &str) -> Vec<&str> {
+    let hosts = list.split(',').map(|url| {
+        let (_, rest) = url.split_once("http://").expect(url);
+        rest.split(':').next().unwrap()
+    });
+    hosts.collect()
+}
+
+#[test]
+fn services_of_the_compose_files_know_each_other() {
+    for name in ["docker/compose.yaml", "docker/compose.cluster.yaml"] {
+        let file = &read(name)[0];
+        let services = file["services"].as_object().unwrap();
+        for (service, of) in services {
+            // The network of the file knows a service by its name.
+            assert_eq!(of["hostname"], service.as_str(), "{name}");
+            for other in texts(&of["depends_on"]) {
+                assert!(services.contains_key(other), "{name}: {other}");
+            }
+            for volume in texts(&of["volumes"]) {
+                let volume = volume.split(':').next().unwrap();
+                assert!(file["volumes"].get(volume).is_some(), "{name}: {volume}");
+            }
+            if let Some(uri) = of["environment"]["ROS_MASTER_URI"].as_str() {
+                assert!(services.contains_key(hosts(uri)[0]), "{name}: {uri}");
+            }
+            let command: Vec<_> = of["command"]
+                .as_str()
+                .into_iter()
+                .flat_map(str::split_whitespace)
+                .collect();
+            is_understood(&command);
+            is_understood(
+                texts(&of["healthcheck"]["test"])
+                    .get(1..)
+                    .unwrap_or_default(),
+            );
+        }
+    }
+}
+
+#[test]
+fn the_compose_file_of_several_computers_has_one_etcd_for_all() {
+    let file = &read("docker/compose.cluster.yaml")[0];
+    let services = file["services"].as_object().unwrap();
+    let all = ["etcd-a", "etcd-b", "etcd-c"];
+    for name in all {
+        let settings = &services[name]["environment"];
+        let text = |name: &str| settings[name].as_str().unwrap();
+        assert_eq!(text("ETCD_NAME"), name);
+        assert_eq!(hosts(text("ETCD_INITIAL_CLUSTER")), all);
+        assert_eq!(hosts(text("ETCD_ADVERTISE_CLIENT_URLS")), [name]);
+        assert_eq!(hosts(text("ETCD_INITIAL_ADVERTISE_PEER_URLS")), [name]);
+    }
+    for name in ["ros-a", "ros-b", "ros-c"] {
+        let command = services[name]["command"].as_str().unwrap();
+        let (_, members) = command.split_once("--cluster ").unwrap();
+        assert_eq!(hosts(members), all);
+    }
+}
+
+#[test]
+fn the_pods_of_kubernetes_have_one_etcd_for_all_and_are_asked_what_rosrescue_answers() {
+    let file = read("kubernetes/rosrescue.yaml");
+    let kind = |kind: &str, name: &str| {
+        let is_it = |of: &&Value| of["kind"] == kind && of["metadata"]["name"] == name;
+        file.iter()
+            .find(is_it)
+            .unwrap_or_else(|| panic!("there is no {kind} {name}"))
+    };
+    let set = &kind("StatefulSet", "rosrescue")["spec"];
+    let template = &set["template"];
+    let labels = &template["metadata"]["labels"];
+    assert_eq!(&set["selector"]["matchLabels"], labels);
+    for service in ["rosrescue", "ros"] {
+        assert_eq!(&kind("Service", service)["spec"]["selector"], labels);
+    }
+    let headless = set["serviceName"].as_str().unwrap();
+    let headless = &kind("Service", headless)["spec"];
+    assert!(headless["clusterIP"] == "None" && headless["publishNotReadyAddresses"] == true);
+    let pods: Vec<_> = (0..set["replicas"].as_u64().unwrap())
+        .map(|number| format!("rosrescue-{number}.rosrescue"))
+        .collect();
+    let [etcd, rosrescue] = template["spec"]["containers"]
+        .as_array()
+        .unwrap()
+        .as_slice()
+    else {
+        panic!("{template}");
+    };
+    let option = |list: &Value, name: &str| {
+        let list = texts(list);
+        let found = list.into_iter().find_map(|text| text.strip_prefix(name));
+        found
+            .unwrap_or_else(|| panic!("there is no {name}"))
+            .to_owned()
+    };
+    assert_eq!(hosts(&option(&etcd["command"], "--initial-cluster=")), pods);
+    assert_eq!(hosts(&option(&rosrescue["args"], "--cluster=")), pods);
+    is_understood(&texts(&rosrescue["args"]));
+    let port = rosrescue["ports"][0]["name"].as_str().unwrap();
+    for (probe, path) in [("readinessProbe", "/ready"), ("livenessProbe", "/live")] {
+        let get = &rosrescue[probe]["httpGet"];
+        assert!(get["path"] == path && get["port"] == port, "{get}");
+    }
+}
