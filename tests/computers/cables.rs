@@ -1,0 +1,126 @@
+use std::thread::{scope, sleep};
+use std::time::{Duration, Instant};
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+use crate::computer::{NAMES, send};
+use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
+use crate::support::{Library, PATIENCE, eventually, holds, params};
+use crate::traffic::Traffic;
+use crate::{alone, rounds, some_time};
+
+/// Waits until `value` is there, on each computer.
+#[track_caller]
+fn await_param(fleet: &Fleet, key: &str, value: i32) {
+    let all = || fleet.computers.iter().map(|computer| computer.param(key));
+    let done = holds(PATIENCE, || {
+        all().any(|found| found != Some(Value::Int(value)))
+    });
+    assert!(
+        !done,
+        "{key} is not {value} but {:?}",
+        all().collect::<Vec<_>>()
+    );
+}
+
+#[test]
+fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let traffic = Traffic::start(&fleet);
+    for round in 0..rounds() {
+        let leader = fleet.await_whole();
+        let cut = victim(round, leader);
+        let rest = fleet.others(cut);
+        let contested = format!("/contested_{round}");
+        fleet.computers[leader].set_param(&contested, 1);
+        await_param(&fleet, &contested, 1);
+        traffic.await_writes(&[0, 1, 2]);
+        sleep(some_time(Duration::from_secs(1)));
+        let (mark, begin) = (fleet.mark(), Instant::now());
+        fleet.network.cut_cable(cut);
+        let next = fleet.await_leader_of(&rest);
+        let led = begin.elapsed();
+        let lonely = &fleet.computers[cut];
+        eventually("it says that it is alone", || lonely.role_is("alone"));
+        let alone = begin.elapsed();
+        traffic.await_writes(&[0, 1, 2]);
+        lonely.set_param(&contested, 2);
+        fleet.computers[next].set_param(&contested, 3);
+        // Its own nodes go on, and others can be started.
+        let name = format!("late_{round}");
+        let rename = format!("__name:={name}");
+        let mut late = lonely.node(Library::Roscpp, "talker", &["30", &rename]);
+        let listener = lonely.listener.as_ref().unwrap();
+        listener.wait_messages(&format!("/{name}"), 1);
+        fleet.assert_streams_whole(&[cut], &mark);
+        fleet.assert_streams_whole(&rest, &mark);
+        let mended = Instant::now();
+        fleet.network.mend_cable(cut);
+        fleet.await_whole();
+        let healed = mended.elapsed();
+        fleet.await_flow(&[0, 1, 2]);
+        // They hear of what was started there.
+        for &index in &rest {
+            let listener = fleet.computers[index].listener.as_ref().unwrap();
+            listener.wait_messages(&format!("/{name}"), 1);
+        }
+        traffic.await_writes(&[0, 1, 2]);
+        let [write, read] = traffic.longest(&[0, 1, 2], begin);
+        println!(
+            "{} is cut off (leader {}): alone after {alone:.2?}, {} leads after {led:.2?}; whole {healed:.2?} after the \
+             cable; longest write {write:.2?}, read {read:.2?}",
+            NAMES[cut], NAMES[leader], NAMES[next],
+        );
+        // TCP itself takes a while to go on after a cable was mended.
+        assert!(led < TTL + TAKEOVER && write < TTL + TAKEOVER && read < READ);
+        await_param(&fleet, &contested, 3);
+        let reported = fleet.computers[cut].logged(&contested);
+        let warnings = reported.iter().filter(|line| line.contains("WARN"));
+        assert_eq!(warnings.count(), 1, "{reported:#?}");
+        send(&late, Signal::TERM);
+        late.wait();
+        traffic.assert_nothing_lost(&fleet);
+        fleet.assert_nodes_live();
+    }
+}
+
+#[test]
+fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "refuse"]);
+    let leader = fleet.await_whole();
+    fleet.computers[leader].set_param("/steady", 7);
+    for cut in [leader, (leader + 1) % 3] {
+        await_param(&fleet, "/steady", 7);
+        let key = format!("/written_{cut}");
+        fleet.network.cut_cable(cut);
+        let lonely = &fleet.computers[cut];
+        eventually("it says that it is alone", || lonely.role_is("alone"));
+        fleet.await_leader_of(&fleet.others(cut));
+        eventually("it runs no master", || lonely.master_state().is_err());
+        let answer = scope(|scope| {
+            let write = || {
+                let params = params!["/test", key.as_str(), 1];
+                lonely.within(|| lonely.client().status("setParam", params))
+            };
+            let write = scope.spawn(write);
+            let waits = holds(Duration::from_secs(2), || {
+                assert_eq!(lonely.param("/steady"), Some(Value::Int(7)));
+                !write.is_finished()
+            });
+            assert!(waits, "it was answered: {:?}", write.join());
+            fleet.network.mend_cable(cut);
+            write.join().unwrap()
+        });
+        fleet.await_whole();
+        println!("a write to {} waited until: {answer:?}", NAMES[cut]);
+        if answer.is_ok() {
+            await_param(&fleet, &key, 1);
+        }
+        fleet.await_flow(&[0, 1, 2]);
+        fleet.await_same_state();
+        fleet.assert_nodes_live();
+    }
+}

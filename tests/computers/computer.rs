@@ -1,0 +1,404 @@
+//! A computer: namespaces for its network and its processes, which end all at once when its power is cut.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use rustix::process::Signal;
+
+use crate::network::{COUNT, Network, address, within};
+use crate::support::{
+    Client, Library, Node, Process, Scratch, State, alive, behind, command, eventually,
+    eventually_some, request, signal,
+};
+
+pub(crate) const NAMES: [&str; COUNT] = ["a", "b", "c"];
+
+/// The port of rosrescue on each.
+pub(crate) const PORT: u16 = 11311;
+
+/// The port of rosmaster on the one that leads.
+const MASTER_PORT: u16 = 11411;
+
+/// What rosrescue says of the cluster.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Seen {
+    pub(crate) role: String,
+    pub(crate) leader: Option<String>,
+    pub(crate) behind: u64,
+}
+
+impl Seen {
+    /// All that this program reads of the page `/status.json`.
+    fn read(page: &serde_json::Value) -> Option<Self> {
+        let cluster = page.get("cluster")?;
+        let leader = cluster["leader"]["name"].as_str();
+        Some(Self {
+            role: cluster["role"].as_str()?.to_owned(),
+            leader: leader.map(str::to_owned),
+            behind: cluster["behind"].as_u64()?,
+        })
+    }
+}
+
+/// From when until when; without an end as long as it lasts.
+type Span = (Instant, Option<Instant>);
+
+/// Times in which calls to a computer's rosrescue may fail.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Downtimes(Arc<Mutex<Vec<Span>>>);
+
+impl Downtimes {
+    pub(crate) fn begin(&self) {
+        if !self.lasts() {
+            self.0.lock().unwrap().push((Instant::now(), None));
+        }
+    }
+
+    pub(crate) fn end(&self) {
+        if let Some((_, end)) = self.0.lock().unwrap().last_mut() {
+            end.get_or_insert_with(Instant::now);
+        }
+    }
+
+    pub(crate) fn lasts(&self) -> bool {
+        matches!(self.0.lock().unwrap().last(), Some((_, None)))
+    }
+
+    /// Whether one falls into that time.
+    pub(crate) fn touch(&self, start: Instant, end: Instant) -> bool {
+        let downtimes = self.0.lock().unwrap();
+        let touches = |&(from, to): &Span| from <= end && to.is_none_or(|to| start <= to);
+        downtimes.iter().any(touches)
+    }
+}
+
+#[derive(Debug)]
+pub(crate) struct Computer {
+    pub(crate) index: usize,
+    pub(crate) name: &'static str,
+    pub(crate) namespace: String,
+    pub(crate) downtimes: Downtimes,
+    pub(crate) talker: Option<Node>,
+    pub(crate) listener: Option<Node>,
+    rescue: Option<Process>,
+    etcd: Option<Process>,
+    /// Its first process. With it all end.
+    power: Option<Process>,
+    boots: u32,
+    scratch: Arc<Scratch>,
+    /// More options of rosrescue.
+    pub(crate) options: Vec<String>,
+}
+
+impl Computer {
+    pub(crate) fn new(index: usize, network: &Network, scratch: &Arc<Scratch>) -> Self {
+        let name = NAMES[index];
+        fs::create_dir_all(scratch.path(name).join("log")).unwrap();
+        let downtimes = Downtimes::default();
+        downtimes.begin();
+        Self {
+            index,
+            name,
+            namespace: network.namespace(index),
+            downtimes,
+            talker: None,
+            listener: None,
+            rescue: None,
+            etcd: None,
+            power: None,
+            boots: 0,
+            scratch: Arc::clone(scratch),
+            options: Vec::new(),
+        }
+    }
+
+    pub(crate) fn address(&self) -> String {
+        address(self.index)
+    }
+
+    /// A file or folder of its own.
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.scratch.path(self.name).join(name)
+    }
+
+    /// Switches it on. Nothing runs there yet.
+    #[track_caller]
+    pub(crate) fn boot(&mut self) {
+        // The first process of a computer has to bury the dead; and a boot has an id, which is the kernel's
+        // and so the same in all namespaces.
+        const INIT: &str = r#"mount --bind "$0" /proc/sys/kernel/random/boot_id && trap "" CHLD &&
+            echo booted && exec sleep infinity"#;
+        self.boots += 1;
+        let boot_id = self.path("boot_id");
+        let id = format!("{:08x}-0000-4000-8000-{:012x}\n", self.boots, self.index);
+        fs::write(&boot_id, id).unwrap();
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &self.namespace, "unshare", "--pid"]);
+        command.args(["--fork", "--kill-child", "--mount-proc", "sh", "-c", INIT]);
+        self.scratch.prepare(command.arg(boot_id));
+        let mut power = Process::start(format!("computer {}", self.name), &mut command);
+        power.wait_line("`booted`", |line| line == "booted");
+        self.power = Some(power);
+    }
+
+    /// SIGKILL to all that runs there, at the same moment.
+    #[track_caller]
+    pub(crate) fn power_off(&mut self) {
+        self.downtimes.begin();
+        let Some(mut power) = self.power.take() else {
+            return;
+        };
+        if let Some(init) = child_of(&power) {
+            signal(init, Signal::KILL);
+        }
+        // It ends when the kernel has seen the last one of them off.
+        power.wait();
+        self.etcd = None;
+        self.assert_no_panic();
+        self.rescue = None;
+        self.talker = None;
+        self.listener = None;
+    }
+
+    pub(crate) fn is_on(&self) -> bool {
+        self.power.is_some()
+    }
+
+    /// `command`, to be run on this computer.
+    fn inside(&self, inner: &Command) -> Command {
+        let power = self.power.as_ref().expect("the computer is off");
+        let init = child_of(power).expect("the first process of a computer");
+        let mut command = Command::new("nsenter");
+        command.args(["--target", &init.to_string(), "--net", "--pid", "--mount"]);
+        command
+            .arg(format!("--wd={}", self.path("").display()))
+            .arg("--");
+        behind(command, inner)
+    }
+
+    fn set_environment(&self, command: &mut Command) {
+        command
+            .env("ROS_IP", self.address())
+            .env("ROS_MASTER_URI", format!("http://localhost:{PORT}"))
+            .env("ROS_HOME", self.path(""))
+            .env("ROS_LOG_DIR", self.path("log"));
+    }
+
+    #[track_caller]
+    pub(crate) fn start_etcd(&mut self) {
+        let url = |index, port| format!("http://{}:{port}", address(index));
+        let (client, peer) = (url(self.index, 2379), url(self.index, 2380));
+        let cluster: Vec<_> = (0..COUNT)
+            .map(|index| format!("{}={}", NAMES[index], url(index, 2380)))
+            .collect();
+        // Its thousands of lines are of use only to whoever looks for them.
+        let mut command = Command::new("sh");
+        command.args(["-c", r#"log=$0; exec "$@" >>"$log" 2>&1"#]);
+        command.arg(self.path("etcd.log"));
+        command.args(["etcd", "--logger", "zap", "--name", self.name, "--data-dir"]);
+        command.arg(self.path("etcd"));
+        command.args([
+            "--listen-client-urls",
+            &client,
+            "--advertise-client-urls",
+            &client,
+        ]);
+        command.args([
+            "--listen-peer-urls",
+            &peer,
+            "--initial-advertise-peer-urls",
+            &peer,
+        ]);
+        command.args(["--initial-cluster", &cluster.join(",")]);
+        self.scratch.prepare(&mut command);
+        let etcd = Process::start(format!("etcd of {}", self.name), &mut self.inside(&command));
+        self.etcd = Some(etcd);
+    }
+
+    /// SIGKILL.
+    #[track_caller]
+    pub(crate) fn kill_etcd(&mut self) {
+        let mut etcd = self.etcd.take().expect("an etcd");
+        send(&etcd, Signal::KILL);
+        etcd.wait();
+    }
+
+    /// Whether its etcd belongs to a majority.
+    pub(crate) fn etcd_is_healthy(&self) -> bool {
+        let page = self.within(|| {
+            let get = request("GET /health HTTP/1.1", &[], b"");
+            let mut wire = Client::at(&self.address(), 2379).connect().ok()?;
+            wire.set_patience(std::time::Duration::from_secs(10));
+            wire.send(&get).ok()?;
+            wire.response().ok()
+        });
+        page.is_some_and(|page| page.text().contains(r#""health":"true""#))
+    }
+
+    /// Starts rosrescue, as a person does, and waits for nothing.
+    #[track_caller]
+    pub(crate) fn start_rescue(&mut self) {
+        let endpoints: Vec<_> = (0..COUNT)
+            .map(|index| format!("http://{}:2379", address(index)))
+            .collect();
+        let cluster = format!("{}/robot", endpoints.join(","));
+        let mut command = command(&self.scratch, PORT, &["core", "--cluster", &cluster]);
+        command.args(["--advertise", &self.address(), "--cluster-name", self.name]);
+        command.args(["-p", &PORT.to_string()]);
+        command.args(["--master-port", &MASTER_PORT.to_string()]);
+        command.arg("--checkpoint").arg(self.path("chkpt.yaml"));
+        command.args(&self.options);
+        self.set_environment(&mut command);
+        let name = format!("rosrescue of {}", self.name);
+        self.rescue = Some(Process::start(name, &mut self.inside(&command)));
+    }
+
+    /// Waits until rosrescue answers.
+    #[track_caller]
+    pub(crate) fn await_answers(&mut self) {
+        let name = self.name;
+        let rescue = self.rescue.as_mut().expect("a rosrescue");
+        let namespace = self.namespace.clone();
+        eventually(&format!("rosrescue of {name} answers"), || {
+            let ended = rescue.exited();
+            assert!(ended.is_none(), "rosrescue of {name} ended: {ended:?}");
+            let params = vec!["/test".into()];
+            within(&namespace, || {
+                Client::new(PORT).ask("getPid", params).is_some()
+            })
+        });
+        self.downtimes.end();
+    }
+
+    /// SIGTERM to rosrescue alone, and its end.
+    #[track_caller]
+    pub(crate) fn stop_rescue(&mut self) {
+        self.downtimes.begin();
+        let rescue = self.rescue.as_mut().expect("a rosrescue");
+        send(rescue, Signal::TERM);
+        rescue.wait();
+        self.assert_no_panic();
+        self.rescue = None;
+    }
+
+    /// Runs `rosrescue ARGUMENTS` to its end: exit status and output.
+    #[track_caller]
+    pub(crate) fn rosrescue(&self, arguments: &[&str]) -> (Option<i32>, String) {
+        let mut command = command(&self.scratch, PORT, arguments);
+        self.set_environment(&mut command);
+        let name = format!("rosrescue {arguments:?} on {}", self.name);
+        let mut process = Process::start(name, &mut self.inside(&command));
+        let status = process.wait_output();
+        (status.code(), process.output().join("\n"))
+    }
+
+    /// Starts a node and waits until it is at work.
+    #[track_caller]
+    pub(crate) fn node(&self, library: Library, node: &str, arguments: &[&str]) -> Node {
+        let mut command = library.command(&self.scratch, PORT, node);
+        command.args(arguments);
+        self.set_environment(&mut command);
+        Node::run(&mut self.inside(&command))
+    }
+
+    /// Panics if a node has ended, as one does that is told to shut down.
+    #[track_caller]
+    pub(crate) fn assert_nodes_live(&mut self) {
+        let nodes = self.talker.iter_mut().chain(&mut self.listener);
+        for node in nodes {
+            let ended = node.exited();
+            assert!(ended.is_none(), "a node ended: {ended:?}\n{}", node.log());
+        }
+    }
+
+    /// A client of rosrescue there, to be used [`within`](Self::within).
+    pub(crate) fn client(&self) -> Client {
+        Client::new(PORT)
+    }
+
+    #[track_caller]
+    pub(crate) fn within<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        within(&self.namespace, work)
+    }
+
+    #[track_caller]
+    pub(crate) fn set_param(&self, key: &str, value: i32) {
+        self.within(|| self.client().set_param(key, value));
+    }
+
+    pub(crate) fn param(&self, key: &str) -> Option<rosrescue::xmlrpc::Value> {
+        self.within(|| self.client().param(key))
+    }
+
+    /// What rosrescue there says to everybody.
+    pub(crate) fn state(&self) -> std::io::Result<State> {
+        self.within(|| State::try_read(&self.client()))
+    }
+
+    /// What the rosmaster there says to rosrescue.
+    pub(crate) fn master_state(&self) -> std::io::Result<State> {
+        self.within(|| State::try_read(&Client::new(MASTER_PORT)))
+    }
+
+    /// The page `/status.json`, if somebody answers.
+    pub(crate) fn status(&self) -> Option<serde_json::Value> {
+        let get = request("GET /status.json HTTP/1.1", &[], b"");
+        let page = self.within(|| self.client().exchange(&get)).ok()?;
+        serde_json::from_slice(&page.body).ok()
+    }
+
+    /// What rosrescue there says of the cluster.
+    pub(crate) fn seen(&self) -> Option<Seen> {
+        Seen::read(&self.status()?)
+    }
+
+    pub(crate) fn role_is(&self, role: &str) -> bool {
+        self.seen().is_some_and(|seen| seen.role == role)
+    }
+
+    /// The lines of rosrescue's log that hold `text`, since it was started.
+    pub(crate) fn logged(&self, text: &str) -> Vec<String> {
+        let lines = self.rescue.iter().flat_map(|rescue| rescue.output());
+        lines.filter(|line| line.contains(text)).collect()
+    }
+
+    #[track_caller]
+    fn assert_no_panic(&self) {
+        let panics = self.logged("panicked at");
+        assert!(panics.is_empty(), "rosrescue of {}: {panics:?}", self.name);
+    }
+}
+
+impl Drop for Computer {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            // Its processes show what they have said when they are dropped.
+            if let Some(init) = self.power.as_ref().and_then(child_of) {
+                signal(init, Signal::KILL);
+            }
+        } else {
+            self.power_off();
+        }
+    }
+}
+
+/// What was started by `ip netns exec … unshare` or `nsenter`, which stay as its parents.
+fn child_of(parent: &Process) -> Option<u32> {
+    let pid = parent.pid();
+    let children = format!("/proc/{pid}/task/{pid}/children");
+    let children = fs::read_to_string(children).unwrap_or_default();
+    children.split_whitespace().next()?.parse().ok()
+}
+
+/// Sends a signal to what runs on the computer.
+#[track_caller]
+pub(crate) fn send(process: &Process, which: Signal) {
+    let child = eventually_some("a process has been started on a computer", || {
+        child_of(process)
+    });
+    assert!(alive(child), "it has ended:\n{}", process.log());
+    signal(child, which);
+}

@@ -1,0 +1,68 @@
+use std::thread::{scope, sleep};
+use std::time::{Duration, Instant};
+
+use crate::computer::{NAMES, send};
+use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
+use crate::support::Library;
+use crate::traffic::Traffic;
+use crate::{alone, rounds, some_time};
+use rustix::process::Signal;
+
+/// By its power, of which nobody hears anything, or by SIGKILL to all that runs there, of which the kernel tells.
+#[test]
+fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let traffic = Traffic::start(&fleet);
+    for round in 0..rounds() {
+        let leader = fleet.await_whole();
+        let dies = victim(round, leader);
+        let rest = fleet.others(dies);
+        traffic.await_writes(&[0, 1, 2]);
+        sleep(some_time(Duration::from_secs(1)));
+        let (mark, begin) = (fleet.mark(), Instant::now());
+        let power = round % 2 == 0;
+        if power {
+            fleet.network.cut_cable(dies);
+        }
+        fleet.computers[dies].power_off();
+        let late = format!("late_{round}");
+        let (mut node, next, took) = scope(|scope| {
+            let library = [Library::Roscpp, Library::Rospy][round / 2 % 2];
+            let name = format!("__name:={late}");
+            let computer = &fleet.computers[rest[round % 2]];
+            let node = scope.spawn(move || computer.node(library, "talker", &["30", &name]));
+            let next = fleet.await_leader_of(&rest);
+            let took = begin.elapsed();
+            (node.join().expect("a late node"), next, took)
+        });
+        let came_up = begin.elapsed();
+        traffic.await_writes(&rest);
+        for &index in &rest {
+            let listener = fleet.computers[index].listener.as_ref().unwrap();
+            listener.wait_messages(&format!("/{late}"), 1);
+        }
+        fleet.assert_streams_whole(&rest, &mark);
+        let [write, read] = traffic.longest(&rest, begin);
+        println!(
+            "{} dies ({}, leader {}): {} leads after {took:.2?}; longest write {write:.2?}, read {read:.2?}; a new \
+             node is at work after {came_up:.2?}",
+            NAMES[dies],
+            if power { "power" } else { "SIGKILL" },
+            NAMES[leader],
+            NAMES[next],
+        );
+        assert!(took < TTL + TAKEOVER && write < TTL + TAKEOVER && read < READ);
+        send(&node, Signal::TERM);
+        node.wait();
+        if power {
+            fleet.network.mend_cable(dies);
+        }
+        fleet.bring_back(dies);
+        fleet.await_whole();
+        fleet.await_flow(&[0, 1, 2]);
+        traffic.await_writes(&[0, 1, 2]);
+        traffic.assert_nothing_lost(&fleet);
+        fleet.assert_nodes_live();
+    }
+}

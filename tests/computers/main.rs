@@ -1,0 +1,56 @@
+//! Three computers, each with an etcd, a rosrescue and nodes of its own: network namespaces on one switch. They are
+//! killed and cut off. One test at a time: each keeps the machine busy. Needs root.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a test"
+)]
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod computer;
+mod fleet;
+mod network;
+mod streams;
+mod traffic;
+
+/// Cables are cut, and mended.
+mod cables;
+/// Computers die, and come back.
+mod deaths;
+/// etcd is away altogether.
+mod etcd;
+/// Another computer leads because somebody says so.
+mod handover;
+/// Two computers do not see each other, or not all of each other.
+mod pairs;
+/// The first start, one that joins, and a start after all have stopped.
+mod starts;
+/// The harness itself.
+mod wiring;
+
+/// Whoever holds this runs alone. A test takes it first, so that it is let go after all that the test has
+/// started has ended.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// How often computers are killed, cut off and told to hand over.
+fn rounds() -> usize {
+    let rounds = std::env::var("ROSRESCUE_ROUNDS");
+    rounds.map_or(3, |rounds| {
+        rounds.parse().expect("ROSRESCUE_ROUNDS is a number")
+    })
+}
+
+/// Some time below `most`.
+fn some_time(most: std::time::Duration) -> std::time::Duration {
+    use std::hash::{BuildHasher, RandomState};
+    most.mul_f64(f64::from(RandomState::new().hash_one(0) as u32) / f64::from(u32::MAX))
+}

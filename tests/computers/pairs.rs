@@ -1,0 +1,101 @@
+use std::time::Instant;
+
+use crate::alone;
+use crate::computer::{NAMES, PORT};
+use crate::fleet::{Fleet, READ, TAKEOVER, TTL};
+use crate::support::eventually;
+use crate::traffic::Traffic;
+
+/// `cut` is done to the leader and a follower, then `mend`. Meanwhile everybody serves; the follower is alone.
+#[track_caller]
+fn without_each_other(
+    fleet: &mut Fleet,
+    what: &str,
+    cut: impl Fn(&Fleet, usize, usize),
+    mend: impl Fn(&Fleet, usize, usize),
+) {
+    let traffic = Traffic::start(fleet);
+    let leader = fleet.await_whole();
+    let follower = (leader + 1) % 3;
+    traffic.await_writes(&[0, 1, 2]);
+    let (mark, begin) = (fleet.mark(), Instant::now());
+    cut(fleet, leader, follower);
+    eventually("the follower is alone", || {
+        fleet.computers[follower].role_is("alone")
+    });
+    let alone = begin.elapsed();
+    traffic.await_writes(&[0, 1, 2]);
+    assert_eq!(
+        fleet.await_leader_of(&[0, 1, 2]),
+        leader,
+        "it leads as before"
+    );
+    for index in [leader, follower] {
+        fleet.assert_streams_whole(&[index, (leader + 2) % 3], &mark);
+    }
+    mend(fleet, leader, follower);
+    let mended = Instant::now();
+    fleet.await_whole();
+    let healed = mended.elapsed();
+    fleet.await_flow(&[0, 1, 2]);
+    let [write, read] = traffic.longest(&[0, 1, 2], begin);
+    println!(
+        "{what}: {} is alone after {alone:.2?}, whole after {healed:.2?}; longest write {write:.2?}, read {read:.2?}",
+        NAMES[follower]
+    );
+    assert!(write < TTL + TAKEOVER && read < READ);
+    traffic.assert_nothing_lost(fleet);
+    fleet.assert_nodes_live();
+}
+
+#[test]
+fn two_that_do_not_reach_each_other_serve_both() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    without_each_other(
+        &mut fleet,
+        "the leader's rosrescue is out of reach of one",
+        |fleet, leader, follower| fleet.network.cut_port(follower, leader, PORT),
+        |fleet, leader, follower| fleet.network.mend_port(follower, leader, PORT),
+    );
+    without_each_other(
+        &mut fleet,
+        "the leader and one do not reach each other",
+        |fleet, leader, follower| fleet.network.cut_pair(leader, follower),
+        |fleet, leader, follower| fleet.network.mend_pair(leader, follower),
+    );
+}
+
+#[test]
+fn a_leader_that_everybody_reaches_and_that_reaches_no_etcd_leads_no_more() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let traffic = Traffic::start(&fleet);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    traffic.await_writes(&[0, 1, 2]);
+    let (mark, begin) = (fleet.mark(), Instant::now());
+    for &other in &rest {
+        fleet.network.cut_port(leader, other, 2379);
+    }
+    fleet.computers[leader].kill_etcd();
+    let next = fleet.await_leader_of(&rest);
+    let took = begin.elapsed();
+    traffic.await_writes(&[0, 1, 2]);
+    fleet.assert_streams_whole(&[0, 1, 2], &mark);
+    assert!(!fleet.computers[leader].role_is("leading"));
+    for &other in &rest {
+        fleet.network.mend_port(leader, other, 2379);
+    }
+    fleet.computers[leader].start_etcd();
+    fleet.await_whole();
+    let [write, read] = traffic.longest(&[0, 1, 2], begin);
+    println!(
+        "{} reaches no etcd: {} leads after {took:.2?}; longest write {write:.2?}, read {read:.2?}",
+        NAMES[leader], NAMES[next]
+    );
+    assert!(took < TTL + TAKEOVER && write < TTL + TAKEOVER && read < READ);
+    traffic.assert_nothing_lost(&fleet);
+    fleet.assert_streams_whole(&[0, 1, 2], &mark);
+    fleet.assert_nodes_live();
+}
