@@ -94,27 +94,9 @@ impl Rig {
 
     /// The state that the sequence starts from: that of a core holds rosout and three parameters.
     fn state(&self) -> Master {
-        let mut wire = self.wire();
-        let deadline = Instant::now() + Duration::from_secs(60);
-        let mut model = Master::default();
-        while self.supervised && !is_complete(&model) {
-            assert!(Instant::now() < deadline, "core is never complete");
-            let look = Inspection::call(&Token::new("none", 1));
-            let look = wire.call(&look.into()).unwrap();
-            let look = Inspection::decode(&look).unwrap();
-            let nothing = Master::default();
-            let second = look
-                .second_call(&nothing)
-                .map(|call| wire.call(&call.into()).unwrap());
-            // A rosout that registers between the two looks is seen by the next.
-            model = look
-                .into_master(second.as_ref(), &nothing)
-                .unwrap_or_default();
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        let (pid, uri) = wire.identity();
-        model.set_identity(pid, uri);
-        model
+        read_state(&mut self.wire(), |model| {
+            !self.supervised || is_complete(model)
+        })
     }
 
     /// Whether rosrescue answers a read to the byte as the master behind it does.
@@ -189,10 +171,39 @@ impl Rig {
     }
 }
 
-/// Whether core has done all that roscore does.
-fn is_complete(model: &Master) -> bool {
+/// The state there once it is `complete`.
+pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) -> Master {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    let mut model = Master::default();
+    while !complete(&model) {
+        assert!(Instant::now() < deadline, "core is never complete");
+        let look = Inspection::call(&Token::new("none", 1));
+        let look = wire.call(&look.into()).unwrap();
+        let look = Inspection::decode(&look).unwrap();
+        let nothing = Master::default();
+        let second = look
+            .second_call(&nothing)
+            .map(|call| wire.call(&call.into()).unwrap());
+        // A rosout that registers between the two looks is seen by the next.
+        model = look
+            .into_master(second.as_ref(), &nothing)
+            .unwrap_or_default();
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let (pid, uri) = wire.identity();
+    model.set_identity(pid, uri);
+    model
+}
+
+/// Whether core has set the parameters that roscore sets.
+pub(crate) fn has_params(model: &Master) -> bool {
     let keys = ["run_id", "rosversion", "rosdistro"];
     keys.iter().all(|key| model.params().contains_key(*key))
+}
+
+/// Whether core has done all that roscore does.
+fn is_complete(model: &Master) -> bool {
+    has_params(model)
         && model.counts().services == 2
         && !model.publishers_of("/rosout_agg").is_empty()
         && !model.subscribers_of("/rosout").is_empty()
@@ -300,7 +311,7 @@ pub(crate) fn run(
                 rig.revive();
                 Ok(())
             }
-            Step::Away | Step::Successor(_) => Ok(()),
+            Step::Away | Step::Handover { .. } | Step::Successor(_) => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }
@@ -339,7 +350,7 @@ fn crash_under(
 }
 
 /// What of that state cannot be brought to an empty master.
-fn skipped(model: &Master) -> Vec<Skipped> {
+pub(crate) fn skipped(model: &Master) -> Vec<Skipped> {
     let plan = Plan::new(model, &Master::default(), &Token::new("test", 1));
     plan.skipped().to_vec()
 }

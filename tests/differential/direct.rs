@@ -72,7 +72,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
                 real = next;
                 succeed(&mut stage, wires, model, found)
             }),
-            Step::Crash { .. } | Step::Away | Step::Back => Ok(()),
+            Step::Crash { .. } | Step::Handover { .. } | Step::Away | Step::Back => Ok(()),
         };
         done.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
     }

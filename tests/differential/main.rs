@@ -1,7 +1,8 @@
 //! The model against the real thing: random sequences of calls must be answered alike, leave the same
 //! state, and cause the same callbacks. Once with a bare rosmaster, whose state is brought whole to
 //! a fresh one on the way; and once through rosrescue, with a rosmaster that is killed again and
-//! again, while the model is a master that never crashed. (`together.rs` has callers that do not take
+//! again, while the model is a master that never crashed; and once through several rosrescues on an
+//! etcd, of which the one that leads is killed or hands over. (`together.rs` has callers that do not take
 //! turns.)
 //!
 //! A sequence that fails is made as short as possible and printed. The variables are:
@@ -10,8 +11,9 @@
 //! |---|---|
 //! | `ROSRESCUE_SEQUENCES` | how many sequences with a bare rosmaster |
 //! | `ROSRESCUE_CRASH_SEQUENCES` | how many through rosrescue; every [`CORE_EACH`]th with `core` |
+//! | `ROSRESCUE_TAKEOVER_SEQUENCES` | how many through several computers; every [`THREE_EACH`]th through three |
 //! | `ROSRESCUE_CALLS` | calls of each |
-//! | `ROSRESCUE_CRASHES` | crashes of each that goes through rosrescue |
+//! | `ROSRESCUE_CRASHES` | crashes, or takeovers, of each that goes through rosrescue |
 //! | `ROSRESCUE_SEED` | the first sequence's number; the others follow it |
 //! | `ROSRESCUE_SCRIPT` | a file with a printed sequence: nothing but that is played |
 
@@ -33,6 +35,7 @@ mod shrinking;
 mod stage;
 #[path = "../support/mod.rs"]
 mod support;
+mod takeovers;
 mod together;
 mod unreturnable;
 
@@ -45,13 +48,17 @@ use nodes::Node;
 use real::Rosmaster;
 use script::{Script, Step, shrink, simpler};
 use stage::Failure;
+use support::Servers;
 
 const SEQUENCES: u64 = 100;
 const CRASH_SEQUENCES: u64 = 30;
+const TAKEOVER_SEQUENCES: u64 = 8;
 const CALLS: u64 = 200;
 const CRASHES: u64 = 3;
 /// A core takes a while to start.
 const CORE_EACH: u64 = 6;
+/// Others have two computers.
+const THREE_EACH: u64 = 3;
 /// Who answers reads; the mirror in two of three sequences.
 const READS: [&str; 2] = ["master", "mirror"];
 /// Nodes that listen.
@@ -180,5 +187,44 @@ fn through_rosrescue_no_crash_of_the_master_can_be_told() {
     if count * crashes as u64 >= 50 {
         assert!(sound.happened * 4 >= sound.asked * 3, "{sound:?}");
         assert!(with_unreturnable.happened > 0, "{with_unreturnable:?}");
+    }
+}
+
+#[test]
+fn through_several_computers_no_takeover_can_be_told() {
+    let nodes = nodes();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let servers = runtime.block_on(Servers::new(1));
+    let mut tally = takeovers::Tally::default();
+    let (scripts, alone) = scripts();
+    for (path, script) in &scripts {
+        println!("{path}");
+        takeovers::run(script, &nodes, &servers, 2, &mut tally).unwrap();
+    }
+    if alone {
+        return;
+    }
+    let calls = usize::try_from(number("ROSRESCUE_CALLS", CALLS)).unwrap();
+    let takeovers = usize::try_from(number("ROSRESCUE_CRASHES", CRASHES)).unwrap();
+    let first = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
+    let count = number("ROSRESCUE_TAKEOVER_SEQUENCES", TAKEOVER_SEQUENCES);
+    let (start, mut played) = (Instant::now(), 0);
+    for seed in first..first + count {
+        let script = takeovers::script(seed, calls, takeovers, NODES);
+        let computers = if seed % THREE_EACH == 0 { 3 } else { 2 };
+        let what = format!("seed {seed} with {takeovers} takeovers of {computers} computers");
+        hold(&what, &script, |script| {
+            takeovers::run(script, &nodes, &servers, computers, &mut tally)
+        });
+        played += script.calls();
+    }
+    println!(
+        "{count} sequences, {played} calls, {tally:?}, seeds from {first}, {:?}",
+        start.elapsed()
+    );
+    // A test without takeovers would show nothing. A few sequences may have none by chance.
+    if count * takeovers as u64 >= 24 {
+        assert!(tally.deaths.happened * 2 >= tally.deaths.asked, "{tally:?}");
+        assert!(tally.handovers.happened > 0, "{tally:?}");
     }
 }

@@ -45,10 +45,17 @@ pub(crate) struct TrueLists {
 }
 
 impl TrueLists {
-    /// The master crashes in that state.
+    /// The master crashes in that state, and all that was heard has been judged.
     pub(crate) fn crash(&mut self, model: &Master) {
-        self.before = std::mem::take(&mut self.since);
-        self.states_before = std::mem::take(&mut self.states_since);
+        self.before.clear();
+        self.states_before.clear();
+        self.crash_unjudged(model);
+    }
+
+    /// The same, and what was heard is judged later.
+    pub(crate) fn crash_unjudged(&mut self, model: &Master) {
+        self.before.extend(self.since.drain());
+        self.states_before.append(&mut self.states_since);
         self.after.clear();
         self.faithful = None;
         self.add(model);

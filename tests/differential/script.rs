@@ -22,6 +22,11 @@ pub(crate) enum Step {
     Away,
     /// A master comes.
     Back,
+    /// The computer that leads has another one lead. Nothing where there is one computer.
+    Handover {
+        /// Whether it is while the next call is under way.
+        in_flight: bool,
+    },
     /// The state is brought to a fresh master, on which others have made these calls before. The
     /// sequence goes on with that one.
     Successor(Vec<Call>),
@@ -79,6 +84,8 @@ impl Script {
                 Step::Call { by, call } => text += &format!("{by} {}\n", call_to_json(call)),
                 Step::Crash { in_flight: true } => text += "crash in flight\n",
                 Step::Crash { in_flight: false } => text += "crash\n",
+                Step::Handover { in_flight: true } => text += "handover in flight\n",
+                Step::Handover { in_flight: false } => text += "handover\n",
                 Step::Away => text += "away\n",
                 Step::Back => text += "back\n",
                 Step::Successor(found) => {
@@ -103,6 +110,8 @@ impl Script {
                 "unreturnable" => unreturnable = true,
                 "crash" => steps.push(Step::Crash { in_flight: false }),
                 "crash in flight" => steps.push(Step::Crash { in_flight: true }),
+                "handover" => steps.push(Step::Handover { in_flight: false }),
+                "handover in flight" => steps.push(Step::Handover { in_flight: true }),
                 "away" => steps.push(Step::Away),
                 "back" => steps.push(Step::Back),
                 "successor" => steps.push(Step::Successor(Vec::new())),
@@ -129,7 +138,7 @@ impl Script {
     pub(crate) fn calls(&self) -> usize {
         let calls = self.steps.iter().map(|step| match step {
             Step::Call { .. } => 1,
-            Step::Crash { .. } | Step::Away | Step::Back => 0,
+            Step::Crash { .. } | Step::Handover { .. } | Step::Away | Step::Back => 0,
             Step::Successor(found) => found.len(),
         });
         calls.sum()
@@ -159,7 +168,7 @@ pub(crate) fn simpler(step: &Step) -> Vec<Step> {
                 Step::Successor(fewer)
             })
             .collect(),
-        Step::Crash { .. } | Step::Away | Step::Back => Vec::new(),
+        Step::Crash { .. } | Step::Handover { .. } | Step::Away | Step::Back => Vec::new(),
     }
 }
 

@@ -4,7 +4,7 @@ use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Value};
 
 use crate::script::{Script, Step, shrink, simpler};
-use crate::{crashes, direct};
+use crate::{crashes, direct, takeovers};
 
 #[test]
 fn the_least_that_fails_is_left() {
@@ -79,7 +79,11 @@ fn a_mistake_of_the_model_is_shown_by_three_calls() {
 #[test]
 fn a_printed_script_is_read_as_it_was() {
     for seed in 0..200 {
-        for script in [direct::script(seed, 50, 5), crashes::script(seed, 50, 3, 5)] {
+        for script in [
+            direct::script(seed, 50, 5),
+            crashes::script(seed, 50, 3, 5),
+            takeovers::script(seed, 50, 3, 5),
+        ] {
             let printed = script.print();
             assert!(Script::parse(&printed) == script, "{printed}");
             assert_eq!(Script::parse(&printed).print(), printed);

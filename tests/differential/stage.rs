@@ -113,6 +113,14 @@ impl<'n> Stage<'n> {
         }
     }
 
+    /// What the nodes have not heard yet may be lost or doubled.
+    pub(crate) fn risk(&mut self) {
+        self.told
+            .iter_mut()
+            .flatten()
+            .for_each(|it| it.risky = true);
+    }
+
     /// Makes every node hear one last thing, and compares what they heard before it.
     pub(crate) fn settle(&mut self) -> Result<(), Failure> {
         static COUNT: AtomicU32 = AtomicU32::new(0);

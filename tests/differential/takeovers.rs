@@ -1,0 +1,438 @@
+//! The model, which never crashes, against several rosrescues on one etcd, of which the one that leads is
+//! killed with all that it runs, or hands over.
+//!
+//! Each client calls the computer that it was given, or another one while that one is dead. So calls come to
+//! the leader and to those that follow it.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use rosrescue::master::{Master, Request};
+use rosrescue::xmlrpc::{Call, Reply, Value};
+use rustix::process::Signal;
+use serde_json::Value as Json;
+
+use crate::crashes::{self, Share, has_params, read_state, skipped};
+use crate::dice::Dice;
+use crate::nodes::{Node, patience};
+use crate::real::Wire;
+use crate::script::{Script, Step};
+use crate::stage::{CLIENTS, Failure, Stage};
+use crate::support::{Client, Rescue, Scratch, Servers, Setup, free_port, signal};
+
+/// On a busy computer a shorter one is over before etcd has answered.
+const TTL: &str = "1.5";
+/// How long after a call was sent its leader may go: by then it may be anywhere.
+const IN_FLIGHT_MICROS: u64 = 10_000;
+
+/// A sequence with so many takeovers.
+pub(crate) fn script(seed: u64, calls: usize, takeovers: usize, nodes: usize) -> Script {
+    let mut script = crashes::script(seed, calls, takeovers, nodes);
+    let mut dice = Dice(!seed);
+    for step in &mut script.steps {
+        if let Step::Crash { in_flight } = *step
+            && dice.once_in(2)
+        {
+            *step = Step::Handover { in_flight };
+        }
+    }
+    script
+}
+
+/// How a computer ceases to lead.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum End {
+    /// It dies, and is switched on again at once.
+    Restart,
+    /// It dies, and stays dead.
+    Death,
+    Handover,
+}
+
+/// What is killed together.
+struct Computer {
+    rescue: Rescue,
+    uri: String,
+    master_port: u16,
+    /// How often it was started; none while it is dead.
+    life: Option<u32>,
+    lives: u32,
+    scratch: Scratch,
+}
+
+impl Computer {
+    fn start(index: usize, cluster: &str) -> Self {
+        let scratch = Scratch::new();
+        let master_port = free_port();
+        let rescue = Setup::core(&scratch, master_port)
+            .args(["--cluster", cluster, "--cluster-ttl", TTL])
+            .args(["--cluster-name", &format!("pc{index}")])
+            // A busy computer that is cut off for a moment may not answer writes by itself: what others write
+            // meanwhile would win over them, and no master does that.
+            .args(["--alone", "refuse", "--hold", "60"])
+            // Another computer's rosout is another node.
+            .arg("--no-rosout")
+            .guarded()
+            .spawn();
+        Self {
+            uri: String::new(),
+            rescue,
+            master_port,
+            life: Some(1),
+            lives: 1,
+            scratch,
+        }
+    }
+
+    /// SIGKILL for rosrescue, its guardian, and its rosmaster.
+    fn kill(&mut self) {
+        self.life = None;
+        loop {
+            let all = self.scratch.survivors();
+            if all.is_empty() {
+                break self.rescue.kill();
+            }
+            all.iter().for_each(|(pid, _)| signal(*pid, Signal::KILL));
+            let _ = self.rescue.exited();
+        }
+    }
+
+    fn revive(&mut self) {
+        if self.life.is_none() {
+            self.rescue.start_again();
+            self.lives += 1;
+            self.life = Some(self.lives);
+        }
+    }
+
+    /// `/status.json`, if it answers.
+    fn status(&self) -> Option<Json> {
+        let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
+        self.life?;
+        let response = self.rescue.client().exchange(get).ok()?;
+        serde_json::from_slice(&response.body).ok()
+    }
+
+    fn wire(&self) -> Option<Wire> {
+        self.life?;
+        Wire::connect(self.rescue.port()).ok()
+    }
+}
+
+struct Rig {
+    computers: Vec<Computer>,
+    /// Where each client is, and in which life of that computer.
+    at: [(usize, u32); CLIENTS],
+}
+
+impl Rig {
+    fn start(servers: &Servers, count: usize) -> Self {
+        static ROBOTS: AtomicU32 = AtomicU32::new(0);
+        let robot = ROBOTS.fetch_add(1, Ordering::Relaxed);
+        let cluster = format!("{}/robot{robot}", servers.endpoints(0).join(","));
+        let mut computers = Vec::new();
+        for index in 0..count {
+            computers.push(Computer::start(index, &cluster));
+        }
+        Self {
+            computers,
+            at: [(0, 0); CLIENTS],
+        }
+    }
+
+    /// The state that the sequence starts from: three parameters.
+    fn state(&mut self) -> Result<Master, Failure> {
+        self.await_all()?;
+        for computer in &mut self.computers {
+            (_, computer.uri) = computer.wire().unwrap().identity();
+        }
+        let mut wire = self.computers[0].wire().unwrap();
+        Ok(read_state(&mut wire, has_params))
+    }
+
+    /// Connects clients whose computer is dead to others, and to their own when that is there again.
+    fn attach(&mut self, stage: &mut Stage<'_>) -> Result<(), Failure> {
+        (0..CLIENTS).try_for_each(|client| self.attach_one(stage, client, None))
+    }
+
+    fn attach_one(
+        &mut self,
+        stage: &mut Stage<'_>,
+        client: usize,
+        but: Option<usize>,
+    ) -> Result<(), Failure> {
+        let count = self.computers.len();
+        await_some("a computer that listens", || {
+            let mut turn = (0..count).map(|step| (client + step) % count);
+            turn.find_map(|index| {
+                let computer = &self.computers[index];
+                let place = (index, computer.life?);
+                if but == Some(index) {
+                    return None;
+                }
+                if self.at[client] != place {
+                    stage.wires[client] = computer.wire()?;
+                    self.at[client] = place;
+                }
+                Some(())
+            })
+        })
+    }
+
+    /// The computer that leads, and whether calls pass to its master.
+    fn leader(&self) -> Option<(usize, bool)> {
+        let mut all = self.computers.iter().enumerate();
+        all.find_map(|(index, computer)| {
+            let status = computer.status()?;
+            (status["cluster"]["role"] == "leading").then(|| (index, status["open"] == true))
+        })
+    }
+
+    fn is_open(&self) -> bool {
+        self.leader().is_some_and(|(_, open)| open)
+    }
+
+    fn await_leader(&self) -> Result<usize, Failure> {
+        await_some("a leader", || self.leader().map(|(index, _)| index))
+    }
+
+    /// The computer that leads, when all others are switched on.
+    fn await_leader_and_another(&mut self) -> Result<usize, Failure> {
+        let leader = self.await_leader()?;
+        self.computers.iter_mut().for_each(Computer::revive);
+        Ok(leader)
+    }
+
+    fn await_open(&self) -> Result<usize, Failure> {
+        await_some("a leader with a master", || {
+            self.leader().filter(|(_, open)| *open).map(|it| it.0)
+        })
+    }
+
+    /// Waits until all are there: one leads, and the others have all that it has.
+    fn await_all(&mut self) -> Result<usize, Failure> {
+        self.computers.iter_mut().for_each(Computer::revive);
+        let leader = self.await_open()?;
+        for (index, computer) in self.computers.iter().enumerate() {
+            await_some(&format!("computer {index}, which follows"), || {
+                let cluster = computer.status()?["cluster"].clone();
+                let follows = cluster["role"] == "following" && cluster["behind"] == 0;
+                (index == leader || follows).then_some(())
+            })?;
+        }
+        Ok(leader)
+    }
+
+    /// Has another computer lead, unless none does, in which case the same one may.
+    fn end(&mut self, end: End) -> Result<(), Failure> {
+        if end == End::Handover {
+            return self.hand_over();
+        }
+        let leader = self.await_leader_and_another()?;
+        self.computers[leader].kill();
+        if end == End::Restart {
+            self.computers[leader].revive();
+        }
+        Ok(())
+    }
+
+    /// The one who is asked need not lead.
+    fn hand_over(&self) -> Result<(), Failure> {
+        let leader = self.await_leader()?;
+        let others = (0..self.computers.len()).rev();
+        let mut asked = others.filter(|index| self.computers[*index].wire().is_some());
+        let asked = &self.computers[asked.next().unwrap_or(leader)];
+        let call = Call::new("rosrescue/handover", vec!["/test".into(), "".into()]);
+        await_some("a handover", || {
+            let reply = asked.wire()?.call(&call).ok()?;
+            match &reply {
+                Reply::Value(Value::Array(answer)) if answer.first() == Some(&1.into()) => Some(()),
+                // Another one has not said yet that it is there, or the next leader does not lead yet.
+                _ => None,
+            }
+        })
+    }
+}
+
+/// Whether that state is the same at the next leader: it lacks what a master cannot return, and sets the three
+/// parameters of roscore if somebody has deleted them.
+fn survives(model: &Master) -> bool {
+    skipped(model).is_empty() && has_params(model)
+}
+
+fn await_some<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> Result<T, Failure> {
+    let deadline = Instant::now() + patience();
+    loop {
+        if let Some(found) = look() {
+            return Ok(found);
+        }
+        if Instant::now() > deadline {
+            return Err(format!("there is never {what}"));
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// What a run was.
+#[derive(Debug, Default)]
+pub(crate) struct Tally {
+    pub(crate) deaths: Share,
+    pub(crate) handovers: Share,
+}
+
+/// Plays a sequence through `count` computers.
+pub(crate) fn run(
+    script: &Script,
+    nodes: &[Node],
+    servers: &Servers,
+    count: usize,
+    tally: &mut Tally,
+) -> Result<(), Failure> {
+    let mut rig = Rig::start(servers, count);
+    let model = rig.state()?;
+    let result = steps(script, nodes, &mut rig, model, tally);
+    if result.is_err() && !crate::nodes::HURRIED.load(Ordering::Relaxed) {
+        for computer in &rig.computers {
+            eprintln!("{}", computer.rescue.log());
+        }
+    }
+    result
+}
+
+fn steps(
+    script: &Script,
+    nodes: &[Node],
+    rig: &mut Rig,
+    model: Master,
+    tally: &mut Tally,
+) -> Result<(), Failure> {
+    let wires = (0..CLIENTS).map(|_| rig.computers[0].wire().unwrap());
+    let mut stage = Stage::new(nodes, wires.collect(), model);
+    stage.callbacks = !script.unreturnable;
+    let mut next_end = None;
+    for (nth, step) in script.steps.iter().enumerate() {
+        let (end, in_flight) = match step {
+            Step::Call { by, call } => {
+                play(rig, &mut stage, by % CLIENTS, call, next_end.take(), nth)
+                    .map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
+                continue;
+            }
+            Step::Crash { in_flight } => (End::Restart, *in_flight),
+            Step::Handover { in_flight } => (End::Handover, *in_flight),
+            Step::Away => (End::Death, false),
+            Step::Back => {
+                rig.computers.iter_mut().for_each(Computer::revive);
+                continue;
+            }
+            Step::Successor(_) => continue,
+        };
+        let share = match end {
+            End::Handover => &mut tally.handovers,
+            End::Restart | End::Death => &mut tally.deaths,
+        };
+        share.asked += 1;
+        let mut after = stage.model.clone();
+        if let (true, Some(Step::Call { call, .. })) = (in_flight, script.steps.get(nth + 1)) {
+            after.apply(&stage.real(call).into());
+        }
+        if next_end.is_some() || ![&stage.model, &after].into_iter().all(survives) {
+            continue;
+        }
+        share.happened += 1;
+        let ended = rig.attach(&mut stage).and_then(|()| {
+            match step {
+                // The last callbacks may be lost with it, and are made good.
+                Step::Crash { .. } => stage.risk(),
+                _ => stage.settle()?,
+            }
+            let repeats = stage.repeats.get_or_insert_default();
+            match step {
+                Step::Crash { .. } => repeats.crash_unjudged(&stage.model),
+                _ => repeats.crash(&stage.model),
+            }
+            stage.away = true;
+            next_end = in_flight.then_some(end);
+            if in_flight { Ok(()) } else { rig.end(end) }
+        });
+        ended.map_err(|why| format!("step {nth}, {step:?}: {why}"))?;
+    }
+    let end = finish(rig, &mut stage);
+    end.map_err(|why| format!("at the end: {why}"))
+}
+
+/// Makes a call; with an `end` of the leader while it is under way.
+fn play(
+    rig: &mut Rig,
+    stage: &mut Stage<'_>,
+    by: usize,
+    call: &Call,
+    end: Option<End>,
+    nth: usize,
+) -> Result<(), Failure> {
+    let call = stage.real(call);
+    stage.away &= !rig.is_open();
+    let mut after = stage.model.clone();
+    after.apply(&Request::from(call.clone()));
+    if stage.away && !survives(&after) {
+        // What cannot be brought to another master is for one that is there.
+        rig.await_open()?;
+    }
+    rig.attach(stage)?;
+    if let Some(End::Restart | End::Death) = end {
+        // A call to a computer that dies is not answered.
+        let leader = rig.await_leader_and_another()?;
+        rig.attach_one(stage, by, Some(leader))?;
+    }
+    let (index, _) = rig.at[by];
+    stage
+        .model
+        .set_identity(1, rig.computers[index].uri.clone());
+    let Some(end) = end else {
+        return stage.call(by, &call);
+    };
+    stage.wires[by].send(&call)?;
+    let micros = Dice(nth as u64).next() % IN_FLIGHT_MICROS;
+    std::thread::sleep(Duration::from_micros(micros));
+    rig.end(end)?;
+    stage.away = true;
+    let reply = stage.wires[by].receive()?;
+    stage.answered(&call, &reply, true)
+}
+
+/// Compares the state at each computer, and once more after the leader's death: that of the journal.
+fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
+    let leader = rig.await_all()?;
+    rig.attach(stage)?;
+    stage.settle()?;
+    for (index, computer) in rig.computers.iter().enumerate() {
+        let status = computer.status().ok_or("no status")?;
+        let counters = [
+            &status["counters"]["divergences"],
+            &status["cluster"]["lost_writes"],
+        ];
+        if counters.iter().any(|counter| **counter != 0) {
+            return Err(format!(
+                "divergences and lost writes of computer {index}: {counters:?}"
+            ));
+        }
+        let mut wire = computer.wire().ok_or("it does not listen")?;
+        stage
+            .same_reads(&mut wire)
+            .map_err(|why| format!("computer {index}: {why}"))?;
+    }
+    let behind = Client::new(rig.computers[leader].master_port);
+    let mut behind = Wire::connect(behind.port()).map_err(|error| error.to_string())?;
+    stage
+        .same_reads(&mut behind)
+        .map_err(|why| format!("the master behind: {why}"))?;
+    if !survives(&stage.model) {
+        return Ok(());
+    }
+    rig.end(End::Death)?;
+    rig.attach(stage)?;
+    let (index, _) = rig.at[0];
+    let mut wire = rig.computers[index].wire().ok_or("it does not listen")?;
+    stage
+        .same_reads(&mut wire)
+        .map_err(|why| format!("after the last leader's death: {why}"))
+}
