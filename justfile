@@ -17,6 +17,7 @@ bench:
     cargo bench --bench pauses
     cargo bench --bench table1
     cargo bench --bench compare
+    . tests/install_etcd.sh && cargo bench --bench computers
 
 # A rescue to look at, with a real rosmaster and nodes
 quickstart:

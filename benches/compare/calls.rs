@@ -6,10 +6,13 @@ use rosrescue::xmlrpc::{self, Struct, Value};
 use serde::{Serialize, Serializer};
 
 use crate::{
-    cpu::Cpu,
-    load::{Load, NUMBER, Script},
     party::{Kind, Party},
-    shared::support::{Client, encode_call, params},
+    shared::{
+        cpu::Cpu,
+        load::{Load, NUMBER, Script},
+        numbers::at,
+        support::{Client, encode_call, params},
+    },
 };
 
 const SMALL: &str = "/compare/small";
@@ -305,11 +308,4 @@ impl Seen {
             turns,
         }
     }
-}
-
-/// The time below which this share of `sorted` is, in milliseconds.
-pub(crate) fn at(sorted: &[Duration], share: f64) -> f64 {
-    let place = (sorted.len() as f64 * share) as usize;
-    let time = sorted.get(place.min(sorted.len().saturating_sub(1)));
-    time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
 }

@@ -12,8 +12,6 @@
 )]
 
 mod calls;
-mod cpu;
-mod load;
 mod party;
 mod picture;
 mod relays;
@@ -25,7 +23,6 @@ mod shared;
 mod small;
 
 use std::{
-    fs,
     path::{Path, PathBuf},
     process::ExitCode,
 };
@@ -33,9 +30,15 @@ use std::{
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use crate::{party::Kind, shared::machine, small::SmallComputer};
+use crate::{
+    party::Kind,
+    shared::{
+        machine,
+        numbers::{self, write},
+    },
+    small::SmallComputer,
+};
 
-const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/benchmarks.md");
 const PICTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/compare.svg");
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -130,19 +133,12 @@ fn main() -> ExitCode {
         write(&json.with_extension("svg"), picture);
     }
     if options.write_docs {
-        let document = fs::read_to_string(DOCUMENT).expect("the document");
-        let document = report::put(&document, &text).expect("marks for the tables");
-        write(Path::new(DOCUMENT), &document);
+        numbers::write_document("compare", &text);
         if let Some(picture) = &picture {
             write(Path::new(PICTURE), picture);
         }
     }
     ExitCode::SUCCESS
-}
-
-fn write(path: &Path, text: &str) {
-    fs::write(path, text).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    eprintln!("written: {}", path.display());
 }
 
 fn measure(options: &Options) -> Measured {

@@ -5,9 +5,9 @@ use std::fmt;
 use serde::{Serialize, Serializer};
 
 use crate::{
-    cpu::family,
     relays,
     shared::{
+        cpu::family,
         second::SecondMaster,
         support::{Client, Process, Rescue, Scratch, Setup, eventually, free_port},
     },

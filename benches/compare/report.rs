@@ -6,22 +6,13 @@ use crate::{
     party::Kind,
     robots::Times,
     scale::Row,
+    shared::numbers::{short, spread},
 };
 
-const BEGIN: &str = "<!-- compare:begin -->";
-const END: &str = "<!-- compare:end -->";
-
-/// `document` with `text` in place of what is between its marks, which `text` has too.
-pub(crate) fn put(document: &str, text: &str) -> Option<String> {
-    let (before, rest) = document.split_once(BEGIN)?;
-    let (_, after) = rest.split_once(END)?;
-    Some(format!("{before}{text}{after}"))
-}
-
-/// All tables, between the marks that `docs/benchmarks.md` has for them.
+/// All tables.
 pub(crate) fn markdown(measured: &Measured) -> String {
     let mut parts = vec![format!(
-        "{BEGIN}\n{}; {} s for each number, in {} turns.",
+        "{}; {} s for each number, in {} turns.",
         measured.machine, measured.seconds, measured.turns
     )];
     if let Some(cells) = &measured.calls {
@@ -45,7 +36,7 @@ pub(crate) fn markdown(measured: &Measured) -> String {
         )),
         None => {}
     }
-    parts.join("\n\n") + "\n" + END
+    parts.join("\n\n")
 }
 
 const CALLS: &str = "
@@ -110,15 +101,6 @@ fn calls(cells: &[Cell]) -> String {
     text
 }
 
-/// Three digits that count.
-fn short(number: f64) -> String {
-    match number {
-        0.0..1.0 => format!("{number:.2}"),
-        1.0..100.0 => format!("{number:.1}"),
-        _ => format!("{number:.0}"),
-    }
-}
-
 fn robots(times: &[Times]) -> String {
     let names = Kind::OURS.map(|kind| kind.to_string()).join(" | ");
     let mut text = format!("### Real clients\n\nIn ms:\n\n| | {names} |\n|---|--:|--:|--:|\n");
@@ -142,15 +124,6 @@ fn robots(times: &[Times]) -> String {
         text += &format!("| {what} | {} |\n", cells.join(" | "));
     }
     text
-}
-
-/// Median and largest.
-fn spread(numbers: &[f64]) -> (f64, f64) {
-    let mut sorted = numbers.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let largest = sorted.last().copied().unwrap_or(f64::NAN);
-    let median = sorted.get(sorted.len() / 2).copied();
-    (median.unwrap_or(f64::NAN), largest)
 }
 
 fn scale(rows: &[Row]) -> String {

@@ -10,9 +10,9 @@ use rosrescue::xmlrpc::Value;
 use serde::Serialize;
 
 use crate::{
-    load::{self, Script},
     party::{self, Kind, Party},
     shared::{
+        load::{self, Script},
         nodes::topics,
         support::{FakeNode, Process, Scratch, encode_call, find_program, params, ros_command},
     },

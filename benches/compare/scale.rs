@@ -13,12 +13,15 @@ use rustix::process::Signal;
 use serde::Serialize;
 
 use crate::{
-    calls::{Call, at, many},
-    cpu::{family, resident_kib},
-    load::Load,
-    shared::support::{
-        Client, FakeNode, Finish, Rescue, Scratch, Setup, encode_call, eventually, eventually_some,
-        free_port, http_request, params, signal, status,
+    calls::{Call, many},
+    shared::{
+        cpu::{family, resident_kib},
+        load::Load,
+        numbers::at,
+        support::{
+            Client, FakeNode, Finish, Rescue, Scratch, Setup, encode_call, eventually,
+            eventually_some, free_port, http_request, params, signal, status,
+        },
     },
 };
 

@@ -8,6 +8,8 @@ use std::{
 
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
+use crate::shared::cpu::Cpu;
+
 /// Of the core's time.
 const SHARE: f64 = 0.25;
 /// In which the group gets its share, in microseconds. The default of 100 ms would make pauses of 75 ms, as no
@@ -58,11 +60,11 @@ impl SmallComputer {
     /// The share of the core's time that a busy process really gets.
     pub(crate) fn share(&self) -> f64 {
         let pids = [std::process::id()];
-        let (begin, before) = (Instant::now(), crate::cpu::Cpu::read(&pids));
+        let (begin, before) = (Instant::now(), Cpu::read(&pids));
         while begin.elapsed() < SPIN {
             std::hint::spin_loop();
         }
-        let used = crate::cpu::Cpu::read(&pids).since(&before);
+        let used = Cpu::read(&pids).since(&before);
         used.as_secs_f64() / begin.elapsed().as_secs_f64()
     }
 }

@@ -12,7 +12,6 @@
     reason = "a bench ends at the first thing that goes wrong"
 )]
 
-mod caller;
 #[path = "../shared/mod.rs"]
 mod shared;
 mod subject;
@@ -22,8 +21,7 @@ use std::time::Duration;
 use clap::Args;
 
 use crate::{
-    caller::Seen,
-    shared::machine,
+    shared::{caller::Seen, machine},
     subject::{Kind, Subject, Window},
 };
 

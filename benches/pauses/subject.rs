@@ -9,16 +9,14 @@ use std::{
 use clap::ValueEnum;
 use rustix::process::Signal;
 
-use crate::{
+use crate::shared::{
     caller::{Caller, Seen},
-    shared::{
-        injection::injection,
-        nodes,
-        second::SecondMaster,
-        support::{
-            Client, FakeNode, Mode, Robot, Rosmaster, Scratch, State, encode_call, eventually,
-            free_port, http_request, params, signal,
-        },
+    injection::injection,
+    nodes,
+    second::SecondMaster,
+    support::{
+        Client, FakeNode, Mode, Robot, Rosmaster, Scratch, State, encode_call, eventually,
+        free_port, http_request, params, signal,
     },
 };
 

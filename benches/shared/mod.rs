@@ -1,10 +1,18 @@
 //! What the benches share.
 
+#[allow(dead_code, reason = "not every bench calls all the time")]
+pub(crate) mod caller;
+#[allow(dead_code, reason = "not every bench looks at processes")]
+pub(crate) mod cpu;
 #[allow(dead_code, reason = "not every bench compares with it")]
 pub(crate) mod injection;
+#[allow(dead_code, reason = "not every bench has load")]
+pub(crate) mod load;
 pub(crate) mod machine;
 #[allow(dead_code, reason = "not every bench has nodes")]
 pub(crate) mod nodes;
+#[allow(dead_code, reason = "not every bench prints all of it")]
+pub(crate) mod numbers;
 #[allow(dead_code, reason = "not every bench compares with it")]
 pub(crate) mod second;
 

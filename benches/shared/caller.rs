@@ -11,17 +11,26 @@ use std::{
 
 use rosrescue::xmlrpc::{Reply, Value};
 
-use crate::shared::support::{Client, Wire, http_request};
+use super::support::{Client, Wire, http_request};
 
 /// Between an answer, or a failure, and the next call.
 const PAUSE: Duration = Duration::from_millis(1);
 
+#[derive(Clone, Copy, Debug)]
+struct Answer {
+    /// When it was asked for, and when it came.
+    asked: Instant,
+    at: Instant,
+    success: bool,
+}
+
 /// When the answers came, and what they were.
 #[derive(Debug, Default)]
 struct Log {
-    /// Whether the answer was a success.
-    answers: Vec<(Instant, bool)>,
+    answers: Vec<Answer>,
     failures: Vec<Instant>,
+    /// The number of the last call that succeeded.
+    last: Option<i32>,
 }
 
 /// What a client saw in a span of time.
@@ -29,6 +38,10 @@ struct Log {
 pub(crate) struct Seen {
     /// The longest time between two answers, in milliseconds.
     pub(crate) pause: f64,
+    /// The longest time of a call that was answered, in milliseconds.
+    pub(crate) longest: f64,
+    /// Until the first call that began in that span was answered with success, in milliseconds.
+    pub(crate) first: f64,
     /// Calls without an answer.
     pub(crate) failed: usize,
     /// Answers that were no success.
@@ -56,14 +69,21 @@ impl Caller {
                 if end.load(Ordering::Relaxed) {
                     return;
                 }
-                let answer = exchange(&master, &mut wire, &http_request(&call(number)));
-                let now = Instant::now();
+                let request = http_request(&call(number));
+                let asked = Instant::now();
+                let answer = exchange(&master, &mut wire, &request);
+                let at = Instant::now();
                 let mut log = theirs.lock().expect("the log");
                 match answer {
-                    Some(success) => log.answers.push((now, success)),
+                    Some(success) => {
+                        log.answers.push(Answer { asked, at, success });
+                        if success {
+                            log.last = Some(number);
+                        }
+                    }
                     None => {
                         wire = None;
-                        log.failures.push(now);
+                        log.failures.push(at);
                     }
                 }
                 drop(log);
@@ -77,22 +97,31 @@ impl Caller {
         }
     }
 
-    /// Whether an answer has come since `then`.
+    /// Whether a call that began after `then` has been answered.
     pub(crate) fn answered_since(&self, then: Instant) -> bool {
         let log = self.log.lock().expect("the log");
-        log.answers.last().is_some_and(|(at, _)| *at > then)
+        log.answers.last().is_some_and(|answer| answer.asked > then)
+    }
+
+    /// The number of the last call that succeeded.
+    pub(crate) fn last(&self) -> Option<i32> {
+        self.log.lock().expect("the log").last
     }
 
     /// What it saw since `begin`.
     pub(crate) fn seen_since(&self, begin: Instant) -> Seen {
+        let ms = |time: Option<Duration>| time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3);
         let log = self.log.lock().expect("the log");
-        let pauses = log.answers.windows(2).filter(|pair| pair[1].0 > begin);
-        let longest = pauses.map(|pair| pair[1].0.duration_since(pair[0].0)).max();
-        let since = log.answers.iter().filter(|(at, _)| *at > begin);
+        let pauses = log.answers.windows(2).filter(|pair| pair[1].at > begin);
+        let pauses = pauses.map(|pair| pair[1].at.duration_since(pair[0].at));
+        let since: Vec<_> = log.answers.iter().filter(|of| of.at > begin).collect();
+        let first = since.iter().find(|of| of.asked > begin && of.success);
         Seen {
-            pause: longest.map_or(f64::NAN, |longest| longest.as_secs_f64() * 1e3),
+            pause: ms(pauses.max()),
+            longest: ms(since.iter().map(|of| of.at.duration_since(of.asked)).max()),
+            first: ms(first.map(|of| of.at.duration_since(begin))),
             failed: log.failures.iter().filter(|at| **at > begin).count(),
-            refused: since.filter(|(_, success)| !success).count(),
+            refused: since.iter().filter(|of| !of.success).count(),
         }
     }
 }

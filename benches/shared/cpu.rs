@@ -22,12 +22,18 @@ pub(crate) fn family(root: u32) -> Vec<u32> {
 
 /// Resident memory of these processes in KiB.
 pub(crate) fn resident_kib(pids: &[u32]) -> u64 {
-    let of = |pid: &u32| {
-        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-        let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
-        line.split_whitespace().nth(1)?.parse::<u64>().ok()
-    };
-    pids.iter().filter_map(of).sum()
+    pids.iter().filter_map(|pid| kib(*pid, "VmRSS:")).sum()
+}
+
+/// The most that was resident of this process in KiB.
+pub(crate) fn peak_kib(pid: u32) -> u64 {
+    kib(pid, "VmHWM:").unwrap_or_default()
+}
+
+fn kib(pid: u32, name: &str) -> Option<u64> {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let line = status.lines().find(|line| line.starts_with(name))?;
+    line.split_whitespace().nth(1)?.parse().ok()
 }
 
 /// Processor time of each thread so far, user and system, in nanoseconds: `utime` and `stime` count hundredths

@@ -17,7 +17,7 @@ use tokio::{
     task::JoinSet,
 };
 
-use crate::shared::support::http_request;
+use super::support::http_request;
 
 /// Stands in a request for a number that is another in each call.
 pub(crate) const NUMBER: i32 = 17_171_717;
