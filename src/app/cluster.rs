@@ -11,7 +11,7 @@ mod join;
 mod merging;
 mod outgoing;
 mod reading;
-mod turns;
+mod roles;
 
 use std::{
     collections::VecDeque,
@@ -31,6 +31,7 @@ use self::{
     background::{Background, Trouble},
     cut_off::CutOff,
     facts::Known,
+    handover::HANDOVER_LIMIT,
     outgoing::Outgoing,
 };
 use super::{RunError, duty::Duty};
@@ -285,7 +286,8 @@ impl Member {
                     self.release_by = None;
                     match self.released.take() {
                         Some((_, tell)) => {
-                            let _ = tell.send(Err("etcd did not answer in time".to_owned()));
+                            let why = format!("etcd did not answer within {HANDOVER_LIMIT:?}");
+                            let _ = tell.send(Err(why));
                         }
                         None if stop.is_cancelled() => return Some(None),
                         None => {}
@@ -297,7 +299,7 @@ impl Member {
                 self.inbox.push_back(Input::Wake);
             }
         }
-        let stopped = stop.is_cancelled() && self.duty_is_free();
+        let stopped = stop.is_cancelled() && self.may_stop();
         stopped.then_some(None)
     }
 

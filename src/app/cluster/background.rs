@@ -1,4 +1,4 @@
-//! What is done beside: saying how this computer is, snapshots, and having etcd forget.
+//! Work beside the calls: this computer's own entry among the members, snapshots, and etcd's compaction.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -20,6 +20,8 @@ use crate::{
 
 /// How often the leader has etcd forget what is older than this.
 const FORGET: Duration = Duration::from_secs(300);
+/// Pause after a snapshot that could not be written.
+const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 /// How long etcd may take for what nobody waits for.
 const LIMIT: Duration = Duration::from_secs(5);
 
@@ -94,10 +96,12 @@ pub(super) enum Done {
 #[derive(Default)]
 pub(super) struct Background {
     pub(super) tasks: JoinSet<Option<Done>>,
-    /// When to say how this computer is.
+    /// When to write this computer's entry among the members.
     say_at: Option<Instant>,
-    /// A snapshot is being written, or none before this moment.
+    /// A snapshot is being written.
     snapshot: bool,
+    /// One has failed: none before this moment.
+    snapshot_at: Option<Instant>,
     /// The revision of etcd at the last look, and when to have it forget what is older.
     forget: Option<(Instant, u64)>,
 }
@@ -108,7 +112,7 @@ impl Background {
         [self.say_at, forget].into_iter().flatten().min()
     }
 
-    /// Says how this computer is as soon as possible.
+    /// Brings this computer's entry among the members up to date as soon as possible.
     pub(super) fn say_now(&mut self) {
         self.say_at = Some(Instant::now());
     }
@@ -127,7 +131,8 @@ impl Member {
             self.background.forget = None;
             return;
         };
-        if !self.background.snapshot && self.progress.wants_snapshot() {
+        let is_early = self.background.snapshot_at.is_some_and(|at| now < at);
+        if !self.background.snapshot && !is_early && self.progress.wants_snapshot() {
             self.background.snapshot = true;
             let (replica, progress) = (self.replica.clone(), self.progress);
             let checkpoint = Checkpoint {
@@ -168,12 +173,15 @@ impl Member {
                 self.progress.snapshot_written(then, bytes);
             }
             Some(Done::Nothing) => {}
-            // A snapshot that failed is due again with the next say.
-            None => self.background.snapshot = false,
+            // An etcd that is full refuses at once.
+            None => {
+                self.background.snapshot = false;
+                self.background.snapshot_at = Some(Instant::now() + SNAPSHOT_PAUSE);
+            }
         }
     }
 
-    /// Says in etcd how this computer is.
+    /// Writes this computer's entry among the members.
     fn say(&mut self) {
         let value = self.known.own(self.machine.role(), self.progress.seq);
         let put = Put {
@@ -187,7 +195,7 @@ impl Member {
                 client.put_with_lease(&put, lease, LIMIT).await
             };
             if let Err(error) = said.await {
-                tracing::debug!(%error, "saying how this computer is");
+                tracing::debug!(%error, "the entry among the members");
             }
             Some(Done::Nothing)
         });

@@ -1,5 +1,5 @@
 //! Writes that were answered while this computer was alone: kept beside the checkpoint until they have been
-//! sent to whoever leads.
+//! sent to the leader.
 
 use std::path::{Path, PathBuf};
 

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{Duty, Member};
+use super::Member;
 use crate::{
     app::RunError,
     cluster::{
@@ -13,22 +13,17 @@ use crate::{
 };
 
 /// How long a leader may take to give up leading.
-const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
+pub(super) const HANDOVER_LIMIT: Duration = Duration::from_secs(5);
 /// The same when it stops.
 const STOP_LIMIT: Duration = Duration::from_secs(4);
 
 impl Member {
     pub(super) fn begin_stop(&mut self) -> Option<Option<RunError>> {
-        if self.duty.is_none() {
+        let Some(duty) = &mut self.duty else {
             return Some(None);
-        }
+        };
+        self.ending_roscore = Some(Box::pin(duty.end_roscore()));
         self.release_by = Some(Instant::now() + STOP_LIMIT);
-        let ended = self.duty.as_mut().map(Duty::end_roscore);
-        self.ending_roscore = Some(Box::pin(async move {
-            if let Some(ended) = ended {
-                ended.await;
-            }
-        }));
         None
     }
 
@@ -49,14 +44,16 @@ impl Member {
         self.released = Some((to, tell));
     }
 
-    /// Calls that write wait from now on for whoever leads next.
+    /// Calls that write wait from now on for the next leader.
     pub(super) fn begin_release(&mut self, to: String) {
         self.set_way(Way::Nobody { known: true });
         self.inbox.push_back(Input::HandOver(to));
     }
 
-    /// Whether nobody waits for this computer to give up leading.
-    pub(super) fn duty_is_free(&self) -> bool {
-        self.machine.role() != Role::Leading && self.inbox.is_empty()
+    /// Whether a stop has nothing more to wait for: rosout has ended, and another computer may lead.
+    pub(super) fn may_stop(&self) -> bool {
+        self.ending_roscore.is_none()
+            && self.machine.role() != Role::Leading
+            && self.inbox.is_empty()
     }
 }

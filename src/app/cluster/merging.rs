@@ -1,4 +1,4 @@
-//! Sends what was answered alone to whoever leads, as far as it still holds.
+//! Sends what was answered alone to the leader, as far as it still holds.
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
@@ -23,7 +23,7 @@ const AGAIN: Duration = Duration::from_millis(100);
 const CALLS_MOST: usize = 200;
 const BYTES_MOST: usize = 512 << 10;
 
-/// The ways to whoever leads.
+/// How to reach the leader.
 pub(super) struct Route {
     /// Who leads, also while calls of nodes wait.
     pub(super) leads: watch::Receiver<Way>,
@@ -33,7 +33,7 @@ pub(super) struct Route {
 }
 
 impl Route {
-    /// The answer of whoever leads to a multicall, however long that takes.
+    /// The leader's answer to a multicall, however long that takes.
     async fn call(&mut self, calls: &[Request]) -> Reply {
         let call = Request::multicall(calls.iter().cloned());
         let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));

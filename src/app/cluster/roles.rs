@@ -81,7 +81,8 @@ impl Member {
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
-            if self.cut_off.is_none() {
+            // What is being sent is in the file until it has arrived.
+            if self.cut_off.is_none() && self.merging.is_none() {
                 cut_off::remove(&self.given.post.checkpoint);
             }
         }
