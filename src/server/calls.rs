@@ -102,6 +102,22 @@ pub struct LargeAnswer {
     text: Bytes,
 }
 
+/// The refusal of a `shutdown` that is not for the master, or not from its own computer.
+fn refuse_shutdown(peer: SocketAddr, call: Option<&Request>) -> Option<HttpReply> {
+    let call = call.filter(|call| call.kind() == Kind::Shutdown)?;
+    if !admission::may_shut_down(peer.ip()) {
+        rarely!(warn, %peer, "refused to shut the master down for another computer");
+        return Some(no_shutdown(
+            "shutdown is taken from the master's own computer only",
+        ));
+    }
+    if admission::is_for_a_node(call) {
+        rarely!(warn, %peer, "refused to shut down for a node that is registered at our address");
+        return Some(no_shutdown("this is the master, and no node"));
+    }
+    None
+}
+
 impl Calls {
     /// Answers a call of `peer`. `call` is none if its body could not be decoded.
     pub(crate) async fn answer(
@@ -111,16 +127,18 @@ impl Calls {
         body: Bytes,
         call: Option<Request>,
     ) -> Result<HttpReply, Closed> {
+        if let Some(refusal) = refuse_shutdown(peer, call.as_ref()) {
+            return Ok(refusal);
+        }
         match &self.others {
-            None => Ok(self.answer_here(peer, head, body, call).await?),
-            Some(others) => others.answer(self, peer, head, body, call).await,
+            None => Ok(self.answer_here(head, body, call).await?),
+            Some(others) => others.answer(self, head, body, call).await,
         }
     }
 
     /// As [`Self::answer`], if this computer has the master.
     pub(super) async fn answer_here(
         &self,
-        peer: SocketAddr,
         head: Head,
         body: Bytes,
         call: Option<Request>,
@@ -131,16 +149,6 @@ impl Calls {
                 if *call.method() == Method::GetUri || !self.gate.is_open() =>
             {
                 Ok(self.identity(call)?)
-            }
-            (_, Kind::Shutdown) if !admission::may_shut_down(peer.ip()) => {
-                rarely!(warn, %peer, "refused to shut the master down for another computer");
-                Ok(no_shutdown(
-                    "shutdown is taken from the master's own computer only",
-                ))
-            }
-            (Some(call), Kind::Shutdown) if admission::is_for_a_node(call) => {
-                rarely!(warn, %peer, "refused to shut down for a node that is registered at our address");
-                Ok(no_shutdown("this is the master, and no node"))
             }
             (_, Kind::Read | Kind::Identity | Kind::Unknown) => {
                 self.read(head, body, call.as_ref(), kind).await

@@ -1,6 +1,6 @@
 //! Calls where there are several computers: answered here, or by the leader.
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use tokio::{
@@ -10,7 +10,7 @@ use tokio::{
 
 use super::{
     calls::{Calls, Closed, NOT_IN_TIME, PATIENCE, Unanswered},
-    replies::{HttpReply, forwarded, no_shutdown, text, xml},
+    replies::{HttpReply, forwarded, text, xml},
 };
 use crate::{
     cluster::{journal::RECORD_BYTES_MAX, way::Way},
@@ -53,7 +53,6 @@ impl Others {
     pub(super) async fn answer(
         &self,
         calls: &Calls,
-        from: SocketAddr,
         mut head: Head,
         body: Bytes,
         call: Option<Request>,
@@ -79,13 +78,12 @@ impl Others {
             kind,
         };
         let mut way = self.way.clone();
-        self.conduct(&on_its_way, from, &mut way, asked_term).await
+        self.conduct(&on_its_way, &mut way, asked_term).await
     }
 
     async fn conduct(
         &self,
         call: &Call<'_>,
-        from: SocketAddr,
         way: &mut watch::Receiver<Way>,
         asked_term: Option<u64>,
     ) -> Result<HttpReply, Closed> {
@@ -118,7 +116,7 @@ impl Others {
                         // What is answered alone holds only if nobody else changes it: the computer that has
                         // asked need not be cut off, and may be about to lead itself.
                         _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
-                        answered = calls.answer_here(from, head, body, request) => answered,
+                        answered = calls.answer_here(head, body, request) => answered,
                     };
                     match answered {
                         Err(Unanswered::Elsewhere) => None,
@@ -199,10 +197,6 @@ impl Call<'_> {
     /// now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
         let Self { calls, call, .. } = self;
-        if self.kind == Kind::Shutdown {
-            let why = format!("the master is on another computer, at {}", leader.uri);
-            return Some(no_shutdown(&why));
-        }
         if self.kind != Kind::Read {
             return match leader.forward(term, &self.head, &self.body).await {
                 Ok(raw) => Some(forwarded(&calls.uri, call.as_ref(), raw)),
