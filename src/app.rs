@@ -12,16 +12,17 @@ use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
-    checkpoint::store::OpenError,
+    checkpoint::store::{OpenError, history},
+    clock,
     cluster::etcd::EtcdError,
     config::{Config, MasterConfig},
     gate::{self, State},
-    guardian::handover::Sockets,
-    ledger::{Ledger, checkpointer::Checkpointer},
-    lifecycle::Supervision,
+    guardian::handover::{self, Sockets},
+    ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
+    lifecycle::{Action, Patience, Supervision},
     nodes::{self, Nodes},
-    process::{ProcessError, Rosmaster},
-    recovery::{Driver, master_process::MasterProcess},
+    process::{ProcessError, Rosmaster, bypass},
+    recovery::{Driver, report_file},
     ros_env::MasterUri,
     server::{
         Server,
@@ -34,13 +35,14 @@ use crate::{
         listener,
         pages::{Pages, status::Rate},
     },
-    status::{Board, Mode, stats::Stats},
+    status::{Board, Earlier, Mode, stats::Stats},
     upstream::{Upstream, pool::Pool},
-    write_queue,
+    wait, write_queue,
 };
 
 mod cluster;
 mod duty;
+mod earlier;
 mod life;
 mod notify;
 mod startup;
@@ -54,6 +56,8 @@ use self::{
 
 /// How long connections may take to end at the stop.
 const DRAIN: Duration = Duration::from_millis(500);
+/// How long a start waits for the reports of earlier rescues: calls wait meanwhile.
+const REPORTS: Duration = Duration::from_secs(1);
 
 /// Why rosrescue cannot start or continue. Exit status 1.
 #[derive(Debug, Error)]
@@ -96,7 +100,7 @@ pub async fn run(
     say: impl Fn(&str),
 ) -> Result<(), RunError> {
     if let Some(bound) = sockets.addresses().first() {
-        config.advertised.port = bound.port();
+        config.serve_on(bound.port());
     }
     let Sockets { listeners, guard } = sockets;
     let listeners = listeners.into_iter().map(TcpListener::from_std);
@@ -129,22 +133,26 @@ pub async fn run(
     let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
     let port = last.map(|uri| uri.port);
     let rosmaster = supervised.map(|(_, rosmaster)| rosmaster);
-    let is_member = config.cluster.is_some();
-    let process = rosmaster.clone().filter(|_| !is_member);
-    let process = process.map(|rosmaster| {
-        let left = rosmaster.left_behind(port);
-        MasterProcess::new(rosmaster, port, left)
-    });
-    let left = process.as_ref().is_some_and(MasterProcess::is_left);
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
     let Beginning {
         mirror,
         session,
         pending,
+        displaced,
         store,
         restored,
+        died,
         ..
     } = beginning;
+    let mut earlier = match &store {
+        Some(store) => {
+            let (path, id) = (store.path().to_owned(), session.id.clone());
+            let read = move || report_file::earlier(&path, &id, died, history::last_rescue(&path));
+            wait::within(REPORTS, read).await.unwrap_or_default()
+        }
+        None => Earlier::default(),
+    };
+    earlier.worker_restarts = earlier.worker_restarts.max(handover::restarts());
     // Lives as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
     let (gate_tx, gate) = gate::gate();
@@ -153,6 +161,12 @@ pub async fn run(
         None => (Mode::Proxy, Supervision::Theirs),
     };
     let (board, slow, looped) = (Arc::new(Board::new(mode)), Arc::default(), Arc::default());
+    let removed = earlier.reports.iter().flat_map(|report| {
+        let at = clock::moment_of(report.detected_at);
+        report.removed.iter().map(move |node| (node.clone(), at))
+    });
+    let removed: Vec<_> = removed.collect();
+    board.update(|facts| facts.go_on(earlier));
     let ledger = Arc::new(Ledger::new(
         mirror,
         session,
@@ -161,6 +175,11 @@ pub async fn run(
         config.sync,
         stats,
     ));
+    // Where there are several computers, each leads with a new master.
+    if restored && config.cluster.is_none() {
+        ledger.set_unconfirmed();
+        ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
+    }
     let pid = i32::try_from(std::process::id()).unwrap_or(-1);
     ledger.set_identity(pid, uri.clone());
     let upstream = Arc::new(Upstream::new(
@@ -176,6 +195,7 @@ pub async fn run(
         stats,
         config.resync_interval,
         config.reap_interval.is_some(),
+        Patience::new(config.probing.patience),
     );
     let nodes = Arc::new(Nodes::new(
         ledger.clone(),
@@ -184,6 +204,9 @@ pub async fn run(
         stats,
         config.node_timeout,
     ));
+    for (node, at) in removed {
+        nodes.removed.add(&node, at);
+    }
     let post = Post {
         ledger: ledger.clone(),
         upstream: upstream.clone(),
@@ -210,7 +233,7 @@ pub async fn run(
     };
     let notified = notify::start(guard, told, stop.clone());
     let halt = CancellationToken::new();
-    let (others, runs) = match (config.cluster.clone(), rosmaster, rosout) {
+    let (others, runs) = match (config.cluster.clone(), rosmaster.clone(), rosout) {
         (Some(cluster), Some(rosmaster), Some(rosout)) => {
             let given = cluster::Given {
                 config: cluster,
@@ -227,19 +250,11 @@ pub async fn run(
             (Some(others), Runs::Member(Box::new(member)))
         }
         _ => {
-            let duties = rosout.map(|rosout| post.roscore(rosout, !left, stop.clone()));
-            tokio::spawn({
-                let (stop, halt) = (stop.clone(), halt.clone());
-                async move {
-                    stop.cancelled().await;
-                    if let Some(duties) = duties {
-                        // A panic there must not prevent the stop.
-                        let _ = duties.await;
-                    }
-                    halt.cancel();
-                }
-            });
-            (None, Runs::Single(Box::new(post.driver(process))))
+            if restored {
+                // The mirror answers before it is known what an earlier rosrescue has left running.
+                post.gate_tx.set(State::StandingIn);
+            }
+            (None, Runs::Single(Box::new(post)))
         }
     };
     let clients = Arc::new(Clients::default());
@@ -270,6 +285,7 @@ pub async fn run(
             ledger: ledger.clone(),
             reads: config.reads,
             last_large: Default::default(),
+            compared: Default::default(),
             pool: Arc::new(pool),
             write_queue,
             slow,
@@ -307,21 +323,37 @@ pub async fn run(
         ));
     }
     drop(server);
+    let is_proxy = matches!(config.master, MasterConfig::External(_));
+    let proxied = is_proxy.then(|| (upstream.clone(), board.clone()));
     // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
-    let (first, runs) = match runs {
-        Runs::Single(mut driver) => (driver.start(restored), Runs::Single(driver)),
-        member => (Vec::new(), member),
-    };
     let checkpointer = Checkpointer::begin(
         ledger.clone(),
         board,
         config.checkpoint,
         config.sync_interval,
-    )
-    .await;
+    );
+    let duty = async {
+        match runs {
+            Runs::Single(post) => {
+                let ends = (stop.clone(), halt.clone());
+                let (driver, first) = post.alone(rosmaster, port, rosout, restored, ends).await;
+                Begun::Single(Box::new(driver), first)
+            }
+            Runs::Member(member) => Begun::Member(member),
+        }
+    };
+    let (checkpointer, begun) = tokio::join!(checkpointer, duty);
     tasks.spawn(checkpointer.run(halt.clone()));
     tasks.spawn(drain.run());
+    tasks.spawn(nodes::liveness::watch(nodes.clone()));
     tasks.spawn(nodes::watch(nodes, config.reap_interval));
+    if let Some((upstream, board)) = proxied {
+        tasks.spawn(bypass::watch(
+            upstream,
+            board,
+            config.advertised.to_string(),
+        ));
+    }
     let announce = async {
         gate.clone()
             .wait_for(|state| state.is_open() || state == State::Elsewhere)
@@ -329,11 +361,11 @@ pub async fn run(
         say("ROS Rescue enabled. Master is now fault tolerant!!");
         std::future::pending().await
     };
-    let mut driver = match runs {
-        Runs::Single(driver) => {
+    let mut driver = match begun {
+        Begun::Single(driver, first) => {
             tokio::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
         }
-        Runs::Member(member) => tokio::spawn(member.run(stop)),
+        Begun::Member(member) => tokio::spawn(member.run(stop)),
     };
     let process = tokio::select! {
         process = &mut driver => match process {
@@ -356,29 +388,37 @@ pub async fn run(
     Ok(())
 }
 
-/// Who sees to the master.
+/// Which computer sees to the master.
 enum Runs {
-    /// This computer.
-    Single(Box<Driver>),
+    /// This one.
+    Single(Box<Post>),
     /// One of several.
     Member(Box<Member>),
 }
 
-/// Writes the closing checkpoint.
+/// What sees to the master.
+enum Begun {
+    /// With what is to be done first.
+    Single(Box<Driver>, Vec<Action>),
+    Member(Box<Member>),
+}
+
+/// Writes the closing checkpoint, if the disk answers within [`DISK_PATIENCE`].
 async fn close(ledger: Arc<Ledger>) {
-    let closed = tokio::task::spawn_blocking(move || {
-        ledger.update_session(|session| session.closed = true);
-        ledger.with_store(|store, checkpoint| store.close(&checkpoint()))
-    });
-    match closed.await {
+    let has_store = ledger.seen_store().is_some();
+    ledger.update_session(|session| session.closed = true);
+    let closed = ledger.on_store_whole(|store, checkpoint| store.close(&checkpoint));
+    match tokio::time::timeout(DISK_PATIENCE, closed).await {
         Ok(Some(Err(error))) => tracing::error!(
             %error,
             "stopped, but the closing checkpoint could not be written: the next start takes this for \
              a crash; free or repair the disk"
         ),
-        Ok(_) => tracing::info!("closed in order"),
-        Err(error) => {
-            tracing::error!(%error, "stopped without a closing checkpoint; please report this")
-        }
+        Ok(Some(Ok(()))) => tracing::info!("closed in order"),
+        Ok(None) if !has_store => tracing::info!("closed in order"),
+        Ok(None) | Err(_) => tracing::error!(
+            "stopped without a closing checkpoint: the disk has not answered for {DISK_PATIENCE:?}. The next start \
+             takes this for a crash; repair the disk"
+        ),
     }
 }

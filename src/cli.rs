@@ -1,4 +1,5 @@
-//! The command line. Every option has an environment variable, a default and a unit in its help.
+//! The command line. Every option has a default and a unit in its help, and an environment variable. Flags of
+//! commands that do not serve have none: consent must not be left over from an earlier command.
 
 pub(crate) mod cluster;
 mod files;
@@ -12,8 +13,8 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 pub use self::{
     cluster::{ClusterArgs, ClusterSync, Members, WhenCutOff},
     files::{
-        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, RestoreArgs,
-        VerifyArgs,
+        CheckpointArgs, DiffArgs, HistoryArgs, InspectArgs, ParamsArgs, ReadArgs, ReportArgs,
+        RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
     serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
@@ -42,12 +43,19 @@ impl Cli {
     /// Reads the command line and the environment; ends the process with what is wrong with them.
     pub fn read() -> Self {
         let mut command = Self::command();
-        let first = std::env::args_os().nth(1);
-        if first.is_some_and(|first| command.find_subcommand(first).is_some()) {
+        let mut words: Vec<_> = std::env::args_os().collect();
+        if words.get(1).is_some_and(|first| first == "help") {
+            words.remove(1);
+            words.push("--help".into());
+        }
+        if words
+            .get(1)
+            .is_some_and(|first| command.find_subcommand(first).is_some())
+        {
             // The options of the bare `rosrescue` are not meant, so neither are their variables.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
-        let matches = command.get_matches();
+        let matches = command.get_matches_from(words);
         Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
     }
 }
@@ -76,13 +84,19 @@ mod tests {
     }
 
     #[test]
-    fn every_option_has_an_environment_variable_and_a_help_text() {
+    fn every_option_but_a_flag_of_a_tool_has_an_environment_variable_and_each_a_help_text() {
         let cli = Cli::command();
         for command in std::iter::once(&cli).chain(cli.get_subcommands()) {
             for option in command.get_arguments().filter(|a| {
                 !a.is_positional() && !["help", "version"].contains(&a.get_id().as_str())
             }) {
                 let name = option.get_id();
+                assert!(option.get_help().is_some(), "{name} has no help");
+                let serves = ["rosrescue", "core", "proxy"].contains(&command.get_name());
+                if !serves && !option.get_action().takes_values() && name != "json" {
+                    assert_eq!(option.get_env(), None, "{name}: consent by environment");
+                    continue;
+                }
                 let variable = option
                     .get_env()
                     .unwrap_or_else(|| panic!("{name} has no variable"));
@@ -90,7 +104,6 @@ mod tests {
                     variable.to_string_lossy().starts_with("ROSRESCUE_"),
                     "{name}"
                 );
-                assert!(option.get_help().is_some(), "{name} has no help");
             }
         }
     }

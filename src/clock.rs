@@ -1,7 +1,7 @@
 //! The wall clock, only for display. No decision may depend on it: robots start without a battery-backed
 //! clock, and it jumps by years when the network comes up.
 
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Seconds since 1970, with microseconds; 0 before that.
 #[allow(
@@ -17,6 +17,13 @@ pub fn wall_time() -> f64 {
 /// The wall time at `moment`, by the clock as it is set now.
 pub fn wall_time_of(moment: Instant) -> f64 {
     (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)
+}
+
+/// The moment of a wall time, by the clock as it is set now; the present for one that is not past.
+pub fn moment_of(seconds: f64) -> Instant {
+    let now = Instant::now();
+    let since = Duration::try_from_secs_f64(wall_time() - seconds).unwrap_or_default();
+    now.checked_sub(since).unwrap_or(now)
 }
 
 /// A wall time as text in UTC, such as `2026-11-21T09:26:53Z`.

@@ -13,6 +13,7 @@ mod install;
 mod live;
 mod man;
 mod params;
+mod report;
 mod restore;
 mod running;
 mod status;
@@ -31,7 +32,10 @@ use std::{
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::cli::{OutputArgs, Tool};
+use crate::{
+    cli::{OutputArgs, Tool},
+    log::{plain, plain_json},
+};
 
 /// How a command ends. A usage error of the command line has 2, too.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,6 +56,12 @@ pub(crate) enum Failure {
     /// No rosrescue answers. Exit status 3.
     #[error("no rosrescue at {uri}: {why}. Start `rosrescue core`, or give its address with --uri")]
     Nobody { uri: String, why: String },
+    /// Something has the port and does not answer as a rosrescue. Exit status 3.
+    #[error(
+        "no rosrescue answers at {uri}: {why}. Something has the port: a rosrescue that is stopped or overloaded, \
+         or another program; `rosrescue check` names it"
+    )]
+    Silent { uri: String, why: String },
     /// It began and could not be finished. Exit status 1.
     #[error("{0}")]
     Failed(String),
@@ -61,7 +71,7 @@ impl Failure {
     fn status(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
-            Self::Nobody { .. } => 3,
+            Self::Nobody { .. } | Self::Silent { .. } => 3,
             Self::Failed(_) => 1,
         }
     }
@@ -87,6 +97,7 @@ pub fn run(tool: &Tool) -> ExitCode {
                 Tool::Install(args) => install::run(args).await,
                 Tool::Man(args) => man::run(args).await,
                 Tool::Params(args) => params::run(args).await,
+                Tool::Report(args) => report::run(args).await,
                 Tool::Restore(args) => restore::run(args).await,
                 Tool::Status(args) => status::run(args).await,
                 Tool::Top(args) => top::run(args).await,
@@ -100,7 +111,7 @@ pub fn run(tool: &Tool) -> ExitCode {
     match ended {
         Ok(exit) => ExitCode::from(exit as u8),
         Err(failure) => {
-            eprintln!("rosrescue: {failure}");
+            eprintln!("rosrescue: {}", plain(&failure.to_string()));
             ExitCode::from(failure.status())
         }
     }
@@ -109,8 +120,8 @@ pub fn run(tool: &Tool) -> ExitCode {
 /// Prints `result`, as text or JSON. A reader that has gone, as `head` does, is no failure.
 fn print(result: &(impl Display + Serialize), output: &OutputArgs) -> Result<(), Failure> {
     let text = if output.json {
-        serde_json::to_string_pretty(result)
-            .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?
+        let json = serde_json::to_string_pretty(result);
+        plain_json(&json.map_err(|error| Failure::Failed(format!("no JSON: {error}")))?)
     } else {
         plain(&result.to_string())
     };
@@ -124,18 +135,6 @@ fn print_line(text: &str) -> Result<bool, Failure> {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(Failure::Failed(format!("cannot print: {error}"))),
     }
-}
-
-/// `text` without what a terminal would take for commands: names come from the network.
-fn plain(text: &str) -> String {
-    let safe = |c: char| {
-        if c.is_control() && c != '\n' {
-            '\u{fffd}'
-        } else {
-            c
-        }
-    };
-    text.chars().map(safe).collect()
 }
 
 /// A number of things, as in `1 message` and `2 messages`.

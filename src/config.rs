@@ -24,8 +24,8 @@ mod files;
 use self::addresses::{advertised_host, listen_addresses, parse_address};
 pub use self::cluster::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
 
-/// Name of the checkpoint in the log folder; the paper's tool uses it too.
-pub const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
+/// Name of the checkpoint in the log folder; the paper's tool uses it too. That of port 11311 only.
+pub(crate) const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
 /// Shortest pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
@@ -81,6 +81,8 @@ pub struct Config {
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
+    /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
+    pub checkpoint_is_given: bool,
     pub restore: Restore,
     /// Most space for the checkpoints that are kept, in bytes.
     pub history: u64,
@@ -192,7 +194,8 @@ impl Config {
         let host = advertised_host(&listen, env, hostname, local_address);
         let advertised = MasterUri { host, port };
         let cluster = ClusterConfig::new(&args.cluster, &advertised, hostname)?;
-        let config = Self::common(&args.common, env, listen, advertised, master)?;
+        let mut config = Self::common(&args.common, env, listen, advertised, master)?;
+        config.probing.start_limit = Duration::from_secs(args.start_limit);
         Ok(Self { cluster, ..config })
     }
 
@@ -226,6 +229,14 @@ impl Config {
         }
     }
 
+    /// Nodes reach rosrescue at `port`: the system may have chosen it.
+    pub fn serve_on(&mut self, port: u16) {
+        self.advertised.port = port;
+        if !self.checkpoint_is_given {
+            self.checkpoint.set_file_name(checkpoint_name(port));
+        }
+    }
+
     /// Serves `addresses` instead, which another process has bound.
     pub fn serve_at(&mut self, addresses: Vec<SocketAddr>, env: Lookup<'_>) {
         let before = self.advertised.clone();
@@ -236,7 +247,7 @@ impl Config {
             self.advertised.host = served.ip().to_string();
         }
         if let Some(first) = addresses.first() {
-            self.advertised.port = first.port();
+            self.serve_on(first.port());
         }
         if let Some(cluster) = &mut self.cluster {
             cluster.follow(&before, &self.advertised);
@@ -264,11 +275,12 @@ impl Config {
             MasterConfig::External(_) => Reads::Master,
         });
         Ok(Self {
+            checkpoint: checkpoint_path(args.checkpoint.as_deref(), advertised.port, env),
+            checkpoint_is_given: args.checkpoint.is_some(),
             listen,
             advertised,
             master,
             reads,
-            checkpoint: checkpoint_path(args.checkpoint.as_deref(), env),
             restore: args.restore,
             history: args.history << 20,
             sync: args.sync,
@@ -277,6 +289,9 @@ impl Config {
             probing: Probing {
                 interval,
                 count: args.probe_count,
+                patience: Duration::from_millis(args.stand_in_after),
+                // Only masters of our own are started.
+                start_limit: Duration::MAX,
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
             node_timeout: Duration::from_millis(args.node_timeout),
@@ -303,12 +318,20 @@ impl Config {
     }
 }
 
-/// The checkpoint that is meant if `given` is on the command line.
-pub(crate) fn checkpoint_path(given: Option<&Path>, env: Lookup<'_>) -> PathBuf {
+/// The checkpoint of the rosrescue at `port`: `given` on the command line, or the default.
+pub(crate) fn checkpoint_path(given: Option<&Path>, port: u16, env: Lookup<'_>) -> PathBuf {
     given.map_or_else(
-        || ros_env::log_dir(env).join(CHECKPOINT_NAME),
+        || ros_env::log_dir(env).join(checkpoint_name(port)),
         Path::to_owned,
     )
+}
+
+/// Each port has a checkpoint of its own.
+fn checkpoint_name(port: u16) -> String {
+    match port {
+        ros_env::DEFAULT_MASTER_PORT => CHECKPOINT_NAME.to_owned(),
+        _ => format!("latest-chkpt-{port}.yaml"),
+    }
 }
 
 fn usize_of(number: u32) -> usize {
@@ -355,8 +378,20 @@ mod tests {
         assert!(config.listen.iter().all(|address| address.port() == 12_345));
         assert_eq!(
             config.checkpoint,
-            PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml")
+            PathBuf::from("/home/r/.ros/log/latest-chkpt-12345.yaml")
         );
+    }
+
+    #[test]
+    fn each_port_has_a_checkpoint_of_its_own() {
+        let mut any = config(&["proxy", "--master", "http://m:1", "--listen", "0"]).unwrap();
+        any.serve_on(40_000);
+        assert!(any.checkpoint.ends_with("log/latest-chkpt-40000.yaml"));
+        any.serve_on(11_311);
+        assert!(any.checkpoint.ends_with("log/latest-chkpt.yaml"));
+        let mut given = config(&["core", "--checkpoint", "/c.yaml"]).unwrap();
+        given.serve_on(40_000);
+        assert_eq!(given.checkpoint, PathBuf::from("/c.yaml"));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Whether calls pass to the master. Any task may read and wait; the only [`Tx`] is the recovery's.
 //!
-//! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], `Examiner::inject` sets
-//! [`State::Injecting`], `Examiner::open_gate` sets [`State::Open`], and `app::cluster`, between the recoveries of
+//! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], the driver [`State::Late`],
+//! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets [`State::Open`], and `app::cluster`, between the recoveries of
 //! two reigns, [`State::Elsewhere`].
 
 use std::time::Duration;
@@ -18,6 +18,9 @@ pub enum State {
     },
     /// The mirror answers reads and writes: the master is away.
     StandingIn,
+    /// The same, but the master has a batch or a look under way, and is given what it missed when it has
+    /// answered that.
+    Late,
     /// The mirror answers reads, and writes that change nothing. Other writes wait: an injection is under
     /// way.
     Injecting,

@@ -37,6 +37,9 @@ use restart::{End, Next, Restarts};
 /// The running program, even after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
 
+/// As `OOMScoreAdjust=` in the systemd unit.
+const OOM_SCORE_ADJUST: &str = "-500";
+
 /// How long to wait for a worker to handle signals before one is sent anyway.
 const START_TIME: Duration = Duration::from_secs(1);
 
@@ -58,27 +61,34 @@ pub enum GuardianError {
 ///
 /// If the first worker cannot be started, or signals cannot be received. Later the guardian never gives up.
 pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
+    evade_oom_killer();
     let signals = receive_signals()?;
     let mut restarts = Restarts::default();
-    let mut worker = Worker::start(listeners)?;
+    let mut worker = Worker::start(listeners, 0)?;
+    let mut count = 0;
     loop {
         let end = worker.attend(&signals, |signal| restarts.stop(signal));
-        let pause = match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
-            Next::Exit(status) => return Ok(status),
-            Next::Restart { pause } => pause,
-        };
+        let (pause, again_and_again) =
+            match restarts.ended(end, worker.has_said(handover::SERVES), Instant::now()) {
+                Next::Exit(status) => return Ok(status),
+                Next::Restart {
+                    pause,
+                    again_and_again,
+                } => (pause, again_and_again),
+            };
         let pid = worker.pid;
-        if pause.is_zero() {
-            rarely!(warn, pid, how = %end, "the worker has ended; another one is started at once, and the port stays open");
-        } else {
+        if again_and_again || !pause.is_zero() {
             rarely!(
                 error, pid, how = %end, ?pause,
-                "the worker dies again and again; it is started after a pause, and the port stays open. \
-                 Its lines above say why; please report them"
+                "the worker dies again and again; another one is started after the pause, and the port stays open. \
+                 The lines above say why; please report them"
             );
+        } else {
+            rarely!(warn, pid, how = %end, "the worker has ended; another one is started at once, and the port stays open");
         }
         let stop;
-        (worker, stop) = start_again(listeners, &signals, pause)?;
+        count += 1;
+        (worker, stop) = start_again(listeners, &signals, pause, count)?;
         if let Some(signal) = stop.or_else(|| restarts.stopped_by()) {
             restarts.stop(signal);
             worker.pass_on(signal);
@@ -92,14 +102,15 @@ fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
     mut pause: Duration,
+    restarts: u64,
 ) -> Result<(Worker, Option<i32>), GuardianError> {
     loop {
         let stop = wait(signals, pause)?;
-        match Worker::start(listeners) {
+        match Worker::start(listeners, restarts) {
             Ok(worker) => return Ok((worker, stop)),
             Err(error) if stop.is_some() => return Err(error),
             Err(error) => {
-                rarely!(error, %error, "no worker can be started, and calls wait; it is tried again")
+                rarely!(error, %error, "cannot start a worker; calls wait; retrying")
             }
         }
         pause = restart::PAUSE_MOST;
@@ -130,7 +141,7 @@ struct Worker {
 }
 
 impl Worker {
-    fn start(listeners: &[TcpListener]) -> Result<Self, GuardianError> {
+    fn start(listeners: &[TcpListener], restarts: u64) -> Result<Self, GuardianError> {
         let (link, of_worker) = UnixStream::pair()?;
         link.set_read_timeout(Some(START_TIME))?;
         let mut passed = Vec::new();
@@ -151,6 +162,7 @@ impl Worker {
             .args(arguments)
             .env(handover::LISTEN_FDS, count)
             .env(handover::GUARDIAN, std::process::id().to_string())
+            .env(handover::RESTARTS, restarts.to_string())
             .env_remove(handover::LISTEN_PID)
             .env_remove(handover::LISTEN_FDNAMES)
             // In a group of its own: terminal signals reach only the guardian, which passes them on once.
@@ -236,6 +248,16 @@ fn reap(worker: Option<u32>) -> Option<End> {
         }
     }
     end
+}
+
+/// Lets the kernel end nodes first when memory runs out, as the systemd unit does. Our children inherit this. Only
+/// with CAP_SYS_RESOURCE, and only if no value was chosen.
+fn evade_oom_killer() {
+    const SCORE: &str = "/proc/self/oom_score_adj";
+    if std::fs::read_to_string(SCORE).is_ok_and(|score| score.trim() == "0") {
+        // Without it, the guardian is still the smallest process.
+        let _ = std::fs::write(SCORE, OOM_SCORE_ADJUST);
+    }
 }
 
 fn receive_signals() -> io::Result<Receiver<i32>> {

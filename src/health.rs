@@ -5,11 +5,13 @@
 //! a dead one.
 
 mod backoff;
+mod liveness;
 mod rates;
 mod repeats;
 mod taken_port;
 mod unreachable;
 
+pub(crate) use liveness::{Health, Liveness};
 pub(crate) use rates::Rates;
 pub(crate) use repeats::Repeats;
 pub(crate) use taken_port::{Eviction, first_taking};
@@ -31,6 +33,17 @@ const COMMON: [&str; 6] = [
     "/tf_static",
     "/diagnostics",
 ];
+
+/// A node's reaction to a call.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Sign {
+    /// It answered.
+    Alive,
+    /// Its port refuses connections: the process is gone.
+    Dead,
+    /// No answer in time, or no valid one. That is no proof of death.
+    Silent,
+}
 
 /// Topics with their types, as listed by a node.
 type Topics = BTreeMap<String, String>;
@@ -143,12 +156,18 @@ pub(crate) fn judge(
     // A new node at the port may have been asked under the previous node's name.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
     let last_of_pid = of_pid.map(|name| name.registered).max();
+    let last = names.iter().map(|name| name.registered).max();
     let verdicts = names.iter().zip(&matches);
     let verdicts = verdicts.map(|(name, found)| match (name.known_pid, pid) {
         (Some(known), Some(pid)) if known == pid => match by_topics(name, found) {
             Verdict::Another if last_of_pid > Some(name.registered) => Verdict::Another,
             _ => Verdict::Itself,
         },
+        // All its topics are there, and no later node is: a process id can change, as behind some node
+        // libraries or when a node is restarted at its port.
+        (Some(_), Some(_)) if matches!(found, Some((_, true))) && last == Some(name.registered) => {
+            Verdict::Itself
+        }
         (Some(_), Some(_)) if !name.registered_since => Verdict::Another,
         _ => by_topics(name, found),
     });
@@ -166,11 +185,38 @@ pub(crate) fn judge(
     verdicts
 }
 
+/// What follows when a port refuses connections.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Refusal {
+    /// Nothing: the nodes there are kept as unreachable, and asked again later.
+    Keep,
+    /// The port is asked again after a pause.
+    AskAgain,
+    /// The nodes there are dead.
+    Dead,
+}
+
+/// Judges a port that refuses connections. `calls` are the last calls of the nodes there, and `before` those when
+/// it refused for the first time. A node may close its port before it unregisters: roslisp does.
+pub(crate) fn judge_refusal<C: PartialEq>(
+    master_serves: bool,
+    before: Option<&C>,
+    calls: &C,
+) -> Refusal {
+    match before {
+        // A living master would not have noticed. The health check after the recovery decides.
+        _ if !master_serves => Refusal::Keep,
+        Some(before) if before == calls => Refusal::Dead,
+        _ => Refusal::AskAgain,
+    }
+}
+
 /// One registration of a node.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Registration {
-    publishes: bool,
-    topic: String,
+    /// Whether the node publishes the topic; else it subscribes it.
+    pub publishes: bool,
+    pub topic: String,
     topic_type: String,
 }
 
@@ -211,10 +257,11 @@ impl Registration {
 /// Where the mirror differs from a node's report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Reconciliation {
-    /// Reported by the node, missing in the mirror.
+    /// Reported by the node, missing in the mirror. No reason to register it: the node may have another
+    /// master, and be known here through a program that synchronises both.
     pub missing: Vec<Registration>,
     /// In the mirror, but not reported by the node. Must be confirmed: a node may register first and list the
-    /// topic later.
+    /// topic later. Nothing if the node lists nothing at all: it may be unable to tell.
     pub extra: Vec<Registration>,
 }
 
@@ -239,9 +286,9 @@ impl Reconciliation {
                     topic_type: topic_type.clone(),
                 }));
             // Topics that a strange node name has changed cannot be compared.
-            let extra = held
-                .iter()
-                .filter(|topic| master::is_plain_topic(topic) && !said.contains_key(**topic));
+            let extra = held.iter().filter(|topic| {
+                !said.is_empty() && master::is_plain_topic(topic) && !said.contains_key(**topic)
+            });
             reconciliation.extra.extend(extra.map(|topic| Registration {
                 publishes,
                 topic: (*topic).to_owned(),

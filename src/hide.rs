@@ -7,7 +7,8 @@ use regex::{Regex, RegexBuilder};
 use crate::xmlrpc::{Struct, Value};
 
 /// The names whose values are hidden unless others are given.
-pub const DEFAULT: &str = "password|token|secret|key";
+pub const DEFAULT: &str =
+    "password|passwd|passphrase|pwd|token|secret|key|credential|private|(^|[^a-z])pin([^a-z]|$)";
 /// Stands where a value is hidden.
 pub const HIDDEN: &str = "(hidden)";
 
@@ -102,7 +103,26 @@ mod tests {
         for name in ["/wifi/password", "/API_Key", "/secrets/user", "/a/tokens"] {
             assert!(hide.hides(name), "{name}");
         }
-        assert!(!hide.hides("/robot/wheels"));
+        for name in [
+            "/wifi/passwd",
+            "/db/pwd",
+            "/cloud_credentials",
+            "/sim_PIN",
+            "/pin",
+            "/a/pin/b",
+            "/privateer",
+        ] {
+            assert!(hide.hides(name), "{name}");
+        }
+        for name in [
+            "/robot/wheels",
+            "/spinning",
+            "/pinion/speed",
+            "/mapping",
+            "/pwm",
+        ] {
+            assert!(!hide.hides(name), "{name}");
+        }
         let hide: Hide = "^/wifi$".parse().unwrap();
         assert!(hide.hides("/wifi/user") && hide.hides("/wifi") && !hide.hides("/wifi2/user"));
         let hide: Hide = DEFAULT.parse().unwrap();

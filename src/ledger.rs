@@ -1,4 +1,5 @@
-//! Mirror and journal under one lock: a write is recorded and applied in one step.
+//! Mirror and journal under one lock: a write is applied and given to the journal in one step. The
+//! answer waits until it is [written](journal).
 //!
 //! The lock also orders both against the takeover by a new incarnation: a reply of the old master that
 //! arrives after the injection's state was taken is not acknowledged.
@@ -6,16 +7,19 @@
 pub(crate) mod activity;
 mod answers;
 pub(crate) mod checkpointer;
+pub(crate) mod delivery;
 mod durability;
 pub(crate) mod history;
 mod injection;
+pub(crate) mod journal;
+pub(crate) mod late;
 mod pending;
 mod shared;
 mod summary;
 
 use std::{
     collections::HashSet,
-    sync::{Mutex, MutexGuard, PoisonError},
+    sync::{Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
     time::Instant,
 };
 
@@ -25,6 +29,8 @@ use self::activity::{Activity, Noticed};
 pub(crate) use self::{durability::Mark, shared::Change};
 use self::{
     durability::Whole,
+    journal::Journal,
+    late::Behind,
     pending::PendingWrites,
     shared::{Agreed, Shared},
 };
@@ -34,7 +40,9 @@ use crate::{
         store::Store,
     },
     cli::SyncPolicy,
+    health::port_of,
     master::{Master, Method, Request},
+    order::Order,
     replay::{self, Answered, Token},
     status::stats::Stats,
     xmlrpc::Reply,
@@ -68,7 +76,12 @@ pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
     stats: &'static Stats,
+    /// The last record that an answer need not wait for.
     durable: watch::Sender<u64>,
+    /// The disk has been asked for a sync that is late.
+    sync_is_late: AtomicBool,
+    /// Wakes what tells of a disk that is silent.
+    disk_silent: Notify,
     /// What other computers have of our writes.
     agreed: watch::Sender<Agreed>,
     /// The mirror's version in the last whole checkpoint that was attempted.
@@ -79,6 +92,7 @@ pub struct Ledger {
     pub shared: Notify,
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
+    order_changed: watch::Sender<()>,
 }
 
 struct Inner {
@@ -87,13 +101,14 @@ struct Inner {
     identity: (i32, String),
     session: Session,
     /// None if no checkpoint could be opened: the state is unprotected.
-    store: Option<Store>,
+    journal: Option<Journal>,
     shared: Shared,
     /// Changes whenever the mirror changes.
     version: u64,
     whole: Whole,
     pending: PendingWrites,
     activity: Activity,
+    order: Order,
     diverged: HashSet<Method>,
     /// An injection is under way: the mirror must not change.
     injecting: bool,
@@ -101,8 +116,14 @@ struct Inner {
     doubted: bool,
     /// The present incarnation may still run a batch whose reply is no longer awaited.
     abandoned: bool,
+    /// What the present incarnation holds when it has answered what it is late with.
+    behind: Option<Behind>,
     /// The incarnation that was served last.
     served: Option<u64>,
+    /// The mirror is a checkpoint's, and no master has been compared with it: a living one may be newer.
+    unconfirmed: bool,
+    /// The session has changed, and its record is not in the journal.
+    session_unwritten: bool,
 }
 
 impl Ledger {
@@ -120,30 +141,42 @@ impl Ledger {
             mirror,
             identity: (-1, String::new()),
             session,
-            store,
+            journal: None,
             shared: Shared::Nobody,
             version: 0,
             whole: Whole::default(),
             pending: PendingWrites::default(),
             activity: Activity::default(),
+            order: Order::default(),
             diverged: HashSet::new(),
             injecting: false,
             doubted: false,
             abandoned: false,
+            behind: None,
             served: None,
+            unconfirmed: false,
+            session_unwritten: false,
         };
         inner.add_pending(pending);
-        Self {
+        inner.pending.are_restored();
+        let ledger = Self {
             inner: Mutex::new(inner),
             sync,
             stats,
             durable: watch::channel(0).0,
+            sync_is_late: AtomicBool::new(false),
+            disk_silent: Notify::new(),
             agreed: watch::channel(Agreed::default()).0,
             attempted: watch::channel(0).0,
             work: Notify::new(),
             shared: Notify::new(),
             outbox_changed: Notify::new(),
+            order_changed: watch::channel(()).0,
+        };
+        if let Some(store) = store {
+            ledger.set_store(store);
         }
+        ledger
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
@@ -155,9 +188,19 @@ impl Ledger {
         look(&self.lock().mirror)
     }
 
+    /// The mirror is a checkpoint's, which may be older than a master that lives.
+    pub fn set_unconfirmed(&self) {
+        self.lock().unconfirmed = true;
+    }
+
     /// Sets the answers to getPid and getUri.
     pub fn set_identity(&self, pid: i32, uri: String) {
         self.lock().set_identity((pid, uri));
+    }
+
+    /// The answer to getUri: our own address.
+    pub fn uri(&self) -> String {
+        self.lock().identity.1.clone()
     }
 
     /// Sets the answer to getPid.
@@ -173,6 +216,7 @@ impl Ledger {
 
     pub fn update_session(&self, change: impl FnOnce(&mut Session)) {
         self.lock().update_session(change);
+        self.write_soon();
         self.work.notify_one();
     }
 
@@ -211,10 +255,14 @@ impl Ledger {
         let mut entries = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
         for (index, answered) in answered.into_iter().enumerate() {
+            // If so, the mirror is known to differ: the master holds what cannot be read from it.
+            let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
-                self.stats.divergences.count();
-                inner.report_divergence(&answered, &outcome);
+                if !is_inexact {
+                    self.stats.divergences.count();
+                    inner.report_divergence(&answered, &outcome);
+                }
                 recorded.doubtful = true;
                 if !answered.executed {
                     // A refused call is in no journal.
@@ -226,14 +274,15 @@ impl Ledger {
             }
         }
         inner.doubted |= recorded.doubtful;
-        if !entries.is_empty() {
+        let has_entries = !entries.is_empty();
+        if has_entries {
             self.stats.writes_recorded.add(entries.len() as u64);
-            inner.append(&entries);
+            inner.append(entries);
         }
         if unrecorded {
             inner.changed_unrecorded();
         }
-        if unrecorded || !entries.is_empty() {
+        if unrecorded || has_entries {
             recorded.mark = inner.mark();
             drop(inner);
             self.recorded();
@@ -245,7 +294,9 @@ impl Ledger {
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
-        inner.append(&[Entry::call(call.clone().into())]);
+        inner.append(vec![Entry::call(call.clone().into())]);
+        drop(inner);
+        self.write_soon();
     }
 
     /// Wakes those who take records further.
@@ -271,6 +322,9 @@ impl Ledger {
         inner.doubted = true;
         // A look that is under way may have come too early.
         inner.version += 1;
+        drop(inner);
+        // Wakes the write queue, which reads the master.
+        self.order_changed.send_replace(());
     }
 
     /// Whether there is such a doubt.
@@ -334,8 +388,25 @@ impl Inner {
     ) -> Reply {
         let mut noticed = Noticed::new(standing_in.is_some());
         noticed.displaced = self.activity.displaced_by(&self.mirror, call);
+        self.activity.note_lost(&self.mirror, call);
         let reply = self.mirror.apply_telling(call, &mut noticed);
         self.version += u64::from(standing_in.unwrap_or(true));
+        match noticed.take_calls() {
+            Some(calls) => {
+                for (api, subject, call) in calls {
+                    self.order.notify(port_of(&api), subject, call);
+                    outbox_changed.notify_one();
+                }
+            }
+            None => {
+                for (subject, nodes) in noticed.subjects() {
+                    self.order.told_by_master(now, &subject, nodes);
+                }
+                if self.order.has_new_repeat() {
+                    outbox_changed.notify_one();
+                }
+            }
+        }
         let registered = |node: &str| self.mirror.api_of(node).is_some();
         if self.activity.applied(now, call, noticed, registered) {
             outbox_changed.notify_one();
@@ -355,8 +426,11 @@ impl Inner {
             difference = replay::difference(&self.mirror, &state);
             self.version += 1;
         }
+        let (unordered, old) = (self.mirror.is_unordered(), self.mirror.is_old());
         // Also if it is equal: it may be known more exactly.
         self.mirror = state;
+        self.mirror.set_unordered(unordered);
+        self.mirror.set_old(old);
         if differs {
             self.changed_unrecorded();
         }
@@ -367,23 +441,30 @@ impl Inner {
     fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
             // If the present incarnation comes back, the mirror's state replaces everything it holds.
-            self.next_incarnation();
+            self.raise_incarnation();
+            self.write_session();
         }
     }
 
-    fn next_incarnation(&mut self) {
+    fn raise_incarnation(&mut self) {
+        self.behind = None;
         self.pending.clear();
-        let seq = self.seq();
-        self.update_session(|session| {
-            session.incarnation += 1;
-            session.delivered = seq;
-        });
+        self.session.incarnation += 1;
+        self.session.delivered = self.seq();
+        self.session_unwritten = true;
     }
 
     fn update_session(&mut self, change: impl FnOnce(&mut Session)) {
         change(&mut self.session);
-        let entry = Entry::Session(self.session.clone());
-        self.append(&[entry]);
+        self.session_unwritten = true;
+        self.write_session();
+    }
+
+    fn write_session(&mut self) {
+        if std::mem::take(&mut self.session_unwritten) {
+            let entry = Entry::Session(self.session.clone());
+            self.append(vec![entry]);
+        }
     }
 
     fn token(&self) -> Token {
@@ -403,7 +484,7 @@ impl Inner {
 
     /// The same; none without a journal.
     fn last_seq(&self) -> Option<u64> {
-        self.store.as_ref().map(Store::seq)
+        self.journal.as_ref().map(Journal::seq)
     }
 
     /// Where the last record is.
@@ -414,13 +495,13 @@ impl Inner {
         }
     }
 
-    /// Appends to the journal. A failure is kept by the store and does not fail the call.
-    fn append(&mut self, entries: &[Entry]) {
-        self.share(entries);
-        if let Some(store) = self.store.as_mut().filter(|_| !entries.is_empty())
-            && let Err(error) = store.append(entries)
-        {
-            tracing::debug!(%error, "append");
+    /// Gives `entries` to the journal. A failure is kept by the store and does not fail the call.
+    fn append(&mut self, entries: Vec<Entry>) {
+        // First: what follows is to reach the incarnation that it names.
+        self.write_session();
+        self.share(&entries);
+        if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {
+            journal.append(entries);
         }
     }
 }

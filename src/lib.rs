@@ -12,6 +12,7 @@
 //! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
 //! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
 //! * `health`: judging what a node reports; which nodes are unreachable.
+//! * `order`: the order in which a node hears of a topic, a parameter or its own name.
 //! * [`checkpoint::session`]: whether a checkpoint's session continues, and the state that it holds.
 //! * [`checkpoint::format`]: the checkpoint's snapshot and records to and from bytes.
 //! * [`checkpoint::compare`], [`checkpoint::putback`]: how two states differ, and what brings a running master
@@ -47,6 +48,8 @@ pub mod clock;
 pub mod cluster;
 pub mod commands;
 pub mod config;
+#[cfg(test)]
+pub(crate) mod dice;
 pub(crate) mod gate;
 pub mod guardian;
 pub(crate) mod health;
@@ -57,8 +60,10 @@ pub(crate) mod limit;
 pub mod log;
 pub mod master;
 pub(crate) mod nodes;
+pub(crate) mod order;
 pub(crate) mod process;
 pub(crate) mod recovery;
+pub(crate) mod regular_file;
 pub mod replay;
 pub(crate) mod resolver;
 pub mod ros_env;

@@ -9,8 +9,13 @@ use std::{
     time::{Duration, Instant},
 };
 
+use self::evidence::{BUSY_LIMIT, Evidence, Sample, Verdict};
+
+pub mod evidence;
+mod patience;
 mod types;
 
+pub use patience::Patience;
 pub use types::{Action, Cause, Input, Probing, Supervision};
 
 /// Older deaths do not count towards a crash loop.
@@ -24,9 +29,10 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 /// A master that has served for this time ends the report of a crash loop. The pauses go on for as long as
 /// more than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// How long a spawned master may take to listen. A Raspberry Pi with a slow card needs some seconds. A
-/// rosmaster whose port was taken stays alive without ever listening.
-const START_LIMIT: Duration = Duration::from_secs(30);
+/// A spawned master that has used the processor for so many times [`Probing::start_limit`] will never listen.
+const STARTS_AT_MOST: u32 = 10;
+/// Pause between two samples of a master that starts slowly.
+const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
 /// Pause before trying again after a server that is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
@@ -38,6 +44,10 @@ enum Phase {
     Examining,
     /// The gate is open.
     Serving,
+    /// The mirror answers until the master answers.
+    Late,
+    /// The master that was late is given what the mirror has answered.
+    CatchingUp,
     Stopped,
 }
 
@@ -77,8 +87,15 @@ pub struct Lifecycle {
     /// examined there.
     dying: bool,
     missed: u32,
+    patience: Patience,
+    /// What was seen of our silent master.
+    evidence: Evidence,
     /// Consecutive failed spawns.
     failed_spawns: usize,
+    /// Masters in a row whose port another program took.
+    taken_ports: usize,
+    /// The last of them has not ended yet.
+    port_taken: bool,
     timer: Option<(Instant, Timer)>,
 }
 
@@ -101,7 +118,11 @@ impl Lifecycle {
             lost: false,
             dying: false,
             missed: 0,
+            patience: Patience::new(probing.patience),
+            evidence: Evidence::default(),
             failed_spawns: 0,
+            taken_ports: 0,
+            port_taken: false,
             timer: None,
         }
     }
@@ -133,6 +154,28 @@ impl Lifecycle {
         self.served
     }
 
+    /// How long a write waits for the master before the mirror answers it.
+    pub fn patience(&self) -> &Patience {
+        &self.patience
+    }
+
+    /// Whether the decision that follows on `input` needs a [`Sample`] of our master.
+    pub fn needs_sample(&self, now: Instant, input: Input) -> bool {
+        let sampled = self.evidence.last_at();
+        let is_old = sampled.is_none_or(|at| now.duration_since(at) >= SAMPLE_PAUSE);
+        self.child.is_some()
+            && match input {
+                Input::ProbeMissed | Input::Unreachable => true,
+                Input::Refused => is_old && self.is_slow_to_start(now),
+                _ => false,
+            }
+    }
+
+    /// Takes what was seen of our master.
+    pub fn observe(&mut self, sample: Sample) {
+        self.evidence.add(sample);
+    }
+
     /// Whether this is a new session that no master has served yet.
     pub fn begins(&self) -> bool {
         !self.served && !self.restored
@@ -144,7 +187,12 @@ impl Lifecycle {
     /// use std::time::{Duration, Instant};
     /// use rosrescue::lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision};
     ///
-    /// let probing = Probing { interval: Duration::from_secs(1), count: 3 };
+    /// let probing = Probing {
+    ///     interval: Duration::from_secs(1),
+    ///     count: 3,
+    ///     patience: Duration::from_millis(100),
+    ///     start_limit: Duration::from_secs(30),
+    /// };
     /// let mut lifecycle = Lifecycle::new(Supervision::Theirs, probing);
     /// let now = Instant::now();
     /// let start = Input::Start { left: false, restored: false };
@@ -170,6 +218,11 @@ impl Lifecycle {
                 vec![Action::Examine]
             }
             Input::Refused => self.refused(now),
+            Input::PortTaken => {
+                self.taken_ports += 1;
+                self.port_taken = true;
+                self.give_up(now)
+            }
             Input::Unreachable => self.unreachable(now),
             Input::NotAMaster | Input::ConnectionLost
                 if self.phase == Phase::Examining && self.is_hopeless(now) =>
@@ -190,14 +243,28 @@ impl Lifecycle {
                 }
                 actions
             }
-            Input::ThreadEnded | Input::BatchLost | Input::Slow if self.phase != Phase::Serving => {
-                Vec::new()
+            Input::Late if self.phase == Phase::Serving => {
+                self.phase = Phase::Late;
+                let probe = self.probe_now();
+                [Action::StandIn].into_iter().chain(probe).collect()
             }
-            // Not while a probe is under way.
-            Input::Slow => match self.timer.take_if(|(_, timer)| *timer == Timer::Probe) {
-                Some(_) => vec![Action::Probe],
-                None => Vec::new(),
-            },
+            Input::LateAnswered if self.phase == Phase::Late => {
+                self.phase = Phase::CatchingUp;
+                self.patience.was_late(now);
+                self.timer = None;
+                vec![Action::CatchUp]
+            }
+            Input::CaughtUp if self.phase == Phase::CatchingUp => {
+                self.phase = Phase::Serving;
+                self.answered(now);
+                vec![Action::OpenGate]
+            }
+            Input::NotCaughtUp if self.phase == Phase::CatchingUp => {
+                self.lost(now, Cause::Late, vec![Action::Connect])
+            }
+            Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
+            Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
+            Input::Slow => self.probe_now().into_iter().collect(),
             // If the master was killed, the rest of its end follows within milliseconds; if not, the next
             // connect shows that it lives.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
@@ -210,23 +277,22 @@ impl Lifecycle {
             }
             Input::Examined { new } => {
                 let died = std::mem::take(&mut self.lost) && new;
-                self.dying = false;
+                (self.dying, self.taken_ports) = (false, 0);
                 self.phase = Phase::Serving;
                 (self.served, self.known) = (true, true);
                 self.seeking_since = None;
                 self.serving_since = Some(now);
-                self.missed = 0;
-                self.timer = Some((now + self.probing.interval, Timer::Probe));
+                self.answered(now);
                 let report = if died { self.their_death(now) } else { None };
                 std::iter::once(Action::OpenGate).chain(report).collect()
             }
             Input::ProbeAnswered => {
-                self.missed = 0;
-                self.timer = Some((now + self.probing.interval, Timer::Probe));
+                self.answered(now);
                 Vec::new()
             }
             Input::ProbeMissed => self.probe_missed(now),
             Input::Spawned => {
+                self.evidence.clear();
                 self.child = Some(now);
                 self.failed_spawns = 0;
                 self.seeking_since = Some(now);
@@ -241,7 +307,10 @@ impl Lifecycle {
             }
             Input::Exited => {
                 self.child = None;
-                let spawn = self.spawn(now);
+                let spawn = match std::mem::take(&mut self.port_taken) {
+                    true => self.spawn_elsewhere(now),
+                    false => self.spawn(now),
+                };
                 self.lost(now, Cause::Exited, spawn)
             }
             Input::Wake if self.calm_at().is_some_and(|at| at <= now) => {
@@ -278,6 +347,24 @@ impl Lifecycle {
         vec![Action::Connect]
     }
 
+    /// Whether calls pass to the master, or would if it was not late.
+    fn is_serving(&self) -> bool {
+        matches!(self.phase, Phase::Serving | Phase::Late | Phase::CatchingUp)
+    }
+
+    /// The master has answered us.
+    fn answered(&mut self, now: Instant) {
+        self.missed = 0;
+        self.evidence.clear();
+        self.timer = Some((now + self.probing.interval, Timer::Probe));
+    }
+
+    /// A probe before its time, but not while one is under way.
+    fn probe_now(&mut self) -> Option<Action> {
+        let due = self.timer.take_if(|(_, timer)| *timer == Timer::Probe);
+        due.map(|_| Action::Probe)
+    }
+
     fn seek(&mut self, now: Instant) {
         self.phase = Phase::Seeking;
         self.serving_since = None;
@@ -288,7 +375,7 @@ impl Lifecycle {
     /// The master is gone. Shuts the gate, then does `then`.
     fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
-        let was_serving = self.phase == Phase::Serving;
+        let was_serving = self.is_serving();
         self.seek(now);
         if cause == Cause::Exited {
             // Set by `spawn`.
@@ -300,23 +387,41 @@ impl Lifecycle {
 
     fn refused(&mut self, now: Instant) -> Vec<Action> {
         self.dying = false;
-        match self.child {
-            Some(since) if now.duration_since(since) > START_LIMIT => self.give_up(now),
-            _ => {
-                let mut actions = self.connect_later(now, false);
-                if std::mem::take(&mut self.lost) {
-                    // The process that closed the connection no longer listens.
-                    actions.extend(self.their_death(now));
-                }
-                actions
-            }
+        if self.is_slow_to_start(now) {
+            let limit = self.probing.start_limit.saturating_mul(STARTS_AT_MOST);
+            return self.give_up_if_hung(now, limit, false);
         }
+        let mut actions = self.connect_later(now, false);
+        if std::mem::take(&mut self.lost) {
+            // The process that closed the connection no longer listens.
+            actions.extend(self.their_death(now));
+        }
+        actions
+    }
+
+    /// Whether our child has had enough time to listen, if it was not busy. A rosmaster whose port was taken stays
+    /// alive without ever listening.
+    fn is_slow_to_start(&self, now: Instant) -> bool {
+        let limit = self.probing.start_limit;
+        self.child
+            .is_some_and(|since| now.duration_since(since) > limit)
     }
 
     /// Whether our child has had enough time, and there is still no master at its port.
     fn is_hopeless(&self, now: Instant) -> bool {
         let since = self.seeking_since.filter(|_| self.child.is_some());
-        since.is_some_and(|since| now.duration_since(since) > START_LIMIT)
+        since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
+    }
+
+    /// Kills our silent child if it [hangs](Evidence::judge), and connects again otherwise.
+    fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
+        match self.evidence.judge(busy_limit) {
+            Verdict::Hung => self.give_up(now),
+            verdict => {
+                let actions = self.connect_later(now, far);
+                actions.into_iter().chain(spare(verdict)).collect()
+            }
+        }
     }
 
     /// Kills our useless child. Its end arrives as `Exited`, which spawns the next one.
@@ -327,14 +432,15 @@ impl Lifecycle {
 
     fn unreachable(&mut self, now: Instant) -> Vec<Action> {
         match self.supervision {
-            // On this computer, silence at an accepting port means a hung process.
             Supervision::Ours if self.phase == Phase::Examining => {
-                self.seek(now);
-                self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
-                vec![Action::Kill]
+                let actions = self.give_up_if_hung(now, BUSY_LIMIT, true);
+                if actions.contains(&Action::Kill) {
+                    self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
+                }
+                actions
             }
             // It does not even accept connections: it is stopped, and its backlog is full.
-            _ if self.is_hopeless(now) => self.give_up(now),
+            _ if self.is_hopeless(now) => self.give_up_if_hung(now, BUSY_LIMIT, true),
             _ => self.connect_later(now, true),
         }
     }
@@ -354,7 +460,10 @@ impl Lifecycle {
             return vec![Action::Probe];
         }
         let then = match self.supervision {
-            Supervision::Ours => vec![Action::Kill],
+            Supervision::Ours => match self.evidence.judge(BUSY_LIMIT) {
+                Verdict::Hung => vec![Action::Kill],
+                verdict => spare(verdict).into_iter().collect(),
+            },
             Supervision::Theirs => Vec::new(),
         };
         let actions = self.lost(now, Cause::Hung, then);
@@ -373,6 +482,17 @@ impl Lifecycle {
         }
         self.timer = Some((now + pause, Timer::Spawn));
         vec![Action::ReportCrashLoop(self.deaths.len())]
+    }
+
+    /// The master that never got its port has ended. That is no death.
+    fn spawn_elsewhere(&mut self, now: Instant) -> Vec<Action> {
+        match self.taken_ports.checked_sub(DEATHS_AT_ONCE + 1) {
+            None => vec![Action::Spawn],
+            Some(further) => {
+                self.timer = Some((now + pause_after(further), Timer::Spawn));
+                Vec::new()
+            }
+        }
     }
 
     /// An external master has died. rosrescue does not slow its restarts; a crash loop is reported once.
@@ -399,6 +519,14 @@ impl Lifecycle {
     fn pause_before_spawn(&self) -> Duration {
         let further = self.deaths.len().checked_sub(DEATHS_AT_ONCE + 1);
         further.map_or(Duration::ZERO, pause_after)
+    }
+}
+
+/// Says why a master is not killed.
+fn spare(verdict: Verdict) -> Option<Action> {
+    match verdict {
+        Verdict::Unproved(why) => Some(Action::Spare(why)),
+        Verdict::Hung | Verdict::Unknown => None,
     }
 }
 

@@ -2,7 +2,7 @@
 //! from time to time.
 
 use std::{
-    sync::{Mutex, PoisonError},
+    sync::{Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
@@ -25,11 +25,7 @@ struct Bucket {
 
 impl Limit {
     pub(crate) const fn new() -> Self {
-        Self(Mutex::new(Bucket {
-            left: BURST,
-            filled: None,
-            left_out: 0,
-        }))
+        Self(Mutex::new(Bucket::FULL))
     }
 
     /// Whether it is done now. If so, the number of those left out before it; none if there are none.
@@ -40,6 +36,12 @@ impl Limit {
 }
 
 impl Bucket {
+    const FULL: Self = Self {
+        left: BURST,
+        filled: None,
+        left_out: 0,
+    };
+
     fn pass(&mut self, now: Instant) -> Option<Option<u64>> {
         let mut filled = *self.filled.get_or_insert(now);
         while self.left < BURST && now.duration_since(filled) >= REFILL {
@@ -60,6 +62,53 @@ impl Bucket {
     }
 }
 
+/// How often an alarm and its all-clear are logged: both, or neither.
+#[derive(Debug)]
+pub(crate) struct Pair(Mutex<Episode>);
+
+#[derive(Debug)]
+struct Episode {
+    bucket: Bucket,
+    /// Whether an alarm was logged since the last all-clear; none if there was no alarm.
+    told: Option<bool>,
+}
+
+impl Pair {
+    pub(crate) const fn new() -> Self {
+        Self(Mutex::new(Episode {
+            bucket: Bucket::FULL,
+            told: None,
+        }))
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Episode> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// As [`Limit::pass`], for an alarm.
+    pub(crate) fn alarm(&self, now: Instant) -> Option<Option<u64>> {
+        let mut episode = self.lock();
+        let passed = episode.bucket.pass(now);
+        episode.told = Some(episode.told == Some(true) || passed.is_some());
+        passed
+    }
+
+    /// As [`Limit::pass`], for the all-clear. It passes if an alarm did since the last one; without any alarm it
+    /// is limited as a line of its own.
+    pub(crate) fn all_clear(&self, now: Instant) -> Option<Option<u64>> {
+        let mut episode = self.lock();
+        match episode.told.take() {
+            Some(told) => told.then_some(None),
+            None => episode.bucket.pass(now),
+        }
+    }
+
+    /// Another line has told of the same trouble: the all-clear follows.
+    pub(crate) fn told(&self) {
+        self.lock().told = Some(true);
+    }
+}
+
 /// As the macro of `tracing` of that level, but [rate-limited](self). The rest is logged at level debug.
 macro_rules! rarely {
     ($level:ident, $($line:tt)+) => {{
@@ -71,6 +120,28 @@ macro_rules! rarely {
     }};
 }
 pub(crate) use rarely;
+
+/// As [`rarely!`], for the alarm of a [`Pair`].
+macro_rules! alarm {
+    ($level:ident, $pair:path, $($line:tt)+) => {
+        match $pair.alarm(std::time::Instant::now()) {
+            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            None => tracing::debug!($($line)+),
+        }
+    };
+}
+pub(crate) use alarm;
+
+/// As [`rarely!`], for the all-clear of a [`Pair`].
+macro_rules! all_clear {
+    ($level:ident, $pair:path, $($line:tt)+) => {
+        match $pair.all_clear(std::time::Instant::now()) {
+            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            None => tracing::debug!($($line)+),
+        }
+    };
+}
+pub(crate) use all_clear;
 
 #[cfg(test)]
 mod tests {
@@ -100,5 +171,36 @@ mod tests {
         assert_eq!(burst(start), 10);
         assert_eq!(burst(start + Duration::from_secs(3_600)), 10);
         assert_eq!(burst(start + Duration::from_secs(3_900)), 1);
+    }
+
+    #[test]
+    fn an_all_clear_is_logged_with_its_alarm_or_left_out_with_it() {
+        let pair = Pair::new();
+        let now = Instant::now();
+        for _ in 0..BURST {
+            assert_eq!(pair.alarm(now), Some(None));
+            assert_eq!(pair.all_clear(now), Some(None));
+        }
+        for _ in 0..5 {
+            assert_eq!((pair.alarm(now), pair.all_clear(now)), (None, None));
+        }
+        let later = now + REFILL;
+        assert_eq!(pair.alarm(later), Some(Some(5)), "so many were left out");
+        // The same trouble goes on, and is not told again.
+        assert_eq!(pair.alarm(later), None);
+        assert_eq!(pair.all_clear(later), Some(None));
+    }
+
+    #[test]
+    fn an_all_clear_follows_whatever_line_has_told_of_the_trouble() {
+        let pair = Pair::new();
+        let now = Instant::now();
+        // Without an alarm, as at the start, it is a line like any other.
+        let alone = (0..20).filter(|_| pair.all_clear(now).is_some()).count();
+        assert_eq!(alone, 10);
+        assert_eq!(pair.alarm(now), None);
+        pair.told();
+        assert_eq!(pair.alarm(now), None);
+        assert_eq!(pair.all_clear(now), Some(None));
     }
 }

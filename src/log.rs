@@ -43,7 +43,7 @@ impl<'a> MakeWriter<'a> for Stderr {
     }
 }
 
-/// Writes one line with this before it.
+/// Writes one line with this before it, and without what a terminal would take for commands.
 #[derive(Debug)]
 pub struct Prefixed(&'static str);
 
@@ -54,13 +54,86 @@ impl Write for Prefixed {
 
     /// All of it at once: other processes may write to the same stream.
     fn write_all(&mut self, line: &[u8]) -> io::Result<()> {
-        match self.0 {
-            "" => io::stderr().write_all(line),
-            prefix => io::stderr().write_all(&[prefix.as_bytes(), line].concat()),
-        }
+        let line = safe(&String::from_utf8_lossy(line));
+        io::stderr().write_all(format!("{}{line}", self.0).as_bytes())
     }
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
+    }
+}
+
+/// In place of a character that a terminal must not get.
+const REPLACEMENT: char = '\u{fffd}';
+
+/// Whether a terminal would take a character for a command, or for another order of the letters.
+fn is_unsafe(c: char) -> bool {
+    let turns = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    turns || c.is_control() && c != '\n'
+}
+
+/// The JSON `text` with such characters escaped: it means the same.
+pub(crate) fn plain_json(text: &str) -> String {
+    let mut plain = String::with_capacity(text.len());
+    for c in text.chars() {
+        match is_unsafe(c) {
+            true => plain += &format!("\\u{:04x}", u32::from(c)),
+            false => plain.push(c),
+        }
+    }
+    plain
+}
+
+/// `text` without what a terminal would take for commands, or for another order of the letters: names come from the
+/// network.
+pub(crate) fn plain(text: &str) -> String {
+    let safe = |c: char| if is_unsafe(c) { REPLACEMENT } else { c };
+    text.chars().map(safe).collect()
+}
+
+/// A line of the log as [`plain`] text with the formatter's colours. The formatter itself escapes ESC in values.
+fn safe(line: &str) -> String {
+    let mut parts = line.split('\u{1b}');
+    let mut safe = plain(parts.next().unwrap_or_default());
+    for part in parts {
+        let colour = part
+            .strip_prefix('[')
+            .map(|colour| colour.trim_start_matches(|c: char| c.is_ascii_digit() || c == ';'));
+        let is_colour = colour.is_some_and(|rest| rest.starts_with('m'));
+        safe.push(if is_colour { '\u{1b}' } else { REPLACEMENT });
+        safe += &plain(part);
+    }
+    safe
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_give_a_terminal_no_commands_and_turn_no_letters() {
+        let shown = plain("a\u{1b}[2J\u{202e}b\u{2066}\nc\u{9b}é");
+        assert_eq!(shown, "a\u{fffd}[2J\u{fffd}b\u{fffd}\nc\u{fffd}é");
+    }
+
+    #[test]
+    fn json_means_the_same_without_such_characters() {
+        let value = serde_json::json!({ "a\u{202e}": ["\u{1b}[2J\u{9b}\n\u{7f}é", 1] });
+        let json = plain_json(&serde_json::to_string_pretty(&value).unwrap());
+        assert!(!json.chars().any(is_unsafe), "{json}");
+        assert!(json.contains("a\\u202e") && json.contains("\\u009b\\n\\u007fé"));
+        assert_eq!(
+            serde_json::from_str::<serde_json::Value>(&json).unwrap(),
+            value
+        );
+    }
+
+    #[test]
+    fn a_line_of_the_log_keeps_its_colours_only() {
+        let line =
+            safe("\u{1b}[2mtime\u{1b}[0m \u{1b}[1;33mWARN\u{1b}[0m /a\u{1b}[2J\u{202e}\rb\n");
+        let shown =
+            "\u{1b}[2mtime\u{1b}[0m \u{1b}[1;33mWARN\u{1b}[0m /a\u{fffd}[2J\u{fffd}\u{fffd}b\n";
+        assert_eq!(line, shown);
     }
 }

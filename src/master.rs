@@ -36,6 +36,6 @@ pub(crate) use returnable::is_readable;
 pub use snapshot::{ServiceEntry, Snapshot, SnapshotNode};
 pub use state::{Counts, InvalidSnapshot, Master};
 pub use tell::{
-    MASTER, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update, publisher_update, question,
-    shutdown,
+    Displaced, MASTER, PARAM_UPDATE, PUBLISHER_UPDATE, get_pid, is_plain_topic, param_update,
+    publisher_update, question, shutdown,
 };

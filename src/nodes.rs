@@ -3,6 +3,7 @@
 pub(crate) mod client;
 pub(crate) mod health_check;
 mod identify;
+pub(crate) mod liveness;
 pub(crate) mod notifications;
 mod removed;
 mod visits;
@@ -23,6 +24,7 @@ use self::{
     client::Sign,
     health_check::CheckResult,
     identify::{IDENTIFY_AFTER, New},
+    liveness::Liveness,
     notifications::Notifications,
     removed::Removed,
     visits::Visits,
@@ -30,11 +32,9 @@ use self::{
 use crate::{
     gate::{self, State},
     health::{Repeats, Unreachable, port_of},
-    ledger::{
-        Ledger,
-        activity::{Change, Notification, Owed},
-    },
+    ledger::{Ledger, activity::Change},
     limit::rarely,
+    order::Subject,
     status::{report::HealthCheck, stats::Stats},
     wait,
     write_queue::WriteQueue,
@@ -43,6 +43,13 @@ use crate::{
 /// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most
 /// masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
+
+/// When a new worker tells nodes what its predecessor may not have told them: by then a master that it has adopted
+/// has sent what it was going to send, unless it has a long backlog.
+const ADOPTED_AFTER: Duration = Duration::from_secs(1);
+
+/// Most nodes that are remembered for not answering `paramUpdate`.
+const MUTE_MOST: usize = 1024;
 
 /// What is known of the nodes beyond their registrations.
 pub struct Nodes {
@@ -54,8 +61,11 @@ pub struct Nodes {
     timeout: Duration,
     pub(super) notifications: Notifications,
     visits: Visits,
+    liveness: Liveness,
     new: New,
     unreachable: Mutex<Unreachable>,
+    /// Ports of nodes that do not answer `paramUpdate`, but answer otherwise.
+    mute: Mutex<HashSet<String>>,
     pub(crate) removed: Removed,
     /// Recoveries whose health check is not over.
     checks: AtomicUsize,
@@ -81,8 +91,10 @@ impl Nodes {
             timeout,
             notifications: Notifications::default(),
             visits: Visits::default(),
+            liveness: Liveness::default(),
             new: New::default(),
             unreachable: Mutex::default(),
+            mute: Mutex::default(),
             removed: Removed::default(),
             checks: AtomicUsize::new(0),
             unanswered: AtomicUsize::new(0),
@@ -98,6 +110,24 @@ impl Nodes {
 
     pub fn is_unreachable(&self, port: &str) -> bool {
         self.lock().contains(port)
+    }
+
+    fn lock_mute(&self) -> MutexGuard<'_, HashSet<String>> {
+        self.mute.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether the node at `port` does not answer `paramUpdate`, but answers otherwise.
+    fn is_mute(&self, port: &str) -> bool {
+        self.lock_mute().contains(port)
+    }
+
+    fn set_mute(&self, port: &str, is_mute: bool) {
+        let mut mute = self.lock_mute();
+        if !is_mute {
+            mute.remove(port);
+        } else if mute.len() < MUTE_MOST {
+            mute.insert(port.to_owned());
+        }
     }
 
     /// The names of the nodes that are unreachable.
@@ -184,9 +214,14 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
         let new = nodes
             .ledger
             .with_activity(|_, activity| activity.next_unidentified());
+        let tell_again_at = nodes.ledger.with_order(|order, _| order.next_repeat());
         let identify_at = new.map(|since| (since + IDENTIFY_AFTER).into());
         tokio::select! {
             () = nodes.ledger.outbox_changed.notified() => empty_outbox(&nodes, &mut repeats),
+            () = wait::until(tell_again_at.map(Into::into)) => {
+                nodes.ledger.with_order(|order, _| order.repeat(Instant::now()));
+                notifications::send_waiting(&nodes);
+            }
             () = gate.changed() => match gate.look() {
                 State::StandingIn if !owed_told => {
                     owed_at.get_or_insert_with(|| tokio::time::Instant::now() + OWED_AFTER);
@@ -196,6 +231,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
             },
             () = wait::until(owed_at) => {
                 (owed_at, owed_told) = (None, true);
+                nodes.ledger.with_order(|order, _| order.master_is_gone());
                 notify_owed(&nodes, Instant::now());
             }
             () = wait::until(next) => ask_unreachable(&nodes),
@@ -222,9 +258,7 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
     let outbox = nodes
         .ledger
         .with_activity(|_, activity| activity.take_outbox());
-    for (api, call) in outbox.calls {
-        notifications::send(nodes, &api, Notification::Call(call));
-    }
+    notifications::send_waiting(nodes);
     for displaced in outbox.displaced {
         notifications::shut_down(nodes, displaced);
     }
@@ -233,28 +267,55 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
     }
 }
 
-/// Sends the notifications that a master lost at `outage` may not have sent. Returns their topics.
-pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
-    let Owed {
-        mut topics,
-        params,
-        displaced,
-    } = nodes
+/// Takes the notifications of topics and parameters that a master lost at `outage` may not have sent, and begins to
+/// shut nodes down that it may not have told.
+fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
+    let owed = nodes
         .ledger
         .with_activity(|_, activity| activity.take_owed(outage));
-    topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
-    for (api, key) in params {
-        notifications::send(nodes, &api, Notification::Param(key));
-    }
-    for displaced in displaced {
+    for displaced in owed.displaced {
         notifications::shut_down(nodes, displaced);
     }
+    (owed.topics, owed.params)
+}
+
+/// Sends the notifications that a master lost at `outage` may not have sent. Returns their topics.
+pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
+    let (mut topics, params) = take_owed(nodes, outage);
+    nodes.ledger.with_order(|order, _| order.master_is_gone());
+    topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
+    for (api, key) in params {
+        notifications::tell(nodes, &api, Subject::Param(key.to_string()));
+    }
+    topics
+}
+
+/// Tells nodes, after a second, what a rosrescue that died may not have told them. Returns the topics.
+///
+/// The master lives and may still have notifications to send: the state goes last.
+pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
+    let (mut topics, params) = take_owed(nodes, outage);
+    let at = Instant::now() + ADOPTED_AFTER;
+    nodes.ledger.with_order(|order, mirror| {
+        topics.retain(|topic| {
+            let subscribers = mirror.subscribers_of(topic);
+            for api in &subscribers {
+                order.tell_state_at(at, port_of(api), Subject::Topic(topic.clone()));
+            }
+            !subscribers.is_empty()
+        });
+        for (api, key) in params {
+            order.tell_state_at(at, port_of(&api), Subject::Param(key.to_string()));
+        }
+    });
     topics
 }
 
 fn tell(nodes: &Arc<Nodes>, change: Change) {
     match change {
-        Change::Param(api, key) => notifications::send(nodes, &api, Notification::Param(key)),
+        Change::Param(api, key) => {
+            notifications::tell(nodes, &api, Subject::Param(key.to_string()));
+        }
         Change::Topic(topic) => {
             notifications::notify_subscribers(nodes, &topic);
         }
@@ -276,8 +337,13 @@ fn ask_unreachable(nodes: &Arc<Nodes>) {
         let nodes = nodes.clone();
         tokio::spawn(async move {
             let outcome = health_check::visit(&nodes, port).await;
-            if outcome.sign != Sign::Silent {
-                say(&outcome, "an unreachable node answers again");
+            match outcome.sign {
+                Sign::Alive => say(&outcome, "an unreachable node answers again"),
+                Sign::Dead if !outcome.removed.is_empty() => say(
+                    &outcome,
+                    "unregistered a dead node: its port refuses connections",
+                ),
+                Sign::Dead | Sign::Silent => {}
             }
         });
     }

@@ -2,10 +2,8 @@
 
 use std::{
     ffi::OsStr,
-    fs::{File, OpenOptions},
-    io::{self, Write},
+    io,
     net::{Ipv4Addr, SocketAddrV4},
-    os::unix::fs::OpenOptionsExt,
     path::{Path, PathBuf},
     process::{ExitStatus, Stdio},
     time::Duration,
@@ -14,19 +12,32 @@ use std::{
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use socket2::{Domain, Socket, Type};
 use thiserror::Error;
-use tokio::process::{Child, Command};
+use tokio::{
+    process::{Child, Command},
+    task::block_in_place,
+};
 
 use crate::{config::SupervisedConfig, guardian::handover};
 
+pub(crate) mod bypass;
+pub(crate) mod effort;
 pub(crate) mod listeners;
+mod log_config;
 mod orphan;
+mod output;
+mod pid_file;
 pub(crate) mod pidfd;
 mod rosout;
 mod spare;
+mod stat;
 
-pub(crate) use orphan::is_in_our_network;
+use log_config::LogConfig;
+pub(crate) use orphan::{Left, is_in_our_network};
+use output::Output;
+use pid_file::PidFile;
 pub(crate) use rosout::Rosout;
 pub(crate) use spare::{Spare, interpreter};
+pub(crate) use stat::Stat;
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
 const STOP_TIME: Duration = Duration::from_secs(2);
@@ -35,28 +46,6 @@ pub(crate) const SERVICE_PATH: &str =
     "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin";
 /// Where ROS installs programs that are not on the PATH.
 const ROS_PREFIXES: &str = "/opt/ros";
-/// rosmaster's default logging also has a handler for the screen, which imports half of rospy: a
-/// file-only configuration halves its start (132 against 72 ms) and leaves master.log as it is.
-const LOG_CONFIG: &str = "\
-# Written by rosrescue for the rosmaster that it supervises: as ROS's own, without the screen.
-[loggers]
-keys=root
-[handlers]
-keys=file
-[formatters]
-keys=default
-[logger_root]
-level=INFO
-handlers=file
-[handler_file]
-class=handlers.RotatingFileHandler
-level=DEBUG
-formatter=default
-args=(os.environ['ROS_LOG_FILENAME'],'a', 50000000, 4)
-[formatter_default]
-format=[%(name)s][%(levelname)s] %(asctime)s: %(message)s
-";
-
 /// Why a child process cannot be started.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -84,9 +73,11 @@ pub(crate) struct Rosmaster {
     program: PathBuf,
     config: SupervisedConfig,
     /// Stdout and stderr of the last one.
-    output: PathBuf,
-    /// The logging configuration for rosmaster.
-    log_config: PathBuf,
+    output: Output,
+    /// The logging configuration for rosmaster; none if the user has one, or the kernel lacks such files.
+    log_config: Option<LogConfig>,
+    /// The last one.
+    pid_file: PidFile,
     checkpoint: PathBuf,
 }
 
@@ -96,10 +87,16 @@ impl Rosmaster {
         Ok(Self {
             program: find_rosmaster(config.rosmaster.as_deref())?,
             config: config.clone(),
-            output: beside(checkpoint, ".rosmaster-output.log"),
-            log_config: beside(checkpoint, ".rosmaster-logging.conf"),
+            output: Output::beside(checkpoint, ".rosmaster-output.log"),
+            log_config: LogConfig::unless_given(),
+            pid_file: PidFile::beside(checkpoint, "rosmaster"),
             checkpoint: checkpoint.to_owned(),
         })
+    }
+
+    /// Whether it is ROS's own program, and no other one was given.
+    pub(crate) fn is_own(&self) -> bool {
+        self.config.rosmaster.is_none()
     }
 
     /// The port for a master: the given one, else `remembered` if free, else a free one.
@@ -121,41 +118,34 @@ impl Rosmaster {
         free_port().map_err(spawn_error)
     }
 
-    /// The rosmaster that an earlier rosrescue with this checkpoint left running at `port`. Others of its
-    /// rosmasters do not listen there and are of no use: they are ended.
-    pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<u32> {
-        let mut all = orphan::find(&orphan::owner(&self.checkpoint));
-        all.retain(|pid| !runs(*pid, "rosout"));
-        let serves = |pid: &u32| port.is_some_and(|port| listeners::listens(*pid, port));
-        let found = all.iter().copied().find(serves);
-        if found.is_none() {
-            let name = self.program.file_name().unwrap_or_default();
-            let name = name.to_string_lossy();
-            for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
-                tracing::info!(
-                    pid,
-                    "ending a rosmaster that was left behind and does not serve"
-                );
-                signal_process(pid, Signal::KILL);
-            }
+    /// Makes `spare` a master on `port` of loopback, or starts one. It outlives rosrescue: dropping the child does
+    /// not end it.
+    pub(crate) async fn start(
+        &self,
+        spare: Option<Spare>,
+        port: u16,
+    ) -> Result<Child, ProcessError> {
+        self.pid_file.clear().await;
+        let child = match spare.and_then(|spare| spare.go(port)) {
+            Some(child) => child,
+            None => self.spawn(port).await?,
+        };
+        if let Some(pid) = child.id() {
+            self.pid_file.write(pid, port);
         }
-        found
+        Ok(child)
     }
 
-    /// Starts a rosmaster on `port` of loopback. It outlives rosrescue: dropping the child does not end it.
-    pub(crate) fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
+    async fn spawn(&self, port: u16) -> Result<Child, ProcessError> {
         let mut command = command(&self.program);
         command.arg("--core").arg("-p").arg(port.to_string());
         command.stdin(Stdio::null());
-        self.spawn_as(command, create(&self.output))
+        self.output.renew().await;
+        self.spawn_as(command).await
     }
 
-    /// Runs `command` with rosmaster's further arguments, its environment and `output`.
-    fn spawn_as(
-        &self,
-        mut command: Command,
-        output: io::Result<File>,
-    ) -> Result<Child, ProcessError> {
+    /// Runs `command` with rosmaster's further arguments and its environment. It prints to the present output.
+    async fn spawn_as(&self, mut command: Command) -> Result<Child, ProcessError> {
         command.arg("-w").arg(self.config.numworkers.to_string());
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
@@ -165,36 +155,27 @@ impl Rosmaster {
         // Loopback only: nodes connect to rosrescue.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
-        // Not if the user has a configuration. If it cannot be written, rosmaster is only slower.
-        let own = std::env::var_os("ROS_PYTHON_LOG_CONFIG_FILE").is_some_and(|own| !own.is_empty());
-        if !own && self.write_log_config().is_ok() {
-            command.env("ROS_PYTHON_LOG_CONFIG_FILE", &self.log_config);
+        if let Some(config) = &self.log_config {
+            command.env(log_config::VARIABLE, config.path());
         }
-        let (stdout, stderr) = match output {
-            Ok(file) => (
+        let (stdout, stderr) = match self.output.file() {
+            Some(file) => (
                 file.try_clone().map_or_else(|_| Stdio::null(), Stdio::from),
                 file.into(),
             ),
-            Err(_) => (Stdio::null(), Stdio::null()),
+            None => (Stdio::null(), Stdio::null()),
         };
         // In a group of its own: rosrescue handles Ctrl-C in the terminal.
         command.stdout(stdout).stderr(stderr).process_group(0);
-        command.spawn().map_err(|source| ProcessError::Spawn {
+        start(command).map_err(|source| ProcessError::Spawn {
             program: self.program.clone(),
             source,
         })
     }
 
-    fn write_log_config(&self) -> io::Result<()> {
-        match std::fs::read(&self.log_config) {
-            Ok(present) if present == LOG_CONFIG.as_bytes() => Ok(()),
-            _ => create(&self.log_config)?.write_all(LOG_CONFIG.as_bytes()),
-        }
-    }
-
     /// The last output of the last rosmaster, for the message that it died early.
-    pub(crate) fn last_words(&self) -> String {
-        tail_of(&self.output)
+    pub(crate) async fn last_words(&self) -> String {
+        self.output.tail().await
     }
 }
 
@@ -224,29 +205,20 @@ fn command(program: &Path) -> Command {
     command
 }
 
+/// The endings of PID files behind the checkpoint's name.
+pub(crate) const PID_FILES: [&str; 2] = [".rosmaster-pid", ".rosout-pid"];
+
 /// A file that belongs to `checkpoint`.
-fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
+pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     let mut name = checkpoint.as_os_str().to_owned();
     name.push(suffix);
     PathBuf::from(name)
 }
 
-/// The end of a file, for messages; empty if it cannot be read.
-fn tail_of(path: &Path) -> String {
-    let text = std::fs::read(path).unwrap_or_default();
-    let tail = text
-        .get(text.len().saturating_sub(400)..)
-        .unwrap_or_default();
-    String::from_utf8_lossy(tail).trim().to_owned()
-}
-
-fn create(path: &Path) -> io::Result<File> {
-    OpenOptions::new()
-        .write(true)
-        .create(true)
-        .truncate(true)
-        .mode(0o600)
-        .open(path)
+/// Starts `command`. Its program may be on a disk that answers late, so other tasks go on meanwhile. A stop cannot
+/// come in between: a process that nobody knows would stay.
+fn start(mut command: Command) -> io::Result<Child> {
+    block_in_place(|| command.spawn())
 }
 
 /// Adds the paths of a ROS in `/opt/ros`, which its programs need to find modules and libraries. `setup.bash`
@@ -336,10 +308,13 @@ pub(crate) fn all() -> impl Iterator<Item = u32> {
 
 /// The parent of the process `pid`.
 pub(crate) fn parent_of(pid: u32) -> Option<u32> {
-    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The command's name in parentheses comes first and may contain anything.
-    let after = stat.rsplit(')').next()?;
-    after.split_whitespace().nth(1)?.parse().ok()
+    Stat::of(pid).map(|stat| stat.parent)
+}
+
+/// The name of the process `pid`; empty if there is none. At most 15 bytes.
+pub(crate) fn name_of(pid: u32) -> String {
+    let name = std::fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+    name.trim_end().to_owned()
 }
 
 /// Whether the process `pid` runs rosrescue, also after its file was replaced.

@@ -2,14 +2,21 @@
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
-mod report_file;
+pub(crate) mod report_file;
 mod reporting;
 mod stall_probe;
 mod thread_exit;
 
-use std::{pin::Pin, sync::Arc, time::Instant};
+use std::{
+    pin::Pin,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
-use tokio::{sync::Notify, task::JoinHandle};
+use tokio::{
+    sync::Notify,
+    task::{JoinHandle, spawn_blocking},
+};
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
@@ -21,28 +28,31 @@ use self::{
 use crate::{
     gate::State,
     ledger::history::Rescues,
-    lifecycle::{Action, Cause, Input, Lifecycle, Supervision},
-    limit::rarely,
+    lifecycle::{Action, Cause, Input, Lifecycle, Supervision, evidence::Sample},
+    limit::{Pair, alarm, all_clear, rarely},
     nodes::Nodes,
-    process::{self, ProcessError},
+    process::{self, ProcessError, effort, listeners::Holder},
     status::{
         Board,
-        report::{Outcome, STARTED},
+        report::{AWAY, Outcome, STARTED},
     },
-    upstream::{
-        ConnectError, Connection,
-        pool::{VerifyError, connect_verified},
-    },
+    upstream::{ConnectError, VerifyError, sentinel::Sentinel, verify},
     wait,
     write_queue::WriteQueue,
 };
 
+/// That masters die again and again, and that the present one lives.
+static CRASH_LOOP: Pair = Pair::new();
+
 /// The result of a step. At most one step runs at a time.
 enum Done {
-    Connected(Connection),
+    Connected(Arc<Sentinel>),
     NotConnected(ConnectError),
-    Examined(Connection, Result<Examination, ExamineError>),
-    Probed(Result<Connection, VerifyError>),
+    /// Another program, with this process id if it is known, listens at the port of the master just started.
+    PortTaken(Option<u32>),
+    Examined(Arc<Sentinel>, Result<Examination, ExamineError>),
+    Probed(Result<(), VerifyError>),
+    CaughtUp(Arc<Sentinel>, Result<bool, ExamineError>),
 }
 
 type Step = Pin<Box<dyn Future<Output = Done> + Send>>;
@@ -58,17 +68,19 @@ pub(crate) struct Driver {
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     rescues: Rescues,
-    /// The gate opens to a master that has just been restored.
-    restored: bool,
+    /// The gate opens to a master that has just been restored, in the rescue of this number.
+    restored: Option<u64>,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
-    connection: Option<Connection>,
-    /// Resolves when the connection to the master ends.
+    sentinel: Option<Arc<Sentinel>>,
+    /// Resolves when the sentinel ends.
     ended: Option<Ended>,
     /// Resolves when a thread of the master ends, once for each master.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
+    /// By how much timers were late, all together.
+    timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
     said: Option<Said>,
@@ -100,13 +112,14 @@ impl Driver {
             board,
             process,
             rescues,
-            restored: false,
+            restored: None,
             spawn_error: None,
-            connection: None,
+            sentinel: None,
             ended: None,
             thread_ended: None,
             step: None,
             probe_deadline: None,
+            timers_late: Duration::ZERO,
             prepared: None,
             said: None,
         }
@@ -154,7 +167,7 @@ impl Driver {
                 {
                     return Err(error);
                 }
-                next = self.carry_out(action).or(next);
+                next = self.carry_out(action).await.or(next);
             }
             if matches!(input, Some(Input::SpawnFailed { .. }))
                 && let Some(error) = self.spawn_error.take()
@@ -169,11 +182,32 @@ impl Driver {
                 None => self.next_input(&stop).await,
             };
             self.end_contact(now);
+            self.sample_for(now).await;
             actions = self.lifecycle.on(Instant::now(), now);
+            if now == Input::LateAnswered {
+                let patience = self.lifecycle.patience().clone();
+                self.write_queue.set_patience(patience);
+            }
             let deaths = self.lifecycle.deaths();
-            self.board.update(|facts| facts.deaths = deaths);
+            self.board.update(|facts| facts.set_deaths(deaths));
             input = Some(now);
         }
+    }
+
+    /// Looks at the process of our master, if the lifecycle needs that to decide.
+    async fn sample_for(&mut self, input: Input) {
+        let process = self.process.as_ref();
+        let pid = process.and_then(MasterProcess::pid);
+        if !self.lifecycle.needs_sample(Instant::now(), input) {
+            return;
+        }
+        let look = move || (pid.and_then(effort::of), effort::own_wait());
+        let (master, own_wait) = spawn_blocking(look).await.unwrap_or_default();
+        self.lifecycle.observe(Sample {
+            at: Instant::now(),
+            master,
+            own_wait: own_wait + self.timers_late,
+        });
     }
 
     /// After an input that ends the contact with the master: tells the lifecycle first whether that master had
@@ -181,13 +215,18 @@ impl Driver {
     fn end_contact(&mut self, input: Input) {
         if !matches!(
             input,
-            Input::ConnectionLost | Input::Exited | Input::Unreachable | Input::NotAMaster
+            Input::ConnectionLost
+                | Input::Exited
+                | Input::Unreachable
+                | Input::NotAMaster
+                | Input::PortTaken
         ) {
             return;
         }
         if self.examiner.gate.state() == State::Injecting && input != Input::NotAMaster {
-            rarely!(
+            alarm!(
                 warn,
+                AWAY,
                 "the new master died while it was given the state; the next one is given it"
             );
             self.lifecycle.on(Instant::now(), Input::Answered);
@@ -223,9 +262,12 @@ impl Driver {
                     }
                 }
                 () = self.write_queue.lost() => return Input::BatchLost,
+                () = self.write_queue.late_answered() => return Input::LateAnswered,
+                () = self.write_queue.late() => return Input::Late,
                 () = self.slow.notified() => return Input::Slow,
                 () = wait::until(self.probe_deadline) => {
-                    self.probe_deadline = None;
+                    let late = self.probe_deadline.take().map(|at| at.elapsed());
+                    self.timers_late += late.unwrap_or_default();
                     return Input::ProbeMissed;
                 }
                 () = wait::until(wake) => return Input::Wake,
@@ -234,7 +276,7 @@ impl Driver {
     }
 
     /// Carries out `action`. Returns its result if that is known at once.
-    fn carry_out(&mut self, action: Action) -> Option<Input> {
+    async fn carry_out(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
                 self.disconnect();
@@ -243,15 +285,21 @@ impl Driver {
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));
                 let upstream = self.examiner.upstream.clone();
+                let new = self.process.as_ref().and_then(MasterProcess::new_one);
                 self.step = Some(Box::pin(async move {
-                    match upstream.connect().await {
-                        Ok(connection) => Done::Connected(connection),
-                        Err(error) => Done::NotConnected(error),
+                    let sentinel = match upstream.connect_sentinel().await {
+                        Ok(sentinel) => Arc::new(sentinel),
+                        Err(error) => return Done::NotConnected(error),
+                    };
+                    // Before the first call: a stranger must not be given the state.
+                    match holder(new).await {
+                        Holder::Stranger(pid) => Done::PortTaken(pid),
+                        Holder::Master | Holder::Unknown => Done::Connected(sentinel),
                     }
                 }));
             }
             Action::Examine => {
-                let mut connection = self.connection.take()?;
+                let sentinel = self.sentinel.clone()?;
                 let examiner = self.examiner.clone();
                 let new = self.process.as_mut().and_then(MasterProcess::take_new);
                 let manner = Manner {
@@ -261,8 +309,9 @@ impl Driver {
                 let master = examiner.upstream.address();
                 let span = tracing::debug_span!("recovery", %master, cause = self.outage.cause);
                 let examined = async move {
-                    let examined = examiner.examine(&mut connection, manner).await;
-                    Done::Examined(connection, examined)
+                    let examined = examiner.examine(&sentinel, manner);
+                    let examined = sentinel.during(&examiner.upstream, examined).await;
+                    Done::Examined(sentinel, examined)
                 };
                 self.step = Some(Box::pin(examined.instrument(span)));
             }
@@ -270,24 +319,46 @@ impl Driver {
                 // A late probe continues: its answer counts whenever it comes.
                 self.probe_deadline =
                     Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
-                if self.step.is_none() {
+                if self.step.is_none()
+                    && let Some(sentinel) = self.sentinel.clone()
+                {
                     let Examiner {
                         upstream, ledger, ..
                     } = self.examiner.clone();
                     self.step = Some(Box::pin(async move {
-                        let fresh = connect_verified(&upstream, &ledger.token()).await;
-                        Done::Probed(fresh)
+                        Done::Probed(verify::probe(&upstream, &ledger.token(), &sentinel).await)
                     }));
                 }
             }
             Action::ShutGate(cause) => self.shut_gate(cause),
+            Action::StandIn => {
+                rarely!(
+                    info,
+                    "the master is late with an answer; rosrescue answers for it until it does"
+                );
+                self.examiner.gate.set(State::Late);
+            }
+            Action::CatchUp => {
+                self.probe_deadline = None;
+                let sentinel = self.sentinel.clone()?;
+                let examiner = self.examiner.clone();
+                self.step = Some(Box::pin(async move {
+                    let caught_up = examiner.catch_up().await;
+                    Done::CaughtUp(sentinel, caught_up)
+                }));
+            }
+            Action::Spare(why) => rarely!(
+                warn,
+                why,
+                "the master does not answer, and is not killed: there is no proof that it hangs"
+            ),
             Action::OpenGate => self.open_gate(),
-            Action::Spawn => return self.spawn(),
+            Action::Spawn => return self.spawn().await,
             // Handled by the caller.
             Action::GiveUp => {}
             Action::Kill => {
                 self.disconnect();
-                if let Some(process) = &self.process {
+                if let Some(process) = &mut self.process {
                     process.kill();
                 }
             }
@@ -295,16 +366,22 @@ impl Driver {
                 self.board.update(|facts| {
                     facts.crash_loop.get_or_insert_with(Instant::now);
                 });
-                match self.process.as_ref().map(MasterProcess::last_words) {
-                    Some(last_words) => rarely!(
+                let last_words = match &self.process {
+                    Some(process) => Some(process.last_words().await),
+                    None => None,
+                };
+                match last_words {
+                    Some(last_words) => alarm!(
                         error,
+                        CRASH_LOOP,
                         last_words,
                         "crash loop: the master has died {deaths} times within a minute; nodes go on, \
                          rosrescue answers in its place and starts the next one after growing pauses. \
                          Its last words and master.log say why"
                     ),
-                    None => rarely!(
+                    None => alarm!(
                         error,
+                        CRASH_LOOP,
                         "crash loop: the master has died {deaths} times within a minute; nodes go on, \
                          rosrescue answers in its place. The log of what starts it says why"
                     ),
@@ -315,7 +392,7 @@ impl Driver {
                     facts.crash_loop = None;
                     facts.calm_since = Some(Instant::now());
                 });
-                rarely!(info, "the crash loop is over: the master lives");
+                all_clear!(info, CRASH_LOOP, "the crash loop is over: the master lives");
             }
         }
         None
@@ -323,10 +400,16 @@ impl Driver {
 
     fn done(&mut self, done: Done) -> Option<Input> {
         match done {
-            Done::Connected(connection) => {
+            Done::Connected(sentinel) => {
                 self.outage.port_open(Instant::now());
-                self.watch(connection);
+                self.watch(sentinel);
                 Some(Input::Connected)
+            }
+            Done::PortTaken(by) => {
+                if let Some(process) = &mut self.process {
+                    process.port_taken(by);
+                }
+                Some(Input::PortTaken)
             }
             Done::NotConnected(error) => {
                 self.log_waiting(&error.to_string());
@@ -335,15 +418,18 @@ impl Driver {
                     ConnectError::Unreachable { .. } => Input::Unreachable,
                 })
             }
-            Done::Examined(connection, Ok(examination)) => {
+            // What was read and written may have been two masters'.
+            Done::Examined(sentinel, Ok(_)) if !sentinel.is_open() => Some(Input::ConnectionLost),
+            Done::Examined(sentinel, Ok(examination)) => {
                 let outcome = examination.outcome;
                 if outcome == Outcome::Resumed {
                     // Another process may have written to the master directly.
                     self.examiner.ledger.doubt();
                 } else {
-                    self.thread_ended = thread_of(&connection, examination.pid);
+                    self.thread_ended = thread_of(&sentinel, examination.pid);
                 }
-                self.connection = Some(connection);
+                let verification = Some(examination.verification.clone());
+                self.examiner.upstream.set_verification(verification);
                 self.report(examination);
                 Some(Input::Examined {
                     new: outcome.is_new(),
@@ -363,24 +449,27 @@ impl Driver {
                 }
                 Some(input)
             }
+            Done::CaughtUp(sentinel, Ok(true)) if sentinel.is_open() => Some(Input::CaughtUp),
+            Done::CaughtUp(_, result) => {
+                tracing::debug!(?result, "the master must be examined");
+                Some(Input::NotCaughtUp)
+            }
             // Another incarnation answers, although the connection to the previous one is still open.
             Done::Probed(Err(VerifyError::OtherIncarnation)) => Some(Input::ConnectionLost),
             // No answer. If the master has just died, the older connection will end and show it.
             Done::Probed(Err(_)) => None,
-            Done::Probed(Ok(fresh)) => {
+            Done::Probed(Ok(())) => {
                 self.probe_deadline = None;
-                self.watch(fresh);
                 Some(Input::ProbeAnswered)
             }
         }
     }
 
-    /// Keeps `connection` to notice the master's end. Renewed with each probe: the kernel closes the
-    /// descriptors of a dying process one by one, the newest first, and a master has one for each node that
-    /// it has ever called.
-    fn watch(&mut self, mut connection: Connection) {
-        self.ended = Some(Box::pin(connection.ended()));
-        self.connection = Some(connection);
+    /// Keeps `sentinel` to notice the master's end.
+    fn watch(&mut self, sentinel: Arc<Sentinel>) {
+        let watched = sentinel.clone();
+        self.ended = Some(Box::pin(async move { watched.ended().await }));
+        self.sentinel = Some(sentinel);
     }
 
     fn disconnect(&mut self) {
@@ -388,7 +477,8 @@ impl Driver {
         if !self.examiner.gate.state().is_open() {
             self.keep_shut();
         }
-        self.connection = None;
+        self.examiner.upstream.set_verification(None);
+        self.sentinel = None;
         self.ended = None;
         self.step = None;
         self.probe_deadline = None;
@@ -414,13 +504,15 @@ impl Driver {
         }
         let cause = cause.as_str();
         match self.process {
-            Some(_) => rarely!(
+            Some(_) => alarm!(
                 warn,
+                AWAY,
                 cause,
                 "the master is away: nodes go on, rosrescue answers in its place and starts a new one"
             ),
-            None => rarely!(
+            None => alarm!(
                 warn,
+                AWAY,
                 cause,
                 "the master is away: nodes go on, rosrescue answers in its place. Start the master, if \
                  nothing else does"
@@ -433,17 +525,17 @@ impl Driver {
     fn open_gate(&mut self) {
         self.said = None;
         self.examiner.open_gate();
-        if std::mem::take(&mut self.restored) {
+        if let Some(number) = self.restored.take() {
             // Not before: calls need not wait for a copy of the state.
-            self.rescues.keep(Instant::now());
+            self.rescues.keep(number, Instant::now());
         }
     }
 
-    fn spawn(&mut self) -> Option<Input> {
+    async fn spawn(&mut self) -> Option<Input> {
         let Examiner {
             ledger, upstream, ..
         } = &self.examiner;
-        match self.process.as_mut()?.spawn(ledger, upstream) {
+        match self.process.as_mut()?.spawn(ledger, upstream).await {
             Ok(()) => Some(Input::Spawned),
             Err(error) => {
                 let pending = ledger.pending() > 0;
@@ -454,13 +546,28 @@ impl Driver {
     }
 }
 
-/// Resolves at the end of a thread of the master `pid`. None if it runs elsewhere or the kernel cannot watch
-/// threads.
-fn thread_of(connection: &Connection, pid: i32) -> Option<Ended> {
-    let is_master = |pid| connection.is_local() && process::runs(pid, "rosmaster");
-    u32::try_from(pid).ok().filter(|pid| is_master(*pid))?;
-    let ended = thread_exit::of(pid).ok()?;
-    Some(Box::pin(ended))
+/// Resolves at the end of a thread of the master `pid`. None if it runs elsewhere. Never resolves if the kernel
+/// cannot watch threads.
+fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
+    let id = u32::try_from(pid).ok().filter(|_| sentinel.is_local())?;
+    Some(Box::pin(async move {
+        // Outside of the runtime: the command line is read under the lock of the master's memory.
+        let watched = spawn_blocking(move || process::runs(id, "rosmaster")).await;
+        if let (Ok(true), Ok(ended)) = (watched, thread_exit::of(pid)) {
+            ended.await;
+        } else {
+            std::future::pending().await
+        }
+    }))
+}
+
+/// Who listens at the port of a master just started. Looked up outside of the runtime.
+async fn holder(new: Option<(u32, u16, bool)>) -> Holder {
+    let Some((pid, port, own)) = new else {
+        return Holder::Unknown;
+    };
+    let look = spawn_blocking(move || Holder::of(pid, port, own));
+    look.await.unwrap_or(Holder::Unknown)
 }
 
 async fn exited(process: &mut Option<MasterProcess>) {

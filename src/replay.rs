@@ -10,6 +10,7 @@
 mod accepted;
 mod difference;
 mod inspect;
+mod order;
 mod plan;
 mod reconcile;
 mod restore;

@@ -4,7 +4,7 @@
 use std::{
     collections::BTreeMap,
     io,
-    net::{IpAddr, SocketAddr, ToSocketAddrs},
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
@@ -52,6 +52,21 @@ pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAdd
         Some(Err(error)) => Err(io::Error::new(error.kind(), error)),
         None => Err(io::ErrorKind::NotFound.into()),
     }
+}
+
+/// Whether an address belongs to this computer: then the kernel routes to it from the same address. Nothing
+/// is sent.
+pub(crate) fn is_own(address: IpAddr) -> bool {
+    let any = match address {
+        IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
+        IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+    };
+    let source = || {
+        let socket = UdpSocket::bind((any, 0))?;
+        socket.connect((address, 9))?;
+        Ok::<_, io::Error>(socket.local_addr()?.ip())
+    };
+    address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
 }
 
 /// Keeps the scope of an IPv6 address.

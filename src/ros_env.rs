@@ -72,6 +72,27 @@ impl MasterUri {
         })
     }
 
+    /// Whether this, named by a node as its master, is the master at `own`. `addresses` are those of the host, as
+    /// seen from here; `is_own` tells this computer's own addresses. A loopback address is one of the node's own
+    /// computer, so it counts only if `node_is_here`.
+    pub(crate) fn names(
+        &self,
+        own: &Self,
+        addresses: &[IpAddr],
+        node_is_here: bool,
+        is_own: impl Fn(IpAddr) -> bool,
+    ) -> bool {
+        let is_loopback = own.host.parse().as_ref().map_or_else(
+            |_| own.host.eq_ignore_ascii_case("localhost"),
+            IpAddr::is_loopback,
+        );
+        let same_name = self.host.eq_ignore_ascii_case(&own.host);
+        let mut addresses = addresses.iter();
+        self.port == own.port
+            && (same_name && (node_is_here || !is_loopback)
+                || addresses.any(|at| is_own(*at) && (node_is_here || !at.is_loopback())))
+    }
+
     /// `HOST:PORT`, with brackets around an IPv6 address: the value of an HTTP `Host` header.
     pub fn authority(&self) -> String {
         if self.host.contains(':') {
@@ -221,6 +242,41 @@ mod tests {
             );
         }
         assert_eq!(uri("::1", 5).to_string(), "http://[::1]:5/");
+    }
+
+    #[test]
+    fn a_node_names_its_master_by_any_name_of_ours() {
+        let parse = |uri: &str| MasterUri::parse(uri).unwrap();
+        let here = ["127.0.0.1", "10.0.0.1", "10.1.0.1"].map(|at| at.parse::<IpAddr>().unwrap());
+        let is_own = |at: IpAddr| at.is_loopback() || here.contains(&at);
+        let names_us = |named: &str, at: &[&str], own: &str, node_is_here| {
+            let at: Vec<IpAddr> = at.iter().map(|at| at.parse().unwrap()).collect();
+            parse(named).names(&parse(own), &at, node_is_here, is_own)
+        };
+        let own = "http://robot:11311/";
+        for (named, at) in [
+            ("http://10.0.0.1:11311", "10.0.0.1"),
+            ("http://10.1.0.1:11311/", "10.1.0.1"),
+            ("http://robot.local:11311", "10.0.0.1"),
+            ("http://ROBOT", "127.0.1.1"),
+        ] {
+            assert!(names_us(named, &[at], own, true), "{named}");
+            assert!(names_us(named, &[at], own, false), "{named}");
+        }
+        // The loopback address is that of the node's own computer.
+        for named in ["http://localhost:11311", "http://127.0.0.1:11311"] {
+            assert!(names_us(named, &["127.0.0.1"], own, true));
+            assert!(!names_us(named, &["127.0.0.1"], own, false));
+            assert!(!names_us(named, &["127.0.0.1"], named, false));
+        }
+        for (named, at) in [
+            ("http://10.0.0.1:11312", "10.0.0.1"),
+            ("http://10.0.0.2:11311", "10.0.0.2"),
+            ("http://other:11311", "10.0.0.2"),
+        ] {
+            assert!(!names_us(named, &[at], own, true), "{named}");
+        }
+        assert!(!names_us("http://nowhere:11311", &[], own, true));
     }
 
     #[test]

@@ -9,13 +9,14 @@ use std::{
     time::{Duration, Instant},
 };
 
+use tokio::task::block_in_place;
 use tokio_util::sync::CancellationToken;
 
 use crate::nodes::client::{self, Sign};
 use crate::{
     gate,
     ledger::Ledger,
-    limit::rarely,
+    limit::{Pair, alarm, all_clear},
     master::{self, CALLER_ID, Method, Request},
     process::{self, Rosout},
     write_queue::WriteQueue,
@@ -120,6 +121,9 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     version.map(|version| set(key, &version))
 }
 
+/// That rosout has ended or cannot be started, and that it is started.
+static ENDED: Pair = Pair::new();
+
 /// Keeps a rosout running: ours, or an existing one.
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
@@ -133,21 +137,22 @@ async fn keep_rosout(roscore: &Roscore) {
         let start = Instant::now();
         match living_rosout(roscore)
             .await
-            .or_else(|| rosout.left_behind())
+            .or_else(|| block_in_place(|| rosout.left_behind()))
         {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
                 process::ended(pid).await;
             }
-            None => match rosout.spawn(&roscore.uri) {
+            None => match rosout.spawn(&roscore.uri).await {
                 Ok(mut child) => {
                     let pid = child.id().unwrap_or_default();
                     roscore.rosout.store(pid, Ordering::Relaxed);
-                    rarely!(info, pid, "started rosout");
+                    all_clear!(info, ENDED, pid, "started rosout");
                     let how = child.wait().await.map(process::describe);
-                    let (how, last_words) = (how.unwrap_or_default(), rosout.last_words());
-                    rarely!(
+                    let (how, last_words) = (how.unwrap_or_default(), rosout.last_words().await);
+                    alarm!(
                         warn,
+                        ENDED,
                         pid,
                         how,
                         last_words,
@@ -155,7 +160,7 @@ async fn keep_rosout(roscore: &Roscore) {
                     );
                 }
                 Err(error) => {
-                    rarely!(warn, %error, "cannot start rosout, and tries again; /rosout is not collected meanwhile")
+                    alarm!(warn, ENDED, %error, "cannot start rosout, and tries again; /rosout is not collected meanwhile")
                 }
             },
         }
@@ -186,7 +191,8 @@ const STARTED: Duration = Duration::from_millis(500);
 async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
         // There may be an orphan that has not been found yet.
-        0 => Rosout::find(&roscore.checkpoint).and_then(|rosout| rosout.left_behind()),
+        0 => Rosout::find(&roscore.checkpoint)
+            .and_then(|rosout| block_in_place(|| rosout.left_behind())),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };

@@ -6,6 +6,7 @@ pub(crate) mod answers;
 pub(crate) mod body;
 pub(crate) mod calls;
 pub(crate) mod clients;
+pub(crate) mod compare;
 pub(crate) mod deadlines;
 pub(crate) mod idle;
 pub mod listener;

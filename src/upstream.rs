@@ -4,17 +4,30 @@ mod connection;
 pub(crate) mod inspect;
 pub(crate) mod peer;
 pub(crate) mod pool;
+pub(crate) mod sentinel;
 pub(crate) mod sockets;
+pub(crate) mod verify;
 
-use std::{io, net::SocketAddr, time::Duration};
+use std::{
+    io,
+    net::SocketAddr,
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
 
 use bytes::Bytes;
-use hyper::{HeaderMap, StatusCode, ext::ReasonPhrase, header::HeaderValue};
+use hyper::{
+    HeaderMap, StatusCode,
+    ext::ReasonPhrase,
+    header::{HeaderValue, SERVER},
+};
 use socket2::{SockRef, TcpKeepalive};
 use thiserror::Error;
 use tokio::{net::TcpStream, sync::watch, time::timeout};
 
 pub(crate) use self::connection::Connection;
+pub(crate) use self::verify::VerifyError;
+use self::{sentinel::Sentinel, verify::Verification};
 use crate::{
     resolver,
     ros_env::MasterUri,
@@ -48,9 +61,15 @@ pub enum CallError {
     /// No byte was sent: it may be sent again.
     #[error("the call was not sent: {0}")]
     NotSent(hyper::Error),
+    /// No byte was sent: the connection for it could not be made.
+    #[error("there is no connection for the call: {0}")]
+    NotConnected(io::Error),
     /// The master may have run it.
     #[error("the master gave no reply: {0}")]
     MaybeSent(hyper::Error),
+    /// The reply may be that of another incarnation.
+    #[error("the reply does not count: {0}")]
+    Unverified(Box<VerifyError>),
     /// The reply's body broke off, or exceeded all limits.
     #[error("the master's reply is not whole: {0}")]
     BrokenReply(Box<dyn std::error::Error + Send + Sync>),
@@ -81,12 +100,14 @@ impl RawReply {
     /// Whether the connection may be used again. rosmaster does not read the body of a request whose head it
     /// refuses, and would take it for the next request.
     pub fn leaves_connection_usable(&self) -> bool {
-        self.status.is_success()
+        self.status.is_success() && self.keeps_alive
     }
 }
 
 #[derive(Clone, Debug)]
 pub struct RawReply {
+    /// Whether the other end takes another request on the connection.
+    pub keeps_alive: bool,
     pub status: StatusCode,
     /// The reason phrase, unless it is the usual one.
     pub reason: Option<ReasonPhrase>,
@@ -95,12 +116,30 @@ pub struct RawReply {
 }
 
 impl RawReply {
+    /// Whether the other end's dictionaries have an order: all but Python's before 3.6.
+    pub fn keeps_order(&self) -> bool {
+        keeps_order(self.headers.get(SERVER).and_then(|it| it.to_str().ok()))
+    }
+
     pub fn decode(&self) -> Result<Reply, CallError> {
         xmlrpc::decode_reply(&self.body).map_err(|error| CallError::NotXmlRpc {
             status: self.status,
             reason: error.to_string(),
         })
     }
+}
+
+fn keeps_order(server: Option<&str>) -> bool {
+    let python = server.and_then(python);
+    python.is_none_or(|version| version >= (3, 6))
+}
+
+/// The version of Python in a `Server` header such as `BaseHTTP/0.3 Python/2.7.18`.
+fn python(server: &str) -> Option<(u32, u32)> {
+    let mut words = server.split_whitespace();
+    let version = words.find_map(|word| word.strip_prefix("Python/"))?;
+    let mut numbers = version.split('.').map(|number| number.parse().ok());
+    Some((numbers.next()??, numbers.next()??))
 }
 
 /// Connects to the master, wherever it is.
@@ -114,6 +153,8 @@ pub struct Upstream {
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
     /// Number of connections for writes.
     writers: watch::Sender<usize>,
+    /// How calls are known to reach the served incarnation; none while no master is served.
+    verification: Mutex<Option<Verification>>,
 }
 
 /// Counts a connection for writes until it ends.
@@ -142,6 +183,7 @@ impl Upstream {
             probe_count,
             found: watch::Sender::new(None),
             writers: watch::Sender::new(0),
+            verification: Mutex::default(),
         }
     }
 
@@ -170,28 +212,66 @@ impl Upstream {
         let _ = self.writers.subscribe().wait_for(|count| *count == 0).await;
     }
 
+    /// A new connection on which nothing is to be sent.
+    pub(crate) async fn connect_sentinel(&self) -> Result<Sentinel, ConnectError> {
+        let (address, stream) = self.bounded_stream().await?;
+        Sentinel::new(stream).map_err(|source| ConnectError::Unreachable {
+            master: address.to_string(),
+            source,
+        })
+    }
+
+    async fn bounded_stream(&self) -> Result<(MasterUri, TcpStream), ConnectError> {
+        let (address, stream) = self.stream().await?;
+        // Best effort: the connection works without it.
+        let _ = self.silence().bound(&stream);
+        Ok((address, stream))
+    }
+
+    /// How calls are known to reach the served incarnation; none while no master is served.
+    pub(crate) fn verification(&self) -> Option<Verification> {
+        self.lock_verification().clone()
+    }
+
+    /// Sets it. The sentinel of an earlier one is closed when no call needs it any more.
+    pub(crate) fn set_verification(&self, verification: Option<Verification>) {
+        *self.lock_verification() = verification;
+    }
+
+    fn lock_verification(&self) -> MutexGuard<'_, Option<Verification>> {
+        self.verification
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
     async fn connect_with(&self, writer: Option<Writer>) -> Result<Connection, ConnectError> {
+        let (address, stream) = self.stream().await?;
+        let (instance, silence) = (self.instance.clone(), Some(self.silence()));
+        Connection::open(stream, &address, instance, MAX_REPLY, silence, writer)
+            .await
+            .map_err(|source| ConnectError::Unreachable {
+                master: address.to_string(),
+                source,
+            })
+    }
+
+    async fn stream(&self) -> Result<(MasterUri, TcpStream), ConnectError> {
         let address = self.address();
         let unreachable = |source| ConnectError::Unreachable {
             master: address.to_string(),
             source,
         };
         let connecting = async { open(self.find(&address).await?).await };
-        let stream = match timeout(CONNECT_LIMIT, connecting).await {
-            Err(_) => return Err(unreachable(io::ErrorKind::TimedOut.into())),
+        match timeout(CONNECT_LIMIT, connecting).await {
+            Err(_) => Err(unreachable(io::ErrorKind::TimedOut.into())),
             Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => {
-                return Err(ConnectError::Refused {
+                Err(ConnectError::Refused {
                     master: address.to_string(),
-                });
+                })
             }
-            Ok(Err(error)) => return Err(unreachable(error)),
-            Ok(Ok(stream)) => stream,
-        };
-        // Best effort: the connection works without it.
-        let _ = self.bound_silence(&stream);
-        Connection::open(stream, &address, self.instance.clone(), MAX_REPLY, writer)
-            .await
-            .map_err(unreachable)
+            Ok(Err(error)) => Err(unreachable(error)),
+            Ok(Ok(stream)) => Ok((address, stream)),
+        }
     }
 
     /// The addresses of the master. When its name cannot be resolved, those resolved last: a failing name
@@ -222,23 +302,38 @@ impl Upstream {
         known().ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
-    /// Ends a connection whose other side has acknowledged nothing for a little longer than the probes take
-    /// to find a dead master. The kernel of a hung master still acknowledges. If a cable is cut, or a router
-    /// has forgotten the connection, nothing is acknowledged, and TCP itself would take a quarter of an hour.
-    /// Not needed on this computer.
-    fn bound_silence(&self, stream: &TcpStream) -> io::Result<()> {
+    fn silence(&self) -> Silence {
+        // The kernel counts whole seconds here.
+        let interval = self.probe_timeout.max(Duration::from_secs(1));
+        Silence {
+            interval,
+            limit: interval * (self.probe_count + 1),
+        }
+    }
+}
+
+/// After which silence a connection to another computer ends: one whose other side has acknowledged nothing for a
+/// little longer than the probes take to find a dead master. The kernel of a hung master still acknowledges. If a
+/// cable is cut, or a router has forgotten the connection, nothing is acknowledged, and TCP itself would take a
+/// quarter of an hour. Not needed on this computer.
+#[derive(Clone, Copy, Debug)]
+struct Silence {
+    interval: Duration,
+    limit: Duration,
+}
+
+impl Silence {
+    fn bound(self, stream: &TcpStream) -> io::Result<()> {
         if is_local(stream)? {
             return Ok(());
         }
-        // The kernel counts whole seconds here.
-        let interval = self.probe_timeout.max(Duration::from_secs(1));
         let probes = TcpKeepalive::new()
-            .with_time(interval)
-            .with_interval(interval);
+            .with_time(self.interval)
+            .with_interval(self.interval);
         let socket = SockRef::from(stream);
         socket.set_tcp_keepalive(&probes)?;
         // This limit, not a count, also ends the probes.
-        socket.set_tcp_user_timeout(Some(interval * (self.probe_count + 1)))
+        socket.set_tcp_user_timeout(Some(self.limit))
     }
 }
 
@@ -260,4 +355,18 @@ async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
 fn is_local(stream: &TcpStream) -> io::Result<bool> {
     let peer = stream.peer_addr()?.ip();
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_server_header_names_python() {
+        assert_eq!(python("BaseHTTP/0.3 Python/2.7.18"), Some((2, 7)));
+        assert_eq!(python("BaseHTTP/0.6 Python/3.11.2"), Some((3, 11)));
+        for other in ["", "BaseHTTP/0.6", "Python/", "Python/3", "Python/x.y"] {
+            assert_eq!(python(other), None, "{other}");
+        }
+    }
 }

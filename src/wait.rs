@@ -1,4 +1,6 @@
-//! Waiting for optional events.
+//! Waiting for optional events, and for disks.
+
+use std::time::Duration;
 
 use tokio::time::Instant;
 
@@ -26,4 +28,13 @@ pub(crate) async fn tick(interval: &mut Option<tokio::time::Interval>) {
         }
         None => std::future::pending().await,
     }
+}
+
+/// The result of `work`, which may wait for a disk, in another thread; none after `limit`. Late work is not ended.
+pub(crate) async fn within<T: Send + 'static>(
+    limit: Duration,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Option<T> {
+    let work = tokio::task::spawn_blocking(work);
+    tokio::time::timeout(limit, work).await.ok()?.ok()
 }

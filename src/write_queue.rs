@@ -14,7 +14,7 @@ use std::{sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use tokio::{
-    sync::{Notify, mpsc, oneshot, watch},
+    sync::{Notify, mpsc, watch},
     time::Instant,
 };
 
@@ -23,6 +23,7 @@ pub(crate) use self::drain::Drain;
 use crate::{
     gate,
     ledger::Ledger,
+    lifecycle::Patience,
     master::Request,
     status::stats::Stats,
     upstream::{Head, Upstream},
@@ -36,7 +37,7 @@ const CHANNEL: usize = 64;
 #[derive(Clone, Debug)]
 pub struct WriteQueue {
     items: mpsc::Sender<Item>,
-    lost: Arc<Notify>,
+    signals: Arc<Signals>,
     sent: watch::Receiver<Option<Instant>>,
 }
 
@@ -78,16 +79,10 @@ impl WriteQueue {
         call: Request,
         condition: Option<Condition>,
     ) -> Option<Reply> {
-        let (answer, answered) = oneshot::channel();
-        let item = Item {
-            raw,
-            call: Some(Arc::new(call)),
-            answer,
-            condition,
-            way_made: false,
-        };
+        let (mut item, answered) = Item::new(raw, Some(Arc::new(call)));
+        item.condition = condition;
         self.items.send(item).await.ok()?;
-        match answered.await.ok()? {
+        match answered.await.ok()?.0 {
             Answer::Made(reply) => Some(reply),
             Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).ok(),
             Answer::Close | Answer::Elsewhere => None,
@@ -97,12 +92,39 @@ impl WriteQueue {
     /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until the
     /// gate has changed. Called by the gate's only writer.
     pub async fn lost(&self) {
-        self.lost.notified().await;
+        self.signals.lost.notified().await;
+    }
+
+    /// Returns when a write has waited for the [patience](Self::set_patience), and the mirror can answer it and
+    /// all that is under way.
+    pub(crate) async fn late(&self) {
+        self.signals.is_late.notified().await;
+    }
+
+    /// Returns when the master, which was late, has answered what was under way.
+    pub(crate) async fn late_answered(&self) {
+        self.signals.has_answered.notified().await;
+    }
+
+    /// How long writes wait for the master from now on.
+    pub(crate) fn set_patience(&self, patience: Patience) {
+        self.signals.patience.send_replace(patience);
     }
 }
 
+/// What the worker and the recovery tell each other.
+#[derive(Debug)]
+struct Signals {
+    /// How long writes wait for the master.
+    patience: watch::Sender<Patience>,
+    lost: Notify,
+    is_late: Notify,
+    has_answered: Notify,
+}
+
 /// Makes a write queue and the worker to run. `resync_interval`: how often the master is compared with the
-/// mirror, if at all. `evicts`: whether a node whose port another one registers is taken out.
+/// mirror, if at all. `evicts`: whether a node whose port another one registers is taken out. `patience`: how long
+/// writes wait for the master.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
@@ -110,9 +132,15 @@ pub(crate) fn write_queue(
     stats: &'static Stats,
     resync_interval: Option<Duration>,
     evicts: bool,
+    patience: Patience,
 ) -> (WriteQueue, Drain) {
     let (items, rx) = mpsc::channel(CHANNEL);
-    let lost = Arc::new(Notify::new());
+    let signals = Arc::new(Signals {
+        patience: watch::Sender::new(patience),
+        lost: Notify::new(),
+        is_late: Notify::new(),
+        has_answered: Notify::new(),
+    });
     let (tell_sent, sent) = watch::channel(None);
     let link = Link { ledger, upstream };
     let mut drain = Drain::new(
@@ -121,11 +149,16 @@ pub(crate) fn write_queue(
         gate,
         stats,
         resync_interval,
-        lost.clone(),
+        signals.clone(),
         tell_sent,
     );
     drain.evicts = evicts;
-    (WriteQueue { items, lost, sent }, drain)
+    let queue = WriteQueue {
+        items,
+        signals,
+        sent,
+    };
+    (queue, drain)
 }
 
 /// What a round trip needs.
@@ -134,3 +167,6 @@ struct Link {
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,
 }
+
+#[cfg(test)]
+mod tests;

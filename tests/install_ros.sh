@@ -4,6 +4,8 @@
 #
 # Debian and Ubuntu carry ROS 1 themselves. A ROS in /opt/ros is used as it is.
 
+. tests/apt_get.sh
+
 for ros_setup in /opt/ros/*/setup.sh; do
     if [ -r "$ros_setup" ] && [ -z "${ROS_DISTRO:-}" ]; then
         set +u # not written for it
@@ -77,18 +79,12 @@ install_missing() { # PACKAGES...
         echo "ROS 1 is not complete here and there is no apt-get to install: $*" >&2
         exit 1
     fi
-    if [ "$(id -u)" = 0 ]; then
-        as_root=
-    elif command -v sudo >/dev/null; then
-        as_root=sudo
-    else
-        echo "neither root nor sudo; let somebody run: apt-get install $*" >&2
+    echo "installing: $*"
+    if ! apt_get update -qq; then
+        echo "the lists of packages cannot be updated; to install: $*" >&2
         exit 1
     fi
-    echo "installing: $*"
-    $as_root apt-get update -qq
-    if ! $as_root env DEBIAN_FRONTEND=noninteractive \
-        apt-get install -y -qq --no-install-recommends "$@"; then
+    if ! apt_get install -y -qq --no-install-recommends "$@"; then
         echo "apt-get cannot install all of: $*" >&2
         echo "This needs a Debian or Ubuntu that carries ROS 1, as Debian 12 does, or a ROS Noetic in" >&2
         echo "/opt/ros." >&2

@@ -34,7 +34,9 @@ else
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 
+# All test programs run, even if one of them fails.
+#
 # Tests with real ROS wait for processes most of the time: twice as many at once as there are cores. Those
 # that measure times (tests/timing) run one at a time in any case.
 threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
-RUST_TEST_THREADS=$threads cargo test --locked
+RUST_TEST_THREADS=$threads cargo test --locked --no-fail-fast

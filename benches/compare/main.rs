@@ -1,7 +1,7 @@
 //! rosrescue side by side with a bare rosmaster, HAProxy and nginx, all in one run: `cargo bench --bench compare`.
 //!
-//! Four parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
-//! what grows with the state; and the first again on a stand-in for a small computer. Prints tables as Markdown,
+//! Five parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
+//! writes that notify nodes; what grows with the state; and the first again on a stand-in for a small computer. Prints tables as Markdown,
 //! draws a picture, and writes every number as JSON. What a number means is said below each table.
 
 #![allow(
@@ -12,6 +12,7 @@
 )]
 
 mod calls;
+mod notify;
 mod party;
 mod picture;
 mod relays;
@@ -41,12 +42,17 @@ use crate::{
 
 const PICTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/compare.svg");
 
+/// For each turn of the writes that notify.
+const NOTIFY_SECONDS: f64 = 5.0;
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Part {
     /// One kind of call at a time, by 1 to 512 connections.
     Calls,
     /// A storm of 100 nodes, and `roslaunch`.
     Robots,
+    /// Writes that notify nodes, and rospy nodes that start together.
+    Notify,
     /// What grows with the state.
     Scale,
     /// The calls on one core at a quarter of its speed.
@@ -58,7 +64,7 @@ enum Part {
 struct Options {
     /// What to measure
     #[arg(long, value_name = "PART,…", value_delimiter = ',', value_enum)]
-    #[arg(default_values_t = [Part::Calls, Part::Robots, Part::Scale, Part::Small])]
+    #[arg(default_values_t = [Part::Calls, Part::Robots, Part::Notify, Part::Scale, Part::Small])]
     parts: Vec<Part>,
     /// Length of each measurement of one party in seconds; there are some 200
     #[arg(
@@ -77,6 +83,9 @@ struct Options {
     /// Launches of 40 nodes for each party
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     launches: usize,
+    /// Turns of the writes that notify, and starts of rospy nodes, for each party
+    #[arg(long, value_name = "COUNT", default_value_t = 5)]
+    notifies: usize,
     /// Where all numbers go as JSON, and the picture beside it as SVG [default: compare.json in Cargo's target
     /// folder]
     #[arg(long, value_name = "FILE")]
@@ -94,6 +103,7 @@ struct Measured {
     turns: usize,
     calls: Option<Vec<calls::Cell>>,
     robots: Option<Vec<robots::Times>>,
+    notify: Option<notify::Notify>,
     scale: Option<Vec<scale::Row>>,
     small: Option<Small>,
 }
@@ -151,6 +161,7 @@ fn measure(options: &Options) -> Measured {
         turns,
         calls: needs(Part::Calls).then(|| calls(calls::WHOLE)),
         robots: needs(Part::Robots).then(|| robots::measure(options.storms, options.launches)),
+        notify: needs(Part::Notify).then(|| notify::measure(NOTIFY_SECONDS, options.notifies)),
         scale: needs(Part::Scale).then(|| scale::measure(seconds)),
         small: needs(Part::Small).then(|| match SmallComputer::enter() {
             Ok(computer) => Small::Measured(computer.share(), calls(calls::SMALLER)),

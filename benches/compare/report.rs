@@ -3,6 +3,7 @@
 use crate::{
     Measured, Small,
     calls::{Cell, Seen},
+    notify::Notify,
     party::Kind,
     robots::Times,
     scale::Row,
@@ -20,6 +21,9 @@ pub(crate) fn markdown(measured: &Measured) -> String {
     }
     if let Some(times) = &measured.robots {
         parts.push(robots(times) + ROBOTS.trim_end());
+    }
+    if let Some(measured) = &measured.notify {
+        parts.push(notify(measured) + NOTIFY.trim_end());
     }
     if let Some(rows) = &measured.scale {
         parts.push(scale(rows) + SCALE.trim_end());
@@ -55,6 +59,13 @@ const ROBOTS: &str = "
 * *A storm of 100 nodes*: all connect at once and make 15 calls each, one after the other, as a node does that starts: publishers, subscribers, services, parameters. Until
   the last answer, median (largest).
 * *`roslaunch`*: 30 rospy and 10 roscpp nodes and 500 parameters, from its start until the last has registered. Most of it is Python's start.
+";
+
+const NOTIFY: &str = "
+* *Calls a second*: by six writers for 5 s in each turn, each with a parameter and a publisher of its own that comes and goes, and random pauses of up to 4 ms between two calls.
+  Four nodes subscribe to all of them, and answer after 1 ms. *Notified by then*: of all notifications, how many had come when the last call was answered; the rest are queued.
+* *Twelve rospy nodes*: started together, with 20 publishers and 60 subscribers each; until the last has registered.
+* A rosmaster as people start it notifies by 3 threads, that of `core` by 32.
 ";
 
 const SCALE: &str = "
@@ -122,6 +133,39 @@ fn robots(times: &[Times]) -> String {
         });
         let cells: Vec<_> = cells.collect();
         text += &format!("| {what} | {} |\n", cells.join(" | "));
+    }
+    text
+}
+
+fn notify(measured: &Notify) -> String {
+    let mut text = "### Writes that notify\n\n\
+        | | calls a second | ratio | time of a call in ms, median (99th percentile) | notified by then | twelve rospy nodes in ms, median (largest) | ratio |\n\
+        |---|--:|--:|--:|--:|--:|--:|\n"
+        .to_owned();
+    let first = &measured.writes[0];
+    for writes in &measured.writes {
+        let at = |share: f64| writes.calls_ms[(writes.calls_ms.len() as f64 * share) as usize];
+        let bare = spread(&measured.starts[0].ms).0;
+        let starts = measured
+            .starts
+            .iter()
+            .find(|starts| starts.name == writes.name);
+        let starts = starts.map_or_else(
+            || "| ".to_owned(),
+            |starts| {
+                let (median, largest) = spread(&starts.ms);
+                format!("{median:.0} ({largest:.0}) | {:.2}", median / bare)
+            },
+        );
+        text += &format!(
+            "| {} | {:.0} | {:.2} | {} ({}) | {:.0} % | {starts} |\n",
+            writes.name,
+            writes.calls_per_second,
+            writes.calls_per_second / first.calls_per_second,
+            short(at(0.5)),
+            short(at(0.99)),
+            writes.told() * 1e2,
+        );
     }
     text
 }

@@ -144,6 +144,7 @@ impl Robot<'_> {
             guard: view.guard(),
             claim: 1,
             seq: 0,
+            settled: true,
         };
         let answer = replica
             .run(settings, &claim, None)

@@ -183,6 +183,8 @@ struct Caller {
     stream: TcpStream,
     /// How often the connection was found closed.
     reconnections: usize,
+    /// The last answer was one of HTTP/1.0: the next call needs a new connection, which is part of its time.
+    spent: bool,
     script: Script,
     /// The last answer, head and body.
     answer: Vec<u8>,
@@ -195,6 +197,7 @@ impl Caller {
             port,
             stream: connect(port).await?,
             reconnections: 0,
+            spent: false,
             script,
             answer: vec![0; ROOM],
             body: 0..0,
@@ -205,6 +208,9 @@ impl Caller {
     /// Python's client does: a rosmaster closes connections that are idle for 5 s.
     async fn call(&mut self) -> io::Result<()> {
         let request = self.script.next().to_vec();
+        if self.spent {
+            self.stream = connect(self.port).await?;
+        }
         match self.exchange(&request).await {
             Err(error) if CLOSED.contains(&error.kind()) => {
                 self.reconnections += 1;
@@ -229,6 +235,7 @@ impl Caller {
             }
             if let Some(body) = &body {
                 if filled >= body.end {
+                    self.spent = self.answer.starts_with(b"HTTP/1.0");
                     self.body = body.clone();
                     return Ok(());
                 }
@@ -273,7 +280,7 @@ fn body_of(answer: &[u8]) -> io::Result<Option<std::ops::Range<usize>>> {
         is_length.then(|| value.trim().parse::<usize>().ok())?
     });
     match length {
-        Some(length) if head.starts_with("HTTP/1.1 200 ") => {
+        Some(length) if head.starts_with("HTTP/1.1 200 ") || head.starts_with("HTTP/1.0 200 ") => {
             let start = end + END.len();
             Ok(Some(start..start + length))
         }

@@ -102,6 +102,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         mirror,
         session,
         pending,
+        displaced,
         ..
     } = rebuild(checkpoint, records);
     let snapshot = mirror.snapshot();
@@ -112,6 +113,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         session: session.unwrap_or_default(),
         snapshot,
         pending: pending.into_iter().map(Call::from).collect(),
+        displaced,
     };
     store
         .begin(&expected)

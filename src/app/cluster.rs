@@ -58,6 +58,7 @@ const AGAIN: Duration = Duration::from_millis(200);
 
 type Loading = Pin<Box<dyn Future<Output = Result<Loaded, ReplicaError>> + Send>>;
 type Flag = Pin<Box<dyn Future<Output = bool> + Send>>;
+type Deciding = Pin<Box<dyn Future<Output = Input> + Send>>;
 type Merging = Pin<Box<dyn Future<Output = u64> + Send>>;
 
 /// See the [module](self).
@@ -70,6 +71,8 @@ pub(super) struct Member {
     /// Who leads, also while calls wait.
     leads: watch::Sender<Way>,
     peers: Arc<Peers>,
+    /// The last record of the journal that the mirror holds.
+    followed: watch::Sender<u64>,
     handovers: mpsc::Receiver<Handover>,
     /// When the machine is started, even if etcd's state has not been read.
     start_by: Option<Instant>,
@@ -103,16 +106,12 @@ pub(super) struct Member {
     before: Option<(String, Instant)>,
     /// It has given up leading by itself.
     was_released: bool,
-    /// This process has led.
+    /// This process has claimed with success.
     led: bool,
     /// Where another computer of this name is.
     namesake: Option<String>,
-    /// Another computer was seen leading, so the session goes on.
-    seen_leading: bool,
     /// Whether the session in etcd goes on, while that is found out.
-    deciding: Option<Flag>,
-    /// What was decided, if it was necessary.
-    goes_on: Option<bool>,
+    deciding: Option<Deciding>,
     probe: Option<Flag>,
     probe_at: Option<Instant>,
     /// Who waits for this computer to give up leading, and until when.
@@ -255,23 +254,23 @@ impl Member {
                 Ok(input) => self.inbox.push_back(input),
                 Err(error) => tracing::error!(%error, "a request to etcd was not finished; please report this line"),
             },
-            () = self.given.post.ledger.shared.notified() => self.take_changes(),
+            () = self.given.post.ledger.shared.notified() => self.take_changes().await,
             done = wait::for_some(self.outgoing.preparing.as_mut()) => self.prepared(done),
             changes = next_changes(&mut self.watch) => self.changed(changes),
             loaded = wait::for_some(self.loading.as_mut()) => {
                 self.loading = None;
                 self.have_loaded(loaded);
             }
-            goes_on = wait::for_some(self.deciding.as_mut()) => {
+            decided = wait::for_some(self.deciding.as_mut()) => {
                 self.deciding = None;
-                self.goes_on = Some(goes_on);
+                self.inbox.push_back(decided);
             }
             leads = wait::for_some(self.probe.as_mut()) => {
                 self.probe = None;
                 self.inbox.push_back(Input::Peer(leads));
             }
             Some(handover) = self.handovers.recv() => self.hand_over(handover),
-            lost = wait::for_some(self.merging.as_mut()) => self.merged(lost),
+            lost = wait::for_some(self.merging.as_mut()) => self.merged(lost).await,
             Some(done) = self.background.tasks.join_next() => self.done(done.ok().flatten()),
             Some(_) = self.endings.join_next() => {}
             () = wait::for_some(self.ending_roscore.as_mut()) => {

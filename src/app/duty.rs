@@ -8,16 +8,16 @@ use std::{
 
 use tokio::{
     sync::Notify,
-    task::{JoinError, JoinHandle},
+    task::{JoinError, JoinHandle, spawn_blocking},
 };
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     gate,
     ledger::{Ledger, history::Rescues},
-    lifecycle::{Probing, Supervision},
+    lifecycle::{Action, Probing, Supervision},
     nodes::Nodes,
-    process::ProcessError,
+    process::{ProcessError, Rosmaster},
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},
     roscore::{self, Roscore},
     status::{Board, stats::Stats},
@@ -87,6 +87,42 @@ impl Post {
             roscore::seed_run_id(&roscore);
         }
         tokio::spawn(roscore::run(roscore, rosout, stop))
+    }
+
+    /// The driver of the only computer, with what is to be done first. `rosmaster` starts masters, of which the
+    /// last one was at `port`; none for a master of others. `rosout`: whether it runs rosout, too; none for
+    /// nothing of what roscore does. `restored`: the mirror is from a checkpoint whose session continues. At the
+    /// first of `ends` rosout is ended, then the second is cancelled.
+    pub(super) async fn alone(
+        self,
+        rosmaster: Option<Rosmaster>,
+        port: Option<u16>,
+        rosout: Option<bool>,
+        restored: bool,
+        ends: (CancellationToken, CancellationToken),
+    ) -> (Driver, Vec<Action>) {
+        let process = match rosmaster {
+            Some(rosmaster) => {
+                let starter = rosmaster.clone();
+                let left = spawn_blocking(move || rosmaster.left_behind(port)).await;
+                Some(MasterProcess::new(starter, port, left.unwrap_or_default()))
+            }
+            None => None,
+        };
+        let left = process.as_ref().is_some_and(MasterProcess::is_left);
+        let (stop, halt) = ends;
+        let duties = rosout.map(|rosout| self.roscore(rosout, !left, stop.clone()));
+        tokio::spawn(async move {
+            stop.cancelled().await;
+            if let Some(duties) = duties {
+                // A panic there must not prevent the stop.
+                let _ = duties.await;
+            }
+            halt.cancel();
+        });
+        let mut driver = self.driver(process);
+        let first = driver.start(restored);
+        (driver, first)
     }
 
     /// Begins the duty of one computer among several, with a master of its own that is given the mirror's

@@ -1,11 +1,6 @@
 //! Whether nodes of a recorded session are alive.
 
-use std::{
-    collections::BTreeSet,
-    io,
-    net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket},
-    time::Duration,
-};
+use std::{collections::BTreeSet, time::Duration};
 
 use tokio::{task::JoinSet, time::timeout};
 
@@ -48,24 +43,11 @@ async fn is_elsewhere(api: &str) -> bool {
         return false;
     };
     match timeout(LIFE_SIGN, resolver::addresses(&host, port)).await {
-        Ok(Ok(addresses)) => !addresses.iter().any(|address| is_own(address.ip())),
+        Ok(Ok(addresses)) => !addresses
+            .iter()
+            .any(|address| resolver::is_own(address.ip())),
         _ => false,
     }
-}
-
-/// Whether an address belongs to this computer: then the kernel routes to it from the same address. Nothing
-/// is sent.
-fn is_own(address: IpAddr) -> bool {
-    let any = match address {
-        IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
-        IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
-    };
-    let source = || {
-        let socket = UdpSocket::bind((any, 0))?;
-        socket.connect((address, 9))?;
-        Ok::<_, io::Error>(socket.local_addr()?.ip())
-    };
-    address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
 }
 
 #[cfg(test)]

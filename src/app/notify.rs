@@ -15,6 +15,8 @@ use crate::{
     gate::{self, State},
     guardian::handover::{self, Guard},
     ledger::Ledger,
+    limit::{Pair, alarm, all_clear},
+    process::{self, Stat},
     status::{
         Board, Guarded,
         condition::{Situation, condition},
@@ -28,14 +30,24 @@ const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Pause between two looks whether other computers have been joined.
 const JOINING: Duration = Duration::from_millis(20);
 
+/// Time between two looks whether the guardian is stopped.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// That the guardian is stopped, and that it runs again.
+static STOPPED: Pair = Pair::new();
+
 /// Starts reporting. The task that is returned reports `stop` and ends.
 pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
         Guard::Guardian { pid, link } => {
-            tokio::spawn(follow_guardian(pid, link, told.clone()));
-            Guarded::Guardian(pid)
+            let guarded = Guarded::Guardian {
+                pid,
+                restarted: is_restarted(pid),
+            };
+            tokio::spawn(follow_guardian(pid, guarded, link, told.clone()));
+            guarded
         }
     };
     told.board.update(|facts| facts.guarded = guarded);
@@ -75,6 +87,35 @@ impl Source {
             .line()
     }
 
+    /// Looks whether the guardian `pid` is stopped: then it starts no worker. It shows neither by the link nor by its
+    /// end. `guarded`: what holds while it runs.
+    fn see_guardian(&self, pid: u32, guarded: Guarded) {
+        let now = match Stat::of(pid).is_some_and(Stat::is_stopped) {
+            true => Guarded::Stopped(pid),
+            false => guarded,
+        };
+        let before = self
+            .board
+            .update(|facts| std::mem::replace(&mut facts.guarded, now));
+        match (before, now) {
+            (Guarded::Stopped(_), Guarded::Stopped(_)) => {}
+            (_, Guarded::Stopped(_)) => alarm!(
+                warn,
+                STOPPED,
+                pid,
+                "unguarded: the guardian process is stopped, by Ctrl-Z perhaps; nodes run as usual, but if \
+                 rosrescue dies now, calls wait until it is continued: `fg`, `bg` or `kill -CONT {pid}`"
+            ),
+            (Guarded::Stopped(_), _) => all_clear!(
+                info,
+                STOPPED,
+                pid,
+                "guarded: the guardian process runs again"
+            ),
+            _ => {}
+        }
+    }
+
     /// Returns when calls are answered, by the master, the mirror, or another computer.
     async fn answers(&self) {
         let mut gate = self.gate.clone();
@@ -89,8 +130,18 @@ impl Source {
     }
 }
 
-/// Reports to the guardian when calls are answered, and logs the guardian's end.
-async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
+/// Whether something starts the guardian `pid` again when it ends: systemd, or what runs the container of which it is
+/// the first process.
+fn is_restarted(pid: u32) -> bool {
+    let parent = process::parent_of(pid);
+    let of_systemd = |parent| process::name_of(parent) == "systemd";
+    // systemd sets it for all that it starts; terminals inherit it.
+    pid == 1 || (std::env::var_os("INVOCATION_ID").is_some() && parent.is_some_and(of_systemd))
+}
+
+/// Reports to the guardian when calls are answered, and logs that the guardian is stopped or has ended. `guarded`: what
+/// holds while it runs.
+async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
@@ -104,10 +155,17 @@ async fn follow_guardian(pid: u32, link: StdLink, told: Source) {
     // The guardian never writes: the read ends only with it.
     let mut byte = [0];
     let ended = from.read(&mut byte);
-    tokio::pin!(ended);
+    let look = async {
+        let mut looks = interval(LOOK);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            looks.tick().await;
+            told.see_guardian(pid, guarded);
+        }
+    };
     tokio::select! {
-        _ = &mut ended => {}
-        () = served => drop(ended.await),
+        _ = ended => {}
+        ((), ()) = async { tokio::join!(served, look) } => {}
     }
     told.board
         .update(|facts| facts.guarded = Guarded::NoLonger(pid));

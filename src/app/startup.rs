@@ -1,18 +1,28 @@
 //! Determines the initial state from the checkpoint.
 
-use std::path::Path;
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
-use super::{RunError, life};
+use tokio::task::spawn_blocking;
+
+use super::{RunError, earlier, life};
 use crate::{
     checkpoint::{
+        folder,
         format::Session,
         session::{self, Decision, Evidence, Rebuilt},
         store::{self, OpenError, Store, history},
     },
     clock,
     config::Config,
-    master::{Master, Request},
+    master::{Displaced, Master, Request},
+    wait,
 };
+
+/// How long the disk may take to open the checkpoint: calls wait meanwhile.
+const OPENING: Duration = Duration::from_secs(20);
 
 /// The initial state.
 pub(super) struct Beginning {
@@ -20,18 +30,31 @@ pub(super) struct Beginning {
     pub(super) session: Session,
     /// Writes that the session's last master may not have run.
     pub(super) pending: Vec<Request>,
+    /// Nodes that may not have been told to shut down.
+    pub(super) displaced: Vec<Displaced>,
     /// Not begun yet.
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
+    /// Whether it continues a session whose process died while this computer went on.
+    pub(super) died: bool,
     /// In words, for the operator.
     pub(super) story: String,
 }
 
 /// Reads the checkpoint and decides whether its session continues.
 pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
-    let (mut store, loaded) = match Store::open(&config.checkpoint) {
-        Ok((store, loaded)) => (Some(store), loaded),
-        Err(error @ OpenError::Io { .. }) => {
+    let own = config.clone();
+    let opened = wait::within(OPENING, move || {
+        let path = &own.checkpoint;
+        earlier::take_over(&own);
+        let found = Folder::look(path);
+        let opened = Store::open(path);
+        found.report(opened.is_ok());
+        opened.map_err(|error| (store::read(path).ok().flatten().map(Box::new), error))
+    });
+    let (mut store, loaded) = match opened.await {
+        Some(Ok((store, loaded))) => (Some(store), loaded),
+        Some(Err((loaded, error @ OpenError::Io { .. }))) => {
             // A robot without a working disk still needs its master.
             tracing::error!(
                 %error,
@@ -39,14 +62,20 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                  rosrescue itself would lose the state. Choose another place with --checkpoint, or \
                  repair this one"
             );
-            (None, store::read(&config.checkpoint).ok().flatten())
+            (None, loaded.map(|loaded| *loaded))
         }
-        Err(error) => return Err(RunError::Checkpoint(error)),
+        Some(Err((_, error))) => return Err(RunError::Checkpoint(error)),
+        None => {
+            say_silent(&config.checkpoint);
+            (None, None)
+        }
     };
     let boot_id = kernel_id("/proc/sys/kernel/random/boot_id");
     let mut story = "a new session begins".to_owned();
     let mut beginning = None;
     let mut master_uri = None;
+    let mut died = false;
+    let mut token = (String::new(), 0);
     if let Some(loaded) = loaded {
         for sentence in loaded.torn.iter() {
             tracing::info!("checkpoint: {sentence}");
@@ -58,6 +87,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             mirror,
             session,
             pending,
+            displaced,
             trouble,
         } = session::rebuild(loaded.checkpoint, loaded.records);
         if let Some(trouble) = trouble {
@@ -67,6 +97,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
         let session = session.unwrap_or_default();
         let same_boot = session.boot_id == boot_id;
+        died = same_boot && !session.closed;
         let mut evidence = Evidence {
             same_boot,
             closed: session.closed,
@@ -78,49 +109,124 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
                 story = format!("the session goes on ({why}): {}", mirror.counts());
-                beginning = Some((mirror, session, pending));
+                beginning = Some((mirror, session, pending, displaced));
             }
             Decision::Fresh(why) => {
                 // A master that a crashed rosrescue left running is taken over.
                 master_uri = session.master_uri.filter(|_| !session.closed);
-                let kept = store.as_mut().map(|store| store.set_aside("session"));
-                let kept = match kept {
-                    Some(Ok(Some(path))) => {
-                        format!("; the checkpoint before is kept as {}", path.display())
-                    }
-                    Some(Err(error)) => {
-                        tracing::error!(%error, "the checkpoint of the session before could not be kept under another name");
-                        String::new()
-                    }
-                    _ => String::new(),
-                };
+                // A copy of that checkpoint must be found to be older than the masters of this session.
+                token = (session.mark, session.incarnation);
+                let kept;
+                (store, kept) = set_aside(store).await;
+                let kept = kept
+                    .map(|path| format!("; the checkpoint before is kept as {}", path.display()));
+                let kept = kept.unwrap_or_default();
                 story = format!("a new session begins ({why}{kept})");
             }
         }
     }
-    if let Some(store) = &store
-        && let Err(error) = history::trim(store.path(), config.history)
-    {
-        tracing::debug!(%error, "the kept checkpoints cannot be listed");
+    if let Some(store) = &store {
+        let (path, most) = (store.path().to_owned(), config.history);
+        spawn_blocking(move || {
+            if let Err(error) = history::trim(&path, most) {
+                tracing::debug!(%error, "the kept checkpoints cannot be listed");
+            }
+        });
     }
     let restored = beginning.is_some();
-    let (mirror, mut session, pending) = beginning.unwrap_or_default();
+    let died = restored && died;
+    let (mirror, mut session, pending, displaced) = beginning.unwrap_or_default();
     if !restored || session.mark.is_empty() {
         session.master_uri = master_uri;
         session.id = kernel_id("/proc/sys/kernel/random/uuid");
-        session.mark = session.id.clone();
+        (session.mark, session.incarnation) = token;
+        if session.mark.is_empty() {
+            session.mark.clone_from(&session.id);
+        }
         session.started = clock::wall_text(clock::wall_time());
     }
     session.boot_id = boot_id;
+    session.port = config.advertised.port;
     session.closed = false;
     Ok(Beginning {
         mirror,
         session,
         pending,
+        displaced,
         store,
         restored,
+        died,
         story,
     })
+}
+
+fn say_silent(checkpoint: &Path) {
+    tracing::error!(
+        checkpoint = %checkpoint.display(),
+        "unprotected: the disk has not opened the checkpoint within {OPENING:?}; starting without it, and \
+         recording begins when the disk answers"
+    );
+}
+
+/// Keeps the checkpoint of the session before under another name, which is returned. No store is left of a disk
+/// that is silent.
+async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
+    let Some(mut store) = store else {
+        return (None, None);
+    };
+    let path = store.path().to_owned();
+    let work = move || {
+        let kept = store.set_aside("session");
+        (store, kept)
+    };
+    match wait::within(OPENING, work).await {
+        Some((store, Ok(kept))) => (Some(store), kept),
+        Some((store, Err(error))) => {
+            tracing::error!(%error, "the checkpoint of the session before could not be kept under another name");
+            (Some(store), None)
+        }
+        None => {
+            say_silent(&path);
+            (None, None)
+        }
+    }
+}
+
+/// What the operator should know of the checkpoint's folder.
+struct Folder<'a> {
+    checkpoint: &'a Path,
+    is_missing: bool,
+}
+
+impl<'a> Folder<'a> {
+    fn look(checkpoint: &'a Path) -> Self {
+        let folder = checkpoint
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty());
+        Self {
+            checkpoint,
+            is_missing: folder.is_some_and(|folder| !folder.exists()),
+        }
+    }
+
+    /// Logs it, after the checkpoint was opened or was not.
+    fn report(&self, is_open: bool) {
+        let checkpoint = self.checkpoint.display();
+        if self.is_missing && is_open {
+            tracing::warn!(
+                %checkpoint,
+                "the checkpoint's folder did not exist and was created; if it is not the right one, correct \
+                 --checkpoint"
+            );
+        }
+        if let Some((folder, why)) = folder::open_to_others(self.checkpoint) {
+            tracing::warn!(
+                %checkpoint,
+                "other users may change the robot's state in {}: {why}; choose another folder with --checkpoint",
+                folder.display()
+            );
+        }
+    }
 }
 
 /// An id from the kernel, or a constant if there is none: it is compared, not trusted.

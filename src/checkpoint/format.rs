@@ -21,7 +21,7 @@ use std::ops::Range;
 
 use thiserror::Error;
 
-use crate::master::Snapshot;
+use crate::master::{Displaced, Snapshot};
 use crate::xmlrpc::Call;
 
 pub use frame::{FORMAT_VERSION, Stamp, decode};
@@ -42,7 +42,8 @@ pub struct Session {
     pub boot_id: String,
     /// Whether the session ended by an orderly stop.
     pub closed: bool,
-    /// The session's part of the incarnation token, equal to `id`; see [`Token`](crate::replay::Token).
+    /// The session's part of the incarnation token: the `id` of the first session at this checkpoint; see
+    /// [`Token`](crate::replay::Token).
     pub mark: String,
     /// The master's address, if there was one yet.
     pub master_uri: Option<String>,
@@ -53,6 +54,8 @@ pub struct Session {
     /// All pending writes up to this record have reached the master. A snapshot's pending writes have the
     /// number of its last record.
     pub delivered: u64,
+    /// The port that nodes use; 0 if an earlier version wrote the session.
+    pub port: u16,
     /// The last term in which this computer led several; 0 if it never did.
     pub term: u64,
 }
@@ -95,6 +98,8 @@ pub struct Checkpoint {
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
     pub pending: Vec<Call>,
+    /// Nodes that may not have been told to shut down.
+    pub displaced: Vec<Displaced>,
 }
 
 /// A checkpoint's text, and the stamp that its records must carry.

@@ -2,9 +2,11 @@
 //!
 //! A robot that is switched on in the morning must not start with yesterday's parameters.
 
+use std::collections::BTreeMap;
+
 use crate::{
     checkpoint::format::{Checkpoint, Entry, Record, Session},
-    master::{Master, Request},
+    master::{Displaced, Master, Request},
 };
 
 /// When a checkpoint is restored at start.
@@ -80,6 +82,9 @@ pub struct Rebuilt {
     pub session: Option<Session>,
     /// Writes that have not reached the master yet, in order.
     pub pending: Vec<Request>,
+    /// Nodes whose names were taken in the records or shortly before the snapshot, in the order of their addresses. It is not known which were
+    /// told to shut down.
+    pub displaced: Vec<Displaced>,
     /// Why the snapshot was left out: it is not the state of a master.
     pub trouble: Option<String>,
 }
@@ -88,10 +93,13 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
     let mut rebuilt = Rebuilt::default();
     // With the number of each write's record, or of the snapshot.
     let mut pending: Vec<(u64, Request)> = Vec::new();
+    let mut displaced = BTreeMap::new();
     if let Some(checkpoint) = checkpoint {
         let writes = checkpoint.pending.into_iter();
         pending.extend(writes.map(|call| (checkpoint.seq, call.into())));
         rebuilt.session = Some(checkpoint.session);
+        let owed = checkpoint.displaced.into_iter();
+        displaced.extend(owed.map(|it| (it.api.clone(), it)));
         match Master::from_snapshot(checkpoint.snapshot) {
             Ok(state) => rebuilt.mirror = state,
             Err(error) => rebuilt.trouble = Some(error.to_string()),
@@ -105,6 +113,9 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                 pending: waits,
             } => {
                 let request = Request::from(call);
+                let calls = request.calls().into_iter();
+                let taken = calls.filter_map(|call| rebuilt.mirror.displaced_by(call));
+                displaced.extend(taken.map(|it| (it.api.clone(), it)));
                 rebuilt.mirror.apply_telling(&request, &mut ());
                 if waits {
                     pending.push((seq, request));
@@ -119,6 +130,7 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
         }
     }
     rebuilt.pending = pending.into_iter().map(|(_, call)| call).collect();
+    rebuilt.displaced = displaced.into_values().collect();
     rebuilt
 }
 
@@ -174,6 +186,30 @@ mod tests {
         assert_eq!(waiting(&records), [""; 0]);
         records.push(write(14, true));
         assert_eq!(waiting(&records), ["/p14"]);
+    }
+
+    #[test]
+    fn who_was_displaced_is_known_from_the_records() {
+        let publish = |topic: &str, port: u16| {
+            let api = format!("http://n:{port}/");
+            let params = ["/n", topic, "x/Y", &api].map(Into::into);
+            Call::new("registerPublisher", params.to_vec())
+        };
+        let calls = [("/a", 1), ("/b", 1), ("/a", 2), ("/c", 1), ("/a", 3)];
+        let records = (1..).zip(calls).map(|(seq, (topic, port))| Record {
+            seq,
+            entry: Entry::call(publish(topic, port)),
+        });
+        let displaced = rebuild(None, records.collect()).displaced;
+        let displaced = displaced.iter().map(|it| (it.api.as_str(), &it.topics));
+        assert_eq!(
+            displaced.collect::<Vec<_>>(),
+            [
+                // Once, with what it did last.
+                ("http://n:1/", &vec!["/c".to_owned()]),
+                ("http://n:2/", &vec!["/a".to_owned()]),
+            ]
+        );
     }
 
     fn restores(policy: Restore, same_boot: bool, closed: bool, node_alive: bool) -> bool {

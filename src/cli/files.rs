@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, builder::FalseyValueParser};
+use clap::Args;
 
 use super::{HideArgs, OutputArgs, TargetArgs};
 use crate::hide::Hide;
@@ -11,7 +11,8 @@ use crate::hide::Hide;
 #[derive(Args, Clone, Debug)]
 pub struct CheckpointArgs {
     /// The checkpoint in use, beside which others are kept [default: that of the rosrescue that runs on this
-    /// computer, else latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
+    /// computer, else latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log;
+    /// latest-chkpt-PORT.yaml if ROS_MASTER_URI has a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
 }
@@ -22,8 +23,7 @@ pub struct ReadArgs {
     #[command(flatten)]
     pub place: CheckpointArgs,
     /// Use what is left of a damaged checkpoint; `rosrescue verify` says what that is
-    #[arg(long, env = "ROSRESCUE_DAMAGED")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub damaged: bool,
 }
 
@@ -65,8 +65,7 @@ pub struct DiffArgs {
     /// Compare it with the running master, read by ordinary calls to rosrescue, on whatever computer: nodes and
     /// their addresses, publishers, subscribers, services, types and parameters. Who watches parameters cannot be
     /// read from a master
-    #[arg(long, env = "ROSRESCUE_LIVE", conflicts_with = "b")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long, conflicts_with = "b")]
     pub live: bool,
     #[command(flatten)]
     pub target: TargetArgs,
@@ -87,6 +86,18 @@ pub struct HistoryArgs {
     pub output: OutputArgs,
 }
 
+/// Options of `rosrescue report`.
+#[derive(Args, Clone, Debug)]
+pub struct ReportArgs {
+    /// The number of the rescue, as in `rosrescue status` and `rosrescue history` [default: the last one]
+    #[arg(value_name = "NUMBER")]
+    pub number: Option<u64>,
+    #[command(flatten)]
+    pub place: CheckpointArgs,
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
 /// Options of `rosrescue restore`.
 #[derive(Args, Clone, Debug)]
 pub struct RestoreArgs {
@@ -94,16 +105,13 @@ pub struct RestoreArgs {
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
     /// Only say what would be done
-    #[arg(long, env = "ROSRESCUE_PLAN")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub plan: bool,
     /// Do not ask. Without a terminal nothing is done otherwise
-    #[arg(short, long, env = "ROSRESCUE_YES", conflicts_with = "plan")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(short, long, conflicts_with = "plan")]
     pub yes: bool,
     /// Also delete the parameters that the checkpoint does not have
-    #[arg(long, env = "ROSRESCUE_EXACT")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub exact: bool,
     #[command(flatten)]
     pub target: TargetArgs,

@@ -23,16 +23,21 @@ pub struct CoreArgs {
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// Threads with which rosmaster tells nodes of changes; more than roscore's 3, so that nodes
-    /// that cannot be reached do not hold up the others
+    /// Threads with which rosmaster notifies nodes. roscore has 3; more keep nodes that cannot be
+    /// reached from holding up the others, but each makes writes that notify slower
     #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT")]
-    #[arg(default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,
     /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none. It is
     /// probed at least twice in this time, since it closes connections that are idle for longer
     #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS")]
     #[arg(default_value_t = 5.0)]
     pub timeout: f64,
+    /// Seconds a started rosmaster may take to listen. One that still uses the processor then is given
+    /// more time
+    #[arg(long, env = "ROSRESCUE_START_LIMIT", value_name = "SECONDS")]
+    #[arg(default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=3600))]
+    pub start_limit: u64,
     /// Port of the rosmaster behind the proxy, on loopback [default: a free one]
     #[arg(long, env = "ROSRESCUE_MASTER_PORT", value_name = "PORT")]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]
@@ -82,7 +87,8 @@ pub struct ProxyArgs {
 /// Options of both commands.
 #[derive(Args, Clone, Debug)]
 pub struct CommonArgs {
-    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
+    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log;
+    /// latest-chkpt-PORT.yaml for a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
     /// When to restore the state of the checkpoint at the start of rosrescue
@@ -110,7 +116,7 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=60_000))]
     pub sync_interval: u64,
-    /// How long a call that only a master can answer, because it is not in the Master API, waits for one
+    /// How long a call that only a master can answer, such as one that cannot be decoded, waits for one
     /// to come back before its connection is closed, in seconds
     #[arg(
         long,
@@ -138,7 +144,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub probe_timeout: u64,
-    /// Number of unanswered probes in a row after which the master is taken for hung
+    /// Number of unanswered probes in a row after which the master is taken for hung. rosrescue kills
+    /// it only if its process shows that it hangs
     #[arg(
         long,
         env = "ROSRESCUE_PROBE_COUNT",
@@ -147,6 +154,16 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub probe_count: u32,
+    /// Time a write waits for the master before rosrescue answers it, in milliseconds. It grows while
+    /// the master is late again and again
+    #[arg(
+        long,
+        env = "ROSRESCUE_STAND_IN_AFTER",
+        value_name = "MS",
+        default_value_t = 100
+    )]
+    #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
+    pub stand_in_after: u64,
     /// Time in which a node must answer a notification or the health check, in milliseconds
     #[arg(
         long,

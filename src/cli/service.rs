@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, builder::FalseyValueParser};
+use clap::Args;
 use clap_complete::Shell;
 
 use super::OutputArgs;
@@ -47,20 +47,16 @@ pub struct UninstallArgs {
 #[derive(Args, Clone, Debug)]
 pub struct ScopeArgs {
     /// A service of this user alone, without root
-    #[arg(long, env = "ROSRESCUE_INSTALL_USER", conflicts_with = "system")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long, conflicts_with = "system")]
     pub user: bool,
     /// A service of this computer; needs root [the default]
-    #[arg(long, env = "ROSRESCUE_INSTALL_SYSTEM")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub system: bool,
     /// Only show what would be changed
-    #[arg(long, env = "ROSRESCUE_DRY_RUN")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub dry_run: bool,
     /// Do not ask. Needed where there is no terminal to ask at
-    #[arg(short, long, env = "ROSRESCUE_YES")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(short, long)]
     pub yes: bool,
     /// In which form.
     #[command(flatten)]

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 use super::{
-    DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, RestoreArgs, TopArgs, VerifyArgs,
-    WaitArgs,
+    DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, ReportArgs, RestoreArgs, TopArgs,
+    VerifyArgs, WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
 use crate::hide::{self, Hide};
@@ -34,6 +34,8 @@ pub enum Tool {
     Man(ManArgs),
     /// Print the parameters of a checkpoint, for `rosparam load`
     Params(ParamsArgs),
+    /// Show the report of a rescue: cause, duration, and what was done
+    Report(ReportArgs),
     /// Put a checkpoint back into a running rosrescue: its parameters, and the registrations of its nodes that are
     /// alive. First says what it would do
     Restore(RestoreArgs),
@@ -93,7 +95,8 @@ pub struct CheckArgs {
     #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]
     pub port: Option<u16>,
-    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log]
+    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log;
+    /// latest-chkpt-PORT.yaml for a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
     /// The rosmaster program [default: the one on the PATH, else in /opt/ros/*/bin]
@@ -102,6 +105,10 @@ pub struct CheckArgs {
     /// Check for `proxy` in front of this master, http://HOST:PORT, instead of for `core`
     #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
     pub master: Option<String>,
+    /// Ask the nodes of the running robot instead: is each subscriber connected to each publisher of its
+    /// topics? Exit status 1 if a link is missing
+    #[arg(long)]
+    pub live: bool,
     /// In which form.
     #[command(flatten)]
     pub output: OutputArgs,
@@ -127,12 +134,10 @@ pub struct DrillArgs {
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub times: u32,
     /// Stop the master with SIGSTOP instead of killing it, so that it hangs
-    #[arg(long, env = "ROSRESCUE_DRILL_HANG", conflicts_with_all = ["kill", "no_kill"])]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long, conflicts_with_all = ["kill", "no_kill"])]
     pub hang: bool,
     /// Kill nothing: only watch, for --seconds
-    #[arg(long, env = "ROSRESCUE_DRILL_NO_KILL", conflicts_with_all = ["kill", "times"])]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long, conflicts_with_all = ["kill", "times"])]
     pub no_kill: bool,
     /// How long --no-kill watches, in seconds
     #[arg(
@@ -161,8 +166,7 @@ pub struct DrillArgs {
     )]
     pub topic: Vec<String>,
     /// Do not ask before anything is killed
-    #[arg(short, long, env = "ROSRESCUE_DRILL_YES")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(short, long)]
     pub yes: bool,
     /// In which form.
     #[command(flatten)]

@@ -8,9 +8,11 @@ use std::time::{Duration, Instant};
 
 mod due;
 mod flight;
+mod session;
 mod types;
 
 use self::flight::{Flight, Reign};
+pub use self::session::Session;
 pub use types::{
     Action, Alive, Answer, Commit, Guard, Input, Leader, Op, Role, Settings, View, WhenAlone,
 };
@@ -51,6 +53,7 @@ pub struct Machine {
     followed: u64,
     /// unless it has to be made anew.
     stale: bool,
+    session: Session,
     recorded: u64,
     committed: u64,
     acknowledged: u64,
@@ -76,6 +79,7 @@ impl Machine {
             claims: 0,
             followed: 0,
             stale: false,
+            session: Session::default(),
             recorded: 0,
             committed: 0,
             acknowledged: 0,
@@ -91,6 +95,11 @@ impl Machine {
     /// What is known of the leader.
     pub fn view(&self) -> &View {
         &self.view
+    }
+
+    /// What is known of the journal's session.
+    pub fn session(&self) -> Session {
+        self.session
     }
 
     /// The term in which this process leads.
@@ -136,6 +145,7 @@ impl Machine {
             Input::Answer { number, answer } => self.answered(now, number, answer, &mut actions),
             Input::View(view) => self.see(now, view, &mut actions),
             Input::Followed(seq) => self.followed(seq),
+            Input::Decided { seq, goes_on } => self.session.decided(seq, goes_on),
             Input::Recorded(seq) => {
                 self.recorded = self.recorded.max(seq);
                 self.acknowledge_early(now, &mut actions);
@@ -175,9 +185,9 @@ impl Machine {
 
     /// The keys after `op` was made.
     fn after(&self, op: &Op, revision: u64, seq: u64) -> View {
-        let (leader, beat, released) = match op {
+        let (leader, beat, released, settled) = match op {
             Op::Read => return self.view.clone(),
-            Op::Claim { claim, .. } => {
+            Op::Claim { claim, settled, .. } => {
                 let Settings {
                     name,
                     id,
@@ -193,15 +203,24 @@ impl Machine {
                     uri,
                     version,
                 };
-                (Some(leader), 0, None)
+                (Some(leader), 0, None, *settled)
             }
-            Op::Beat { beat, released, .. } => (self.view.leader.clone(), *beat, released.clone()),
+            Op::Beat {
+                beat,
+                released,
+                settled,
+                ..
+            } => {
+                let leader = self.view.leader.clone();
+                (leader, *beat, released.clone(), *settled)
+            }
         };
         let alive = Alive {
             revision,
             beat,
             seq,
             released,
+            settled,
         };
         View {
             revision,
@@ -216,8 +235,15 @@ impl Machine {
         if view.revision < self.view.revision {
             return;
         }
-        if self.observed.is_none() || view.guard() != self.view.guard() {
+        let first = self.observed.is_none();
+        let changed = view.guard() != self.view.guard();
+        if first || changed {
             self.observed = Some(now);
+        }
+        let other = view.leader.as_ref();
+        let other = other.is_some_and(|leader| leader.id != self.settings.id);
+        if let Some(alive) = &view.alive {
+            self.session.see(alive, other && changed && !first);
         }
         if view.guard().leader != self.view.guard().leader {
             // Nothing is known of the next leader's rosrescue.

@@ -4,6 +4,9 @@
 
 mod facts;
 mod judge;
+mod launch;
+mod links;
+mod planting;
 mod ros;
 mod units;
 
@@ -18,6 +21,9 @@ use crate::{cli::CheckArgs, ros_env::MasterUri};
 pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     let master = args.master.as_deref().map(MasterUri::parse).transpose();
     let master = master.map_err(|error| Failure::Usage(format!("--master: {error}")))?;
+    if args.live {
+        return finish(args, links::look(args).await?);
+    }
     let facts = Facts::gather(args, master);
     let slow = async {
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -28,7 +34,13 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
         facts = facts => facts,
         never = slow => match never {},
     };
-    let report = Report::new(judge::judge(&facts));
+    let mut findings = judge::judge(&facts);
+    findings.extend(planting::look(&facts.disk.checkpoint));
+    finish(args, findings)
+}
+
+fn finish(args: &CheckArgs, findings: Vec<Finding>) -> Result<Exit, Failure> {
+    let report = Report::new(findings);
     print(&report, &args.output)?;
     Ok(match report.problems {
         0 => Exit::Good,

@@ -31,14 +31,14 @@ use self::{
 };
 use super::{Exit, Failure, counted, print, running::Running};
 use crate::{
+    checkpoint::store::history,
     cli::{DrillArgs, Victim},
     process,
     status::summary::Status,
     xmlrpc::Value,
 };
 
-/// Names of drills' nodes and parameters begin so; the process id follows.
-const PREFIX: &str = "/rosrescue_drill_";
+const PREFIX: &str = history::DRILLS;
 /// How long the robot is watched before the first kill, and to choose topics.
 const BEFORE: Duration = Duration::from_secs(2);
 /// Topics that are watched if none is named.

@@ -20,6 +20,7 @@ use crate::{
     cli::{CheckpointArgs, ReadArgs, TargetArgs},
     config,
     master::{Master, Request},
+    ros_env::DEFAULT_MASTER_PORT,
 };
 
 /// A file that takes longer than a second to read, in bytes.
@@ -51,15 +52,24 @@ pub(super) async fn present(place: &CheckpointArgs) -> PathBuf {
         None => of_running().await,
         Some(_) => None,
     };
-    let path =
-        running.unwrap_or_else(|| config::checkpoint_path(place.checkpoint.as_deref(), &env));
+    let path = running.unwrap_or_else(|| {
+        let target = Running::find(&target());
+        let port = target.map_or(DEFAULT_MASTER_PORT, |running| running.address.port);
+        config::checkpoint_path(place.checkpoint.as_deref(), port, &env)
+    });
     fs::canonicalize(&path).unwrap_or(path)
+}
+
+/// The rosrescue that the environment means.
+fn target() -> TargetArgs {
+    TargetArgs {
+        uri: std::env::var("ROSRESCUE_URI").ok(),
+    }
 }
 
 /// The checkpoint of the rosrescue that runs on this computer. A service has another home than the user who asks.
 async fn of_running() -> Option<PathBuf> {
-    let uri = std::env::var("ROSRESCUE_URI").ok();
-    let running = Running::find(&TargetArgs { uri }).ok()?;
+    let running = Running::find(&target()).ok()?;
     if !is_here(&running.address).await {
         return None;
     }

@@ -9,10 +9,15 @@ use super::{
     files::{self, size},
     print,
 };
-use crate::{cli::HistoryArgs, clock};
+use crate::{
+    cli::HistoryArgs,
+    clock,
+    recovery::report_file::{self, Kept},
+};
 
 pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
     let present = files::present(&args.place).await;
+    let reports = report_file::read(&present);
     let rows = files::list(&present)
         .into_iter()
         .zip(1..)
@@ -22,6 +27,7 @@ pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
             Row {
                 number,
                 what: what(&listed.name),
+                rescue: Rescue::of(&listed.name, &reports),
                 name: listed.name,
                 written: clock::wall_text(listed.written as f64),
                 bytes: std::fs::metadata(&listed.path).map_or(0, |metadata| metadata.len()),
@@ -60,11 +66,36 @@ struct History {
     kept: Vec<Row>,
 }
 
+/// What the report of a rescue tells.
+#[derive(Serialize)]
+struct Rescue {
+    cause: String,
+    /// How the master before had ended, if that was seen.
+    ended: Option<String>,
+    /// How long calls did not pass.
+    total_ms: f64,
+}
+
+impl Rescue {
+    fn of(name: &str, reports: &[Kept]) -> Option<Self> {
+        let number: u64 = name.strip_prefix("rescue-")?.parse().ok()?;
+        let mut reports = reports.iter().map(|kept| &kept.report);
+        let report = reports.find(|report| report.number == number)?;
+        Some(Self {
+            cause: report.cause.clone(),
+            ended: report.ended.clone(),
+            total_ms: report.phases.total_ms,
+        })
+    }
+}
+
 #[derive(Serialize)]
 struct Row {
     number: usize,
     name: String,
     what: &'static str,
+    /// None if there is no report of it.
+    rescue: Option<Rescue>,
     /// Last written to, by the wall clock.
     written: String,
     bytes: u64,
@@ -89,11 +120,23 @@ impl fmt::Display for History {
             let [nodes, params] = [row.nodes, row.parameters]
                 .map(|count| count.map_or_else(|| "?".to_owned(), |count| count.to_string()));
             let size = size(row.bytes);
-            writeln!(
+            write!(
                 f,
                 "{:>3}  {name:<11} {written}  {nodes:>4} nodes {params:>5} parameters {size:>10}  {what}",
                 row.number
             )?;
+            if let Some(Rescue {
+                cause,
+                ended,
+                total_ms,
+            }) = &row.rescue
+            {
+                let ended = ended
+                    .as_ref()
+                    .map_or_else(String::new, |how| format!(" ({how})"));
+                write!(f, " after {total_ms:.0} ms: {cause}{ended}")?;
+            }
+            writeln!(f)?;
             writeln!(f, "     {}", row.path)?;
             if let Some(problem) = &row.problem {
                 writeln!(f, "     {problem}")?;

@@ -126,7 +126,11 @@ fn plan(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
     let run_as = match (place.user, &args.run_as) {
         (true, _) => None,
         (false, Some(user)) => Some(user.clone()),
-        (false, None) => Some(before.run_as.clone().or_else(|| caller.get("SUDO_USER").cloned()).ok_or_else(|| {
+        (false, None) => Some(before.run_as.clone().or_else(|| caller.get("SUDO_USER").cloned()).or_else(|| {
+            // Nothing is done: the caller sees what it would be.
+            let caller = caller.get("USER").or_else(|| caller.get("LOGNAME"));
+            caller.filter(|_| args.scope.dry_run).cloned()
+        }).ok_or_else(|| {
             Failure::Usage("say who runs it, as in --run-as robot: sudo was not used, which would tell".to_owned())
         })?),
     };

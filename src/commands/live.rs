@@ -43,11 +43,12 @@ impl Live {
         };
         let connection = match timeout(CONNECT_LIMIT, connect).await {
             Ok(connected) => connected.map_err(|error| nobody(error.to_string()))?,
+            // A rosrescue that is stopped accepts no connection once its backlog is full.
             Err(_) => {
-                return Err(nobody(format!(
-                    "no answer in {} s",
-                    CONNECT_LIMIT.as_secs()
-                )));
+                return Err(Failure::Silent {
+                    uri,
+                    why: format!("no connection in {} s", CONNECT_LIMIT.as_secs()),
+                });
             }
         };
         Ok(Self { connection, uri })
@@ -109,5 +110,33 @@ fn refusal(result: &Value) -> Option<String> {
         Some([Value::Int(1), ..]) => None,
         Some([_, message, ..]) => Some(message.as_str().unwrap_or("no reason given").to_owned()),
         _ => Some(crate::checkpoint::format::shown(result)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{SocketAddr, TcpStream};
+
+    use socket2::{Domain, Socket, Type};
+
+    use super::*;
+    use crate::ros_env::MasterUri;
+
+    #[tokio::test]
+    async fn a_port_that_accepts_no_connection_is_taken() {
+        let listener = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        let any: SocketAddr = ([127, 0, 0, 1], 0).into();
+        listener.bind(&any.into()).unwrap();
+        listener.listen(0).unwrap();
+        let address = listener.local_addr().unwrap().as_socket().unwrap();
+        // Until the backlog is full.
+        let connect = || TcpStream::connect_timeout(&address, Duration::from_millis(500)).ok();
+        let _waiting: Vec<_> = std::iter::from_fn(connect).collect();
+        let address = MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port: address.port(),
+        };
+        let connected = Live::connect(&Running { address }).await;
+        assert!(matches!(connected, Err(Failure::Silent { .. })));
     }
 }

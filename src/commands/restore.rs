@@ -20,7 +20,7 @@ use crate::{
     },
     cli::RestoreArgs,
     hide::Hide,
-    master::{CALLER_ID, Master, Method, Request},
+    master::{CALLER_ID, Displaced, Master, Method, Request},
     xmlrpc::Value,
 };
 
@@ -190,7 +190,9 @@ impl Work {
         let mut calls = Vec::new();
         for Registration { text, call, .. } in &self.registrations {
             match now.displaced_by(call) {
-                Some((node, at)) => failed.push(format!("{text}: {node} is at {at} by now")),
+                Some(Displaced { node, api, .. }) => {
+                    failed.push(format!("{text}: {node} is at {api} by now"));
+                }
                 None => calls.push((text.clone(), call.clone())),
             }
         }

@@ -11,7 +11,10 @@ use hyper::{
 };
 use hyper_util::rt::TokioIo;
 use serde::Deserialize;
-use tokio::{net::TcpStream, time::timeout};
+use tokio::{
+    net::TcpStream,
+    time::{Instant, timeout, timeout_at},
+};
 
 use super::Failure;
 use crate::{
@@ -69,9 +72,8 @@ impl Running {
         }
         let (_, json) = self.get("/status.json").await?;
         let at = &self.address;
-        let versioned = serde_json::from_slice(&json).map_err(|_| Failure::Nobody {
-            uri: at.to_string(),
-            why: "something else answers there, a bare rosmaster perhaps".to_owned(),
+        let versioned = serde_json::from_slice(&json).map_err(|_| {
+            self.silent("something else answers there, a bare rosmaster perhaps".to_owned())
         })?;
         let Versioned { schema, version } = versioned;
         if schema > SCHEMA {
@@ -116,25 +118,38 @@ impl Running {
         request: hyper::http::Result<Request<Full<Bytes>>>,
         limit: Duration,
     ) -> Result<(StatusCode, Bytes), Failure> {
-        match timeout(limit, self.try_exchange(request)).await {
-            Ok(Ok(answer)) => Ok(answer),
-            Ok(Err(error)) => Err(self.nobody(error.to_string())),
-            Err(_) => Err(self.nobody(format!("no answer in {} s", limit.as_secs()))),
+        let deadline = Instant::now() + limit;
+        let connect = async {
+            let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
+            TcpStream::connect(&*addresses).await
+        };
+        let stream = match timeout_at(deadline, connect).await {
+            Ok(connected) => connected.map_err(|error| self.nobody(error.to_string()))?,
+            Err(_) => return Err(self.nobody(format!("no connection in {} s", limit.as_secs()))),
+        };
+        match timeout_at(deadline, try_exchange(stream, request)).await {
+            Ok(answer) => answer.map_err(|error| self.silent(error.to_string())),
+            Err(_) => Err(self.silent(format!("no answer in {} s", limit.as_secs()))),
         }
     }
 
-    async fn try_exchange(
-        &self,
-        request: hyper::http::Result<Request<Full<Bytes>>>,
-    ) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
-        let addresses = resolver::addresses(&self.address.host, self.address.port).await?;
-        let stream = TcpStream::connect(&*addresses).await?;
-        let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
-        tokio::spawn(connection);
-        let (head, body) = sender.send_request(request?).await?.into_parts();
-        let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
-        Ok((head.status, body))
+    fn silent(&self, why: String) -> Failure {
+        Failure::Silent {
+            uri: self.address.to_string(),
+            why,
+        }
     }
+}
+
+async fn try_exchange(
+    stream: TcpStream,
+    request: hyper::http::Result<Request<Full<Bytes>>>,
+) -> Result<(StatusCode, Bytes), Box<dyn std::error::Error + Send + Sync>> {
+    let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
+    tokio::spawn(connection);
+    let (head, body) = sender.send_request(request?).await?.into_parts();
+    let body = Limited::new(body, MAX_PAGE).collect().await?.to_bytes();
+    Ok((head.status, body))
 }
 
 /// Whether a connection to `address` ends on this computer.

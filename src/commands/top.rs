@@ -13,7 +13,7 @@ use tokio::{
 };
 
 use super::{
-    Exit, Failure, plain, print_line,
+    Exit, Failure, plain, plain_json, print_line,
     running::Running,
     terminal::{self, Terminal},
 };
@@ -25,7 +25,7 @@ use crate::{
         computers::Computers,
         condition::Condition,
         report::Report,
-        summary::{Caller, Status},
+        summary::{Caller, Status, some},
     },
 };
 
@@ -57,6 +57,7 @@ struct Top {
     calls_unanswered: u64,
     state: Counts,
     unreachable: Vec<String>,
+    dead_nodes: Vec<String>,
     cluster: Option<Computers>,
     /// The busiest first, then the slowest.
     callers: Vec<Row>,
@@ -142,6 +143,7 @@ fn top(status: Status, before: Option<&Sample>, now: Instant, height: usize) -> 
         condition: status.condition,
         state: status.state,
         unreachable: status.unreachable,
+        dead_nodes: status.dead_nodes,
         cluster: status.cluster,
         callers,
         rescues: status.rescues,
@@ -193,8 +195,13 @@ impl fmt::Display for Top {
             "nodes {nodes}, publishers {publishers}, subscribers {subscribers}, services {services}, \
              parameters {params}"
         )?;
-        if !self.unreachable.is_empty() {
-            writeln!(head, "no answer from {}", self.unreachable.join(", "))?;
+        for (what, names) in [
+            ("no answer from", &self.unreachable),
+            ("dead but registered:", &self.dead_nodes),
+        ] {
+            if !names.is_empty() {
+                writeln!(head, "{what} {}", some(names))?;
+            }
         }
         if let Some(cluster) = &self.cluster {
             writeln!(head, "computers: {}", cluster.line())?;
@@ -290,6 +297,7 @@ pub(super) async fn run(args: &TopArgs) -> Result<Exit, Failure> {
                 before = Some(sample);
                 shown = match args.json {
                     true => serde_json::to_string(&top)
+                        .map(|json| plain_json(&json))
                         .map_err(|error| Failure::Failed(format!("no JSON: {error}")))?,
                     false => plain(&top.to_string()),
                 };

@@ -95,7 +95,9 @@ async fn missing(
     let all = || wanted.iter().map(ToString::to_string).collect();
     let status = match running.status().await {
         Ok(status) => status,
-        Err(nobody @ Failure::Nobody { .. }) => return Ok((all(), Some(nobody.to_string()))),
+        Err(nobody @ (Failure::Nobody { .. } | Failure::Silent { .. })) => {
+            return Ok((all(), Some(nobody.to_string())));
+        }
         Err(failure) => return Err(failure),
     };
     let mut missing = Vec::new();

@@ -31,10 +31,12 @@ pub(super) const LISTEN_PID: &str = "LISTEN_PID";
 pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
 /// The process id of the worker's guardian.
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
+/// How many workers have died before this one.
+pub(super) const RESTARTS: &str = "ROSRESCUE_WORKER_RESTARTS";
 /// The worker's memory, unless the user has said otherwise: one heap, and large pieces apart from it. What a
 /// large call has taken goes back to the system after it. By default glibc keeps most of it, in a heap for
 /// each thread.
-pub(super) const TUNABLES: (&str, &str) = (
+pub const TUNABLES: (&str, &str) = (
     "GLIBC_TUNABLES",
     "glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=131072:glibc.malloc.trim_threshold=131072",
 );
@@ -170,6 +172,12 @@ fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     }
 }
 
+/// How many workers of the guardian have died before this one.
+pub fn restarts() -> u64 {
+    let restarts = std::env::var(RESTARTS).ok();
+    restarts.and_then(|count| count.parse().ok()).unwrap_or(0)
+}
+
 /// Hides from a child process the variables that the guardian and systemd have set for its parent.
 pub fn keep_from(command: &mut Command) {
     for name in [
@@ -177,6 +185,7 @@ pub fn keep_from(command: &mut Command) {
         LISTEN_PID,
         LISTEN_FDNAMES,
         GUARDIAN,
+        RESTARTS,
         "NOTIFY_SOCKET",
         "WATCHDOG_PID",
         "WATCHDOG_USEC",

@@ -6,12 +6,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Deaths within [`SPAN`] after which the worker is restarted at once.
+/// Workers in a row that fail before they serve, each followed by another one at once; and deaths within
+/// [`SPAN`] that are not *again and again* yet.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
 /// The first pause; each further one is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
-/// The longest pause. Six of them fit into a minute, so workers that keep dying quickly stay at it.
+/// The longest pause.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
 /// The exit status of a Rust program that panicked.
@@ -49,7 +50,11 @@ pub enum Next {
     /// End with this status.
     Exit(i32),
     /// Start another worker.
-    Restart { pause: Duration },
+    Restart {
+        pause: Duration,
+        /// More than five have died within a minute.
+        again_and_again: bool,
+    },
 }
 
 /// Decides whether and when to restart the worker.
@@ -57,8 +62,8 @@ pub enum Next {
 pub struct Restarts {
     /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
     deaths: VecDeque<Instant>,
-    /// The last pause.
-    pause: Duration,
+    /// Workers that have ended before they served since the last one that did.
+    failures: usize,
     /// Whether any worker has served.
     served: bool,
     /// The signal that asks for the end.
@@ -89,35 +94,49 @@ impl Restarts {
     /// A worker has ended at `now`. `served`: whether it had answered calls.
     ///
     /// Before any worker has served, an exit status is an error of the start, such as a missing rosmaster.
-    /// Later the same error may be temporary.
+    /// Later the same error may be temporary. A worker that has served is followed by another one at once: calls
+    /// wait for it, and only those that fail before they serve would keep the processor busy for nothing.
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
+        self.failures = match served {
+            true => 0,
+            false => self.failures + 1,
+        };
         match end {
             _ if self.died_stopping(end) && !self.cleaning => {
                 self.cleaning = true;
-                let pause = Duration::ZERO;
-                Next::Restart { pause }
+                Next::Restart {
+                    pause: Duration::ZERO,
+                    again_and_again: false,
+                }
             }
             _ if self.stop.is_some() => Next::Exit(end.status()),
             End::Code(0) => Next::Exit(0),
             End::Code(code) if code != PANIC && !self.served => Next::Exit(code),
             _ => Next::Restart {
-                pause: self.pause_after(now),
+                pause: self.pause(),
+                again_and_again: self.died(now) > AT_ONCE,
             },
         }
     }
 
-    fn pause_after(&mut self, now: Instant) -> Duration {
+    fn pause(&self) -> Duration {
+        let further = self.failures.checked_sub(AT_ONCE + 1);
+        further.map_or(Duration::ZERO, |further| {
+            let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
+            (PAUSE_LEAST * 2_u32.pow(doublings)).min(PAUSE_MOST)
+        })
+    }
+
+    /// Counts a death, and returns how many there were lately.
+    fn died(&mut self, now: Instant) -> usize {
         self.deaths
             .retain(|death| now.saturating_duration_since(*death) < SPAN);
         self.deaths.push_back(now);
-        self.pause = if self.deaths.len() > AT_ONCE {
+        if self.deaths.len() > AT_ONCE + 1 {
             self.deaths.pop_front();
-            (self.pause * 2).clamp(PAUSE_LEAST, PAUSE_MOST)
-        } else {
-            Duration::ZERO
-        };
-        self.pause
+        }
+        self.deaths.len()
     }
 }
 
@@ -127,25 +146,42 @@ mod tests {
 
     const KILLED: End = End::Signal(9);
 
+    const AT_ONCE: Next = Next::Restart {
+        pause: Duration::ZERO,
+        again_and_again: false,
+    };
+
     #[test]
-    fn pauses_grow_while_workers_die_and_end_when_one_lives() {
+    fn pauses_grow_while_workers_fail_and_end_when_one_serves() {
         let mut restarts = Restarts::default();
-        let mut now = Instant::now();
-        let mut die = |lived: Duration| match restarts.ended(KILLED, true, now + lived) {
-            Next::Restart { pause } => {
-                now += lived + pause;
-                pause.as_millis()
-            }
+        let now = Instant::now();
+        let mut die = |served| match restarts.ended(KILLED, served, now) {
+            Next::Restart { pause, .. } => pause.as_millis(),
             Next::Exit(status) => panic!("exit {status}"),
         };
-        let second = Duration::from_secs(1);
-        let pauses: Vec<_> = (0..14).map(|_| die(second / 10)).collect();
-        let expected = [
-            0, 0, 0, 0, 0, 500, 1000, 2000, 4000, 8000, 10_000, 10_000, 10_000, 10_000,
-        ];
+        let pauses: Vec<_> = (0..12).map(|_| die(false)).collect();
+        let expected = [0, 0, 0, 0, 0, 500, 1000, 2000, 4000, 8000, 10_000, 10_000];
         assert_eq!(pauses, expected);
-        assert_eq!(die(61 * second), 0);
-        assert_eq!(die(second), 0);
+        assert_eq!(die(true), 0);
+        assert_eq!(die(false), 0);
+    }
+
+    #[test]
+    fn workers_that_have_served_are_followed_at_once_and_many_deaths_are_told() {
+        let mut restarts = Restarts::default();
+        let start = Instant::now();
+        let mut die = |at| match restarts.ended(KILLED, true, start + Duration::from_secs(at)) {
+            Next::Restart {
+                pause,
+                again_and_again,
+            } => (pause.is_zero(), again_and_again),
+            Next::Exit(status) => panic!("exit {status}"),
+        };
+        // For longer than a minute.
+        for number in 0..40 {
+            assert_eq!(die(2 * number), (true, number >= 5), "{number}");
+        }
+        assert_eq!(die(200), (true, false), "much later");
     }
 
     #[test]
@@ -153,15 +189,12 @@ mod tests {
         let now = Instant::now();
         let mut restarts = Restarts::default();
         assert_eq!(restarts.ended(End::Code(1), false, now), Next::Exit(1));
-        let at_once = Next::Restart {
-            pause: Duration::ZERO,
-        };
-        assert_eq!(restarts.ended(KILLED, false, now), at_once);
-        assert_eq!(restarts.ended(End::Code(PANIC), false, now), at_once);
+        assert_eq!(restarts.ended(KILLED, false, now), AT_ONCE);
+        assert_eq!(restarts.ended(End::Code(PANIC), false, now), AT_ONCE);
         // Still none has served.
         assert_eq!(restarts.ended(End::Code(2), false, now), Next::Exit(2));
-        assert_eq!(restarts.ended(KILLED, true, now), at_once);
-        assert_eq!(restarts.ended(End::Code(1), false, now), at_once);
+        assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
+        assert_eq!(restarts.ended(End::Code(1), false, now), AT_ONCE);
     }
 
     #[test]
@@ -178,13 +211,12 @@ mod tests {
             assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
         }
         // The one that was to stop has left its master; so may the one after it, but only once.
-        let pause = Duration::ZERO;
-        assert_eq!(restarts.ended(KILLED, true, now), Next::Restart { pause });
+        assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(KILLED, true, now), Next::Exit(137));
         let mut restarts = Restarts::default();
         restarts.stop(15);
         let panicked = End::Code(PANIC);
-        assert_eq!(restarts.ended(panicked, true, now), Next::Restart { pause });
+        assert_eq!(restarts.ended(panicked, true, now), AT_ONCE);
         assert_eq!(restarts.ended(panicked, true, now), Next::Exit(PANIC));
     }
 }

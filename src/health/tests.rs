@@ -71,6 +71,40 @@ fn another_process_id_is_another_node() {
 }
 
 #[test]
+fn topics_that_match_outweigh_a_process_id_that_changes() {
+    let mut master = Master::default();
+    publish(&mut master, "/a", "/ta", "http://n:1/");
+    publish(&mut master, "/a", "/more", "http://n:1/");
+    let judge = |names: &[Name], topics: &[&str]| {
+        judge(&master, names, Some(2), Some(&claims(topics, &[])))
+    };
+    let a = name("/a", Some(1), 1);
+    let all = ["/more", "/ta", "/other"];
+    assert_eq!(judge(std::slice::from_ref(&a), &all), [Verdict::Itself]);
+    let some = ["/ta", "/other"];
+    assert_eq!(judge(std::slice::from_ref(&a), &some), [Verdict::Another]);
+    // A later node at the port publishes the same topics.
+    publish(&mut master.clone(), "/b", "/ta", "http://n:1/");
+    let verdicts = judge(&[a, name("/b", Some(2), 2)], &all);
+    assert_eq!(verdicts, [Verdict::Another, Verdict::Itself]);
+}
+
+#[test]
+fn a_list_of_nothing_is_no_evidence() {
+    let mut master = Master::default();
+    publish(&mut master, "/a", "/t", "http://n:1/");
+    subscribe(&mut master, "/a", "/s", "http://n:1/");
+    let extra = |publications: &[&str], subscriptions: &[&str]| {
+        let said = claims(publications, subscriptions);
+        Reconciliation::new(&master, "/a", &said).extra.len()
+    };
+    assert_eq!(extra(&[], &[]), 0);
+    assert_eq!(extra(&["/t"], &[]), 0);
+    assert_eq!(extra(&["/u"], &[]), 1);
+    assert_eq!(extra(&["/u"], &["/t"]), 2);
+}
+
+#[test]
 fn a_node_that_registered_since_may_be_another_process() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
@@ -178,4 +212,15 @@ fn the_difference_is_what_one_side_lacks() {
     }
     assert!(Reconciliation::new(&master, "/a", &said).is_empty());
     assert_eq!(master.publishers_of("/new"), ["http://o:1/", "http://n:1/"]);
+}
+
+#[test]
+fn a_port_that_refuses_twice_without_a_call_in_between_is_of_a_dead_node() {
+    let refused = |master_serves, before: Option<u64>, calls| {
+        judge_refusal(master_serves, before.as_ref(), &calls)
+    };
+    assert_eq!(refused(true, None, 7), Refusal::AskAgain);
+    assert_eq!(refused(true, Some(7), 8), Refusal::AskAgain);
+    assert_eq!(refused(true, Some(8), 8), Refusal::Dead);
+    assert_eq!(refused(false, Some(8), 8), Refusal::Keep);
 }

@@ -1,7 +1,7 @@
 //! Recent effects of calls: notifications that nodes may have missed, and when nodes registered.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeMap, HashMap, VecDeque},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -9,27 +9,22 @@ use std::{
 use indexmap::{IndexMap, IndexSet};
 
 use crate::{
-    master::{self, Kind, Master, NoticeSink, Request},
+    master::{self, Displaced, Kind, Master, Method, NoticeSink, Request, names},
+    order::Subject,
     xmlrpc::{Call, Value},
 };
 
 /// How long before an outage a change may lie whose notifications the dead master may not have sent.
 /// Unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
+/// How long it may take to tell a node to shut down, with all retries.
+const TELLING: Duration = Duration::from_secs(60);
 /// Most remembered topics, and parameters of one node; also most changes in the outbox.
 const NOTICES: usize = 4096;
+/// Longest names of a lost registration that is remembered, in bytes, all together.
+const LOST_MOST: usize = 1024;
 /// Nodes to remember although they are no longer registered.
 const NODES: usize = 1024;
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Notification {
-    /// A call that a master would have sent at that moment.
-    Call(Arc<Call>),
-    /// All publishers of a topic at the time of sending.
-    Topic(String),
-    /// The value of a parameter at the time of sending. The key ends in a slash.
-    Param(Arc<str>),
-}
 
 /// A change whose notification a master may send late.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -38,17 +33,6 @@ pub enum Change {
     Topic(String),
     /// A parameter, for the subscriber at an address. The key ends in a slash.
     Param(String, Arc<str>),
-}
-
-/// A node that is to shut down: another one has taken its name at another address.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Displaced {
-    pub node: String,
-    pub api: String,
-    /// The process id that was last seen behind the address.
-    pub pid: Option<i32>,
-    /// What it published and subscribed.
-    pub topics: Vec<String>,
 }
 
 /// Notifications that a dead master may not have sent.
@@ -65,8 +49,6 @@ pub struct Owed {
 /// New notifications since the last time.
 #[derive(Debug, Default)]
 pub struct Outbox {
-    /// By address, in order.
-    pub calls: Vec<(String, Arc<Call>)>,
     /// Nodes that are to shut down.
     pub displaced: Vec<Displaced>,
     /// Changes that the master sends too, but maybe late.
@@ -81,6 +63,16 @@ pub struct LastCalls {
     pub registered: u64,
     /// The last call that unregistered something.
     pub unregistered: u64,
+}
+
+/// A topic that a node had registered, and that was unregistered.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Lost {
+    node: String,
+    api: String,
+    /// Whether the node published the topic; else it subscribed it.
+    publishes: bool,
+    topic: String,
 }
 
 /// A process id that was behind a node's port.
@@ -111,21 +103,34 @@ pub struct Activity {
     pids: HashMap<String, Pid>,
     /// When nodes registered that have not been asked for their process id since.
     unidentified: IndexMap<String, Instant>,
+    /// The last registrations of topics that were taken back, by whatever client.
+    lost: VecDeque<Lost>,
     /// Nodes that a master had to shut down, and when.
     displaced: Vec<(Instant, Displaced)>,
+    /// All nodes that were displaced lately, and when: whether they have been told is not known at the next start.
+    lately: Vec<(Instant, Displaced)>,
+    /// Nodes of which the checkpoint does not tell whether they were told to shut down.
+    restored: Vec<Displaced>,
     /// Whether changes that a master sends are collected.
     notifying: bool,
     outbox: Outbox,
 }
 
+/// A notification that no master sends: to whom, of what, and the call.
+type Unsent = (String, Subject, Arc<Call>);
+
 /// Who is to be notified of a call.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
+    /// Most subscribers of one of them.
+    subscribers: usize,
     /// By address and key.
     params: IndexSet<(String, Arc<str>)>,
-    /// The notifications themselves, if no master sends them.
-    calls: Option<Vec<(String, Arc<Call>)>>,
+    /// Whether no master sends the notifications.
+    standing_in: bool,
+    /// The notifications themselves, if so.
+    calls: Vec<Unsent>,
     pub(super) displaced: Vec<Displaced>,
 }
 
@@ -133,27 +138,50 @@ impl Noticed {
     /// `standing_in`: no master sends notifications.
     pub(super) fn new(standing_in: bool) -> Self {
         Self {
-            calls: standing_in.then(Vec::new),
+            standing_in,
             ..Self::default()
         }
     }
 
-    fn add(&mut self, to: &[String], call: impl FnOnce() -> Call) {
-        if let Some(calls) = &mut self.calls {
+    fn add(&mut self, to: &[String], subject: &Subject, call: impl FnOnce() -> Call) {
+        if self.standing_in {
             let call = Arc::new(call());
-            calls.extend(to.iter().map(|to| (to.clone(), call.clone())));
+            let calls = to
+                .iter()
+                .map(|to| (to.clone(), subject.clone(), call.clone()));
+            self.calls.extend(calls);
         }
+    }
+
+    /// The notifications that no master sends; none if a master sends them.
+    pub(super) fn take_calls(&mut self) -> Option<Vec<Unsent>> {
+        self.standing_in.then(|| std::mem::take(&mut self.calls))
+    }
+
+    /// Of what nodes are notified, and how many.
+    pub(super) fn subjects(&self) -> impl Iterator<Item = (Subject, usize)> {
+        let topics = self.topics.iter().cloned().map(Subject::Topic);
+        let topics = topics.map(|topic| (topic, self.subscribers));
+        let mut keys = IndexMap::<&Arc<str>, usize>::new();
+        for (_, key) in &self.params {
+            *keys.entry(key).or_default() += 1;
+        }
+        let keys = keys.into_iter();
+        topics.chain(keys.map(|(key, nodes)| (Subject::Param(key.to_string()), nodes)))
     }
 }
 
 impl NoticeSink for Noticed {
     fn publisher_update(&mut self, to: &[String], topic: &str, publishers: &[String]) {
         self.topics.insert(topic.to_owned());
-        self.add(to, || master::publisher_update(topic, publishers));
+        self.subscribers = self.subscribers.max(to.len());
+        let subject = Subject::Topic(topic.to_owned());
+        self.add(to, &subject, || master::publisher_update(topic, publishers));
     }
 
     fn param_update(&mut self, to: &[String], key: &str, value: &Value) {
-        self.add(to, || master::param_update(key, value.clone()));
+        let subject = Subject::Param(key.to_owned());
+        self.add(to, &subject, || master::param_update(key, value.clone()));
         let key = Arc::<str>::from(key);
         let params = to.iter().map(|to| (to.clone(), key.clone()));
         self.params.extend(params);
@@ -177,7 +205,7 @@ impl Activity {
         if self.last_calls.len() > self.prune_at.max(NODES) {
             self.prune(registered);
         }
-        let standing_in = noticed.calls.is_some();
+        let standing_in = noticed.standing_in;
         let notifying = self.notifying && !standing_in;
         let noted = Noted {
             at: now,
@@ -185,9 +213,6 @@ impl Activity {
         };
         let outbox = &mut self.outbox;
         let before = outbox.len();
-        if let Some(calls) = noticed.calls {
-            outbox.calls.extend(calls);
-        }
         for topic in noticed.topics {
             if notifying && outbox.changes.len() < NOTICES {
                 outbox.changes.insert(Change::Topic(topic.clone()));
@@ -201,6 +226,12 @@ impl Activity {
                     .insert(Change::Param(to.clone(), key.clone()));
             }
             self.params.insert((to, key), noted);
+        }
+        self.lately
+            .retain(|(at, _)| now.duration_since(*at) < TELLING);
+        if self.lately.len() < NOTICES {
+            let lately = noticed.displaced.iter().cloned();
+            self.lately.extend(lately.map(|it| (now, it)));
         }
         if standing_in {
             outbox.displaced.extend(noticed.displaced);
@@ -218,18 +249,53 @@ impl Activity {
     /// The present holders of the names that `call` would take.
     pub(super) fn displaced_by(&self, mirror: &Master, call: &Request) -> Vec<Displaced> {
         let found = call.calls().into_iter().filter_map(|call| {
-            let (node, api) = mirror.displaced_by(call)?;
-            let topics = mirror
-                .publications(&node)
-                .chain(mirror.subscriptions(&node));
+            let displaced = mirror.displaced_by(call)?;
+            let pid = self.pid_of(&displaced.node, &displaced.api);
             Some(Displaced {
-                pid: self.pid_of(&node, &api).map(|(pid, _)| pid),
-                topics: topics.map(str::to_owned).collect(),
-                node,
-                api,
+                pid: pid.map(|(pid, _)| pid),
+                ..displaced
             })
         });
         found.collect()
+    }
+
+    /// Notes the registrations of topics that `call`, not applied to `mirror` yet, takes back.
+    pub(super) fn note_lost(&mut self, mirror: &Master, call: &Request) {
+        for call in call.calls() {
+            let publishes = match call.method() {
+                Method::UnregisterPublisher => true,
+                Method::UnregisterSubscriber => false,
+                _ => continue,
+            };
+            let (Some(node), Some(name)) = (call.caller(), call.text(1)) else {
+                continue;
+            };
+            let topic = names::resolve(name, node);
+            if let Some(api) = mirror.api_of(node)
+                && mirror.has_topic(node, publishes, &topic)
+                && node.len() + api.len() + topic.len() <= LOST_MOST
+            {
+                if self.lost.len() == NOTICES {
+                    self.lost.pop_front();
+                }
+                self.lost.push_back(Lost {
+                    node: node.to_owned(),
+                    api: api.to_owned(),
+                    publishes,
+                    topic,
+                });
+            }
+        }
+    }
+
+    /// Whether the master had this registration of a topic by `node` at `api`, and it was unregistered.
+    pub fn has_lost(&self, node: &str, api: &str, publishes: bool, topic: &str) -> bool {
+        self.lost.iter().any(|lost| {
+            lost.publishes == publishes
+                && lost.topic == topic
+                && lost.node == node
+                && lost.api == api
+        })
     }
 
     fn note(&mut self, now: Instant, call: &Request) {
@@ -307,7 +373,22 @@ impl Activity {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Treats everything that nodes subscribe as changed now.
+    /// Remembers `displaced`, by the journal, until [`Self::notice_all`].
+    pub fn restore_displaced(&mut self, displaced: Vec<Displaced>) {
+        self.restored = displaced;
+    }
+
+    /// Nodes that may not have been told to shut down by `now`, for a checkpoint.
+    pub(super) fn displaced_lately(&self, now: Instant) -> Vec<Displaced> {
+        let lately = self.lately.iter();
+        let lately = lately.filter(|(at, _)| now.duration_since(*at) < TELLING);
+        let all = self.restored.iter().chain(lately.map(|(_, node)| node));
+        let all: BTreeMap<_, _> = all.map(|node| (&node.api, node)).collect();
+        all.into_values().cloned().collect()
+    }
+
+    /// Treats everything that nodes subscribe as changed now, and nodes that the journal shows as displaced as
+    /// displaced now. `mirror` must be what the master holds: a node that has taken its name back stays.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,
@@ -318,6 +399,11 @@ impl Activity {
             .extend(topics.map(|topic| (topic.to_owned(), noted)));
         let params = mirror.param_subscribers().into_iter();
         self.params.extend(params.map(|param| (param, noted)));
+        let displaced = std::mem::take(&mut self.restored).into_iter();
+        let displaced = displaced.filter(|it| mirror.is_held_elsewhere(&it.node, &it.api));
+        let displaced: Vec<_> = displaced.take(NOTICES).map(|it| (now, it)).collect();
+        self.lately.extend(displaced.iter().cloned());
+        self.displaced.extend(displaced);
     }
 
     /// Collects once more what the master may not have sent by `now`.
@@ -375,7 +461,7 @@ impl Activity {
 
 impl Outbox {
     fn len(&self) -> usize {
-        self.calls.len() + self.displaced.len() + self.changes.len()
+        self.displaced.len() + self.changes.len()
     }
 }
 

@@ -1,11 +1,12 @@
 //! The mirror's answers: for the master, beside it, and while it is away.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
-use super::{Ledger, Mark};
+use super::{Ledger, Mark, delivery::Delivery};
 use crate::{
     checkpoint::format::Entry,
     master::{Kind, Method, Request},
+    order::Concern,
     replay,
     xmlrpc::{Reply, Value},
 };
@@ -46,18 +47,27 @@ impl Ledger {
 
     /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
     /// Nodes are notified as by a master. Returns where the last record is, too: the earlier write that made
-    /// this one redundant may be as new as that.
-    pub fn answer_if_unchanged(&self, now: Instant, write: &Request) -> Option<(Reply, Mark)> {
+    /// this one redundant may be as new as that. None also if the master may notify the caller of something newer
+    /// before it has the answer.
+    pub(crate) fn answer_if_unchanged(
+        self: &Arc<Self>,
+        now: Instant,
+        write: &Request,
+    ) -> Option<(Reply, Mark, Option<Delivery>)> {
+        let concern = Concern::of(Some(write));
         let mut inner = self.lock();
         // An unregistration may concern a registration that is still on its way to the master.
         let idle = !inner.doubted
+            && !inner.unconfirmed
             && !inner.is_elsewhere()
             && !write.calls().into_iter().any(is_unregistration)
             && !inner.mirror.would_change(write)
             && inner.mirror.fits(write, ANSWER_MOST);
-        if !idle {
+        let heard = concern.heard();
+        if !idle || inner.order.holds_read(&heard) {
             return None;
         }
+        let number = inner.order.begin(now, heard);
         let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
         // A refusal is the master's, in its own words.
         let refused = match &reply {
@@ -67,7 +77,10 @@ impl Ledger {
             }
             Reply::Fault { .. } => true,
         };
-        (!refused).then(|| (reply, inner.mark()))
+        let mark = inner.mark();
+        drop(inner);
+        let delivery = number.map(|number| Delivery::new(self, number));
+        (!refused).then_some((reply, mark, delivery))
     }
 
     /// The master's predicted answer to this call.
@@ -82,10 +95,35 @@ impl Ledger {
     ///
     /// None during an injection, if another computer has the master, or if the call also reads too much: it has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
+        let (reply, mark, _) = self.answer_standing_in(now, call, &Concern::default())?;
+        Some((reply, mark))
+    }
+
+    /// As [`Self::stand_in`] for a client's call, of which this is the concern, with its answer under way.
+    pub(crate) fn stand_in_for(
+        self: &Arc<Self>,
+        now: Instant,
+        call: &Request,
+        concern: &Concern,
+    ) -> Option<(Reply, Mark, Option<Delivery>)> {
+        let (reply, mark, number) = self.answer_standing_in(now, call, concern)?;
+        let delivery = number.map(|number| Delivery::new(self, number));
+        Some((reply, mark, delivery))
+    }
+
+    fn answer_standing_in(
+        &self,
+        now: Instant,
+        call: &Request,
+        concern: &Concern,
+    ) -> Option<(Reply, Mark, Option<u64>)> {
         let mut inner = self.lock();
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
+        // First: the caller may be notified of what its own call changes.
+        let heard = concern.heard();
+        let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
@@ -102,12 +140,17 @@ impl Ledger {
         };
         if !changes {
             // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
-            // before the reply.
+            // before the reply, and any state if the checkpoint is older than the master. Parameter subscriptions
+            // cannot be read from it, and loggers repeat them all the time.
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
-            writes.retain(|call| room && is_unregistration(call) && !inner.pending.contains(call));
+            let unsure = |call: &Request| {
+                is_unregistration(call)
+                    || (inner.unconfirmed && *call.method() != Method::SubscribeParam)
+            };
+            writes.retain(|call| room && unsure(call) && !inner.pending.contains(call));
         }
         if writes.is_empty() {
-            return Some((reply, inner.mark()));
+            return Some((reply, inner.mark(), number));
         }
         // Makes an inspection under way outdated: it could bring back what this call takes away.
         inner.version += u64::from(!changes);
@@ -116,12 +159,12 @@ impl Ledger {
             call: call.clone().into(),
             pending: true,
         });
-        inner.append(&entries.collect::<Vec<_>>());
+        inner.append(entries.collect());
         let mark = inner.mark();
         inner.add_pending(writes.into_iter().cloned());
         drop(inner);
         self.recorded();
-        Some((reply, mark))
+        Some((reply, mark, number))
     }
 }
 

@@ -4,17 +4,21 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::Arc,
+    sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
+use tokio::{task::spawn_blocking, time::timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::Ledger;
+use super::{
+    Ledger,
+    journal::{DISK_PATIENCE, Seen},
+};
 use crate::{
     checkpoint::store::{CheckJob, Store, SyncJob},
     cli::SyncPolicy,
-    limit::rarely,
+    limit::{Pair, alarm, all_clear, rarely},
     status::Board,
 };
 
@@ -27,9 +31,12 @@ const QUIET: Duration = Duration::from_secs(2);
 /// but not more often than this: a memory card wears out.
 const BETWEEN: Duration = Duration::from_secs(10);
 
+/// That the state is not recorded, and that it is again.
+static UNPROTECTED: Pair = Pair::new();
+
 pub(crate) struct Checkpointer {
     ledger: Arc<Ledger>,
-    board: Arc<Board>,
+    voice: Arc<Voice>,
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
@@ -38,53 +45,66 @@ pub(crate) struct Checkpointer {
     recorded_at: Instant,
     compacted_at: Option<Instant>,
     failed_at: Option<Instant>,
-    /// The failure that was logged last.
-    said: Option<String>,
 }
 
 impl Checkpointer {
     /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be answered before:
     /// it would be in no journal. Later it is synced every `sync_interval`, unless the ledger's policy
-    /// differs.
+    /// differs. Does not wait longer than [`DISK_PATIENCE`] for the disk.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,
         path: PathBuf,
         sync_interval: Duration,
     ) -> Self {
-        let opened = ledger.with_store(|_, _| ()).is_some();
+        let opened = ledger.seen_store().is_some();
+        // Logged when the checkpoint was opened.
+        let said = ledger.unprotected().filter(|_| !opened);
         let mut checkpointer = Self {
             seq: 0,
             recorded_at: Instant::now(),
             compacted_at: None,
             failed_at: None,
-            // Logged when the checkpoint was opened.
-            said: ledger.unprotected().filter(|_| !opened),
             sync: ledger.sync,
+            voice: Arc::new(Voice {
+                ledger: ledger.clone(),
+                board,
+                path: path.clone(),
+                said: Mutex::new(said),
+            }),
             ledger,
-            board,
             path,
             sync_interval,
         };
-        checkpointer.compact().await;
-        checkpointer.say_protection();
+        if timeout(DISK_PATIENCE, checkpointer.compact())
+            .await
+            .is_err()
+        {
+            checkpointer.ledger.give_up_disk();
+        }
+        checkpointer.voice.say_protection();
         checkpointer
     }
 
     /// Keeps the checkpoint until `stop`.
-    pub(crate) async fn run(mut self, stop: CancellationToken) {
+    pub(crate) async fn run(self, stop: CancellationToken) {
+        let voice = Arc::clone(&self.voice);
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = voice.tell_of_silence() => {}
+            () = self.keep() => {}
+        }
+    }
+
+    async fn keep(mut self) {
         loop {
             tokio::select! {
-                () = stop.cancelled() => return,
                 () = self.ledger.work.notified() => {}
                 () = tokio::time::sleep(LOOK) => {}
             }
             self.round(true).await;
             if self.sync != SyncPolicy::Always {
-                tokio::select! {
-                    () = stop.cancelled() => return,
-                    () = self.pause() => {}
-                }
+                self.pause().await;
             }
         }
     }
@@ -103,67 +123,77 @@ impl Checkpointer {
     }
 
     async fn round(&mut self, sync: bool) {
-        if self.ledger.with_store(|_, _| ()).is_none() {
+        if self.ledger.seen_store().is_none() {
             self.open_again().await;
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
         // Before the repair below: a failure is logged even if it is repaired at once.
-        self.say_protection();
+        self.voice.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
         }
-        self.say_protection();
+        self.voice.say_protection();
+    }
+
+    /// The result of `work`, however long the disk takes for it. A silence is told when it is too long.
+    async fn waited_for<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
+        let mut work = std::pin::pin!(work);
+        match timeout(DISK_PATIENCE, &mut work).await {
+            Ok(done) => done,
+            Err(_) => {
+                silent();
+                work.await
+            }
+        }
+    }
+
+    /// As [`Ledger::on_store`]. The store is not expected to be silent.
+    async fn on_store<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&mut Store) -> T + Send + 'static,
+    ) -> Option<T> {
+        let done = self.ledger.on_store(work);
+        self.waited_for(done, || self.ledger.give_up_disk()).await
     }
 
     /// Checks the file and, with `syncs`, syncs it.
     async fn sync(&self, syncs: bool) {
-        let ledger = &self.ledger;
-        let jobs = ledger.with_store(|store, _| {
+        let jobs = self.on_store(move |store| {
             let check = store.check_job();
             (check, syncs.then(|| store.sync_job()).flatten())
         });
-        let (check, sync) = jobs.unwrap_or_default();
+        let (check, sync) = jobs.await.unwrap_or_default();
         let folder = self.path.parent().map(PathBuf::from).unwrap_or_default();
-        let work = move || {
+        let work = spawn_blocking(move || {
             let free = free_bytes(&folder);
             (check.map(CheckJob::run), sync.map(SyncJob::run), free)
-        };
-        if let Ok((checked, synced, free)) = tokio::task::spawn_blocking(work).await {
-            self.board.update(|facts| facts.disk.free = free);
+        });
+        let ledger = &self.ledger;
+        let done = self
+            .waited_for(work, || ledger.set_sync_is_late(true))
+            .await;
+        ledger.set_sync_is_late(false);
+        if let Ok((checked, synced, free)) = done {
+            self.voice.board.update(|facts| facts.disk.free = free);
             // The store keeps a failure; `say_protection` logs it.
-            ledger.with_store(|store, _| {
+            let noted = self.on_store(move |store| {
                 let _ = checked.map(|done| store.checked(done));
                 let _ = synced.map(|done| store.synced(done));
             });
-        }
-        if !syncs {
-            return;
-        }
-        let durable = ledger.with_store(|store, _| match store.unprotected() {
-            None => store.synced_seq(),
-            Some(_) => store.seq(),
-        });
-        // Without a store there are no records to wait for; a store opened later counts from the end of its
-        // file.
-        if let Some(durable) = durable {
-            ledger.set_durable(durable);
+            noted.await;
         }
     }
 
     fn compaction_is_due(&mut self) -> bool {
         let now = Instant::now();
         let due = self.ledger.checkpoint_due();
-        let state = self.ledger.with_store(|store, _| {
-            (
-                store.unprotected().is_some(),
-                store.wants_compaction(),
-                store.seq(),
-                store.journal_bytes(),
-            )
-        });
-        let Some((unprotected, outgrown, seq, journal_bytes)) = state else {
+        let Some(seen) = self.ledger.seen_store() else {
             return false;
         };
+        let Seen {
+            seq, journal_bytes, ..
+        } = seen;
+        let unprotected = seen.unprotected.is_some();
         if seq != self.seq {
             self.seq = seq;
             self.recorded_at = now;
@@ -176,21 +206,22 @@ impl Checkpointer {
         let failed = self
             .failed_at
             .is_some_and(|at| now.duration_since(at) < AGAIN);
-        !failed && (due || outgrown || unprotected || (journal_bytes > 0 && quiet && rested))
+        !failed && (due || seen.outgrown || unprotected || (journal_bytes > 0 && quiet && rested))
     }
 
     async fn compact(&mut self) {
-        let ledger = &self.ledger;
-        let mut seq = 0;
-        let begun = ledger.with_store(|store, checkpoint| {
-            seq = store.seq();
-            store.begin_compaction(checkpoint())
-        });
-        let finished = match begun {
+        let ledger = Arc::clone(&self.ledger);
+        let begun = ledger
+            .on_store_whole(|store, checkpoint| (store.seq(), store.begin_compaction(checkpoint)));
+        let begun = self.waited_for(begun, || ledger.give_up_disk()).await;
+        let (seq, finished) = match begun {
             None => return,
-            Some(Err(error)) => Some(Err(error)),
-            Some(Ok(job)) => match tokio::task::spawn_blocking(move || job.run()).await {
-                Ok(done) => ledger.with_store(|store, _| store.finish_compaction(done)),
+            Some((seq, Err(error))) => (seq, Some(Err(error))),
+            Some((seq, Ok(job))) => match spawn_blocking(move || job.run()).await {
+                Ok(done) => {
+                    let finished = self.on_store(|store| store.finish_compaction(done));
+                    (seq, finished.await)
+                }
                 Err(_) => return,
             },
         };
@@ -203,13 +234,13 @@ impl Checkpointer {
             _ => {
                 let now = Instant::now();
                 self.compacted_at = Some(now);
-                self.board
-                    .update(|facts| facts.disk.compacted = Some((now, seq)));
+                let board = &self.voice.board;
+                board.update(|facts| facts.disk.compacted = Some((now, seq)));
                 if self.sync == SyncPolicy::Always {
                     // The new file's name is not on the disk yet.
                     self.sync(true).await;
                 }
-                self.ledger.set_attempted(Ok(()));
+                ledger.set_attempted(Ok(()));
             }
         }
     }
@@ -218,17 +249,35 @@ impl Checkpointer {
     /// memory is newer; but they are unknown, so the file is kept.
     async fn open_again(&self) {
         let path = self.path.clone();
-        let opened = tokio::task::spawn_blocking(move || Store::open_over(&path)).await;
+        let opened = spawn_blocking(move || Store::open_over(&path)).await;
         if let Ok(Ok(store)) = opened {
             self.ledger.set_store(store);
         }
     }
+}
 
-    /// Logs once that the state is no longer recorded, and once that it is again.
-    fn say_protection(&mut self) {
+/// Says whether the state is recorded.
+struct Voice {
+    ledger: Arc<Ledger>,
+    board: Arc<Board>,
+    path: PathBuf,
+    /// The failure that was logged last.
+    said: Mutex<Option<String>>,
+}
+
+impl Voice {
+    async fn tell_of_silence(&self) {
+        loop {
+            self.ledger.disk_silent.notified().await;
+            self.say_protection();
+        }
+    }
+
+    /// Logs once that the state is no longer recorded, and once that it is again; and where a file was kept that
+    /// was found at the path.
+    fn say_protection(&self) {
         let path = self.path.display();
-        let kept = self.ledger.with_store(|store, _| store.take_kept());
-        if let Some(kept) = kept.flatten() {
+        if let Some(kept) = self.ledger.take_kept() {
             rarely!(
                 warn,
                 checkpoint = %path, kept = %kept.display(),
@@ -237,15 +286,17 @@ impl Checkpointer {
             );
         }
         let unprotected = self.ledger.unprotected();
-        match (&unprotected, &self.said) {
-            (Some(reason), None) => rarely!(
+        let mut said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
+        match (&unprotected, &*said) {
+            (Some(reason), None) => alarm!(
                 error,
+                UNPROTECTED,
                 checkpoint = %path, reason,
                 "unprotected: nodes run as usual, but a crash of rosrescue itself would lose the state; \
                  free or repair the disk, and recording begins again by itself"
             ),
             (None, Some(_)) => {
-                rarely!(info, checkpoint = %path, "protected again: a whole checkpoint is written")
+                all_clear!(info, UNPROTECTED, checkpoint = %path, "protected again: a whole checkpoint is written")
             }
             _ => {}
         }
@@ -255,7 +306,7 @@ impl Checkpointer {
                 (facts.disk.protected, facts.disk.since) = (protected, Instant::now());
             }
         });
-        self.said = unprotected;
+        *said = unprotected;
     }
 }
 

@@ -1,11 +1,25 @@
 //! The ledger's side of the checkpointer, and how calls wait for it.
 
-use super::{Inner, Ledger, shared::Agreed};
+use std::{
+    path::PathBuf,
+    sync::{Arc, atomic::Ordering},
+    time::Instant,
+};
+
+use tokio::{
+    task::{block_in_place, spawn_blocking},
+    time::timeout,
+};
+
+use super::{
+    Inner, Ledger,
+    journal::{self, DISK_PATIENCE, Journal, SILENT, Seen},
+    shared::Agreed,
+};
 use crate::checkpoint::{
     format::Checkpoint,
     store::{Store, StoreError},
 };
-use crate::cli::SyncPolicy;
 
 /// Where a record is: what an answer may have to wait for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -54,19 +68,24 @@ impl Ledger {
     /// What must be safe before a call whose last record is at `mark` is answered; none if nothing must.
     pub fn to_await(&self, mark: Mark) -> Option<Mark> {
         let mark = Mark {
-            disk: mark.disk.filter(|_| self.sync == SyncPolicy::Always),
+            disk: mark.disk.filter(|seq| *self.durable.borrow() < *seq),
             ..mark
         };
         (mark != Mark::default()).then_some(mark)
     }
 
-    /// Returns when the records up to `mark` are safe: on the disk, or the disk has failed; and where other
-    /// computers find them. False if another one leads by now and may not have them.
+    /// Returns when the records up to `mark` are safe: written, with `--sync always` also on the disk, or the disk
+    /// has failed; and where other computers find them. False if another one leads by now and may not have them.
+    /// A disk that is silent for [`DISK_PATIENCE`] has failed.
     pub async fn durable(&self, mark: Mark) -> bool {
         if let Some(seq) = mark.disk {
+            self.write();
             let mut durable = self.durable.subscribe();
-            // We own the sender.
-            let _ = durable.wait_for(|reached| *reached >= seq).await;
+            while *durable.borrow_and_update() < seq {
+                if timeout(DISK_PATIENCE, durable.changed()).await.is_err() {
+                    self.give_up_disk();
+                }
+            }
         }
         match mark.shared {
             Some(place) => self.agreed(place).await,
@@ -74,27 +93,56 @@ impl Ledger {
         }
     }
 
-    /// The journal up to `seq` is on the disk, or the disk has failed.
-    pub fn set_durable(&self, seq: u64) {
-        raise(&self.durable, seq);
+    /// Writes the records so far. Other tasks go on meanwhile, however long the disk takes for it.
+    fn write(&self) {
+        if let Some(worker) = self.worker() {
+            block_in_place(|| worker.work());
+        }
+    }
+
+    /// Has the records written, by another thread.
+    pub(super) fn write_soon(&self) {
+        if let Some(worker) = self.worker() {
+            spawn_blocking(move || worker.work());
+        }
+    }
+
+    fn worker(&self) -> Option<Arc<journal::Shared>> {
+        self.lock().journal.as_ref().map(Journal::worker)
+    }
+
+    /// The disk is silent. Answers wait for it no more, and nothing is recorded before the next whole checkpoint.
+    pub(super) fn give_up_disk(&self) {
+        if let Some(journal) = &mut self.lock().journal {
+            journal.give_up();
+        }
+        self.disk_silent.notify_one();
+    }
+
+    /// Sets whether a sync is late.
+    pub(super) fn set_sync_is_late(&self, late: bool) {
+        self.sync_is_late.store(late, Ordering::Relaxed);
+        self.disk_silent.notify_one();
     }
 
     /// The version to wait for with [`Self::attempted`] until the file holds the mirror as it is now. None if
     /// it does, or if the file cannot be written.
     pub fn unwritten(&self) -> Option<u64> {
         let inner = self.lock();
-        let store = inner.store.as_ref();
-        let works = store.is_some_and(|store| store.unprotected().is_none());
+        let journal = inner.journal.as_ref();
+        let works = journal.is_some_and(|journal| journal.seen().unprotected.is_none());
         let whole = &inner.whole;
         (works && whole.failure.is_none() && whole.is_due()).then_some(whole.unrecorded)
     }
 
     /// Returns when a whole checkpoint of this or a later version of the mirror has been written, or has
-    /// failed.
+    /// failed. A disk that is silent for [`DISK_PATIENCE`] has failed.
     pub async fn attempted(&self, version: u64) {
         let mut attempted = self.attempted.subscribe();
-        // We own the sender.
-        let _ = attempted.wait_for(|reached| *reached >= version).await;
+        let attempt = attempted.wait_for(|reached| *reached >= version);
+        if timeout(DISK_PATIENCE, attempt).await.is_err() {
+            self.give_up_disk();
+        }
     }
 
     /// Notes the result of the whole checkpoint that was taken last.
@@ -110,29 +158,45 @@ impl Ledger {
         raise(&self.attempted, taken);
     }
 
-    /// Runs `work` on the store, if there is one, and on a function that takes a checkpoint of the same
-    /// moment.
-    pub fn with_store<T>(
+    /// Runs `work` on the store, after everything recorded so far. None without a store. Waits for the disk.
+    pub async fn on_store<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&mut Store, &mut dyn FnMut() -> Checkpoint) -> T,
+        work: impl FnOnce(&mut Store) -> T + Send + 'static,
     ) -> Option<T> {
-        let mut inner = self.lock();
-        let mut store = inner.store.take()?;
-        let seq = store.seq();
-        let result = work(&mut store, &mut || {
+        let result = self.lock().journal.as_ref()?.run(work)?;
+        self.write_soon();
+        result.await.ok()
+    }
+
+    /// As [`Self::on_store`], for `work` that writes the checkpoint of this moment.
+    pub async fn on_store_whole<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
+    ) -> Option<T> {
+        let result = {
+            let mut inner = self.lock();
+            let checkpoint = inner.checkpoint();
             inner.whole.taken = inner.version;
-            Checkpoint {
-                seq,
-                ..inner.checkpoint()
-            }
-        });
-        inner.store = Some(store);
-        Some(result)
+            inner.journal.as_mut()?.run_whole(checkpoint, work)?
+        };
+        self.write_soon();
+        result.await.ok()
+    }
+
+    /// The store after its last job; none without a store.
+    pub(crate) fn seen_store(&self) -> Option<Seen> {
+        Some(self.lock().journal.as_ref()?.seen())
+    }
+
+    /// Where a file was kept that was found at the checkpoint's path; returned once.
+    pub(super) fn take_kept(&self) -> Option<PathBuf> {
+        self.lock().journal.as_ref()?.take_kept()
     }
 
     /// Sets a new store, which holds nothing yet.
     pub fn set_store(&self, store: Store) {
-        self.lock().store = Some(store);
+        let journal = Journal::new(store, self.durable.clone(), self.sync);
+        self.lock().journal = Some(journal);
     }
 
     /// The checkpoint to write now.
@@ -148,13 +212,15 @@ impl Ledger {
     /// Why the state is not recorded; none if it is.
     pub fn unprotected(&self) -> Option<String> {
         let inner = self.lock();
-        let Some(store) = &inner.store else {
+        let Some(journal) = &inner.journal else {
             return Some("the checkpoint could not be opened".to_owned());
         };
         // Then the journal alone is not enough.
         let failure = inner.whole.failure.as_deref();
         let failure = failure.filter(|_| inner.whole.is_due());
-        store.unprotected().or(failure).map(str::to_owned)
+        let late = self.sync_is_late.load(Ordering::Relaxed).then_some(SILENT);
+        let unprotected = journal.seen().unprotected;
+        unprotected.or_else(|| failure.or(late).map(str::to_owned))
     }
 }
 
@@ -171,11 +237,13 @@ impl Inner {
                 .map(Into::into)
                 .collect(),
             snapshot: self.mirror.snapshot(),
+            displaced: self.activity.displaced_lately(Instant::now()),
         }
     }
 }
 
-fn raise(to: &tokio::sync::watch::Sender<u64>, value: u64) {
+/// Sets what `to` has reached to `value`, if that is more.
+pub(super) fn raise(to: &tokio::sync::watch::Sender<u64>, value: u64) {
     to.send_if_modified(|reached| {
         let more = value > *reached;
         *reached = value.max(*reached);

@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::Ledger;
+use super::{Ledger, journal::Seen};
 use crate::{checkpoint::store::history, limit::Limit};
 
 pub(crate) struct Rescues {
@@ -22,25 +22,23 @@ impl Rescues {
         }
     }
 
-    /// Keeps the present state: a new master has just been brought to it. It is written beside traffic.
-    pub(crate) fn keep(&self, now: Instant) {
+    /// Keeps the present state, to which a new master has just been brought, as that of rescue `number`. It is
+    /// written beside traffic.
+    pub(crate) fn keep(&self, number: u64, now: Instant) {
         let bytes_most = self.bytes_most;
         if bytes_most == 0 || self.limit.pass(now).is_none() {
             return;
         }
-        let place = self.ledger.with_store(|store, _| {
-            // A disk that is full or broken is not written to more than it must be.
-            let fits = store.snapshot_bytes() <= bytes_most && store.unprotected().is_none();
-            fits.then(|| store.path().to_owned())
-        });
-        let Some(path) = place.flatten() else {
+        // A disk that is full or broken is not written to more than it must be.
+        let fits = |store: &Seen| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
+        let Some(Seen { path, .. }) = self.ledger.seen_store().filter(fits) else {
             tracing::debug!("the state of this rescue is not kept: no room, or no working disk");
             return;
         };
         // Now: the health check is about to take out nodes that have died.
         let checkpoint = self.ledger.checkpoint();
         tokio::task::spawn_blocking(move || {
-            let kept = history::keep_rescue(&path, &checkpoint);
+            let kept = history::keep_rescue(&path, number, checkpoint);
             match kept.and_then(|kept| history::trim(&path, bytes_most).map(|()| kept)) {
                 Ok(kept) => tracing::debug!(path = %kept.display(), "the rescue's state is kept"),
                 Err(error) => tracing::info!(%error, "the state of this rescue is not kept"),

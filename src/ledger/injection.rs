@@ -15,6 +15,16 @@ impl Ledger {
         }
     }
 
+    /// Sets whether the dictionaries of the present master have no order, as in Python 2.
+    pub fn set_unordered(&self, unordered: bool) {
+        self.lock().mirror.set_unordered(unordered);
+    }
+
+    /// Sets whether the present master behaves as 1.14.3 and before.
+    pub fn set_old(&self, old: Option<bool>) {
+        self.lock().mirror.set_old(old);
+    }
+
     /// The mirror's version and state, and the next incarnation's token.
     pub fn next(&self) -> (u64, Master, Token) {
         let inner = self.lock();
@@ -22,10 +32,23 @@ impl Ledger {
         (inner.version, inner.mirror.clone(), token)
     }
 
+    /// The checkpoint is older than the master, which is incarnation `number`. The pending writes of the
+    /// checkpoint have reached a master since.
+    pub fn catch_up(&self, number: u64) {
+        let mut inner = self.lock();
+        inner.pending.forget_restored();
+        inner.session.incarnation = number;
+        inner.session_unwritten = true;
+    }
+
     /// Starts the next incarnation: replies of the previous one no longer count. Returns the new token.
+    ///
+    /// The journal has the new number when the master has it. A rosrescue that is started in between finds a
+    /// master of a later number, or one that misses the pending writes.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
-        inner.next_incarnation();
+        inner.raise_incarnation();
+        inner.order.master_is_gone();
         // Either side is brought to the other's state, so there is no doubt.
         (inner.doubted, inner.abandoned) = (false, false);
         inner.token()
@@ -36,16 +59,20 @@ impl Ledger {
         let mut inner = self.lock();
         if !inner.pending.calls().is_empty() {
             inner.pending.clear();
-            let seq = inner.seq();
-            inner.update_session(|session| session.delivered = seq);
-            self.work.notify_one();
+            inner.session.delivered = inner.seq();
+            inner.session_unwritten = true;
         }
+        inner.write_session();
+        drop(inner);
+        self.write_soon();
+        self.work.notify_one();
     }
 
     /// The present incarnation is served from now on: the mirror may change again. Returns its number.
     pub fn serve(&self) -> u64 {
         let mut inner = self.lock();
         inner.injecting = false;
+        inner.unconfirmed = false;
         let incarnation = inner.session.incarnation;
         inner.served = Some(incarnation);
         incarnation
@@ -64,7 +91,8 @@ impl Ledger {
 
     /// The connection to the present incarnation ended with a batch in flight: it may still be run.
     pub fn abandon_batch(&self) {
-        self.lock().abandoned = true;
+        let mut inner = self.lock();
+        (inner.abandoned, inner.behind) = (true, None);
     }
 
     /// The present incarnation cannot be running an earlier call any more.

@@ -16,6 +16,8 @@ pub(super) struct TooMany;
 pub(super) struct PendingWrites {
     calls: Vec<Request>,
     bytes: usize,
+    /// How many of them are a checkpoint's.
+    restored: usize,
 }
 
 impl PendingWrites {
@@ -39,8 +41,23 @@ impl PendingWrites {
         Ok(())
     }
 
+    /// Those so far are a checkpoint's.
+    pub(super) fn are_restored(&mut self) {
+        self.restored = self.calls.len();
+    }
+
+    /// Drops those of a checkpoint.
+    pub(super) fn forget_restored(&mut self) {
+        let calls = self.calls.split_off(self.restored);
+        self.clear();
+        // Fewer than before.
+        let _ = self.extend(calls);
+    }
+
+    /// Whether this process has added `call`. Those of a checkpoint may still be dropped.
     pub(super) fn contains(&self, call: &Request) -> bool {
-        self.calls.contains(call)
+        let added = self.calls.get(self.restored..).unwrap_or_default();
+        added.contains(call)
     }
 
     pub(super) fn calls(&self) -> &[Request] {
@@ -56,6 +73,19 @@ impl PendingWrites {
 mod tests {
     use super::*;
     use crate::master::Method;
+
+    #[test]
+    fn a_write_that_a_checkpoint_has_too_outlives_it() {
+        let write = || Request::new(Method::SetParam, ["/n", "/k", "v"]);
+        let mut pending = PendingWrites::default();
+        pending.extend([write()]).unwrap();
+        pending.are_restored();
+        assert!(!pending.contains(&write()));
+        pending.extend([write()]).unwrap();
+        assert!(pending.contains(&write()));
+        pending.forget_restored();
+        assert_eq!(pending.calls(), [write()]);
+    }
 
     #[test]
     fn too_many_or_too_large_writes_are_dropped() {

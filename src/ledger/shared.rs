@@ -98,6 +98,11 @@ impl Ledger {
         }
     }
 
+    /// The last record that the others have, or need not have, in this time that this computer has the master.
+    pub fn last_agreed(&self) -> u64 {
+        self.agreed.borrow().seq
+    }
+
     /// The others have the records up to `seq`, or need not have them.
     pub fn agree(&self, seq: u64) {
         self.agreed.send_if_modified(|agreed| {
@@ -134,8 +139,9 @@ impl Ledger {
                 inner.version += 1;
             }
         }
-        inner.append(&entries);
+        inner.append(entries);
         drop(inner);
+        self.write_soon();
         self.work.notify_one();
         Ok(())
     }

@@ -1,23 +1,30 @@
 mod crash_loop;
+mod late;
 
 use super::*;
 
 const PROBING: Probing = Probing {
     interval: Duration::from_secs(1),
     count: 3,
+    patience: Duration::from_millis(100),
+    start_limit: START_LIMIT,
 };
+const START_LIMIT: Duration = Duration::from_secs(30);
 
 /// Drives the machine along a virtual clock.
 struct Script {
     machine: Lifecycle,
+    start: Instant,
     now: Instant,
 }
 
 impl Script {
     fn new(supervision: Supervision) -> Self {
+        let start = Instant::now();
         Self {
             machine: Lifecycle::new(supervision, PROBING),
-            now: Instant::now(),
+            start,
+            now: start,
         }
     }
 
@@ -321,6 +328,32 @@ fn a_child_that_never_listens_is_killed() {
     script
         .feed(Input::Refused, &[Action::Kill])
         .feed(Input::Exited, &[Action::Spawn]);
+}
+
+#[test]
+fn a_child_whose_port_was_taken_is_replaced_at_once_and_is_no_death() {
+    let mut script = Script::new(Supervision::Ours);
+    let start = Input::Start {
+        left: false,
+        restored: false,
+    };
+    script.feed(start, &[Action::Spawn]);
+    let take = |script: &mut Script, spawned: &[Action]| {
+        script
+            .feed(Input::Spawned, &[Action::Connect])
+            .feed(Input::PortTaken, &[Action::Kill])
+            .feed(Input::Exited, spawned);
+    };
+    for _ in 0..DEATHS_AT_ONCE {
+        take(&mut script, &[Action::Spawn]);
+    }
+    // Whoever takes each one does not keep the processor busy.
+    take(&mut script, &[]);
+    script.wake(FIRST_PAUSE, &[Action::Spawn]);
+    take(&mut script, &[]);
+    script.wake(2 * FIRST_PAUSE, &[Action::Spawn]);
+    script.feed(Input::Spawned, &[Action::Connect]).serve(true);
+    assert_eq!(script.machine.deaths(), 0);
 }
 
 #[test]

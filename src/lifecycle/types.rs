@@ -16,8 +16,12 @@ pub enum Supervision {
 pub struct Probing {
     /// Pause between an answered probe and the next.
     pub interval: Duration,
-    /// The master hangs after this many missed probes in a row.
+    /// The master is taken for hung after this many missed probes in a row.
     pub count: u32,
+    /// How long a write waits for the master before the mirror answers it.
+    pub patience: Duration,
+    /// How long a master that was spawned may take to listen without any progress.
+    pub start_limit: Duration,
 }
 
 /// What happened.
@@ -37,6 +41,8 @@ pub enum Input {
     Connected,
     /// Nothing listens at the master's address.
     Refused,
+    /// Another program listens at the port of the master that was spawned.
+    PortTaken,
     /// The master's address cannot be reached, or does not answer in time.
     Unreachable,
     /// The connection to the master has ended.
@@ -47,6 +53,14 @@ pub enum Input {
     BatchLost,
     /// The master takes too long to answer a call.
     Slow,
+    /// A write has waited for [`Lifecycle::patience`](super::Lifecycle::patience), and the mirror can answer it.
+    Late,
+    /// The master has answered what was under way when it was [late](Self::Late).
+    LateAnswered,
+    /// The master that was late holds what the mirror has answered meanwhile.
+    CaughtUp,
+    /// The master could not be given that.
+    NotCaughtUp,
     /// The master holds the whole state.
     Examined {
         /// Whether it is a new incarnation.
@@ -84,6 +98,8 @@ pub enum Cause {
     Exited,
     /// The master no longer answers.
     Hung,
+    /// The master was late, and must be examined.
+    Late,
     /// rosrescue stops.
     Stopping,
 }
@@ -96,22 +112,29 @@ impl Cause {
             Self::ThreadEnded => "the master is ending",
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
+            Self::Late => "the master answered late",
             Self::Stopping => "rosrescue stops",
         }
     }
 }
 
-/// What the shell must do, in order. A new `Connect` or `Examine` cancels the step under way; a `Probe` does
-/// not.
+/// What the shell must do, in order. A new `Connect`, `Examine` or `CatchUp` cancels the step under way; a
+/// `Probe` does not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
-    /// Connect to the master. Results: `Connected`, `Refused` or `Unreachable`.
+    /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or
+    /// `Unreachable`.
     Connect,
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
     /// Let no call pass.
     ShutGate(Cause),
+    /// Let the mirror answer until the master has answered what is under way. Results: `LateAnswered`.
+    StandIn,
+    /// Give the master that was late what the mirror has answered meanwhile. Results: `CaughtUp` or
+    /// `NotCaughtUp`.
+    CatchUp,
     /// Let calls pass.
     OpenGate,
     /// Probe the master. Results: `ProbeAnswered` or `ProbeMissed`.
@@ -120,6 +143,8 @@ pub enum Action {
     Spawn,
     /// Kill the master.
     Kill,
+    /// The master does not answer, and is not killed for this reason.
+    Spare(&'static str),
     /// Stop rosrescue: no master can be started, and there is no state to give to a later one. Reporting the
     /// error is better than retrying for ever.
     GiveUp,

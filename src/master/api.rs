@@ -45,6 +45,21 @@ struct Spec {
 
 const MULTICALL: &str = "system.multicall";
 
+/// What rosmaster takes for methods, with their Python types: the public attributes of `ROSMasterHandler`.
+const ATTRIBUTES: [(&str, &str); 11] = [
+    ("done", "bool"),
+    ("param_server", "ParamDictionary"),
+    ("param_subscribers", "Registrations"),
+    ("ps_lock", "Condition"),
+    ("publishers", "Registrations"),
+    ("reg_manager", "RegistrationManager"),
+    ("services", "Registrations"),
+    ("subscribers", "Registrations"),
+    ("thread_pool", "MarkedThreadPool"),
+    ("topics_types", "dict"),
+    ("uri", "str"),
+];
+
 macro_rules! methods {
     ($($method:ident $name:literal $kind:ident $arity:literal $error:expr => $run:ident;)*) => {
         /// A method of a master.
@@ -205,7 +220,8 @@ impl Master {
             .filter(|(_, _, value)| *value != Value::Nil)?;
         // A node that only subscribes parameters may have registered past rosrescue: nothing shows it.
         let hidden = *read.method() == Method::LookupNode && code != 1;
-        (!hidden).then(|| Value::Array(vec![code.into(), message.into(), value]))
+        let in_some_order = self.unordered && shows_order(read.method(), &value);
+        (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
     /// Answers any method except for a multicall. An error is the text of a fault.
@@ -215,28 +231,42 @@ impl Master {
         notices: &mut dyn NoticeSink,
     ) -> Result<Value, String> {
         let Some(spec) = request.method().spec() else {
-            let name = request.method().name();
-            return Err(format!(
-                "<class 'Exception'>:method \"{name}\" is not supported"
-            ));
+            return Err(self.unsupported(request.method().name()));
+        };
+        let old = self.old == Some(true);
+        let error = || match request.method() {
+            Method::RegisterPublisher | Method::RegisterSubscriber | Method::LookupService
+                if old =>
+            {
+                0.into()
+            }
+            _ => (spec.error)(),
         };
         let (code, message, value) = match self.validate_and_run(spec, request.params(), notices) {
             Ok((_, _, Value::Nil)) => {
                 let text = "Internal error (None value returned)".to_owned();
-                (-1, text, (spec.error)())
+                (-1, text, error())
             }
             Ok(answer) => answer,
-            Err(Failure::Refused(text)) => (-1, text, (spec.error)()),
-            Err(Failure::Type(text)) => (
-                -1,
-                format!("Error: invalid arguments: {text}"),
-                (spec.error)(),
-            ),
-            Err(Failure::Internal(text)) => {
-                (0, format!("Internal failure: {text}"), (spec.error)())
-            }
+            Err(Failure::Refused(text)) => (-1, text, error()),
+            Err(Failure::Type(text)) => (-1, format!("Error: invalid arguments: {text}"), error()),
+            Err(Failure::Internal(text)) => (0, format!("Internal failure: {text}"), error()),
         };
         Ok(Value::Array(vec![code.into(), message.into(), value]))
+    }
+
+    /// The text of the fault to a method that rosmaster lacks.
+    fn unsupported(&self, name: &str) -> String {
+        let attribute = ATTRIBUTES.iter().find(|(attribute, _)| *attribute == name);
+        let (class, text) = match attribute {
+            None => ("Exception", format!("method \"{name}\" is not supported")),
+            Some((_, is_a)) => ("TypeError", format!("'{is_a}' object is not callable")),
+        };
+        // Only Python 2 has dictionaries without an order.
+        match self.unordered {
+            true => format!("<type 'exceptions.{class}'>:{text}"),
+            false => format!("<class '{class}'>:{text}"),
+        }
     }
 
     /// `apivalidate`.
@@ -281,5 +311,27 @@ pub(crate) fn fault(text: &str) -> Reply {
     Reply::Fault {
         code: 1,
         text: text.to_owned(),
+    }
+}
+
+/// Whether the value of a read shows the order of a dictionary.
+fn shows_order(method: &Method, value: &Value) -> bool {
+    match (method, value) {
+        (Method::GetSystemState, Value::Array(lists)) => {
+            let is_long = |list: &Value| list.as_array().is_some_and(|list| list.len() > 1);
+            lists.iter().any(is_long)
+        }
+        (Method::GetTopicTypes | Method::GetPublishedTopics | Method::GetParamNames, list) => {
+            list.as_array().is_some_and(|list| list.len() > 1)
+        }
+        (_, value) => holds_order(value),
+    }
+}
+
+fn holds_order(value: &Value) -> bool {
+    match value {
+        Value::Struct(members) => members.len() > 1 || members.values().any(holds_order),
+        Value::Array(elements) => elements.iter().any(holds_order),
+        _ => false,
     }
 }

@@ -15,9 +15,20 @@ fn refuse<T>(what: &str, complaint: &str) -> Checked<T> {
 /// `non_empty_str('key')`.
 pub(crate) fn key(value: &Value) -> Checked<&str> {
     match value.as_str() {
-        Some("") => refuse("key", "must be specified and non-empty"),
-        Some(text) => Ok(text),
-        None => refuse("key", "must be a string"),
+        Some(text) if !text.is_empty() => Ok(text),
+        None if !is_falsy(value) => refuse("key", "must be a string"),
+        _ => refuse("key", "must be specified and non-empty"),
+    }
+}
+
+/// Whether Python takes a value other than a text for false.
+fn is_falsy(value: &Value) -> bool {
+    match value {
+        Value::Nil | Value::Bool(false) | Value::Int(0) => true,
+        Value::Double(number) => *number == 0.0,
+        Value::Array(elements) => elements.is_empty(),
+        Value::Struct(members) => members.is_empty(),
+        _ => false,
     }
 }
 

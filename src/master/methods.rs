@@ -24,7 +24,7 @@ impl Master {
         let bumped = self
             .registry
             .register(Shared::Publishers, &topic, caller_id, api);
-        notify_bumped(caller_id, bumped, of.notices);
+        self.notify_bumped(caller_id, bumped, of.notices);
         if topic_type != "*" || !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
@@ -39,7 +39,7 @@ impl Master {
         let bumped = self
             .registry
             .register(Shared::Subscribers, &topic, of.caller_id, api);
-        notify_bumped(of.caller_id, bumped, of.notices);
+        self.notify_bumped(of.caller_id, bumped, of.notices);
         if topic_type != "*" && !self.topic_types.contains_key(&topic) {
             self.topic_types
                 .insert(topic.clone(), topic_type.to_owned());
@@ -57,7 +57,7 @@ impl Master {
         let bumped = self
             .registry
             .register_service(&service, caller_id, api, service_api);
-        notify_bumped(caller_id, bumped, of.notices);
+        self.notify_bumped(caller_id, bumped, of.notices);
         let message = format!("Registered [{caller_id}] as provider of [{service}]");
         Ok((1, message, 1.into()))
     }
@@ -165,9 +165,8 @@ impl Master {
         let value = checks::param_value(value)?;
         let changed = names::param_key(&key);
         let subscribers = &self.registry.param_subscribers;
-        let updates = self
-            .params
-            .set(&changed, value, of.caller_id, subscribers)?;
+        let ignored = (self.old != Some(true)).then_some(of.caller_id);
+        let updates = self.params.set(&changed, value, ignored, subscribers)?;
         self.registry.notify_params(updates, of.notices);
         Ok((1, format!("parameter {key} set"), 0.into()))
     }
@@ -231,7 +230,7 @@ impl Master {
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
         let kind = Shared::ParamSubscribers;
         let bumped = self.registry.register(kind, &subscribed, of.caller_id, api);
-        notify_bumped(of.caller_id, bumped, of.notices);
+        self.notify_bumped(of.caller_id, bumped, of.notices);
         Ok((1, format!("Subscribed to parameter [{key}]"), value))
     }
 
@@ -273,8 +272,11 @@ fn pair(topic: &str, topic_type: &str) -> Value {
     vec![topic, topic_type].into()
 }
 
-fn notify_bumped(caller_id: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
-    if let Some(to) = bumped {
-        notices.shutdown(&to, &super::tell::bump_reason(caller_id));
+impl Master {
+    /// Tells the node whose name was taken.
+    fn notify_bumped(&self, by: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
+        if let Some(to) = bumped {
+            notices.shutdown(&to, &super::tell::bump_reason(by, self.old == Some(true)));
+        }
     }
 }

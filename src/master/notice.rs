@@ -1,5 +1,7 @@
 //! The callbacks that a master sends to nodes.
 
+#[cfg(test)]
+use crate::xmlrpc::Call;
 use crate::xmlrpc::Value;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -27,6 +29,31 @@ pub enum Notice {
         to: String,
         reason: String,
     },
+}
+
+#[cfg(test)]
+impl Notice {
+    /// The address of the node.
+    pub(crate) fn to(&self) -> &str {
+        match self {
+            Self::PublisherUpdate { to, .. }
+            | Self::ParamUpdate { to, .. }
+            | Self::Shutdown { to, .. } => to,
+        }
+    }
+
+    pub(crate) fn call(&self) -> Call {
+        match self {
+            Self::PublisherUpdate {
+                topic, publishers, ..
+            } => super::publisher_update(topic, publishers),
+            Self::ParamUpdate { key, value, .. } => super::param_update(key, value.clone()),
+            Self::Shutdown { reason, .. } => Call::new(
+                "shutdown",
+                vec![super::tell::MASTER.into(), reason.as_str().into()],
+            ),
+        }
+    }
 }
 
 /// Receives callbacks as the master queues them. Arguments are borrowed: one change may go to thousands of

@@ -82,12 +82,12 @@ impl Params {
         Some(found)
     }
 
-    /// `set_param` of a key with a trailing slash. The tree changes even if computing the updates fails.
+    /// `set_param` of a key with a trailing slash. The tree changes even if computing the updates fails. None go to `ignored`.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
         value: &'a Value,
-        caller_id: &'a str,
+        ignored: Option<&'a str>,
         subscribers: &'a Registrations,
     ) -> Result<Vec<Update<'a>>, Failure> {
         if key == "/" {
@@ -97,7 +97,7 @@ impl Params {
                 ));
             };
         }
-        let updates = updates(subscribers, key, value, Some(caller_id));
+        let updates = updates(subscribers, key, value, ignored);
         let path: Vec<&str> = names::parts(key).take(DEEPEST_TREE + 1).collect();
         self.detach(&path);
         self.put(&path, value.clone())?;

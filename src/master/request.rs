@@ -1,6 +1,8 @@
 //! A call, parsed once: the method, its parameters, and the entries of a multicall.
 
-use super::{Kind, Method, names, returnable};
+use std::borrow::Cow;
+
+use super::{Kind, Method};
 use crate::xmlrpc::{self, Call, DecodeError, Value};
 
 /// Most levels of nested multicalls that are parsed. A decoded document cannot have more, because each takes
@@ -39,8 +41,9 @@ pub enum Entry {
     Request(Request),
     /// An entry that gets a fault of its own, with this text.
     Refused(&'static str),
-    /// An entry that ends the multicall with a fault after the previous ones have run. Always the last.
-    Malformed(&'static str),
+    /// An entry that ends the multicall with a fault after the previous ones have run. Always the last. The text
+    /// is rosmaster's if it begins with `<`, else our own.
+    Malformed(Cow<'static, str>),
 }
 
 impl Request {
@@ -144,27 +147,21 @@ impl Request {
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror may answer the call alone. The call, and every entry of a multicall, must be of the
-    /// Master API, well formed and not a `shutdown`: then the model answers as any master does. Also, the
-    /// result must be restorable to a master: a parameter that no master can return is not.
+    /// Whether the mirror may answer the call alone: whether rosmaster's answer is determined. It is not for a
+    /// `shutdown`, an error whose text depends on Python's version, and what rosmaster exports by accident and does
+    /// more than answer.
     pub fn is_answerable(&self) -> bool {
-        match self.method {
-            Method::Multicall => self
-                .entries
-                .iter()
-                .all(|entry| matches!(entry, Entry::Request(request) if request.is_answerable())),
-            Method::SetParam => self.is_restorable(),
-            _ => !matches!(self.method.kind(), Kind::Unknown | Kind::Shutdown),
+        match &self.method {
+            Method::Multicall => self.entries.iter().all(|entry| match entry {
+                Entry::Request(request) => request.is_answerable(),
+                Entry::Refused(_) => false,
+                Entry::Malformed(text) => text.starts_with('<'),
+            }),
+            // Without its two parameters it is refused.
+            Method::Shutdown => self.params.len() != 2 || self.caller().is_none(),
+            Method::Unknown(name) => **name != *"param_update_task",
+            _ => true,
         }
-    }
-
-    /// Whether this `setParam` is refused, or sets a value that a master can return.
-    fn is_restorable(&self) -> bool {
-        let [Value::String(caller_id), Value::String(key), value] = self.params.as_slice() else {
-            return true;
-        };
-        let key = names::resolve(key, caller_id);
-        returnable::is_readable_at(names::parts(&key).count(), value)
     }
 
     /// Caller id and address of the node for which this call registers something.
@@ -206,12 +203,13 @@ impl From<Request> for Call {
 
 /// The entries of a multicall with these parameters, up to the first malformed one.
 fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
-    let list = match <[Value; 1]>::try_from(params) {
-        Ok([list]) => items(list),
-        Err(_) => None,
+    let Ok([list]) = <[Value; 1]>::try_from(params) else {
+        return vec![Entry::Malformed("system.multicall takes one list".into())];
     };
-    let Some(list) = list else {
-        return vec![Entry::Malformed("system.multicall takes one list")];
+    let is_a = list.python_type();
+    let Some(list) = items(list) else {
+        let text = format!("<class 'TypeError'>:'{is_a}' object is not iterable");
+        return vec![Entry::Malformed(text.into())];
     };
     let mut entries = Vec::with_capacity(list.len());
     for element in list {
@@ -225,12 +223,25 @@ fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
 
 impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
-        let Value::Struct(mut members) = element else {
-            return Self::Malformed("an entry of a multicall is no struct");
+        let mut members = match element {
+            Value::Struct(members) => members,
+            // Depends on Python's version.
+            Value::String(_) => return Self::Malformed("an entry of a multicall is a text".into()),
+            Value::Array(_) => {
+                let text = "<class 'TypeError'>:list indices must be integers or slices, not str";
+                return Self::Malformed(text.into());
+            }
+            other => {
+                let is_a = other.python_type();
+                let text = format!("<class 'TypeError'>:'{is_a}' object is not subscriptable");
+                return Self::Malformed(text.into());
+            }
         };
-        let mut member = |name| members.swap_remove(name);
-        let (Some(name), Some(params)) = (member("methodName"), member("params")) else {
-            return Self::Malformed("an entry of a multicall lacks methodName or params");
+        let Some(name) = members.swap_remove("methodName") else {
+            return Self::Malformed("<class 'KeyError'>:'methodName'".into());
+        };
+        let Some(params) = members.swap_remove("params") else {
+            return Self::Malformed("<class 'KeyError'>:'params'".into());
         };
         let Value::String(name) = name else {
             return Self::Refused("the name of a method is no string");
@@ -268,7 +279,7 @@ fn items(value: Value) -> Option<Vec<Value>> {
 impl Request {
     /// Adds a malformed entry at the end of this multicall.
     pub(crate) fn malformed(mut self) -> Self {
-        self.entries.push(Entry::Malformed("malformed"));
+        self.entries.push(Entry::Malformed("malformed".into()));
         self
     }
 }
@@ -310,17 +321,22 @@ mod tests {
         for method in ["registerService", "getPid", "unsubscribeParam"] {
             assert!(call(method).is_answerable(), "{method}");
         }
-        for method in ["shutdown", "nonsense", "system.listMethods"] {
-            assert!(!call(method).is_answerable(), "{method}");
-            let inner = Request::multicall([call("setParam"), call(method)]);
-            assert!(!Request::multicall([inner]).is_answerable(), "{method}");
+        for method in ["nonsense", "system.listMethods", "shutdown", "uri"] {
+            // A `shutdown` without its reason is refused.
+            assert!(call(method).is_answerable(), "{method}");
+        }
+        let shutdown = Request::new(Method::Shutdown, ["/n", "reason"]);
+        for call in [shutdown, call("param_update_task")] {
+            assert!(!call.is_answerable(), "{call:?}");
+            let inner = Request::multicall([self::call("setParam"), call]);
+            assert!(!Request::multicall([inner]).is_answerable());
         }
         let inner = Request::multicall([call("setParam"), call("getParam")]);
         assert!(Request::multicall([inner]).is_answerable());
-        assert!(!multicall(vec![Value::Int(1)]).is_answerable());
-        let set = |value| Request::new(Method::SetParam, ["/n".into(), "/a".into(), value]);
-        assert!(set(Value::Int(1)).is_answerable());
-        assert!(!set(vec![Value::Nil].into()).is_answerable());
+        assert!(multicall(vec![Value::Int(1)]).is_answerable());
+        assert!(!multicall(vec!["text".into()]).is_answerable());
+        let set = |value: Value| Request::new(Method::SetParam, ["/n".into(), "/a".into(), value]);
+        assert!(set(vec![Value::Nil].into()).is_answerable());
     }
 
     #[test]

@@ -54,12 +54,6 @@ pub(crate) fn is_readable(value: &Value) -> bool {
     is_returnable(value, DEEPEST_NAMESPACE)
 }
 
-/// Whether a multicall can return the whole tree with `value` at a key of so many `names`.
-pub(crate) fn is_readable_at(names: usize, value: &Value) -> bool {
-    let levels = DEEPEST_NAMESPACE.checked_sub(names.saturating_sub(1));
-    levels.is_some_and(|levels| is_returnable(value, levels))
-}
-
 /// The tree without values that a master accepts but cannot return, and the keys that were left out.
 pub(crate) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();

@@ -25,6 +25,28 @@ pub struct Snapshot {
     pub params: Struct,
 }
 
+impl Snapshot {
+    /// Removes nodes, topics, services and parameters whose names begin with `prefix`.
+    pub(crate) fn remove_named(&mut self, prefix: &str) {
+        let stays = |name: &str| !name.starts_with(prefix);
+        self.nodes.retain(|name, _| stays(name));
+        self.topic_types.retain(|topic, _| stays(topic));
+        for registrations in [
+            &mut self.publishers,
+            &mut self.subscribers,
+            &mut self.param_subscribers,
+        ] {
+            registrations.retain(|key, nodes| {
+                nodes.retain(|node| stays(node));
+                stays(key) && !nodes.is_empty()
+            });
+        }
+        self.services
+            .retain(|name, entry| stays(name) && stays(&entry.node));
+        self.params.retain(|key, _| stays(&format!("/{key}")));
+    }
+}
+
 /// A node reference.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct SnapshotNode {

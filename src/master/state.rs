@@ -12,7 +12,7 @@ use super::registry::{Node, Registry, Shared};
 use super::snapshot::{Snapshot, SnapshotNode};
 use super::updates::Update;
 use super::{Method, Request, names};
-use crate::xmlrpc::Struct;
+use crate::xmlrpc::{Reply, Struct, Value};
 
 /// A complete master without IO: rosmaster's state, with answers through [`Master::apply`].
 ///
@@ -26,6 +26,10 @@ pub struct Master {
     /// Whether something is kept otherwise than rosmaster keeps it, so that answers may differ. No ROS client
     /// sends such a thing.
     pub(crate) inexact: bool,
+    /// Whether the dictionaries of the master behind have no order, as in Python 2.
+    pub(crate) unordered: bool,
+    /// Whether the master behind behaves as 1.14.3 and before, if that is known.
+    pub(crate) old: Option<bool>,
     pub(crate) pid: i32,
     pub(crate) uri: String,
 }
@@ -119,6 +123,8 @@ impl Master {
         Self {
             params: self.params.clone(),
             inexact: self.inexact,
+            unordered: self.unordered,
+            old: self.old,
             ..Self::default()
         }
     }
@@ -126,6 +132,44 @@ impl Master {
     /// Whether the answers to reads may differ from rosmaster's. The state itself is compared without that.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()
+    }
+
+    /// Sets whether the dictionaries of the master behind have no order, as in Python 2.
+    pub fn set_unordered(&mut self, unordered: bool) {
+        self.unordered = unordered;
+    }
+
+    /// See [`Self::set_unordered`]. The state itself is compared without that.
+    pub fn is_unordered(&self) -> bool {
+        self.unordered
+    }
+
+    /// Sets whether the master behind behaves as 1.14.3 and before: a node is notified of a parameter that it has set
+    /// itself, and three refusals have the value 0.
+    pub fn set_old(&mut self, old: Option<bool>) {
+        self.old = old;
+    }
+
+    /// See [`Self::set_old`]. None if it is not known. The state itself is compared without that.
+    pub fn is_old(&self) -> Option<bool> {
+        self.old
+    }
+
+    /// A call that shows which it is, and changes nothing.
+    pub fn ask_if_old() -> Request {
+        Request::new(Method::LookupService, [names::CALLER_ID, ""])
+    }
+
+    /// What the answer to [`Self::ask_if_old`] shows. None if no rosmaster answers so.
+    pub fn shows_old(reply: &Reply) -> Option<bool> {
+        match reply {
+            Reply::Value(Value::Array(answer)) => match answer.as_slice() {
+                [Value::Int(-1), _, Value::Int(0)] => Some(true),
+                [Value::Int(-1), _, Value::String(_)] => Some(false),
+                _ => None,
+            },
+            _ => None,
+        }
     }
 
     /// The nodes' caller ids and addresses.
@@ -172,6 +216,15 @@ impl Master {
         node.into_iter()
             .flat_map(|node| &node.subscriptions)
             .map(String::as_str)
+    }
+
+    /// Whether a node publishes a topic, or else subscribes it.
+    pub fn has_topic(&self, caller_id: &str, publishes: bool, topic: &str) -> bool {
+        let node = self.registry.nodes.get(caller_id);
+        node.is_some_and(|node| match publishes {
+            true => node.publications.contains(topic),
+            false => node.subscriptions.contains(topic),
+        })
     }
 
     /// The services that a node provides, with their addresses.

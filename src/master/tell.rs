@@ -10,6 +10,21 @@ use crate::xmlrpc::{Call, Struct, Value};
 pub const MASTER: &str = "/master";
 /// The method that notifies a node of a topic's publishers.
 pub const PUBLISHER_UPDATE: &str = "publisherUpdate";
+/// The method that notifies a node of a parameter.
+pub const PARAM_UPDATE: &str = "paramUpdate";
+
+/// A node that is to shut down: another one has taken its name at another address.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Displaced {
+    /// Its name.
+    pub node: String,
+    /// Its address.
+    pub api: String,
+    /// The process id that was last seen behind the address, if any was.
+    pub pid: Option<i32>,
+    /// What it published and subscribed.
+    pub topics: Vec<String>,
+}
 
 impl Master {
     /// The `publisherUpdate` with the full list of a topic's publishers.
@@ -39,6 +54,11 @@ impl Master {
         node.into_iter()
             .flat_map(|node| &node.param_subscriptions)
             .map(String::as_str)
+    }
+
+    /// Whether a node subscribes any parameter.
+    pub fn subscribes_params(&self, caller_id: &str) -> bool {
+        self.param_subscriptions(caller_id).next().is_some()
     }
 
     /// Every subscription of a set parameter: the subscriber's address, and the key with a trailing slash.
@@ -78,12 +98,23 @@ impl Master {
             .any(|node| self.api_of(node).is_some_and(at))
     }
 
-    /// The node that `call` displaces, and its present address: the call registers something under the same
-    /// name at another address, so the master would shut that node down.
-    pub fn displaced_by(&self, call: &Request) -> Option<(String, String)> {
+    /// The node that `call` displaces: the call registers something under the same name at another address, so
+    /// the master would shut that node down. Its process id is unknown.
+    pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
         let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
-        Some((node.to_owned(), held.to_owned()))
+        let topics = self.publications(node).chain(self.subscriptions(node));
+        Some(Displaced {
+            topics: topics.map(str::to_owned).collect(),
+            node: node.to_owned(),
+            api: held.to_owned(),
+            pid: None,
+        })
+    }
+
+    /// Whether a node is registered as `node` at another address than `api`.
+    pub fn is_held_elsewhere(&self, node: &str, api: &str) -> bool {
+        self.api_of(node).is_some_and(|held| held != api)
     }
 }
 
@@ -96,20 +127,24 @@ pub fn publisher_update(topic: &str, publishers: &[String]) -> Call {
 
 /// The `paramUpdate` with this value.
 pub fn param_update(key: &str, value: Value) -> Call {
-    Call::new("paramUpdate", vec![MASTER.into(), key.into(), value])
+    Call::new(PARAM_UPDATE, vec![MASTER.into(), key.into(), value])
 }
 
 /// The `shutdown` to a node whose name another one has taken.
 pub fn shutdown(node: &str) -> Call {
     Call::new(
         Method::Shutdown.name(),
-        vec![MASTER.into(), bump_reason(node).into()],
+        vec![MASTER.into(), bump_reason(node, false).into()],
     )
 }
 
-/// rosmaster's reason for it.
-pub(crate) fn bump_reason(node: &str) -> String {
-    format!("[{node}] Reason: new node registered with same name")
+/// rosmaster's reason for it; that of `old` ones does not name the node.
+pub(crate) fn bump_reason(node: &str, old: bool) -> String {
+    let reason = "new node registered with same name";
+    match old {
+        true => reason.to_owned(),
+        false => format!("[{node}] Reason: {reason}"),
+    }
 }
 
 /// A call to a node or a master whose only parameter is the caller id.
@@ -179,7 +214,15 @@ mod tests {
         assert_eq!(master.displaced_by(&publish("http://p:1/")), None);
         master.apply(&publish("http://p:1/"));
         assert_eq!(master.displaced_by(&publish("http://p:1/")), None);
-        let displaced = Some(("/p".to_owned(), "http://p:1/".to_owned()));
+        let displaced = Some(Displaced {
+            node: "/p".to_owned(),
+            api: "http://p:1/".to_owned(),
+            pid: None,
+            topics: vec!["/t".to_owned()],
+        });
+        assert!(!master.is_held_elsewhere("/p", "http://p:1/"));
+        assert!(master.is_held_elsewhere("/p", "http://p:2/"));
+        assert!(!master.is_held_elsewhere("/q", "http://p:1/"));
         assert_eq!(master.displaced_by(&publish("http://p:2/")), displaced);
         let watch = call("subscribeParam", &["/p", "http://p:2/", "/k"]);
         assert_eq!(master.displaced_by(&watch), displaced);

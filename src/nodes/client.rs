@@ -8,6 +8,7 @@ use std::{
 use hyper::header::HeaderValue;
 use tokio::{net::TcpStream, time::timeout};
 
+pub(crate) use crate::health::Sign;
 use crate::{
     health::Claims,
     master::{self, question},
@@ -19,17 +20,6 @@ use crate::{
 
 /// Largest accepted reply of a node, in bytes.
 const MAX_REPLY: usize = 16 << 20;
-
-/// A node's reaction to a call.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Sign {
-    /// It answered.
-    Alive,
-    /// Its port refuses connections: the process is gone.
-    Dead,
-    /// No answer in time, or no valid one. That is no proof of death.
-    Silent,
-}
 
 /// Makes `call` to the node at `api` and waits for a sign of life for at most `limit`.
 pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {

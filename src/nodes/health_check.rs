@@ -6,6 +6,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    net::{IpAddr, SocketAddr},
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
@@ -22,12 +23,14 @@ use tracing::Instrument;
 
 use crate::{
     gate::State,
-    health::{Name, Reconciliation, Registration, Verdict, judge, port_of},
-    master::{self, CALLER_ID, Kind, Method, Request},
+    health::{Name, Reconciliation, Refusal, Registration, Verdict, judge, judge_refusal, port_of},
+    ledger::activity::LastCalls,
+    master::{self, CALLER_ID, Kind, Method, Request, question},
     replay::Token,
+    resolver,
     ros_env::MasterUri,
     write_queue::batch::{self, Condition},
-    xmlrpc::Reply,
+    xmlrpc::{Reply, Value},
 };
 
 /// Pause before a node is asked again, to confirm what is to be removed from it.
@@ -62,8 +65,8 @@ pub(crate) async fn after_recovery(
     // Queued calls first: they are newer than a node's answers.
     barrier(&nodes).await;
     let mut notified = match outcome {
-        // A master that was never away notifies nodes itself.
-        Outcome::Adopted => Vec::new(),
+        // This master notifies nodes itself, but the rosrescue before us may have died while it stood in for another.
+        Outcome::Adopted => super::notify_later(&nodes, outage),
         Outcome::Reconciled => {
             // It may send old notifications now.
             nodes
@@ -144,6 +147,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
         reconciled: Vec::new(),
     };
     let mut before = BTreeMap::new();
+    let mut refused = None;
     for question in 0..QUESTIONS {
         if question > 0 {
             tokio::time::sleep(SECOND_QUESTION).await;
@@ -168,11 +172,25 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
                 break;
             }
             Sign::Dead => {
-                outcome.removed = remove_all(nodes, asked).await;
-                nodes.clear(port);
+                drop(waiting.take());
+                let calls: Vec<_> = asked.iter().flat_map(Asked::calls).collect();
+                match judge_refusal(nodes.gate.is_open(), refused.as_ref(), &calls) {
+                    Refusal::AskAgain if question + 1 < QUESTIONS => {
+                        refused = Some(calls);
+                        continue;
+                    }
+                    Refusal::Dead => outcome.removed = remove_all(nodes, asked).await,
+                    _ => {}
+                }
+                if outcome.removed.is_empty() {
+                    nodes.mark_unreachable(port);
+                } else {
+                    nodes.clear(port);
+                }
                 break;
             }
             Sign::Alive => {
+                refused = None;
                 if nodes.clear(port) {
                     // Notifications that were held back meanwhile.
                     notifications::notify_of_all(nodes, port);
@@ -182,7 +200,10 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
         drop(waiting.take());
         let mut found = BTreeMap::new();
         for asked in asked {
-            let findings = asked.findings(nodes, &interview);
+            let mut findings = asked.findings(nodes, &interview);
+            if findings.has_missing() && !has_our_master(nodes, &asked.api).await {
+                findings.forget_missing();
+            }
             let before = before.remove(&asked.api).unwrap_or_default();
             findings.act(nodes, &asked.api, &before, &mut outcome).await;
             found.insert(asked.api, findings);
@@ -250,6 +271,18 @@ impl Asked {
         })
     }
 
+    /// The last calls of each name.
+    fn calls(&self) -> impl Iterator<Item = (String, LastCalls)> {
+        let calls = self.names.iter().zip(&self.unregistered);
+        calls.map(|(name, unregistered)| {
+            let last_calls = LastCalls {
+                registered: name.registered,
+                unregistered: *unregistered,
+            };
+            (name.node.clone(), last_calls)
+        })
+    }
+
     /// The findings about nodes that have registered nothing since the question.
     fn findings(&self, nodes: &Nodes, interview: &Interview) -> Findings {
         let api = self.api.as_str();
@@ -278,7 +311,11 @@ impl Asked {
                     && sure
                     && last_calls.unregistered == *unregistered
                 {
-                    let reconciliation = Reconciliation::new(mirror, &name.node, claims);
+                    let mut reconciliation = Reconciliation::new(mirror, &name.node, claims);
+                    let had = |one: &Registration| {
+                        activity.has_lost(&name.node, api, one.publishes, &one.topic)
+                    };
+                    reconciliation.missing.retain(had);
                     let condition = Condition {
                         node: name.node.clone(),
                         last_calls,
@@ -293,7 +330,45 @@ impl Asked {
     }
 }
 
+/// Whether the node at `api` says that we are its master. If not, what it says of itself may be meant for
+/// another master. roscpp cannot say.
+async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
+    let limit = nodes.timeout;
+    let Some(_admitted) = nodes.visits.admit(port_of(api), limit).await else {
+        return false;
+    };
+    let (_, named) = client::ask_for(api, &question("getMasterUri"), limit).await;
+    let named = named.as_ref().and_then(Value::as_str);
+    let named = named.map(MasterUri::parse).and_then(Result::ok);
+    let own = MasterUri::parse(&nodes.ledger.uri());
+    let (Some(named), Ok(own), Ok(node)) = (named, own, MasterUri::parse(api)) else {
+        return false;
+    };
+    let named_at = addresses(&named, limit).await;
+    let mut at = addresses(&node, limit).await.into_iter();
+    let node_is_here = at.any(resolver::is_own);
+    named.names(&own, &named_at, node_is_here, resolver::is_own)
+}
+
+/// The addresses of a host; none if it gets none within `limit`.
+async fn addresses(at: &MasterUri, limit: Duration) -> Vec<IpAddr> {
+    let found = tokio::time::timeout(limit, resolver::addresses(&at.host, at.port)).await;
+    let found = found.ok().and_then(Result::ok).unwrap_or_default();
+    found.iter().map(SocketAddr::ip).collect()
+}
+
 impl Findings {
+    fn has_missing(&self) -> bool {
+        let mut reconciliations = self.reconciliations.iter();
+        reconciliations.any(|(_, _, reconciliation)| !reconciliation.missing.is_empty())
+    }
+
+    fn forget_missing(&mut self) {
+        for (_, _, reconciliation) in &mut self.reconciliations {
+            reconciliation.missing.clear();
+        }
+    }
+
     fn is_settled(&self) -> bool {
         let mut reconciliations = self.reconciliations.iter();
         self.others.is_empty()
@@ -308,7 +383,8 @@ impl Findings {
             let mut earlier = before.others.iter();
             let again =
                 earlier.any(|found| found.node == name.node && found.registered == name.registered);
-            if again && remove(nodes, name, api).await {
+            let same = |last_calls: LastCalls| last_calls.registered == name.registered;
+            if again && remove(nodes, &name.node, api, same).await {
                 outcome.removed.push(name.node.clone());
             }
         }
@@ -369,34 +445,39 @@ fn is_done(reply: &Reply) -> bool {
 /// Unregisters all of `asked`: their port refuses. Returns who was.
 async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     let mut removals = JoinSet::new();
-    for Asked { api, names, .. } in asked {
-        for name in names {
-            let (nodes, api) = (nodes.clone(), api.clone());
-            removals.spawn(async move { remove(&nodes, &name, &api).await.then_some(name.node) });
+    for asked in asked {
+        for (node, before) in asked.calls() {
+            let (nodes, api) = (nodes.clone(), asked.api.clone());
+            removals.spawn(async move {
+                let same = |last_calls| last_calls == before && nodes.gate.is_open();
+                remove(&nodes, &node, &api, same).await.then_some(node)
+            });
         }
     }
     removals.join_all().await.into_iter().flatten().collect()
 }
 
 /// Unregisters a node as it would do itself. Not if it has come back since it was asked: its address is
-/// different, or it has registered something.
-async fn remove(nodes: &Nodes, name: &Name, api: &str) -> bool {
+/// different, or its last calls are not the `same`.
+async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
     // Its queued calls come first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
-        let last_calls = activity.last_calls(&name.node);
-        let same =
-            mirror.api_of(&name.node) == Some(api) && last_calls.registered == name.registered;
-        same.then(|| (mirror.unregister_calls(&name.node), last_calls))
+        let last_calls = activity.last_calls(node);
+        let same = mirror.api_of(node) == Some(api) && same(last_calls);
+        same.then(|| (mirror.unregister_calls(node), last_calls))
     });
     let Some((calls, last_calls)) = found.filter(|(calls, _)| !calls.is_empty()) else {
         return false;
     };
-    let node = name.node.clone();
-    let (call, condition) = (Request::multicall(calls), Condition { node, last_calls });
+    let condition = Condition {
+        node: node.to_owned(),
+        last_calls,
+    };
+    let call = Request::multicall(calls);
     let reply = nodes.write_queue.call_if(call, condition).await;
     if reply.is_some() {
-        nodes.removed.add(&name.node);
+        nodes.removed.add(node, Instant::now());
     }
     reply.is_some()
 }

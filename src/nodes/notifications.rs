@@ -1,15 +1,12 @@
 //! Notifications to nodes that the master would send, has not sent, or will send late.
 //!
-//! Each port gets its notifications in order, one at a time; a node that does not answer delays no other. A
-//! node ignores a list of publishers that it knows already, but a stale list could make it drop links. So a
-//! repeated notification takes its content from the mirror when it is sent, and if that changes on the way,
-//! another one follows.
+//! Each port gets its notifications in [order](crate::order), one at a time; a node that does not answer delays
+//! no other.
 
 use std::{
-    collections::{HashMap, VecDeque},
     pin::pin,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
-    time::Duration,
+    sync::Arc,
+    time::{Duration, Instant},
 };
 
 use tokio::sync::Semaphore;
@@ -20,28 +17,27 @@ use super::{
 };
 use crate::{
     health::{Claims, port_of},
-    ledger::activity::{Displaced, Notification},
     limit::rarely,
-    master::{self, Master},
-    xmlrpc::{Call, Value},
+    master::{self, Displaced, Master},
+    order::{Next, Order, Subject},
+    wait,
 };
 
 /// Nodes notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
 /// A node that takes longer yields its place to the next one: living nodes answer within milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
+/// How long to wait for the answer to a `paramUpdate` of a node that has not answered one, but answers
+/// otherwise, as rosnodejs does: it only has to be read.
+const MUTE: Duration = Duration::from_millis(500);
 /// Further slow nodes that may be waited for: many nodes on a computer whose packets vanish.
 const SLOW: usize = 128;
-/// When more notifications wait for a node, it gets only the latest of each kind.
-const QUEUE_MAX: usize = 256;
 /// Pauses before asking a node again to shut down, if it does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 
 /// The notifications under way.
 #[derive(Debug)]
 pub(crate) struct Notifications {
-    /// Waiting notifications by port. A port being notified has an entry, which may be empty.
-    pending: Mutex<HashMap<String, VecDeque<Notification>>>,
     permits: Semaphore,
     slow: Semaphore,
 }
@@ -49,16 +45,9 @@ pub(crate) struct Notifications {
 impl Default for Notifications {
     fn default() -> Self {
         Self {
-            pending: Mutex::default(),
             permits: Semaphore::new(AT_ONCE),
             slow: Semaphore::new(SLOW),
         }
-    }
-}
-
-impl Notifications {
-    fn lock(&self) -> MutexGuard<'_, HashMap<String, VecDeque<Notification>>> {
-        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -68,99 +57,79 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
         .ledger
         .with_mirror(|mirror| mirror.subscribers_of(topic));
     for api in &subscribers {
-        send(nodes, api, Notification::Topic(topic.to_owned()));
+        tell(nodes, api, Subject::Topic(topic.to_owned()));
     }
     !subscribers.is_empty()
 }
 
 /// Notifies the node at `port` of every topic and parameter that it subscribes.
 pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
-    let notifications = nodes.ledger.with_mirror(|mirror| {
-        let names = mirror.nodes().filter(|(_, api)| port_of(api) == port);
-        let notifications = names.flat_map(|(name, _)| {
-            let topics = mirror.subscriptions(name).map(str::to_owned);
-            // Nothing to send for a parameter that is not set, and may never have been.
-            let keys = mirror.param_subscriptions(name);
-            let keys = keys.filter(|key| mirror.is_set(key)).map(Arc::from);
-            topics
-                .map(Notification::Topic)
-                .chain(keys.map(Notification::Param))
-        });
-        notifications.collect::<Vec<_>>()
-    });
-    for notification in notifications {
-        send(nodes, port, notification);
-    }
-}
-
-/// Notifies the node at `api`, unless it is unreachable: such a node gets everything once it answers. A node
-/// that does not take a notification becomes unreachable.
-pub(crate) fn send(nodes: &Arc<Nodes>, api: &str, notification: Notification) {
-    let port = port_of(api);
-    if nodes.is_unreachable(port) {
-        return;
-    }
-    let mut pending = nodes.notifications.lock();
-    if let Some(queue) = pending.get_mut(port) {
-        add(queue, notification);
-        return;
-    }
-    pending.insert(port.to_owned(), VecDeque::from([notification]));
-    drop(pending);
-    tokio::spawn(deliver(nodes.clone(), port.to_owned()));
-}
-
-fn add(queue: &mut VecDeque<Notification>, notification: Notification) {
-    let repeated = !matches!(notification, Notification::Call(_));
-    if repeated && queue.contains(&notification) {
-        return;
-    }
-    queue.push_back(notification);
-    if queue.len() > QUEUE_MAX {
-        let all = std::mem::take(queue);
-        for notification in all.into_iter().filter_map(latest) {
-            if !queue.contains(&notification) {
-                queue.push_back(notification);
+    nodes.ledger.with_order(|order, mirror| {
+        for (name, _) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
+            for topic in mirror.subscriptions(name) {
+                order.tell_state(port, Subject::Topic(topic.to_owned()));
             }
+            // Nothing to send for a parameter that is not set, and may never have been.
+            for key in mirror
+                .param_subscriptions(name)
+                .filter(|key| mirror.is_set(key))
+            {
+                order.tell_state(port, Subject::Param(key.to_owned()));
+            }
+        }
+    });
+    send_waiting(nodes);
+}
+
+/// Tells the node at `api` the present state of `subject`.
+pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
+    let port = port_of(api);
+    let tell = |order: &mut Order, _: &Master| order.tell_state(port, subject);
+    nodes.ledger.with_order(tell);
+    send_waiting(nodes);
+}
+
+/// Sends the notifications that wait for nodes. A node that is unreachable gets everything once it answers.
+pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
+    let ports = nodes.ledger.with_order(|order, _| order.take_idle_ports());
+    for port in ports {
+        match nodes.is_unreachable(&port) {
+            true => nodes.ledger.with_order(|order, _| order.drop_port(&port)),
+            false => drop(tokio::spawn(deliver(nodes.clone(), port))),
         }
     }
 }
 
-/// One notification that replaces all others of its kind; it takes its content when it is sent.
-fn latest(notification: Notification) -> Option<Notification> {
-    let Notification::Call(call) = notification else {
-        return Some(notification);
-    };
-    let subject = call.params.get(1).and_then(Value::as_str)?;
-    Some(match call.method == master::PUBLISHER_UPDATE {
-        true => Notification::Topic(subject.to_owned()),
-        false => Notification::Param(subject.into()),
-    })
-}
-
+/// Sends a node its notifications, in order, one at a time. One that does not take a notification becomes
+/// unreachable. One that only does not answer `paramUpdate` gets the next notification all the same.
 async fn deliver(nodes: Arc<Nodes>, port: String) {
     let notifications = &nodes.notifications;
+    let mut changed = nodes.ledger.order_changed();
     loop {
-        let notification = {
-            let mut pending = notifications.lock();
-            match pending.get_mut(&port).and_then(VecDeque::pop_front) {
-                Some(notification) => notification,
-                None => {
-                    pending.remove(&port);
-                    return;
-                }
-            }
-        };
-        let compose = || {
-            nodes
-                .ledger
-                .with_mirror(|mirror| compose(mirror, &port, &notification))
-        };
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
-        let Some(call) = compose() else { continue };
+        changed.mark_unchanged();
+        let (call, number) = match nodes.ledger.next_notification(&port) {
+            Next::Send { call, number } => (call, number),
+            Next::Wait { until } => {
+                drop(permit);
+                tokio::select! {
+                    // The ledger lives as long.
+                    _ = changed.changed() => {}
+                    () = wait::until(until.map(Into::into)) => {}
+                }
+                continue;
+            }
+            Next::Idle => return,
+        };
         nodes.stats.notifications_sent.count();
-        let mut asked = pin!(client::ask(&port, &call, nodes.timeout));
+        let is_param = call.method == master::PARAM_UPDATE;
+        let is_mute = is_param && nodes.is_mute(&port);
+        let limit = match is_mute {
+            true => MUTE.min(nodes.timeout),
+            false => nodes.timeout,
+        };
+        let mut asked = pin!(client::ask(&port, &call, limit));
         let sign = match tokio::time::timeout(PROMPT, &mut asked).await {
             Ok(sign) => sign,
             Err(_) => {
@@ -168,32 +137,25 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
                 asked.await
             }
         };
-        if sign != Sign::Alive {
-            notifications.lock().remove(&port);
-            nodes.mark_unreachable(&port);
-            return;
+        nodes.ledger.notification_ended(number);
+        if is_param && sign == Sign::Silent && answers(&nodes, &port).await {
+            nodes.set_mute(&port, true);
+            continue;
         }
-        if compose().is_some_and(|now| now != call)
-            && let Some(queue) = notifications.lock().get_mut(&port)
-        {
-            add(queue, notification);
+        if is_mute && sign == Sign::Alive {
+            nodes.set_mute(&port, false);
+        }
+        if sign != Sign::Alive {
+            nodes.mark_unreachable(&port);
+            nodes.ledger.with_order(|order, _| order.drop_port(&port));
+            return;
         }
     }
 }
 
-/// The call to send to the node at `port` now; none if it no longer concerns that node.
-fn compose(mirror: &Master, port: &str, notification: &Notification) -> Option<Arc<Call>> {
-    let at = |api: &str| port_of(api) == port;
-    match notification {
-        Notification::Call(call) => Some(call.clone()),
-        Notification::Topic(topic) => mirror
-            .subscribes(at, topic)
-            .then(|| mirror.publisher_update(topic).into()),
-        Notification::Param(key) => match mirror.subscribes_param(at, key) {
-            true => mirror.param_update(key).map(Arc::new),
-            false => None,
-        },
-    }
+/// Whether the node at `port` answers a question.
+async fn answers(nodes: &Nodes, port: &str) -> bool {
+    client::ask(port, &master::get_pid(), nodes.timeout).await == Sign::Alive
 }
 
 /// Asks a node to shut down because another one has taken its name, as a master does. Never a different node
@@ -203,6 +165,8 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     tokio::spawn(async move {
         for seconds in SHUTDOWN_PAUSES {
             tokio::time::sleep(Duration::from_secs(seconds)).await;
+            let name = Subject::Name(displaced.node.clone());
+            answers_are_written(&nodes, port_of(&displaced.api), &name).await;
             if is_taken(&nodes, &displaced.api) {
                 return;
             }
@@ -236,6 +200,24 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             return;
         }
     });
+}
+
+/// Returns when no answer to the node at `port` about `subject` is under way.
+async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
+    let mut changed = nodes.ledger.order_changed();
+    loop {
+        changed.mark_unchanged();
+        let under_way =
+            |order: &mut Order, _: &Master| order.is_under_way(Instant::now(), port, subject);
+        let Some(held) = nodes.ledger.with_order(under_way) else {
+            return;
+        };
+        tokio::select! {
+            // The ledger lives as long.
+            _ = changed.changed() => {}
+            () = wait::until(held.until.map(Into::into)) => {}
+        }
+    }
 }
 
 /// Whether a node is registered at this address.

@@ -14,13 +14,13 @@ const MOST: usize = 100;
 pub(crate) struct Removed(Mutex<VecDeque<(String, Instant)>>);
 
 impl Removed {
-    pub(super) fn add(&self, node: &str) {
+    pub(crate) fn add(&self, node: &str, at: Instant) {
         let mut removed = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         removed.retain(|(name, _)| name != node);
         if removed.len() == MOST {
             removed.pop_front();
         }
-        removed.push_back((node.to_owned(), Instant::now()));
+        removed.push_back((node.to_owned(), at));
     }
 
     /// Their names, and when they were taken out. They may have come back.
@@ -38,7 +38,7 @@ mod tests {
     fn each_is_listed_once_and_the_oldest_are_forgotten() {
         let removed = Removed::default();
         for index in (0..=MOST).chain([7]) {
-            removed.add(&format!("/{index}"));
+            removed.add(&format!("/{index}"), Instant::now());
         }
         let names: Vec<_> = removed.list().into_iter().map(|(name, _)| name).collect();
         assert_eq!(names.len(), MOST);

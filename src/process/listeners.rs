@@ -1,9 +1,56 @@
 //! Which processes listen at a port, as far as the system lets us see.
 
-use std::{collections::HashSet, fs, path::PathBuf};
+use std::{
+    collections::HashSet,
+    fs::{self, File},
+    io::{BufRead, BufReader},
+    path::PathBuf,
+};
 
 /// State of a listening socket in the kernel's tables.
 const LISTENING: &str = "0A";
+
+/// Who listens at the port of a master that we have started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Holder {
+    /// The master, or a process that it has started.
+    Master,
+    /// Another program, with its process id if we may see it. The master can never listen there.
+    Stranger(Option<u32>),
+    /// Nobody any more, or nobody whom we may see.
+    Unknown,
+}
+
+impl Holder {
+    /// Who listens at `port`, of which the master `child` has been told. `own`: it is ROS's own program, which starts
+    /// no other one.
+    pub(crate) fn of(child: u32, port: u16, own: bool) -> Self {
+        let sockets = sockets(port);
+        if holds_one(child, &sockets) {
+            return Self::Master;
+        }
+        judge(!sockets.is_empty(), &at(port), own, |pid| {
+            descends(pid, child)
+        })
+    }
+}
+
+/// `taken`: somebody listens, and not the child itself.
+fn judge(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
+    match seen.first() {
+        _ if !taken => Holder::Unknown,
+        _ if seen.iter().any(|pid| descends(*pid)) => Holder::Master,
+        // Processes of another user, of which we see none.
+        None if !own => Holder::Unknown,
+        first => Holder::Stranger(first.copied()),
+    }
+}
+
+/// Whether `ancestor` has started the process `pid`, directly or not.
+fn descends(pid: u32, ancestor: u32) -> bool {
+    let parent = |pid: &u32| super::parent_of(*pid).filter(|parent| *parent > 1);
+    std::iter::successors(Some(pid), parent).any(|pid| pid == ancestor)
+}
 
 /// The processes that listen at `port`, in our network namespace. Those of other users are seen by root only.
 pub(crate) fn at(port: u16) -> Vec<u32> {
@@ -35,7 +82,7 @@ pub(crate) fn ports(pid: u32) -> Vec<u16> {
 }
 
 /// The listening sockets at `port`, as links in `/proc/PID/fd` name them.
-fn sockets(port: u16) -> HashSet<PathBuf> {
+pub(super) fn sockets(port: u16) -> HashSet<PathBuf> {
     let listening = listening().into_iter();
     listening
         .filter_map(|(at, socket)| (at == port).then_some(socket))
@@ -43,9 +90,13 @@ fn sockets(port: u16) -> HashSet<PathBuf> {
 }
 
 fn listening() -> Vec<(u16, PathBuf)> {
-    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(fs::read_to_string);
-    let tables = tables.map(Result::unwrap_or_default).join("\n");
-    tables.lines().filter_map(socket).collect()
+    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
+    let sockets = tables.into_iter().flatten().flat_map(|table| {
+        // The kernel lists those that listen first. There may be ten thousands of others, and each costs it time.
+        let lines = BufReader::new(table).lines().skip(1);
+        lines.map_while(|line| socket(&line.ok()?))
+    });
+    sockets.collect()
 }
 
 /// Port and socket of a table's line, if it listens.
@@ -62,13 +113,23 @@ fn socket(line: &str) -> Option<(u16, PathBuf)> {
     ))
 }
 
+/// The inodes of the sockets that the process `pid` has open. None of another user's, unless we are root.
+pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
+    let sockets = open_files(pid).filter_map(|file| {
+        let inode = file.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;
+        inode.parse().ok()
+    });
+    sockets.collect()
+}
+
 fn open_files(pid: u32) -> impl Iterator<Item = PathBuf> {
     let open = fs::read_dir(format!("/proc/{pid}/fd"));
     let open = open.into_iter().flatten().flatten();
     open.filter_map(|entry| fs::read_link(entry.path()).ok())
 }
 
-fn holds_one(pid: u32, sockets: &HashSet<PathBuf>) -> bool {
+/// Whether the process `pid` has one of `sockets` open.
+pub(super) fn holds_one(pid: u32, sockets: &HashSet<PathBuf>) -> bool {
     open_files(pid).any(|file| sockets.contains(&file))
 }
 
@@ -77,6 +138,37 @@ mod tests {
     use std::net::TcpListener;
 
     use super::*;
+
+    #[test]
+    fn a_stranger_at_the_port_of_our_master_is_told_from_its_own_processes() {
+        let child = |pid| pid == 7;
+        assert_eq!(judge(false, &[], true, child), Holder::Unknown);
+        assert_eq!(judge(true, &[7], false, child), Holder::Master);
+        assert_eq!(judge(true, &[8, 7], false, child), Holder::Master);
+        assert_eq!(judge(true, &[8], false, child), Holder::Stranger(Some(8)));
+        assert_eq!(judge(true, &[], true, child), Holder::Stranger(None));
+        assert_eq!(judge(true, &[], false, child), Holder::Unknown);
+    }
+
+    #[test]
+    fn whose_port_it_is_is_known() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let own = std::process::id();
+        let mut child = std::process::Command::new("sleep")
+            .arg("60")
+            .spawn()
+            .unwrap();
+        assert_eq!(Holder::of(own, port, true), Holder::Master);
+        let parent = std::os::unix::process::parent_id();
+        assert_eq!(Holder::of(parent, port, true), Holder::Master);
+        let stranger = Holder::Stranger(Some(own));
+        assert_eq!(Holder::of(child.id(), port, true), stranger);
+        drop(listener);
+        assert_eq!(Holder::of(child.id(), port, true), Holder::Unknown);
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
 
     #[test]
     fn who_listens_is_known() {

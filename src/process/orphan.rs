@@ -1,7 +1,8 @@
 //! Orphans: rosmasters and rosouts that a killed rosrescue left running.
 //!
 //! They are identified by their process, not by their port: another program may have taken the port since,
-//! even another rosmaster. Each started process has the checkpoint's path in its environment. No other
+//! even another rosmaster. A [`PidFile`](super::PidFile) names the process that was started last. Without that
+//! file all processes are searched: each started process has the checkpoint's path in its environment. No other
 //! program sets that variable, and the kernel shows it as long as the process lives.
 
 use std::{
@@ -11,9 +12,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use rustix::process::PidfdFlags;
+use rustix::process::{PidfdFlags, Signal};
 
-use super::pidfd;
+use super::{Rosmaster, listeners, pid_file::Last, pidfd, runs, signal_process};
 
 /// The environment variable that identifies a process's owner.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
@@ -29,12 +30,96 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
     }
 }
 
+/// A rosmaster that an earlier rosrescue left running.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Left {
+    /// It listens at the expected port.
+    Serving(u32),
+    /// It was started for that port and does not listen yet, so it is still empty.
+    Starting(u32),
+}
+
+impl Rosmaster {
+    /// The rosmaster that an earlier rosrescue with this checkpoint left running for `port`. Ends the others
+    /// if there is none: they are of no use. Blocks for long if it must be searched for.
+    pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<Left> {
+        let owner = owner(&self.checkpoint);
+        let last = self.pid_file.last();
+        let all = match last {
+            Last::Running { pid, .. } if is_in_our_network(pid) => vec![pid],
+            Last::Running { .. } | Last::Ended => Vec::new(),
+            Last::Unknown => {
+                let mut all = find(&owner);
+                all.retain(|pid| !runs(*pid, "rosout"));
+                all
+            }
+        };
+        let is_told = |pid, port| match last {
+            Last::Running { port: told, .. } => told == port,
+            _ => is_told(pid, port),
+        };
+        if let Some(port) = port
+            && let Some(left) = left_for(port, &all, &owner, is_told)
+        {
+            let (Left::Serving(pid) | Left::Starting(pid)) = left;
+            self.pid_file.record(pid, port);
+            return Some(left);
+        }
+        let name = self.program.file_name().unwrap_or_default();
+        let name = name.to_string_lossy();
+        for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
+            tracing::info!(
+                pid,
+                "ending a rosmaster that was left behind and does not serve"
+            );
+            signal_process(pid, Signal::KILL);
+        }
+        None
+    }
+}
+
+/// The one of `all` that listens at `port`, or that will: a rosmaster whose port is taken never listens. `is_told`:
+/// whether a process was told a port. If none of `all` listens, another process of `owner` may: a program given by
+/// `--rosmaster` may start another one.
+fn left_for(
+    port: u16,
+    all: &[u32],
+    owner: &OsStr,
+    is_told: impl Fn(u32, u16) -> bool,
+) -> Option<Left> {
+    let sockets = listeners::sockets(port);
+    let mut known = all.iter().copied();
+    if sockets.is_empty() {
+        let starting = known.find(|pid| is_told(*pid, port));
+        return starting.map(Left::Starting);
+    }
+    let serving = known
+        .find(|pid| listeners::holds_one(*pid, &sockets))
+        .or_else(|| {
+            let mut others = listeners::at(port).into_iter();
+            others.find(|pid| is_orphan(*pid, owner))
+        });
+    serving.map(Left::Serving)
+}
+
+/// Whether the command line of the process `pid` gives `port` as rosmaster's. That of a spare does not.
+fn is_told(pid: u32, port: u16) -> bool {
+    let command_line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    let words: Vec<_> = command_line.split(|byte| *byte == 0).collect();
+    let port = port.to_string();
+    words
+        .windows(2)
+        .any(|pair| pair == [b"-p", port.as_bytes()])
+}
+
 /// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes of other
 /// containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
-    super::all()
-        .filter(|pid| bears(*pid, owner) && is_in_our_network(*pid) && !has_rosrescue(*pid))
-        .collect()
+    super::all().filter(|pid| is_orphan(*pid, owner)).collect()
+}
+
+fn is_orphan(pid: u32, owner: &OsStr) -> bool {
+    bears(pid, owner) && is_in_our_network(pid) && !has_rosrescue(pid)
 }
 
 /// Whether the process `pid` was started with this `owner`.
@@ -90,6 +175,7 @@ mod tests {
     };
 
     use super::*;
+    use crate::{config::SupervisedConfig, process::Stat};
 
     /// Runs `program` and gives the id of the process that it prints.
     fn pid_of(program: &str, owner: &OsStr) -> u32 {
@@ -121,12 +207,66 @@ mod tests {
         assert_eq!(find(&owner), [orphan]);
         assert_eq!(find(OsStr::new("another")), Vec::<u32>::new());
         let end = tokio::spawn(ended(orphan));
-        crate::process::signal_process(orphan, rustix::process::Signal::KILL);
+        signal_process(orphan, Signal::KILL);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
         end.expect("the end is told").unwrap().unwrap();
         assert_eq!(find(&owner), Vec::<u32>::new());
         kept.kill().unwrap();
         kept.wait().unwrap();
+    }
+
+    #[test]
+    fn processes_are_searched_only_without_a_pid_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner(&checkpoint));
+        let config = SupervisedConfig {
+            port: None,
+            rosmaster: Some("/bin/sleep".into()),
+            spare: false,
+            numworkers: 1,
+            timeout: 0.0,
+            rosout: false,
+            log_dir: folder.path().to_owned(),
+        };
+        let rosmaster = Rosmaster::find(&config, &checkpoint).unwrap();
+        let mut ended = Command::new("sleep").arg("60").spawn().unwrap();
+        rosmaster.pid_file.record(ended.id(), 1);
+        ended.kill().unwrap();
+        ended.wait().unwrap();
+        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        assert!(Stat::of(orphan).is_some_and(Stat::is_alive), "not found");
+
+        rosmaster.pid_file.record(orphan, 1);
+        let starting = Some(Left::Starting(orphan));
+        assert_eq!(rosmaster.left_behind(Some(1)), starting);
+        rosmaster.pid_file.remove();
+        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        while Stat::of(orphan).is_some_and(Stat::is_alive) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn a_master_is_starting_if_it_was_told_a_port_at_which_nobody_listens() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let mut starting = Command::new("sh")
+            .args(["-c", "read line", "rosmaster", "--core", "-p"])
+            .arg(port.to_string())
+            .stdin(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let own = std::process::id();
+        let pid = starting.id();
+        let left_for = |port, all: &[u32]| left_for(port, all, OsStr::new("nothing"), is_told);
+        assert_eq!(left_for(port, &[pid, own]), Some(Left::Serving(own)));
+        assert_eq!(left_for(port, &[pid]), None, "its port is taken");
+        drop(listener);
+        assert_eq!(left_for(port, &[own, pid]), Some(Left::Starting(pid)));
+        assert_eq!(left_for(1, &[own, pid]), None, "it is for another port");
+        starting.kill().unwrap();
+        starting.wait().unwrap();
     }
 
     #[test]

@@ -10,14 +10,17 @@ use std::{
 use tokio::process::{Child, Command};
 
 use super::{
-    add_ros_paths, beside, command, create, find_program, is_program, orphan, runs, tail_of,
+    Output, PidFile, add_ros_paths, command, find_program, is_program, orphan, pid_file::Last,
+    runs, start,
 };
 
 #[derive(Debug)]
 pub(crate) struct Rosout {
     program: PathBuf,
     /// Stderr of the last one.
-    output: PathBuf,
+    output: Output,
+    /// The last one.
+    pid_file: PidFile,
     /// Their owner: the checkpoint.
     owner: OsString,
 }
@@ -30,23 +33,41 @@ impl Rosout {
         })?;
         Some(Self {
             program,
-            output: beside(checkpoint, ".rosout-output.log"),
+            output: Output::beside(checkpoint, ".rosout-output.log"),
+            pid_file: PidFile::beside(checkpoint, "rosout"),
             owner: orphan::owner(checkpoint),
         })
     }
 
     /// The rosout that an earlier rosrescue with this checkpoint left running. It may not have registered
-    /// yet.
+    /// yet. Blocks for long if it must be searched for.
     pub(crate) fn left_behind(&self) -> Option<u32> {
-        let mut all = orphan::find(&self.owner).into_iter();
-        all.find(|pid| runs(*pid, "rosout"))
+        match self.pid_file.last() {
+            Last::Running { pid, .. } => Some(pid).filter(|pid| orphan::is_in_our_network(*pid)),
+            Last::Ended => None,
+            Last::Unknown => {
+                let mut all = orphan::find(&self.owner).into_iter();
+                let found = all.find(|pid| runs(*pid, "rosout"))?;
+                self.pid_file.record(found, 0);
+                Some(found)
+            }
+        }
     }
 
     /// Starts one as a node of the master at `uri`. It outlives rosrescue: dropping the child does not end
     /// it.
-    pub(crate) fn spawn(&self, uri: &str) -> io::Result<Child> {
-        let stderr = create(&self.output).map_or_else(|_| Stdio::null(), Stdio::from);
-        self.command(uri).stderr(stderr).spawn()
+    pub(crate) async fn spawn(&self, uri: &str) -> io::Result<Child> {
+        self.output.renew().await;
+        let stderr = self.output.file().map_or_else(Stdio::null, Stdio::from);
+        let mut command = self.command(uri);
+        command.stderr(stderr);
+        self.pid_file.clear().await;
+        let child = start(command)?;
+        if let Some(pid) = child.id() {
+            // rosout chooses its ports itself.
+            self.pid_file.write(pid, 0);
+        }
+        Ok(child)
     }
 
     fn command(&self, uri: &str) -> Command {
@@ -62,8 +83,8 @@ impl Rosout {
     }
 
     /// The last output of the last one.
-    pub(crate) fn last_words(&self) -> String {
-        tail_of(&self.output)
+    pub(crate) async fn last_words(&self) -> String {
+        self.output.tail().await
     }
 }
 
@@ -77,7 +98,8 @@ mod tests {
     fn a_rosout_in_opt_finds_its_libraries() {
         let rosout = Rosout {
             program: PathBuf::from("/opt/ros/noetic/lib/rosout/rosout"),
-            output: PathBuf::new(),
+            output: Output::beside(Path::new(""), ""),
+            pid_file: PidFile::beside(Path::new(""), "rosout"),
             owner: OsString::new(),
         };
         let command = rosout.command("http://localhost:1/");

@@ -1,12 +1,7 @@
 //! A spare rosmaster: a process that has loaded the program and waits to be told its port. It needs a tenth of
 //! the time of a new one.
 
-use std::{
-    fs::{self, OpenOptions},
-    path::Path,
-    process::Stdio,
-    time::Duration,
-};
+use std::{fs, path::Path, process::Stdio, time::Duration};
 
 use rustix::process::Signal;
 use tokio::{
@@ -24,7 +19,7 @@ const LIMIT: Duration = Duration::from_secs(3);
 /// it is. The end of the input means that rosrescue has ended.
 const PROGRAM: &str = "\
 import runpy, sys
-import rosmaster.main, rosgraph.roslogging, rosgraph.xmlrpc, logging.config, logging.handlers, xmlrpc.client
+import rosmaster.main, rosgraph.roslogging, rosgraph.xmlrpc, logging.config, logging.handlers
 port = sys.stdin.readline().strip()
 if not port:
     sys.exit()
@@ -45,12 +40,11 @@ pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
 
 impl Rosmaster {
     /// Starts a spare, if one is wanted and the program is ROS's own.
-    pub(crate) fn spawn_spare(&self) -> Option<Spare> {
+    pub(crate) async fn spawn_spare(&self) -> Option<Spare> {
         if !self.config.spare {
             return None;
         }
-        let own = self.config.rosmaster.is_none();
-        let interpreter = own.then(|| interpreter(&self.program)).flatten();
+        let interpreter = self.is_own().then(|| interpreter(&self.program)).flatten();
         let Some(interpreter) = interpreter else {
             rarely!(
                 info,
@@ -64,8 +58,10 @@ impl Rosmaster {
         command.arg(&self.program).arg("--core");
         command.stdin(Stdio::piped());
         // The last words of the present master stay.
-        let output = OpenOptions::new().append(true).open(&self.output);
-        match self.spawn_as(command, output) {
+        if self.output.file().is_none() {
+            self.output.renew().await;
+        }
+        match self.spawn_as(command).await {
             Ok(child) => Spare::new(child),
             Err(error) => {
                 rarely!(warn, %error, "no spare rosmaster: the next one takes longer to start");

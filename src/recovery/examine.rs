@@ -9,24 +9,29 @@ use std::{
 use thiserror::Error;
 use tokio::task::JoinHandle;
 
-use crate::status::report::Outcome;
+use crate::status::{report::Outcome, software};
 use crate::{
     gate::{State, Tx},
-    ledger::{Basis, Ledger},
+    ledger::{Basis, Ledger, late::CatchUp},
     lifecycle::{Input, Probing, Supervision},
     limit::rarely,
     master::{Counts, Master, Method, Request},
+    process::listeners,
     replay::{self, Authority, Bears, Inspection, Known, Plan, Token, Treatment},
     status::stats::Stats,
     upstream::{
-        CallError, Connection, Upstream,
+        CallError, ConnectError, Connection, RawReply, Upstream,
         inspect::{self, InspectError},
+        sentinel::Sentinel,
         sockets,
+        verify::Verification,
     },
 };
 
 /// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
+/// How long a master that was late may take for each step of catching up: writes wait for it.
+const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
 /// Most rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
 /// How long to wait for running calls of closed connections. A `setParam` of 60,000 keys takes some 10 s.
@@ -40,6 +45,8 @@ const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 pub(crate) enum ExamineError {
     #[error("no answer within {limit:?}")]
     Silent { limit: Duration },
+    #[error(transparent)]
+    Connect(#[from] ConnectError),
     /// A call of ours failed, or the server is no master.
     #[error(transparent)]
     Look(#[from] InspectError),
@@ -55,10 +62,14 @@ impl ExamineError {
     /// The lifecycle's input for this error.
     pub(crate) fn as_input(&self) -> Input {
         match self {
-            Self::Silent { .. } => Input::Unreachable,
+            Self::Silent { .. } | Self::Connect(ConnectError::Unreachable { .. }) => {
+                Input::Unreachable
+            }
             Self::Look(InspectError::Call(
                 CallError::NotSent(error) | CallError::MaybeSent(error),
             )) if !error.is_parse() => Input::ConnectionLost,
+            Self::Connect(ConnectError::Refused { .. })
+            | Self::Look(InspectError::Call(CallError::NotConnected(_))) => Input::ConnectionLost,
             Self::Look(_) => Input::NotAMaster,
         }
     }
@@ -71,6 +82,10 @@ pub(crate) struct Examination {
     pub outcome: Outcome,
     /// The master's process id.
     pub pid: i32,
+    /// What it speaks, for people.
+    pub speaks: String,
+    /// How calls are known to reach it.
+    pub verification: Verification,
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
@@ -117,8 +132,27 @@ pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
 struct Target {
     state: Master,
     found: Master,
-    /// Its token, if everything that it holds is to be replaced.
-    replaced: Option<Token>,
+    change: Change,
+}
+
+/// How a master is brought to a state.
+enum Change {
+    /// What it lacks is added.
+    Add,
+    /// It holds the state, and gets a new token in place of this one.
+    Renew(Token),
+    /// All that it holds, with this token, is replaced.
+    Replace(Token),
+}
+
+impl Change {
+    fn plan(&self, state: &Master, found: &Master, token: &Token) -> Plan {
+        match self {
+            Self::Add => Plan::new(state, found, token),
+            Self::Renew(before) => Plan::renew(found, before, token),
+            Self::Replace(before) => Plan::replace(state, found, before, token),
+        }
+    }
 }
 
 /// Examines masters, and opens the gate to one that holds the mirror's state.
@@ -153,23 +187,26 @@ impl Examiner {
         self.gate.set(State::Open { incarnation });
     }
 
-    /// Examines the master behind `connection`.
+    /// Examines the master to which `sentinel` leads. All of it is that master's if the sentinel is still open
+    /// afterwards.
     pub(crate) async fn examine(
         &self,
-        connection: &mut Connection,
+        sentinel: &Arc<Sentinel>,
         manner: Manner,
     ) -> Result<Examination, ExamineError> {
         let start = Instant::now();
+        let connection = &mut self.while_alive(self.upstream.connect()).await?;
         let served = matches!(manner.known, Known::ServedIfPresent);
         let resumes =
             |first: &Inspection| served && first.bears() == Bears::Present && self.ledger.resume();
+        let is_new = matches!(manner.known, Known::New { .. });
         let mut first = match manner.known {
             Known::New { pid } => Inspection::at_new(pid),
             _ => self.first_look(connection).await?,
         };
         let mut resumed = resumes(&first);
-        if !matches!(manner.known, Known::New { .. }) && !resumed {
-            self.settle(connection).await?;
+        if !is_new && !resumed {
+            self.settle(sentinel.peer()).await?;
             self.ledger.settled();
             first = self.first_look(connection).await?;
             resumed = resumes(&first);
@@ -177,6 +214,8 @@ impl Examiner {
         let mut examination = Examination {
             outcome: Outcome::Resumed,
             pid: first.pid(),
+            speaks: String::new(),
+            verification: Verification::TokenFirst,
             counts: Counts::default(),
             skipped: Vec::new(),
             mismatches: Vec::new(),
@@ -187,17 +226,58 @@ impl Examiner {
             self.inject(connection, first, manner, start, &mut examination)
                 .await?;
         }
+        // Those that we start are of one release.
+        if !is_new || self.ledger.with_mirror(Master::is_old).is_none() {
+            let ask = Master::ask_if_old().into();
+            let reply = self.while_alive(connection.call(&ask)).await?;
+            self.ledger.set_old(Master::shows_old(&reply));
+        }
+        self.ledger.set_unordered(!connection.keeps_order());
+        let keeps_alive = connection.keeps_alive() != Some(false);
+        examination.speaks = software::speaks(keeps_alive, connection.server());
+        let sees_master =
+            !keeps_alive && sentinel.is_local() && listens(examination.pid, sentinel.peer()).await;
+        examination.verification = Verification::of(keeps_alive, sees_master, sentinel);
         examination.injection = start.elapsed().saturating_sub(examination.look);
         examination.counts = self.ledger.with_mirror(Master::counts);
         Ok(examination)
     }
 
+    /// Gives the master to which `sentinel` leads, which was late and has answered, what the mirror has answered
+    /// meanwhile. Returns whether it holds the mirror's state now; if not, it must be examined.
+    pub(super) async fn catch_up(&self) -> Result<bool, ExamineError> {
+        let connect = self.upstream.connect();
+        let mut connection = within(CATCH_UP_LIMIT, connect).await?;
+        // From here until the gate opens the mirror must not change, and writes wait.
+        self.gate.set(State::Injecting);
+        let missed = match self.ledger.begin_catch_up(Instant::now()) {
+            None => return Ok(false),
+            Some(CatchUp::Nothing) => return Ok(true),
+            Some(CatchUp::Run(missed)) => *missed,
+        };
+        let (count, mirror) = (missed.writes.len(), &missed.mirror);
+        let plan = tokio::task::block_in_place(|| {
+            Plan::run(&missed.behind, missed.writes, &missed.before, &missed.token)
+        });
+        if plan.expected() != mirror {
+            return Ok(false);
+        }
+        let reply = connection.predicted(plan.request().clone(), plan.answer());
+        let raw = within(CATCH_UP_LIMIT, reply).await?;
+        let verdict = verdict(&plan, &raw)?;
+        tracing::debug!(writes = count, ?verdict, "the master has caught up");
+        if verdict.is_ok() {
+            self.ledger.delivered();
+        }
+        Ok(verdict.is_ok())
+    }
+
     /// Returns when the master cannot be running a call of a closed connection any more. Its state is
     /// reliable only then.
-    async fn settle(&self, connection: &Connection) -> Result<(), ExamineError> {
+    async fn settle(&self, master: SocketAddr) -> Result<(), ExamineError> {
         let settled = async {
             self.upstream.no_writers().await;
-            while may_run_a_call(connection.peer()).await {
+            while may_run_a_call(master).await {
                 tokio::time::sleep(SETTLE_PAUSE).await;
             }
         };
@@ -231,6 +311,9 @@ impl Examiner {
     ) -> Result<(), ExamineError> {
         let (bears, empty) = (first.bears(), first.is_empty());
         tracing::debug!(?bears, empty, pid = first.pid(), "inspected");
+        if let Bears::Later(number) = bears {
+            self.ledger.catch_up(number);
+        }
         let fresh = bears == Bears::Nothing && empty;
         let ready = match manner.prepared {
             Some(prepared) if fresh => prepared.await.ok(),
@@ -263,13 +346,19 @@ impl Examiner {
             Treatment::Begin => Outcome::Begun,
             Treatment::TakeOver => Outcome::Adopted,
             Treatment::Inject | Treatment::Replace => Outcome::Injected,
-            Treatment::Reconcile(Authority::PendingWrites) => Outcome::Reconciled,
             Treatment::Reconcile(_) if manner.known == Known::Nothing => Outcome::Adopted,
-            Treatment::Reconcile(_) => Outcome::Injected,
+            Treatment::Reconcile(Authority::PendingWrites) => Outcome::Reconciled,
+            Treatment::Reconcile(Authority::Mirror) => Outcome::Injected,
         };
-        let (state, replaced) = match treatment {
-            Treatment::Begin | Treatment::TakeOver | Treatment::Inject => (mirror.clone(), None),
-            Treatment::Replace => (mirror.clone(), Some(before)),
+        let say_difference = |difference: &[String]| match manner.known {
+            Known::Nothing => say_older(difference),
+            _ => say_difference(difference),
+        };
+        let (state, change) = match treatment {
+            Treatment::Begin | Treatment::TakeOver | Treatment::Inject => {
+                (mirror.clone(), Change::Add)
+            }
+            Treatment::Replace => (mirror.clone(), Change::Replace(before)),
             Treatment::Reconcile(authority) => {
                 let state = tokio::task::block_in_place(|| {
                     replay::reconcile(&mirror, &found, &pending, authority)
@@ -279,12 +368,16 @@ impl Examiner {
                     let method = call.method();
                     matches!(method, Method::SubscribeParam | Method::UnsubscribeParam)
                 };
-                if state == found && !pending.iter().any(hidden) {
+                if state != found || pending.iter().any(hidden) {
+                    (state, Change::Replace(before))
+                } else if pending.is_empty() {
                     self.ledger.delivered();
                     say_difference(&self.ledger.adopt(found));
                     return Ok(());
+                } else {
+                    // A later start with an older copy of the checkpoint must not take the writes for pending.
+                    (state, Change::Renew(before))
                 }
-                (state, Some(before))
             }
         };
         if state != mirror {
@@ -294,7 +387,7 @@ impl Examiner {
         let target = Target {
             state,
             found,
-            replaced,
+            change,
         };
         let ready = ready.filter(|ready| ready.basis.as_ref() == Some(&(version, token.clone())));
         self.bring(connection, &target, &token, ready, examination)
@@ -313,13 +406,10 @@ impl Examiner {
         let Target {
             state,
             found,
-            replaced,
+            change,
         } = target;
         let mut next = ready.unwrap_or_else(|| {
-            let plan = tokio::task::block_in_place(|| match replaced {
-                Some(before) => Plan::replace(state, found, before, token),
-                None => Plan::new(state, found, token),
-            });
+            let plan = tokio::task::block_in_place(|| change.plan(state, found, token));
             Prepared {
                 basis: None,
                 complete: plan.expected() == state,
@@ -332,20 +422,16 @@ impl Examiner {
             let reply = connection.predicted(plan.request().clone(), plan.answer());
             let raw = self.while_alive(reply).await?;
             examination.skipped = plan.skipped().iter().map(ToString::to_string).collect();
-            // The reply is long and calls are waiting: it is decoded only if it differs from the predicted
-            // one.
-            let verdict = match raw.body == plan.answer() {
-                true => Ok(()),
-                false => plan.verify(&raw.decode()?),
-            };
-            let Err(mismatches) = verdict else {
+            let Err(mismatches) = verdict(&plan, &raw)? else {
                 examination.mismatches.clear();
                 if !complete || plan.expected().is_inexact() {
                     self.ledger.adopt(plan.expected().clone());
                 }
                 self.ledger.delivered();
                 tracing::debug!(skipped = plan.skipped().len(), "injected");
-                self.stats.masters_restored.count();
+                if !matches!(change, Change::Renew(_)) {
+                    self.stats.masters_restored.count();
+                }
                 // Thousands of small allocations: freed in another thread.
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());
@@ -375,8 +461,13 @@ impl Examiner {
     }
 
     async fn first_look(&self, connection: &mut Connection) -> Result<Inspection, ExamineError> {
-        self.while_alive(inspect::first(connection, &self.ledger.token()))
-            .await
+        let mut first = self
+            .while_alive(inspect::first(connection, &self.ledger.token()))
+            .await?;
+        if !connection.keeps_order() {
+            self.ledger.with_mirror(|mirror| first.arrange_like(mirror));
+        }
+        Ok(first)
     }
 
     /// Waits for slow `work` as long as the master answers probes.
@@ -391,10 +482,26 @@ impl Examiner {
     }
 }
 
+/// Whether a master has answered as planned. The reply is long and calls are waiting: it is decoded only if it differs
+/// from the predicted one.
+fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
+    Ok(match raw.body == plan.answer() {
+        true => Ok(()),
+        false if raw.keeps_order() => plan.verify(&raw.decode()?),
+        false => plan.verify_in_any_order(&raw.decode()?),
+    })
+}
+
 /// As [`sockets::may_run_a_call`], off the runtime's threads: with 15,000 sockets it takes 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
+}
+
+/// Whether the process `pid` listens at the port of `master`, as far as the system lets us see.
+async fn listens(pid: i32, master: SocketAddr) -> bool {
+    let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
+    tokio::task::spawn_blocking(look).await.unwrap_or(false)
 }
 
 /// Logs where the master differed from the mirror.
@@ -405,6 +512,18 @@ fn say_difference(difference: &[String]) {
             ?difference,
             "the master was changed past rosrescue, and the mirror follows it; let everybody use \
              rosrescue's address"
+        );
+    }
+}
+
+/// Logs where a living master differed from the checkpoint.
+fn say_older(difference: &[String]) {
+    if !difference.is_empty() {
+        rarely!(
+            warn,
+            ?difference,
+            "the master holds a newer state than the checkpoint, and goes on with it: the disk was full, the \
+             checkpoint came from a copy, or the master was changed past rosrescue"
         );
     }
 }

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use tokio::{sync::mpsc, time::Instant};
+use tokio::{sync::mpsc, task::JoinHandle, time::Instant};
 
 use crate::{
     ledger::Ledger,
-    limit::rarely,
-    process::{self, ProcessError, Rosmaster, Spare},
+    limit::{Pair, alarm, all_clear, rarely},
+    process::{self, Left, ProcessError, Rosmaster, Spare},
     ros_env::MasterUri,
     upstream::Upstream,
     wait,
@@ -15,6 +15,9 @@ use crate::{
 
 /// A spare is started so long after a master: a recovery and the health check need the processor.
 const SPARE_AFTER: Duration = Duration::from_secs(2);
+
+/// That the master has ended or is killed, and that one is started.
+static ENDED: Pair = Pair::new();
 
 /// A child's process id, and how it ended.
 type End = (u32, String);
@@ -27,41 +30,70 @@ pub(crate) struct MasterProcess {
     port: Option<u16>,
     /// Our child, or the master that was left running, until its end is reported.
     current: Option<u32>,
+    /// A master that an earlier rosrescue had just started. It is empty, and used in place of a new one.
+    starting: Option<u32>,
     /// Our child, until it is called for the first time.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     spare: Option<Spare>,
     /// When to start one.
     spare_at: Option<Instant>,
+    /// The one that is being started.
+    coming_spare: Option<JoinHandle<Option<Spare>>>,
     /// How the last master ended, until it is reported.
     end: Option<String>,
+    /// Whether the present one was killed by us.
+    killed: bool,
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`. The last one was at `port`, and still runs as process `left`, if that is
-    /// given.
-    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<u32>) -> Self {
-        let this = Self {
+    /// Starts masters with `rosmaster`. The last one was at `port`; `left` is what still runs of an earlier
+    /// rosrescue.
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Left>) -> Self {
+        let mut this = Self {
             rosmaster,
             port,
-            current: left,
+            current: None,
+            starting: None,
             new: None,
             ends: mpsc::channel(4),
             spare: None,
-            spare_at: left.map(|_| Instant::now() + SPARE_AFTER),
+            spare_at: None,
+            coming_spare: None,
             end: None,
+            killed: false,
         };
-        if let (Some(pid), Some(port)) = (left, port) {
-            tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
-            this.watch(pid, async move {
-                process::ended(pid).await;
-                "it was no child of this rosrescue".to_owned()
-            });
-        }
+        let pid = match left {
+            None => return this,
+            Some(Left::Serving(pid)) => {
+                tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
+                this.current = Some(pid);
+                this.spare_at = Some(Instant::now() + SPARE_AFTER);
+                pid
+            }
+            Some(Left::Starting(pid)) => {
+                tracing::info!(
+                    pid,
+                    port,
+                    "an earlier rosrescue had just started this rosmaster"
+                );
+                this.starting = Some(pid);
+                pid
+            }
+        };
+        this.watch(pid, async move {
+            process::ended(pid).await;
+            "it was no child of this rosrescue".to_owned()
+        });
         this
     }
 
-    /// Whether a master of an earlier rosrescue is running.
+    /// The process id of the present one.
+    pub(crate) fn pid(&self) -> Option<u32> {
+        self.current
+    }
+
+    /// Whether a master of an earlier rosrescue is running that may hold a state.
     pub(crate) fn is_left(&self) -> bool {
         self.current.is_some()
     }
@@ -75,12 +107,24 @@ impl MasterProcess {
         });
     }
 
-    /// Starts a master and returns its address.
-    pub(crate) fn spawn(
+    /// Starts a master, or takes one that is starting already.
+    pub(crate) async fn spawn(
         &mut self,
         ledger: &Ledger,
         upstream: &Upstream,
     ) -> Result<(), ProcessError> {
+        let pid = match self.starting.take() {
+            // It is at the address that the upstream has from the checkpoint.
+            Some(pid) => pid,
+            None => self.start(ledger, upstream).await?,
+        };
+        self.current = Some(pid);
+        self.spare_at = Some(Instant::now() + SPARE_AFTER);
+        Ok(())
+    }
+
+    /// Starts a master and returns its process id.
+    async fn start(&mut self, ledger: &Ledger, upstream: &Upstream) -> Result<u32, ProcessError> {
         let port = self.rosmaster.choose_port(self.port)?;
         let address = MasterUri {
             host: "127.0.0.1".to_owned(),
@@ -92,13 +136,9 @@ impl MasterProcess {
             // Recorded before it runs: if rosrescue dies now, the next one can find the master.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
-        let mut child = match self.spare.take().and_then(|spare| spare.go(port)) {
-            Some(child) => child,
-            None => self.rosmaster.spawn(port)?,
-        };
-        self.spare_at = Some(Instant::now() + SPARE_AFTER);
+        let mut child = self.rosmaster.start(self.spare.take(), port).await?;
         let pid = child.id().unwrap_or_default();
-        rarely!(info, pid, port, "started rosmaster");
+        all_clear!(info, ENDED, pid, port, "started rosmaster");
         self.watch(pid, async move {
             match child.wait().await {
                 Ok(status) => process::describe(status),
@@ -106,9 +146,26 @@ impl MasterProcess {
             }
         });
         self.port = Some(port);
-        self.current = Some(pid);
         self.new = i32::try_from(pid).ok();
-        Ok(())
+        Ok(pid)
+    }
+
+    /// A master that was started since the last call of [`Self::take_new`]: its process id and port, and whether it
+    /// is ROS's own program.
+    pub(crate) fn new_one(&self) -> Option<(u32, u16, bool)> {
+        let pid = u32::try_from(self.new?).ok()?;
+        Some((pid, self.port?, self.rosmaster.is_own()))
+    }
+
+    /// Gives up the master's port, which another program has.
+    pub(crate) fn port_taken(&mut self, by: Option<u32>) {
+        rarely!(
+            warn,
+            port = self.port,
+            by,
+            "another program took the port before rosmaster could listen; starting rosmaster at another port"
+        );
+        self.port = None;
     }
 
     /// The process id of a master that was started since the last call.
@@ -126,54 +183,71 @@ impl MasterProcess {
         let how = loop {
             let spare_at = self.spare_at;
             tokio::select! {
-                how = self.gone() => break how,
+                how = gone(&mut self.ends.1, self.current) => break how,
                 () = wait::until(spare_at) => {
                     self.spare_at = None;
-                    self.spare = self.rosmaster.spawn_spare();
+                    let rosmaster = self.rosmaster.clone();
+                    let coming = async move { rosmaster.spawn_spare().await };
+                    self.coming_spare = Some(tokio::spawn(coming));
+                }
+                spare = wait::for_some(self.coming_spare.as_mut()) => {
+                    self.coming_spare = None;
+                    self.spare = spare.ok().flatten();
                 }
             }
         };
-        rarely!(warn, pid = self.current, how, "rosmaster has ended");
+        let how = match std::mem::take(&mut self.killed) {
+            true => format!("{how}, sent by rosrescue"),
+            false => how,
+        };
+        alarm!(warn, ENDED, pid = self.current, how, "rosmaster has ended");
         self.end = Some(how);
         self.current = None;
         self.new = None;
     }
 
-    /// Returns how the master ended, when it has ended. Cancel safe.
-    async fn gone(&mut self) -> String {
-        loop {
-            match self.ends.1.recv().await {
-                Some((pid, how)) if Some(pid) == self.current => return how,
-                Some(_) => {}
-                // Never: we hold a sender.
-                None => std::future::pending().await,
-            }
-        }
-    }
-
-    pub(crate) fn kill(&self) {
+    pub(crate) fn kill(&mut self) {
         // A child's process id cannot be reused before its end is reported. For a master that was left
         // running this holds except for a moment between its end and the report.
         if let Some(pid) = self.current {
-            rarely!(
-                warn,
-                pid,
-                "the master does not answer, and is killed; a new one is started"
-            );
+            if self.port.is_some() {
+                alarm!(
+                    warn,
+                    ENDED,
+                    pid,
+                    "the master does not answer, and is killed; a new one is started"
+                );
+            }
             process::signal_process(pid, rustix::process::Signal::KILL);
+            self.killed = true;
         }
     }
 
     /// Stops the master in order.
     pub(crate) async fn stop(mut self) {
         self.spare = None;
+        // One that is starting is ended, too.
+        self.coming_spare = None;
+        self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
-            process::stop(pid, self.gone()).await;
+            process::stop(pid, gone(&mut self.ends.1, self.current)).await;
         }
     }
 
     /// The last output of the last master.
-    pub(crate) fn last_words(&self) -> String {
-        self.rosmaster.last_words()
+    pub(crate) async fn last_words(&self) -> String {
+        self.rosmaster.last_words().await
+    }
+}
+
+/// Returns how the master `current` ended, when it has ended. Cancel safe.
+async fn gone(ends: &mut mpsc::Receiver<End>, current: Option<u32>) -> String {
+    loop {
+        match ends.recv().await {
+            Some((pid, how)) if Some(pid) == current => return how,
+            Some(_) => {}
+            // Never: the caller holds a sender.
+            None => std::future::pending().await,
+        }
     }
 }

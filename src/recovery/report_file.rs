@@ -1,4 +1,5 @@
-//! The reports of rescues as files beside the checkpoint, for questions next week.
+//! The reports of rescues as files beside the checkpoint, for questions next week, and for the process that goes
+//! on with the session.
 
 use std::{
     fs::{self, OpenOptions},
@@ -8,30 +9,64 @@ use std::{
     time::Instant,
 };
 
-use crate::{clock, limit::Limit, status::report::Report};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    clock,
+    limit::Limit,
+    regular_file,
+    status::{Board, Earlier, report::Report},
+};
 
 /// Reports that are kept.
 const KEPT: usize = 20;
+/// Largest file that is read, in bytes.
+const LARGEST: u64 = 16 << 20;
 /// A master that dies every few seconds must not wear out a memory card.
 static LIMIT: Limit = Limit::new();
 
-/// Writes `report` beside the checkpoint at `checkpoint`, in another thread. It is not synced.
-pub(super) fn keep(checkpoint: PathBuf, report: Report) {
+/// The last line of a report's file, as JSON. The lines before it are the report for people.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct Kept {
+    /// The id of the session.
+    session: String,
+    /// What had happened in the session by then, as in [`Facts`](crate::status::Facts).
+    rescues: u64,
+    deaths: u64,
+    worker_restarts: u64,
+    pub(crate) report: Report,
+}
+
+impl Kept {
+    pub(super) fn new(board: &Board, session: &str, report: Report) -> Self {
+        let facts = board.read();
+        Self {
+            session: session.to_owned(),
+            rescues: facts.rescues,
+            deaths: facts.deaths,
+            worker_restarts: facts.earlier.worker_restarts,
+            report,
+        }
+    }
+}
+
+/// Writes a report beside the checkpoint at `checkpoint`, in another thread. It is not synced.
+pub(super) fn keep(checkpoint: PathBuf, kept: Kept) {
     if LIMIT.pass(Instant::now()).is_none() {
         return;
     }
     tokio::task::spawn_blocking(move || {
-        if let Err(error) = write(&checkpoint, &report) {
+        if let Err(error) = write(&checkpoint, &kept) {
             tracing::debug!(%error, "the report of this rescue is not kept");
         }
     });
 }
 
-fn write(checkpoint: &Path, report: &Report) -> io::Result<()> {
-    let (Some(folder), Some(name)) = (checkpoint.parent(), checkpoint.file_name()) else {
+fn write(checkpoint: &Path, kept: &Kept) -> io::Result<()> {
+    let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
         return Ok(());
     };
-    let prefix = format!("{}.report-", name.to_string_lossy());
+    let report = &kept.report;
     let at = clock::wall_text(report.detected_at).replace(':', "-");
     let path = folder.join(format!("{prefix}{at}-{}.txt", report.number));
     let mut file = OpenOptions::new()
@@ -39,20 +74,90 @@ fn write(checkpoint: &Path, report: &Report) -> io::Result<()> {
         .create_new(true)
         .mode(0o600)
         .open(&path)?;
-    write!(file, "rosrescue {}\n{report}", env!("CARGO_PKG_VERSION"))?;
-    let mut kept = Vec::new();
+    let json = serde_json::to_string(kept)?;
+    write!(
+        file,
+        "rosrescue {}\n{report}{json}\n",
+        env!("CARGO_PKG_VERSION")
+    )?;
+    let mut others = files(checkpoint)?;
+    // Not this one: a clock that was set back makes it the oldest.
+    others.retain(|other| *other != path);
+    let surplus = (others.len() + 1).saturating_sub(KEPT);
+    others.iter().take(surplus).try_for_each(fs::remove_file)
+}
+
+/// How the names of the files begin.
+fn prefix(checkpoint: &Path) -> Option<String> {
+    Some(format!(
+        "{}.report-",
+        checkpoint.file_name()?.to_string_lossy()
+    ))
+}
+
+/// The files of reports, by their dates.
+fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
+    let (Some(folder), Some(prefix)) = (checkpoint.parent(), prefix(checkpoint)) else {
+        return Ok(Vec::new());
+    };
+    let mut files = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
         let name = entry.file_name();
-        let other = name.to_string_lossy();
-        // Not this one: a clock that was set back makes it the oldest.
-        if other.starts_with(&prefix) && other.ends_with(".txt") && entry.path() != path {
-            kept.push(entry.path());
+        let name = name.to_string_lossy();
+        if name.starts_with(&prefix) && name.ends_with(".txt") {
+            files.push(entry.path());
         }
     }
-    kept.sort();
-    let surplus = (kept.len() + 1).saturating_sub(KEPT);
-    kept.iter().take(surplus).try_for_each(fs::remove_file)
+    files.sort();
+    Ok(files)
+}
+
+/// The reports beside the checkpoint at `checkpoint`, by number. Files that cannot be read, and those without a last
+/// line in JSON, are left out.
+pub(crate) fn read(checkpoint: &Path) -> Vec<Kept> {
+    let files = files(checkpoint).unwrap_or_default();
+    let mut all: Vec<Kept> = files.iter().filter_map(|file| read_one(file)).collect();
+    all.sort_by_key(|kept| kept.report.number);
+    all
+}
+
+fn read_one(file: &Path) -> Option<Kept> {
+    let file = regular_file::open(file).ok()?;
+    if file.metadata().ok()?.len() > LARGEST {
+        return None;
+    }
+    let text = io::read_to_string(file).ok()?;
+    serde_json::from_str(text.lines().next_back()?).ok()
+}
+
+/// What the files beside the checkpoint at `checkpoint` tell of the session with this id. `died`: its last process
+/// did not end in order. `states`: the last number of a state of a rescue.
+pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64) -> Earlier {
+    let all = read(checkpoint);
+    let last = all.last().map_or(0, |kept| kept.report.number);
+    let mut earlier = Earlier {
+        worker_restarts: u64::from(died),
+        died,
+        last_number: last.max(states),
+        ..Earlier::default()
+    };
+    for kept in all.into_iter().filter(|kept| kept.session == session) {
+        let Kept {
+            rescues,
+            deaths,
+            worker_restarts,
+            report,
+            ..
+        } = kept;
+        // A rescue that was not kept, as in a crash loop, is in the count of the next one.
+        earlier.rescues = earlier.rescues.max(rescues);
+        earlier.deaths = earlier.deaths.max(deaths);
+        let restarts = worker_restarts + u64::from(died);
+        earlier.worker_restarts = earlier.worker_restarts.max(restarts);
+        earlier.reports.push(report);
+    }
+    earlier
 }
 
 #[cfg(test)]
@@ -62,6 +167,16 @@ mod tests {
     use super::*;
     use crate::status::report::{Outcome, Phases};
 
+    fn kept(session: &str, number: u64) -> Kept {
+        Kept {
+            session: session.to_owned(),
+            rescues: number,
+            deaths: number + 1,
+            worker_restarts: 2,
+            report: report(number),
+        }
+    }
+
     fn report(number: u64) -> Report {
         Report {
             number,
@@ -70,6 +185,7 @@ mod tests {
             detected_at: 1_795_253_213.0 + number as f64,
             outcome: Outcome::Injected,
             master_pid: 7,
+            master_speaks: "HTTP/1.1".to_owned(),
             phases: Phases::default(),
             answered: 3,
             unanswered: 0,
@@ -90,10 +206,10 @@ mod tests {
         let checkpoint = folder.path().join("chkpt.yaml");
         fs::write(&checkpoint, "").unwrap();
         for number in 1..=25 {
-            write(&checkpoint, &report(number)).unwrap();
+            write(&checkpoint, &kept("a", number)).unwrap();
         }
-        let mut early = report(26);
-        early.detected_at = 0.0;
+        let mut early = kept("a", 26);
+        early.report.detected_at = 0.0;
         write(&checkpoint, &early).unwrap();
         let mut names: Vec<_> = fs::read_dir(folder.path())
             .unwrap()
@@ -113,5 +229,29 @@ mod tests {
             fs::metadata(path).unwrap().permissions().mode() & 0o777,
             0o600
         );
+    }
+
+    #[test]
+    fn the_next_process_goes_on_with_the_reports_of_its_session() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let nothing = earlier(&checkpoint, "b", false, 0);
+        assert_eq!((nothing.last_number, nothing.worker_restarts), (0, 0));
+        for (session, number) in [("a", 1), ("b", 2), ("b", 3)] {
+            write(&checkpoint, &kept(session, number)).unwrap();
+        }
+        // One of an older version, and a damaged one.
+        let other = |name: &str| folder.path().join(format!("chkpt.yaml.report-{name}.txt"));
+        fs::write(other("2026-11-21T09-27-18Z-1"), "rosrescue 0.8.0\ntext\n").unwrap();
+        fs::write(other("x"), [0xff]).unwrap();
+        let found = earlier(&checkpoint, "b", true, 7);
+        let numbers: Vec<_> = found.reports.iter().map(|report| report.number).collect();
+        assert_eq!(numbers, [2, 3]);
+        assert_eq!(
+            (found.rescues, found.deaths, found.worker_restarts),
+            (3, 4, 3)
+        );
+        assert_eq!((found.last_number, found.died), (7, true));
+        assert_eq!(earlier(&checkpoint, "c", false, 0).last_number, 3);
     }
 }

@@ -4,13 +4,19 @@ use std::time::{Duration, Instant};
 
 use tracing::Instrument;
 
-use super::{Driver, examine::Examination, master_process::MasterProcess, report_file};
+use super::{
+    Driver,
+    examine::Examination,
+    master_process::MasterProcess,
+    report_file::{self, Kept},
+};
 use crate::lifecycle::Cause;
 use crate::{
     clock,
+    limit::all_clear,
     nodes::health_check,
     status::{
-        report::{Outcome, Phases, Report, ms},
+        report::{AWAY, Outcome, Phases, Report, ms},
         stats::Stats,
     },
 };
@@ -74,6 +80,7 @@ impl Outage {
             detected_at: self.wall,
             outcome: examination.outcome,
             master_pid: examination.pid,
+            master_speaks: examination.speaks,
             phases: Phases {
                 absence_ms: ms(absence),
                 inspection_ms: ms(examination.look),
@@ -119,20 +126,22 @@ impl Driver {
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
             // Usual: a master with `-t` closes each idle connection, and the threads of a master that is
             // being stopped end before it does.
-            tracing::debug!("the same master goes on");
+            all_clear!(info, AWAY, "calls pass to the master: the same one goes on");
             return;
         }
         let report = self.board.update(|facts| facts.add(report));
         report.log();
-        let store = self.examiner.ledger.with_store(|store, _| {
-            let works = store.unprotected().is_none();
-            works.then(|| store.path().to_owned())
-        });
-        let checkpoint = store.flatten().filter(|_| report.is_rescue());
+        let session = self.examiner.ledger.session().id;
+        let store = self.examiner.ledger.seen_store();
+        let works = store.filter(|store| store.unprotected.is_none() && report.is_rescue());
+        let checkpoint = works.map(|store| store.path);
         if let (Some(checkpoint), Outcome::Resumed) = (&checkpoint, report.outcome) {
-            report_file::keep(checkpoint.clone(), report.clone());
+            report_file::keep(
+                checkpoint.clone(),
+                Kept::new(&self.board, &session, report.clone()),
+            );
         }
-        self.restored = report.outcome == Outcome::Injected;
+        self.restored = (report.outcome == Outcome::Injected).then_some(report.number);
         if !self.lifecycle.has_served() {
             // After a restart of rosrescue it is unknown what changed just before.
             self.examiner.ledger.with_activity(|mirror, activity| {
@@ -150,7 +159,7 @@ impl Driver {
                 if let Some(report) = board.update(|facts| facts.add_check(number, check)) {
                     report.log_check();
                     if let Some(checkpoint) = checkpoint {
-                        report_file::keep(checkpoint, report);
+                        report_file::keep(checkpoint, Kept::new(&board, &session, report));
                     }
                 }
             };
@@ -181,6 +190,7 @@ impl Driver {
             _ => REPEAT,
         };
         tracing::warn!("{text}");
+        AWAY.told();
         let next = now + pause;
         self.said = Some(Said { text, pause, next });
     }

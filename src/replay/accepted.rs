@@ -1,5 +1,6 @@
 //! Which of a call's mutations a master has executed, and whether the mirror agrees.
 
+use super::order;
 use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
 use crate::xmlrpc::{Reply, Value};
 
@@ -11,6 +12,8 @@ pub struct Answered<'a> {
     pub reply: Reply,
     /// Whether it changed the master's state.
     pub executed: bool,
+    /// The master's dictionaries have no order.
+    pub unordered: bool,
 }
 
 impl Answered<'_> {
@@ -22,7 +25,10 @@ impl Answered<'_> {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
         let same = match [&self.reply, mirror].map(is_success) {
-            [true, true] => live || self.reply == *mirror,
+            [true, true] => {
+                let in_any_order = || self.unordered && order::are_alike(&self.reply, mirror);
+                live || self.reply == *mirror || in_any_order()
+            }
             [true, false] => live,
             [false, true] => false,
             [false, false] => true,
@@ -89,6 +95,7 @@ impl<'a> Walk<'_, 'a> {
             call,
             reply,
             executed,
+            unordered: self.mirror.is_unordered(),
         });
     }
 

@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use indexmap::IndexMap;
 use thiserror::Error;
 
-use super::{Bears, Token};
+use super::{Bears, Token, order};
 use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Reply, Struct, Value};
@@ -60,6 +60,18 @@ impl Inspection {
         }
     }
 
+    /// Puts everything into the order of `mirror`, as far as it is there: the master has none of its own.
+    pub fn arrange_like(&mut self, mirror: &Master) {
+        let registry = &mirror.registry;
+        order::arrange(&mut self.publishers, &registry.publishers);
+        order::arrange(&mut self.subscribers, &registry.subscribers);
+        order::arrange(&mut self.services, &registry.services);
+        order::arrange(&mut self.topic_types, &mirror.topic_types);
+        if let Some(params) = &mut self.params {
+            order::arrange_params(params, mirror.params());
+        }
+    }
+
     /// Whether the parameters are known.
     pub fn has_params(&self) -> bool {
         self.params.is_some()
@@ -88,15 +100,15 @@ impl Inspection {
         ]
     }
 
-    /// Decodes the reply to either request.
+    /// Decodes the reply to either request with `token`.
     ///
     /// # Errors
     ///
     /// If this is not a master's reply. After [`NotAMaster::ParamsUnreadable`], use
     /// [`Inspection::call_without_params`].
-    pub fn decode(reply: &Reply) -> Result<Self, NotAMaster> {
+    pub fn decode(reply: &Reply, token: &Token) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
-        let [pid, token, session, state, types, params @ ..] = results else {
+        let [pid, number, session, state, types, params @ ..] = results else {
             return Err(form(Method::Multicall));
         };
         let success = |result, method| match answer(result) {
@@ -106,12 +118,12 @@ impl Inspection {
         let pid = success(pid, Method::GetPid)?
             .as_int()
             .ok_or_else(|| form(Method::GetPid))?;
-        let found = |result| Ok(answer(result).ok_or_else(|| form(Method::LookupNode))?.0 == 1);
-        let bears = match (found(token)?, found(session)?) {
-            (true, _) => Bears::Present,
-            (false, true) => Bears::Earlier,
-            (false, false) => Bears::Nothing,
+        let api = |result| match answer(result) {
+            Some((1, api)) => Ok(Some(api.as_str().unwrap_or_default())),
+            Some(_) => Ok(None),
+            None => Err(form(Method::LookupNode)),
         };
+        let bears = token.found(api(number)?.is_some(), api(session)?);
         let state = success(state, Method::GetSystemState)?.as_array();
         let Some([publishers, subscribers, services]) = state else {
             return Err(form(Method::GetSystemState));

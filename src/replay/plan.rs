@@ -4,9 +4,9 @@ use std::fmt;
 
 use bytes::Bytes;
 
-use super::Token;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
+use super::{Token, order};
 use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
@@ -142,16 +142,64 @@ impl Plan {
     ///
     /// Tokens in `target` or `found` are ignored.
     pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
-        Self::write(target, found, None, token)
+        Self::write(target, found, None, false, token)
+    }
+
+    /// The plan that replaces the token `before` of a master that holds `found`, and changes nothing else.
+    pub fn renew(found: &Master, before: &Token, token: &Token) -> Self {
+        Self::write(found, found, Some(before), false, token)
     }
 
     /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token `before`
     /// by `token`. Everything is removed, subscribers first, and added again. No node is called back.
     pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
-        Self::write(target, found, Some(before), token)
+        Self::write(target, found, Some(before), true, token)
     }
 
-    fn write(target: &Master, found: &Master, before: Option<&Token>, token: &Token) -> Self {
+    /// The plan that has a master that holds `behind` run `writes`, and replaces its token `before` by `token`.
+    pub fn run(behind: &Master, writes: Vec<Request>, before: &Token, token: &Token) -> Self {
+        Self::sequence(behind, Some(before), token, |write| {
+            let mut model = behind.clone();
+            for call in writes {
+                let predicted = model.apply(&call).reply;
+                write(call, predicted);
+            }
+            (model, Vec::new())
+        })
+    }
+
+    /// `empties`: everything is removed first.
+    fn write(
+        target: &Master,
+        found: &Master,
+        before: Option<&Token>,
+        empties: bool,
+        token: &Token,
+    ) -> Self {
+        Self::sequence(found, before, token, |write| {
+            let mut emptied = None;
+            if empties {
+                let mut model = found.clone();
+                for call in restore::removal(found, target) {
+                    let predicted = model.apply(&call).reply;
+                    write(call, predicted);
+                }
+                emptied = Some(model);
+            }
+            let Restore { model, skipped, .. } =
+                Restore::run(target, emptied.as_ref().unwrap_or(found), empties, write);
+            (model, skipped)
+        })
+    }
+
+    /// The plan of the calls that `bring` writes, to a master that holds `found`. It returns the state afterwards,
+    /// and what it has left out.
+    fn sequence(
+        found: &Master,
+        before: Option<&Token>,
+        token: &Token,
+        bring: impl FnOnce(&mut dyn FnMut(Request, Reply)) -> (Master, Vec<Skipped>),
+    ) -> Self {
         let mut request = ListWriter::request(Method::Multicall.name());
         let mut answer = ListWriter::answer();
         let mut write = |call: Request, predicted: Reply| {
@@ -163,20 +211,11 @@ impl Plan {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
         };
-        let mut emptied = None;
         if let Some(before) = before {
             let (call, predicted) = aside(before.remove());
             write(call, predicted);
-            let mut model = found.clone();
-            for call in restore::removal(found, target) {
-                let predicted = model.apply(&call).reply;
-                write(call, predicted);
-            }
-            emptied = Some(model);
         }
-        let Restore {
-            mut model, skipped, ..
-        } = Restore::run(target, emptied.as_ref().unwrap_or(found), &mut write);
+        let (mut model, skipped) = bring(&mut write);
         for call in reads(&model, found) {
             let predicted = model.apply(&call).reply;
             write(call, predicted);
@@ -220,6 +259,19 @@ impl Plan {
     ///
     /// A sentence for each entry that was not, up to 20 of them. They hold no parameter values.
     pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
+        self.verify_by(reply, true)
+    }
+
+    /// As [`Self::verify`], for a master whose dictionaries have no order.
+    ///
+    /// # Errors
+    ///
+    /// The same.
+    pub fn verify_in_any_order(&self, reply: &Reply) -> Result<(), Vec<String>> {
+        self.verify_by(reply, false)
+    }
+
+    fn verify_by(&self, reply: &Reply, ordered: bool) -> Result<(), Vec<String>> {
         let whole = |text: &str| {
             let sentence = format!("the injection as a whole was answered: {text}");
             Err(vec![sentence])
@@ -239,7 +291,13 @@ impl Plan {
         };
         let mismatches: Vec<_> = (results.iter().zip(predicted))
             .zip(call.calls())
-            .filter(|((result, predicted), _)| !is_alike(result, predicted))
+            .filter(|((result, predicted), call)| {
+                let in_any_order = || {
+                    let lists = !matches!(call.method(), Method::GetParam);
+                    order::sorted(result, lists) == order::sorted(predicted, lists)
+                };
+                !is_alike(result, predicted) && (ordered || !in_any_order())
+            })
             .map(|(_, call)| mismatch(call))
             .take(MOST_MISMATCHES)
             .collect();

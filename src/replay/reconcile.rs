@@ -8,9 +8,9 @@ use crate::xmlrpc::Value;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
     /// The mirror only where it has answered writes since both were equal: all other differences were written
-    /// to the master directly, and are newer.
+    /// to the master directly, or are in no checkpoint, and are newer.
     PendingWrites,
-    /// The mirror wherever it has an entry: it is unknown when both were equal last.
+    /// The mirror wherever it has an entry: the master was given its state, and has not confirmed it.
     Mirror,
 }
 

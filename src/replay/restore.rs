@@ -22,11 +22,14 @@ pub(super) struct Restore<'a, W> {
     types_in: usize,
     /// Whether the new master's topic types are the first of the target's; if not, their order is lost.
     ordered: bool,
+    /// Whether the target's topic types win over those of the new master, which has no registrations.
+    types_win: bool,
 }
 
 impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
-    /// Brings a model of `found` to `target`.
-    pub(super) fn run(target: &'a Master, found: &'a Master, write: W) -> Self {
+    /// Brings a model of `found` to `target`. `types_win`: `found` has no registrations, and where it has another
+    /// type for a topic it gets the target's.
+    pub(super) fn run(target: &'a Master, found: &'a Master, types_win: bool, write: W) -> Self {
         let known = found.topic_types.keys();
         let first = target.topic_types.keys().take(known.len());
         let mut restore = Self {
@@ -38,6 +41,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             target,
             found,
             types_in: 0,
+            types_win,
         };
         restore.params();
         restore.nodes();
@@ -45,6 +49,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         restore.services();
         restore.had_services();
         restore.star_types();
+        restore.changed_types();
         restore.subscribers();
         restore.types_before(target.topic_types.len());
         restore.param_subscribers();
@@ -135,9 +140,10 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The type to register a topic with. A type known to the new master is kept.
+    /// The type to register a topic with. A type known to the new master is kept, unless the target's wins.
     fn topic_type(&self, topic: &str) -> &'a str {
-        let known = self.found.type_of(topic).filter(|known| *known != "*");
+        let known = self.found.type_of(topic);
+        let known = known.filter(|known| *known != "*" && !self.types_win);
         known.or_else(|| self.target.type_of(topic)).unwrap_or("*")
     }
 
@@ -362,6 +368,19 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
+    /// Changes the types of topics without publishers. Only a publisher can do that, and it must come before the
+    /// subscribers, who would be notified of it.
+    fn changed_types(&mut self) {
+        let target = self.target;
+        for (topic, topic_type) in &target.topic_types {
+            let known = self.model.type_of(topic);
+            let differs = known.is_some_and(|known| known != topic_type);
+            if self.types_win && differs && topic_type != "*" {
+                self.set_type(topic, topic_type, true);
+            }
+        }
+    }
+
     /// Adds the first `end` of the target's types.
     fn types_before(&mut self, end: usize) {
         let target = self.target;
@@ -385,14 +404,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         if self.model.topic_types.contains_key(topic) {
             return;
         }
-        let Some((helper, name)) = self.helper(topic) else {
-            return self.skip_unnameable(topic, HELPER);
-        };
-        let (register, unregister) = if topic_type != "*" {
-            (Method::RegisterSubscriber, Method::UnregisterSubscriber)
-        } else if !self.model.registry.subscribers.contains_key(topic) {
-            (Method::RegisterPublisher, Method::UnregisterPublisher)
-        } else {
+        let is_star = topic_type == "*";
+        if is_star && self.model.registry.subscribers.contains_key(topic) {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
@@ -401,6 +414,18 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
                 self.skipped.push(skipped);
             }
             return;
+        }
+        self.set_type(topic, topic_type, is_star);
+    }
+
+    /// Has a helper register the topic, as a publisher or a subscriber, and unregister it again.
+    fn set_type(&mut self, topic: &str, topic_type: &str, as_publisher: bool) {
+        let Some((helper, name)) = self.helper(topic) else {
+            return self.skip_unnameable(topic, HELPER);
+        };
+        let (register, unregister) = match as_publisher {
+            true => (Method::RegisterPublisher, Method::UnregisterPublisher),
+            false => (Method::RegisterSubscriber, Method::UnregisterSubscriber),
         };
         self.push(register, [&helper, name.as_str(), topic_type, NO_API]);
         self.push(unregister, [&helper, name.as_str(), NO_API]);

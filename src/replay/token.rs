@@ -14,7 +14,8 @@ pub(super) const HELPER: &str = "rosrescue/injection";
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
 /// Two parameter subscriptions by unique caller ids: one has the session's id, the other the id and the
-/// incarnation's number. A master with only the first was ours and has been succeeded since.
+/// incarnation's number. The address of the first one ends in that number, so that a rosrescue with an older
+/// checkpoint can read it. A master with another number was ours before, or is newer than the checkpoint.
 ///
 /// Each makes a node reference that only `lookupNode` finds: it has no registration, parameter or topic type
 /// that another read could show. The subscribed key is outside the tree that starts at `/`, so no `setParam`
@@ -23,6 +24,7 @@ pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 pub struct Token {
     session: String,
     name: String,
+    number: u64,
 }
 
 /// The token in a master.
@@ -32,6 +34,8 @@ pub enum Bears {
     Present,
     /// Of an earlier incarnation of the same session.
     Earlier,
+    /// Of a later incarnation of the same session, with its number.
+    Later(u64),
     /// No token of this session.
     Nothing,
 }
@@ -51,17 +55,20 @@ impl Token {
         Self {
             name: format!("{NAMESPACE}{id}/{number}"),
             session: format!("{NAMESPACE}{id}"),
+            number,
         }
     }
 
     /// The calls that leave it, in order: the incarnation's number is last.
     pub fn leave(&self) -> [Request; 2] {
-        [&self.session, &self.name].map(|name| subscription(Method::SubscribeParam, name))
+        let session_api = format!("{NO_API}/{}", self.number);
+        [(&self.session, session_api.as_str()), (&self.name, NO_API)]
+            .map(|(name, api)| subscription(Method::SubscribeParam, name, api))
     }
 
     /// The call that removes the incarnation's number.
     pub fn remove(&self) -> Request {
-        subscription(Method::UnsubscribeParam, &self.name)
+        subscription(Method::UnsubscribeParam, &self.name, NO_API)
     }
 
     /// The call that looks up the incarnation's number: answered with code 1 if it is there.
@@ -72,6 +79,21 @@ impl Token {
     /// The call that looks up the session.
     pub(super) fn lookup_session(&self) -> Request {
         lookup(&self.session)
+    }
+
+    /// What a master bears that answers [`Self::lookup`] with `number`, whether the token is there, and
+    /// [`Self::lookup_session`] with `session`, the address of the session's token. Without a number in the
+    /// address, as earlier versions left it, the master is no later one.
+    pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
+        let later = session
+            .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())
+            .filter(|later| *later > self.number);
+        match (later, number, session) {
+            (Some(later), _, _) => Bears::Later(later),
+            (None, true, _) => Bears::Present,
+            (None, false, Some(_)) => Bears::Earlier,
+            (None, false, None) => Bears::Nothing,
+        }
     }
 
     /// Whether the reply to [`Self::lookup`] means that the token is there.
@@ -85,8 +107,8 @@ impl Token {
     }
 }
 
-fn subscription(method: Method, name: &str) -> Request {
-    Request::new(method, [name, NO_API, "~"])
+fn subscription(method: Method, name: &str, api: &str) -> Request {
+    Request::new(method, [name, api, "~"])
 }
 
 fn lookup(name: &str) -> Request {

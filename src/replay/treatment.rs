@@ -46,9 +46,17 @@ pub fn treatment(
         (Bears::Nothing, _) if !mirror_is_empty => Treatment::Inject,
         (Bears::Nothing, _) if master_is_empty => Treatment::Begin,
         (Bears::Nothing, _) => Treatment::TakeOver,
+        // A session that has just begun knows nothing that could replace what it holds.
+        (Bears::Earlier, Known::Nothing) if mirror_is_empty => Treatment::TakeOver,
         // Another incarnation has succeeded it: the mirror is newer than anything it holds.
         (Bears::Earlier, _) => Treatment::Replace,
-        (Bears::Present, Known::ServedIfPresent) => Treatment::Reconcile(Authority::PendingWrites),
+        // The checkpoint is older than this master, or another rosrescue has a copy of it.
+        (Bears::Later(_), Known::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
+        (Bears::Later(_), _) => Treatment::Replace,
+        // It has run every write of the checkpoint that is not pending, and maybe more.
+        (Bears::Present, Known::Nothing | Known::ServedIfPresent) => {
+            Treatment::Reconcile(Authority::PendingWrites)
+        }
         (Bears::Present, _) => Treatment::Reconcile(Authority::Mirror),
     }
 }
@@ -81,8 +89,16 @@ mod tests {
                 Known::Nothing,
                 false,
                 false,
-                Reconcile(Authority::Mirror),
+                Reconcile(Authority::PendingWrites),
             ),
+            (
+                Bears::Later(7),
+                Known::Nothing,
+                false,
+                false,
+                Reconcile(Authority::PendingWrites),
+            ),
+            (Bears::Later(7), served, false, false, Replace),
             (
                 Bears::Present,
                 served,
@@ -91,7 +107,8 @@ mod tests {
                 Reconcile(Authority::PendingWrites),
             ),
             (Bears::Earlier, served, false, false, Replace),
-            (Bears::Earlier, Known::Nothing, true, false, Replace),
+            (Bears::Earlier, Known::Nothing, false, false, Replace),
+            (Bears::Earlier, Known::Nothing, true, false, TakeOver),
             (Bears::Nothing, Known::Nothing, true, false, TakeOver),
             (Bears::Nothing, Known::Nothing, true, true, Begin),
             (Bears::Nothing, Known::Nothing, false, false, Inject),

@@ -2,30 +2,36 @@
 
 use std::{
     net::SocketAddr,
+    pin::Pin,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use bytes::Bytes;
 use thiserror::Error;
-use tokio::sync::{Mutex, Notify, oneshot};
+use tokio::{
+    sync::{Mutex, Notify},
+    time::Sleep,
+};
 
 use super::{
     admission,
+    body::SMALL,
+    compare::Comparisons,
     others::Others,
-    replies::{HttpReply, encoded, forwarded, made, no_shutdown, xml},
+    replies::{HttpReply, delivered, encoded, forwarded, made, no_shutdown, xml},
 };
 use crate::{
     cli::Reads,
     gate::{self, State},
-    ledger::Ledger,
+    ledger::{Ledger, delivery::Delivery},
     limit::rarely,
-    master::{Kind, Method, Request},
+    master::{Kind, Master, Method, Request},
     status::stats::Stats,
     upstream::{Head, pool::Pool},
     write_queue::{
         WriteQueue,
-        batch::{self, Answer, Item},
+        batch::{self, Answer, Answered, Item},
         parts::Parts,
     },
     xmlrpc::{self, ListWriter, Reply, Value},
@@ -82,6 +88,8 @@ pub struct Calls {
     pub reads: Reads,
     /// The last large answer of the mirror.
     pub last_large: Mutex<Option<LargeAnswer>>,
+    /// Comparisons of the master's answers with the mirror.
+    pub compared: Comparisons,
     /// Connections for reads.
     pub pool: Arc<Pool>,
     pub write_queue: WriteQueue,
@@ -143,6 +151,14 @@ impl Calls {
         body: Bytes,
         call: Option<Request>,
     ) -> Result<HttpReply, Unanswered> {
+        let undecoded = || self.decode_without_master(&head, &body);
+        let call = match call.map(Ok).or_else(undecoded).transpose() {
+            Ok(call) => call,
+            Err(fault) => {
+                self.stats.calls_without_master.count();
+                return Ok(xml(&fault));
+            }
+        };
         let kind = call.as_ref().map_or(Kind::Mutate, Request::kind);
         match (&call, kind) {
             (Some(call), Kind::Identity)
@@ -151,7 +167,7 @@ impl Calls {
                 Ok(self.identity(call)?)
             }
             (_, Kind::Read | Kind::Identity | Kind::Unknown) => {
-                self.read(head, body, call.as_ref(), kind).await
+                self.read(head, body, call.as_ref()).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
                 self.write(head, body, call).await
@@ -163,6 +179,28 @@ impl Calls {
     pub(super) fn identity(&self, call: &Request) -> Result<HttpReply, Closed> {
         let reply = self.ledger.answer(call).ok_or(Closed(UNANSWERABLE))?;
         Ok(xml(&reply))
+    }
+
+    /// What rosmaster makes of a request that [`Request::decode`] does not decode, while it is away: the call, or
+    /// the fault that it answers. None if only a master knows.
+    fn decode_without_master(&self, head: &Head, body: &Bytes) -> Option<Result<Request, Reply>> {
+        let is_away = matches!(self.gate.state(), State::StandingIn | State::Injecting);
+        let is_plain = head.encoding.is_none() && matches!(head.path.as_str(), "/" | "/RPC2");
+        if !is_away || !is_plain || body.len() > SMALL {
+            return None;
+        }
+        // The words of Python 2 differ.
+        let is_python_3 = !self.ledger.with_mirror(Master::is_unordered);
+        match Request::decode(body)
+            .err()?
+            .fault(body)
+            .filter(|_| is_python_3)
+        {
+            Some(text) => Some(Err(Reply::Fault { code: 1, text })),
+            None => Request::decode(&xmlrpc::without_doctype(body)?)
+                .ok()
+                .map(Ok),
+        }
     }
 
     /// The mirror's answer to a read while there is a master; none if the master's may differ.
@@ -223,11 +261,45 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<&Request>,
-        kind: Kind,
     ) -> Result<HttpReply, Unanswered> {
-        let known = call.filter(|_| kind != Kind::Unknown);
+        let known = call.filter(|call| call.is_answerable());
         let mut gate = self.gate.clone();
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
+        let delivery = self.begin_read(call).await;
+        let reply = self.read_in_order(head, body, call, known, &mut gate, hold.as_mut());
+        Ok(delivered(reply.await?, delivery))
+    }
+
+    /// The answer to a read is under way from now on. Waits until the master has answered what it may notify the
+    /// caller of, but not for a master that is late: what it notifies nodes of then is told once more.
+    async fn begin_read(&self, read: Option<&Request>) -> Option<Delivery> {
+        let mut changed = self.ledger.order_changed();
+        let patience = self.patience();
+        loop {
+            changed.mark_unchanged();
+            if let Ok(delivery) = self.ledger.begin_read(Instant::now(), read) {
+                return delivery;
+            }
+            if tokio::time::timeout_at(patience, changed.changed())
+                .await
+                .is_err()
+            {
+                self.slow.notify_one();
+                return self.ledger.begin_read_now(read?);
+            }
+        }
+    }
+
+    /// As [`Self::read`], with the answer under way. `known`: the call, if the mirror may answer it.
+    async fn read_in_order(
+        &self,
+        head: Head,
+        body: Bytes,
+        call: Option<&Request>,
+        known: Option<&Request>,
+        gate: &mut gate::Rx,
+        mut hold: Pin<&mut Sleep>,
+    ) -> Result<HttpReply, Unanswered> {
         loop {
             match gate.look() {
                 State::Open { incarnation } => {
@@ -235,13 +307,17 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // A mirror in doubt waits for the probes' verdict on the master.
-                    let known_now = known.filter(|_| !self.ledger.is_doubted());
+                    // A mirror in doubt waits for the probes' verdict on the master. A master that is late may
+                    // know more methods than rosmaster.
+                    let is_late =
+                        |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
+                    let known_now = known.filter(is_late);
                     if patience <= tokio::time::Instant::now()
                         && let Some(reply) = self.stand_in(known_now).await
                     {
                         return Ok(reply);
                     }
+                    let version = self.comparable(call);
                     let mut forwarding = Box::pin({
                         let (pool, head, body) = (self.pool.clone(), head.clone(), body.clone());
                         async move { pool.forward(incarnation, &head, &body).await }
@@ -263,14 +339,17 @@ impl Calls {
                         }
                     };
                     match reply {
-                        Ok(raw) => return Ok(forwarded(&self.uri, call, raw)),
+                        Ok(raw) => {
+                            self.compare(call, version, &raw);
+                            return Ok(forwarded(&self.uri, call, raw));
+                        }
                         Err(error) => tracing::debug!(%error, "read"),
                     }
                     if let Some(reply) = self.stand_in(known).await {
                         return Ok(reply);
                     }
                 }
-                State::StandingIn | State::Injecting => {
+                State::StandingIn | State::Late | State::Injecting => {
                     if let Some(reply) = self.stand_in(known).await {
                         return Ok(reply);
                     }
@@ -280,7 +359,7 @@ impl Calls {
             }
             tokio::select! {
                 () = gate.changed() => {}
-                () = &mut hold => {
+                () = hold.as_mut() => {
                     self.stats.calls_unanswered.count();
                     return Err(Closed(NOT_IN_TIME).into());
                 }
@@ -300,8 +379,8 @@ impl Calls {
             return self.write_parts(&head, parts).await;
         }
         let call = call.map(Arc::new);
-        let answer = self.queue(head, body, call.clone()).await?;
-        self.http(call.as_deref(), answer)
+        let (answer, delivery) = self.queue(head, body, call.clone()).await?;
+        self.http(call.as_deref(), answer, delivery)
     }
 
     /// Makes one part after the other. If one gets no result for each entry, its answer is that to the whole.
@@ -310,7 +389,9 @@ impl Calls {
         for part in parts {
             let part = Arc::new(part);
             let body = xmlrpc::encode_call(&Request::clone(&part).into());
-            let answer = self
+            // No node both hears and tells of a subject in so many calls at once: each part's answer counts as
+            // written when it is there.
+            let (answer, delivery) = self
                 .queue(head.clone(), body.into(), Some(part.clone()))
                 .await?;
             let reply = match &answer {
@@ -324,19 +405,25 @@ impl Calls {
                 {
                     results.iter().for_each(|result| whole.push(result));
                 }
-                _ => return self.http(Some(&part), answer),
+                _ => return self.http(Some(&part), answer, delivery),
             }
         }
         Ok(encoded(whole.finish()))
     }
 
-    fn http(&self, call: Option<&Request>, answer: Answer) -> Result<HttpReply, Unanswered> {
-        match answer {
-            Answer::Raw(raw) => Ok(forwarded(&self.uri, call, raw)),
-            Answer::Made(reply) => Ok(made(&self.uri, call, &reply)),
-            Answer::Close => Err(Closed(UNANSWERED).into()),
-            Answer::Elsewhere => Err(Unanswered::Elsewhere),
-        }
+    fn http(
+        &self,
+        call: Option<&Request>,
+        answer: Answer,
+        delivery: Option<Delivery>,
+    ) -> Result<HttpReply, Unanswered> {
+        let reply = match answer {
+            Answer::Raw(raw) => forwarded(&self.uri, call, raw),
+            Answer::Made(reply) => made(&self.uri, call, &reply),
+            Answer::Close => return Err(Closed(UNANSWERED).into()),
+            Answer::Elsewhere => return Err(Unanswered::Elsewhere),
+        };
+        Ok(delivered(reply, delivery))
     }
 
     /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection,
@@ -346,20 +433,13 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Arc<Request>>,
-    ) -> Result<Answer, Unanswered> {
+    ) -> Result<Answered, Unanswered> {
         if self.gate.state() == State::Injecting
-            && let Some(reply) = self.answer_if_unchanged(call.as_deref()).await
+            && let Some((reply, delivery)) = self.answer_if_unchanged(call.as_deref()).await
         {
-            return Ok(Answer::Made(reply));
+            return Ok((Answer::Made(reply), delivery));
         }
-        let (answer, mut answered) = oneshot::channel();
-        let item = Item {
-            raw: Some((head, body)),
-            call: call.clone(),
-            answer,
-            condition: None,
-            way_made: false,
-        };
+        let (item, mut answered) = Item::new(Some((head, body)), call.clone());
         self.write_queue.submit(item).await;
         let call = call.as_deref();
         let mut gate = self.gate.clone();
@@ -390,8 +470,8 @@ impl Calls {
                     }
                     patient = false;
                     self.slow.notify_one();
-                    if let Some(reply) = self.answer_if_unchanged(call).await {
-                        return Ok(Answer::Made(reply));
+                    if let Some((reply, delivery)) = self.answer_if_unchanged(call).await {
+                        return Ok((Answer::Made(reply), delivery));
                     }
                 }
             }
@@ -409,9 +489,12 @@ impl Calls {
     }
 
     /// The mirror's answer to a write that changes nothing; none if it does.
-    async fn answer_if_unchanged(&self, call: Option<&Request>) -> Option<Reply> {
+    async fn answer_if_unchanged(
+        &self,
+        call: Option<&Request>,
+    ) -> Option<(Reply, Option<Delivery>)> {
         let call = call.filter(|call| call.is_answerable())?;
-        let (reply, mark) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
+        let (reply, mark, delivery) = self.ledger.answer_if_unchanged(Instant::now(), call)?;
         // The write that made this one redundant may not be safe yet.
         if let Some(mark) = self.ledger.to_await(mark)
             && !self.ledger.durable(mark).await
@@ -419,6 +502,6 @@ impl Calls {
             return None;
         }
         self.stats.calls_without_master.count();
-        Some(reply)
+        Some((reply, delivery))
     }
 }

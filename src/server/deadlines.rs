@@ -8,7 +8,7 @@ use std::{
     io,
     pin::Pin,
     sync::{
-        Arc,
+        Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicU8, Ordering},
     },
     task::{Context, Poll},
@@ -24,6 +24,7 @@ use tokio::{
 use super::{
     answers::Reader,
     idle::{Idle, Idling},
+    replies::UntilWritten,
 };
 
 /// Time in which a request's head must arrive, from its first byte.
@@ -32,9 +33,11 @@ const HEAD_TIME: Duration = Duration::from_secs(10);
 const WRITE_TIME: Duration = Duration::from_secs(60);
 
 /// Where a connection stands between requests.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub(crate) struct Deadlines {
     place: Arc<AtomicU8>,
+    /// Held until the answer has been written.
+    held: Arc<Mutex<Option<UntilWritten>>>,
     pub(super) reader: Arc<Reader>,
 }
 
@@ -49,9 +52,14 @@ impl Deadlines {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
-    /// The answer is ready. After it has been sent, the next byte starts a head.
-    pub(crate) fn replying(&self) {
+    /// The answer is ready. After it has been sent, `held` is dropped, and the next byte starts a head.
+    pub(crate) fn replying(&self, held: Option<UntilWritten>) {
+        *self.held() = held;
         self.place.store(REPLYING, Ordering::Relaxed);
+    }
+
+    fn held(&self) -> MutexGuard<'_, Option<UntilWritten>> {
+        self.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// No request has begun since the last answer was sent.
@@ -70,7 +78,6 @@ impl Deadlines {
 }
 
 /// A stream that enforces `deadlines` and counts as idle between requests.
-#[derive(Debug)]
 pub(crate) struct Timed<'a, S> {
     stream: S,
     deadlines: Deadlines,
@@ -166,6 +173,8 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Timed<'_, S> {
         // hyper flushes once the whole answer is written.
         if polled.is_ready() && this.deadlines.is(REPLYING) {
             this.deadlines.place.store(IDLE, Ordering::Relaxed);
+            let written = this.deadlines.held().take();
+            drop(written);
             this.idling = Some(this.idle.enter(&this.close));
         }
         polled
@@ -210,7 +219,7 @@ mod tests {
             let (read, ()) = tokio::join!(stream.read(&mut byte), late);
             assert_eq!(read.unwrap(), 1);
             deadlines.serving();
-            deadlines.replying();
+            deadlines.replying(None);
             stream.flush().await.unwrap();
         }
         let start = Instant::now();
@@ -260,7 +269,7 @@ mod tests {
         peer.write_all(b"PO").await.unwrap();
         stream.read_exact(&mut bytes).await.unwrap();
         deadlines.serving();
-        deadlines.replying();
+        deadlines.replying(None);
         stream.write_all(b"HTTP").await.unwrap();
         assert!(!deadlines.is_idle());
         // Another one is idle meanwhile.

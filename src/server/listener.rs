@@ -4,7 +4,7 @@ use std::{
     io,
     net::{self, IpAddr, Ipv6Addr, SocketAddr},
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use hyper::service::service_fn;
@@ -35,6 +35,11 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// After this idle time the kernel probes the peer, so that connections of vanished computers do not pile up.
 const KEEPALIVE: Duration = Duration::from_secs(60);
 
+/// How long a port may stay in use: the kernel closes the sockets of a process that was killed a moment after its
+/// end.
+const LINGER: Duration = Duration::from_secs(2);
+const LINGER_PAUSE: Duration = Duration::from_millis(20);
+
 /// Why an address cannot be served.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -60,7 +65,7 @@ pub enum ListenError {
     },
 }
 
-/// Listens at all of `addresses`, without blocking. All but the first are left out if the computer lacks
+/// Listens at all of `addresses`; the listeners do not block. Waits for up to two seconds for a port that is in use. All but the first are left out if the computer lacks
 /// their address family. With port 0 they share one free port. Errors name `option`, which chooses the port.
 pub fn bind(
     addresses: &[SocketAddr],
@@ -68,9 +73,10 @@ pub fn bind(
 ) -> Result<Vec<net::TcpListener>, ListenError> {
     let mut listeners: Vec<net::TcpListener> = Vec::new();
     let mut port = None;
+    let begin = Instant::now();
     for address in addresses {
         let address = SocketAddr::new(address.ip(), port.unwrap_or_else(|| address.port()));
-        match bind_one(address) {
+        match bind_lingering(address, begin + LINGER) {
             Ok(listener) => {
                 port = listener.local_addr().ok().map(|bound| bound.port());
                 listeners.push(listener);
@@ -96,6 +102,18 @@ pub fn bind(
         }
     }
     Ok(listeners)
+}
+
+/// As [`bind_one`], again and again until `deadline` while the port is in use.
+fn bind_lingering(address: SocketAddr, deadline: Instant) -> io::Result<net::TcpListener> {
+    loop {
+        match bind_one(address) {
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse && Instant::now() < deadline => {
+                std::thread::sleep(LINGER_PAUSE);
+            }
+            bound => return bound,
+        }
+    }
 }
 
 fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {

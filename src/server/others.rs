@@ -1,27 +1,40 @@
 //! Calls where there are several computers: answered here, or by the leader.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    collections::VecDeque,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
 
 use bytes::Bytes;
+use hyper::header::HeaderValue;
 use tokio::{
+    runtime::Handle,
     sync::{mpsc, oneshot, watch},
     time::Instant,
 };
 
 use super::{
     calls::{Calls, Closed, NOT_IN_TIME, PATIENCE, Unanswered},
-    replies::{HttpReply, forwarded, text, xml},
+    replies::{HttpReply, UntilWritten, forwarded, text, xml},
 };
 use crate::{
     cluster::{journal::RECORD_BYTES_MAX, way::Way},
-    master::{Kind, Method, Request, names},
+    master::{CALLER_ID, Kind, Method, Request, names},
+    order::ANSWER_LIMIT,
     upstream::{
         Head, RawReply,
         peer::{self, Peer, PeerError, Peers},
     },
-    xmlrpc::{Reply, Value},
+    xmlrpc::{self, Reply, Value},
 };
 
+/// How long a read waits for a mirror that is behind. With `--cluster-sync interval` the leader may take with it
+/// what the mirror waits for.
+const CATCH_UP_LIMIT: Duration = Duration::from_secs(3);
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// The method by which `rosrescue handover` has the leader give up leading.
@@ -36,12 +49,95 @@ pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
+    /// Answers that followers have not passed on yet.
+    pub(crate) passing: Arc<Passing>,
+    /// The last record of the journal that the mirror holds.
+    pub(crate) followed: watch::Receiver<u64>,
+    /// The last one that a leader's answer told of.
+    pub(crate) told: Arc<AtomicU64>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
 }
 
+/// The method by which a follower tells the leader that it has passed an answer on to its caller.
+const PASSED_ON: &str = "rosrescue/passedOn";
+
+/// Answers on their way to callers through followers: what is held until they have been written there.
+#[derive(Default)]
+pub(crate) struct Passing(Mutex<Passed>);
+
+#[derive(Default)]
+struct Passed {
+    last: u64,
+    /// By number, the oldest first.
+    held: VecDeque<(Instant, u64, UntilWritten)>,
+}
+
+impl std::fmt::Debug for Passing {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Passing")
+    }
+}
+
+impl Passing {
+    fn lock(&self) -> MutexGuard<'_, Passed> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Keeps what an answer holds. Returns the number by which it is [ended](Self::end). A follower that says
+    /// nothing holds up nobody for longer than a client that does not read.
+    fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
+        let mut old = Vec::new();
+        let mut passing = self.lock();
+        let Passed { last, held: kept } = &mut *passing;
+        while let Some((since, ..)) = kept.front()
+            && now.duration_since(*since) > ANSWER_LIMIT
+        {
+            old.extend(kept.pop_front());
+        }
+        *last += 1;
+        kept.push_back((now, *last, held));
+        *last
+    }
+
+    /// The answer with this number has been written to its caller, or never will be.
+    fn end(&self, number: u64) {
+        let mut passing = self.lock();
+        let at = passing.held.iter().position(|(_, of, _)| *of == number);
+        let held = at.and_then(|at| passing.held.remove(at));
+        drop(passing);
+        drop(held);
+    }
+}
+
+/// Tells the leader, when it is dropped, that an answer of its has been passed on.
+struct PassOn {
+    leader: Arc<Peer>,
+    term: u64,
+    number: String,
+}
+
+impl Drop for PassOn {
+    fn drop(&mut self) {
+        // Without a runtime rosrescue stops.
+        let Ok(runtime) = Handle::try_current() else {
+            return;
+        };
+        let (leader, term) = (self.leader.clone(), self.term);
+        let params = [CALLER_ID, self.number.as_str()];
+        let call = Request::new(Method::named(PASSED_ON), params);
+        let body = Bytes::from(xmlrpc::encode_call(&call.into()));
+        runtime.spawn(async move {
+            if let Err(error) = leader.forward(term, &Head::default(), &body).await {
+                tracing::debug!(%error, "telling the leader that an answer was passed on");
+            }
+        });
+    }
+}
+
 /// A call on its way.
 struct Call<'a> {
+    others: &'a Others,
     calls: &'a Calls,
     head: Head,
     body: Bytes,
@@ -71,6 +167,7 @@ impl Others {
             return calls.identity(call);
         }
         let on_its_way = Call {
+            others: self,
             calls,
             head,
             body,
@@ -106,6 +203,10 @@ impl Others {
                     if let Some(to) = call.hands_over() {
                         return Ok(self.hand_over(to).await);
                     }
+                    if let Some(number) = call.was_passed_on() {
+                        self.passing.end(number);
+                        return Ok(passed_on());
+                    }
                     let Call {
                         calls, head, body, ..
                     } = call;
@@ -120,6 +221,16 @@ impl Others {
                     };
                     match answered {
                         Err(Unanswered::Elsewhere) => None,
+                        Ok(mut reply) if asked_term.is_some() => {
+                            if let Some(held) = reply.extensions_mut().remove() {
+                                let number = self.passing.keep(Instant::now(), held);
+                                let number = HeaderValue::from(number);
+                                reply.headers_mut().insert(peer::ANSWER_HEADER, number);
+                            }
+                            let seq = HeaderValue::from(calls.ledger.last_agreed());
+                            reply.headers_mut().insert(peer::SEQ_HEADER, seq);
+                            return Ok(reply);
+                        }
                         answered => return Ok(answered?),
                     }
                 }
@@ -193,13 +304,40 @@ impl Call<'_> {
         is_it.then(|| call.text(1).unwrap_or_default())
     }
 
+    /// The number of the answer that a follower has passed on, if that is what is told.
+    fn was_passed_on(&self) -> Option<u64> {
+        let call = self.call.as_ref()?;
+        let is_it = matches!(call.method(), Method::Unknown(name) if **name == *PASSED_ON);
+        is_it.then(|| call.text(1)?.parse().ok()).flatten()
+    }
+
+    /// The leader's answer, to be passed on to the caller. This computer's nodes know of it from now on.
+    fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
+        let seq = raw.headers.get(peer::SEQ_HEADER);
+        let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
+        let told = &self.others.told;
+        told.fetch_max(seq.unwrap_or(0), Ordering::Relaxed);
+        let number = raw.headers.get(peer::ANSWER_HEADER);
+        let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
+        let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);
+        if let Some(number) = number {
+            let leader = leader.clone();
+            let pass_on = PassOn {
+                leader,
+                term,
+                number,
+            };
+            reply.extensions_mut().insert(UntilWritten::new(pass_on));
+        }
+        reply
+    }
+
     /// The leader's answer, or to a read the mirror's if that of the leader takes long; none if there is none
     /// now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
-        let Self { calls, call, .. } = self;
         if self.kind != Kind::Read {
             return match leader.forward(term, &self.head, &self.body).await {
-                Ok(raw) => Some(forwarded(&calls.uri, call.as_ref(), raw)),
+                Ok(raw) => Some(self.pass_on(leader, term, raw)),
                 Err(error) => {
                     tracing::debug!(%error, "a call to the leader");
                     None
@@ -228,7 +366,7 @@ impl Call<'_> {
                 }
             };
         match reply {
-            Ok(raw) => Some(forwarded(&calls.uri, call.as_ref(), raw)),
+            Ok(raw) => Some(self.pass_on(leader, term, raw)),
             Err(error) => {
                 tracing::debug!(%error, "a read from the leader");
                 self.by_mirror().await
@@ -251,10 +389,21 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// The mirror's answer to a read; none to any other call.
+    /// The mirror's answer to a read; none to any other call. It shows what the leader's answers have shown
+    /// before, unless that is lost.
     async fn by_mirror(&self) -> Option<HttpReply> {
-        let read = self.call.as_ref().filter(|_| self.kind == Kind::Read);
-        self.calls.stand_in(read).await
+        let read = self.call.as_ref().filter(|_| self.kind == Kind::Read)?;
+        let told = self.others.told.load(Ordering::Relaxed);
+        let mut followed = self.others.followed.clone();
+        let caught_up = async { followed.wait_for(|seq| *seq >= told).await.is_ok() };
+        let caught_up = tokio::time::timeout(CATCH_UP_LIMIT, caught_up).await;
+        if caught_up.is_err() {
+            // Lost: the next read need not wait for it.
+            let now = *self.others.followed.borrow();
+            let (set, seen) = (Ordering::Relaxed, Ordering::Relaxed);
+            let _ = self.others.told.compare_exchange(told, now, set, seen);
+        }
+        self.calls.stand_in(Some(read)).await
     }
 }
 
@@ -262,6 +411,11 @@ impl Call<'_> {
 fn deleted(key: &str) -> HttpReply {
     let text = format!("parameter {key} deleted");
     let reply: [Value; 3] = [1.into(), text.as_str().into(), 0.into()];
+    xml(&Reply::Value(reply.to_vec().into()))
+}
+
+fn passed_on() -> HttpReply {
+    let reply: [Value; 3] = [1.into(), "passed on".into(), 0.into()];
     xml(&Reply::Value(reply.to_vec().into()))
 }
 

@@ -3,6 +3,7 @@
 use std::{
     convert::Infallible,
     pin::Pin,
+    sync::Arc,
     task::{Context, Poll},
 };
 
@@ -16,6 +17,7 @@ use hyper::{
 use tokio::sync::mpsc;
 
 use crate::{
+    ledger::delivery::Delivery,
     master::Request,
     upstream::RawReply,
     write_queue::batch,
@@ -24,6 +26,27 @@ use crate::{
 
 /// What hyper sends.
 pub(crate) type HttpReply = Response<Content>;
+
+/// In the extensions of a reply: dropped when the reply has been written, or never will be.
+#[derive(Clone)]
+pub(crate) struct UntilWritten(
+    #[expect(dead_code, reason = "held, not read")] Arc<dyn Send + Sync>,
+);
+
+impl UntilWritten {
+    pub(super) fn new(held: impl Send + Sync + 'static) -> Self {
+        Self(Arc::new(held))
+    }
+}
+
+/// `reply`, which is ready to be written.
+pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> HttpReply {
+    if let Some(delivery) = delivery {
+        delivery.ready();
+        reply.extensions_mut().insert(UntilWritten::new(delivery));
+    }
+    reply
+}
 
 /// The body of a reply.
 #[derive(Debug)]

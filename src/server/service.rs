@@ -50,7 +50,7 @@ pub(crate) async fn serve(
     request: Request<Incoming>,
 ) -> Result<HttpReply, Closed> {
     deadlines.serving();
-    let reply = match grant.check(peer.ip()) {
+    let mut reply = match grant.check(peer.ip()) {
         Ok(()) => route(server, peer, grant, &deadlines, request).await,
         Err(refusal) => {
             let mut reply = keep_out(&server, peer, &refusal);
@@ -60,7 +60,8 @@ pub(crate) async fn serve(
             Ok(reply)
         }
     };
-    deadlines.replying();
+    let extensions = reply.as_mut().map(hyper::Response::extensions_mut);
+    deadlines.replying(extensions.ok().and_then(|of| of.remove()));
     reply
 }
 

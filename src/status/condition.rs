@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Facts, Guarded, Mode};
+use super::{Facts, Guarded, Mode, summary::some};
 use crate::{clock, gate::State};
 
 /// The conditions, from the best to the worst.
@@ -129,7 +129,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let (mut text, mut action) = nodes_notice(now, facts);
     let (mut name, mut since) = match now.gate {
         State::Unknown => (Name::Waiting, now.gate_since),
-        State::StandingIn | State::Injecting => (Name::StandingIn, now.gate_since),
+        State::StandingIn | State::Late | State::Injecting => (Name::StandingIn, now.gate_since),
         State::Elsewhere => (Name::NoLeader, now.gate_since),
         State::Open { .. } => (Name::Protected, now.gate_since.max(facts.settled_since())),
     };
@@ -162,14 +162,42 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
             "free or repair the disk; recording begins again by itself.".to_owned()
         });
     }
-    if let Guarded::NoLonger(pid) = facts.guarded {
-        text += &format!(
-            " The guardian, process {pid}, has ended: if rosrescue dies now, nobody starts it again."
-        );
-        action.get_or_insert_with(|| "start rosrescue anew when the robot is at rest.".to_owned());
+    match facts.guarded {
+        Guarded::NoLonger(pid) => {
+            text += &format!(
+                " The guardian, process {pid}, has ended: if rosrescue dies now, nobody starts it again."
+            );
+            action.get_or_insert_with(|| {
+                "start rosrescue anew when the robot is at rest.".to_owned()
+            });
+        }
+        Guarded::Stopped(pid) => {
+            text += &format!(
+                " The guardian, process {pid}, is stopped: if rosrescue dies now, calls wait until it is \
+                 continued."
+            );
+            action.get_or_insert_with(|| {
+                format!("continue the guardian: `fg`, `bg` or `kill -CONT {pid}`.")
+            });
+        }
+        Guarded::Nobody | Guarded::Systemd | Guarded::Guardian { .. } => {}
     }
     if matches!(name, Name::Protected | Name::Following) {
-        text += " Every change is recorded.";
+        text += match facts.bypassing.is_empty() {
+            true => " Every change is recorded.",
+            false => " Every change that comes through rosrescue is recorded.",
+        };
+    }
+    if !facts.bypassing.is_empty() {
+        let (count, verb) = match facts.bypassing.len() {
+            1 => ("1 client".to_owned(), "talks"),
+            count => (format!("{count} clients"), "talk"),
+        };
+        let who = some(&facts.bypassing);
+        text += &format!(" {count} {verb} to the master directly, unprotected: {who}.");
+        action.get_or_insert_with(|| {
+            "start it again with the ROS_MASTER_URI of rosrescue.".to_owned()
+        });
     }
     Condition {
         name,
@@ -281,11 +309,26 @@ mod tests {
     #[test]
     fn an_unguarded_rosrescue_is_protected_and_asks_for_something() {
         let mut facts = Facts::new(Mode::Core);
-        facts.guarded = Guarded::NoLonger(7);
+        for guarded in [Guarded::NoLonger(7), Guarded::Stopped(7)] {
+            facts.guarded = guarded;
+            let condition = of(OPEN, None, &facts);
+            assert_eq!(condition.name, Name::Protected);
+            assert!(!condition.is_good() && !guarded.is_guarded());
+            assert!(condition.text.contains("process 7"), "{condition:?}");
+        }
+    }
+
+    #[test]
+    fn what_goes_past_rosrescue_is_not_protected() {
+        let mut facts = Facts::new(Mode::Proxy);
+        facts.bypassing = vec!["rosout (process 7)".to_owned()];
         let condition = of(OPEN, None, &facts);
         assert_eq!(condition.name, Name::Protected);
         assert!(!condition.is_good());
-        assert!(condition.text.contains("process 7"), "{condition:?}");
+        let said = "1 client talks to the master directly, unprotected: rosout (process 7).";
+        assert!(condition.text.contains(said), "{condition:?}");
+        assert!(!condition.text.contains("Every change is recorded"));
+        assert!(condition.action.unwrap().contains("ROS_MASTER_URI"));
     }
 
     #[test]

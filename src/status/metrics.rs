@@ -16,7 +16,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let flag = u8::from;
     let journal = &status.journal;
     #[rustfmt::skip]
-    let values: [(&str, &str, Option<f64>); 22] = [
+    let values: [(&str, &str, Option<f64>); 27] = [
         ("calls_pass", "whether calls pass to the master", Some(flag(status.open).into())),
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
@@ -24,6 +24,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("guarded", "whether another process keeps the port when rosrescue dies", Some(flag(status.guarded).into())),
         ("action_needed", "whether somebody should look: the status says what to do", Some(flag(status.condition.action.is_some()).into())),
         ("master_deaths_total", "masters that have died", Some(status.deaths as f64)),
+        ("worker_restarts_total", "times that rosrescue itself has died and was started again, in this session", Some(status.worker_restarts as f64)),
         ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),
         ("rescues_total", "rescues: recoveries but for an ordinary start", Some(status.rescues as f64)),
         ("pending_writes", "writes answered by the mirror that the master has not run yet", Some(status.pending_writes as f64)),
@@ -33,6 +34,10 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("services", "services registered", Some(status.state.services as f64)),
         ("params", "parameters set", Some(status.state.params as f64)),
         ("unreachable_nodes", "nodes that do not answer and are not known to be dead", Some(status.unreachable.len() as f64)),
+        ("alive_nodes", "registered nodes whose port a process listens at, or that have answered lately", Some(status.alive_nodes as f64)),
+        ("dead_nodes", "registered nodes whose port refuses connections", Some(status.dead_nodes.len() as f64)),
+        ("unchecked_nodes", "registered nodes that were not asked yet, or not lately", Some(status.unchecked_nodes.len() as f64)),
+        ("bypassing", "processes and computers that talk to the master past rosrescue", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
         ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),
         ("journal_bytes", "size of the checkpoint's journal", Some(journal.bytes as f64)),

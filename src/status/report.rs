@@ -4,11 +4,16 @@ use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
-use crate::limit::rarely;
+use crate::limit::{Pair, all_clear, rarely};
 use crate::{clock, master::Counts};
+
+/// That the master is away, and that calls pass again.
+pub(crate) static AWAY: Pair = Pair::new();
 
 /// The cause of a report when rosrescue itself was started.
 pub(crate) const STARTED: &str = "rosrescue was started";
+/// The same, if the one before had died.
+pub(crate) const DIED: &str = "rosrescue itself died and was started again";
 /// The cause of the first one after another computer has led.
 pub(crate) const TAKEN_OVER: &str = "this computer took over";
 /// The cause of the first one of a computer that was cut off from the leader.
@@ -66,7 +71,7 @@ pub struct Phases {
 /// rescue.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// Counts reports since the start of rosrescue, from 1.
+    /// The rescue's number, as in the names of its files; 0 for an ordinary start.
     pub number: u64,
     /// Why calls no longer passed.
     pub cause: String,
@@ -78,6 +83,9 @@ pub struct Report {
     pub outcome: Outcome,
     /// The process id that the master reports.
     pub master_pid: i32,
+    /// What the master speaks: HTTP and Python.
+    #[serde(default)]
+    pub master_speaks: String,
     pub phases: Phases,
     /// Calls that the mirror answered meanwhile.
     pub answered: u64,
@@ -144,8 +152,9 @@ impl Report {
     /// Logs that calls pass again.
     pub(crate) fn log(&self) {
         let phases = &self.phases;
-        rarely!(
+        all_clear!(
             info,
+            AWAY,
             cause = self.cause,
             ended = self.ended,
             absence_ms = phases.absence_ms,
@@ -191,8 +200,14 @@ impl Report {
     /// One line for people.
     pub(crate) fn line(&self) -> String {
         let at = clock::wall_text(self.detected_at);
-        let Self { cause, outcome, .. } = self;
-        format!("{at}  {:.0} ms: {outcome} ({cause})", self.phases.total_ms)
+        let Self {
+            number,
+            cause,
+            outcome,
+            ..
+        } = self;
+        let total = self.phases.total_ms;
+        format!("{number:>3}  {at}  {total:.0} ms: {outcome} ({cause})")
     }
 }
 
@@ -205,6 +220,9 @@ impl fmt::Display for Report {
             injection_ms,
             total_ms,
         } = self.phases;
+        if self.number > 0 {
+            write!(f, "{}  ", self.number)?;
+        }
         write!(f, "{}  {}", clock::wall_text(self.detected_at), self.cause)?;
         if let Some(ended) = &self.ended {
             write!(f, " ({ended})")?;

@@ -68,6 +68,15 @@ pub(crate) struct Status {
     pub(crate) master: String,
     /// Its process id, or the last one's; none if there was none.
     pub(crate) master_pid: Option<i32>,
+    /// What the last one spoke: HTTP and Python.
+    #[serde(default)]
+    pub(crate) master_speaks: Option<String>,
+    /// What talks to the master of `proxy` past rosrescue: processes, users and other computers.
+    #[serde(default)]
+    pub(crate) bypassing: Vec<String>,
+    /// Whether the master of `proxy` is on this computer and takes connections from others.
+    #[serde(default)]
+    pub(crate) master_is_open: bool,
     /// Whether calls pass to the master.
     pub(crate) open: bool,
     /// Whether calls are answered, by the master or the mirror.
@@ -81,8 +90,11 @@ pub(crate) struct Status {
     pub(crate) pending_writes: usize,
     /// Whether the master keeps dying.
     pub(crate) crash_loop: bool,
-    /// Masters that have died since the start.
+    /// Masters that have died in this session.
     pub(crate) deaths: u64,
+    /// Times that rosrescue itself has died and was started again, in this session.
+    #[serde(default)]
+    pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
     /// Why the state is not recorded; none if it is.
     pub(crate) unprotected: Option<String>,
@@ -94,11 +106,20 @@ pub(crate) struct Status {
     pub(crate) state: Counts,
     /// Nodes that do not answer and are not known to be dead.
     pub(crate) unreachable: Vec<String>,
+    /// Registered nodes whose port refuses connections.
+    #[serde(default)]
+    pub(crate) dead_nodes: Vec<String>,
+    /// Registered nodes that were not asked yet, or not lately.
+    #[serde(default)]
+    pub(crate) unchecked_nodes: Vec<String>,
+    /// How many registered nodes live, by the kernel's table of sockets or an answer.
+    #[serde(default)]
+    pub(crate) alive_nodes: usize,
     /// Masters examined since the start, the first one included.
     pub(crate) recoveries: u64,
     /// The report of the last one.
     pub(crate) last_recovery: Option<Report>,
-    /// Rescues since the start, and the reports of the last 20, the oldest first.
+    /// Rescues in this session, and the reports of the last 20, the oldest first.
     pub(crate) rescues: u64,
     pub(crate) last_rescues: Vec<Report>,
     /// Between the last two times when somebody asked, at least a second apart.
@@ -121,16 +142,31 @@ impl Status {
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)
     }
 
+    fn nodes_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let lists = [
+            (&self.dead_nodes, "dead but registered"),
+            (&self.unreachable, "without an answer"),
+            (&self.unchecked_nodes, "not checked"),
+        ];
+        write!(f, "nodes       {} alive", self.alive_nodes)?;
+        for (names, what) in lists.into_iter().filter(|(names, _)| !names.is_empty()) {
+            write!(f, "; {} {what}: {}", names.len(), some(names))?;
+        }
+        writeln!(f)
+    }
+
     fn master_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "master      {}", self.master)?;
         if let Some(pid) = self.master_pid {
             write!(f, ", process {pid}")?;
         }
-        match self.deaths {
-            0 => writeln!(f),
-            1 => writeln!(f, ", died once"),
-            deaths => writeln!(f, ", died {deaths} times"),
+        if let Some(speaks) = &self.master_speaks {
+            write!(f, ", {speaks}")?;
         }
+        if self.master_is_open {
+            write!(f, ", open to other computers")?;
+        }
+        writeln!(f, "{}", died(self.deaths))
     }
 }
 
@@ -161,10 +197,11 @@ impl fmt::Display for Status {
         };
         writeln!(
             f,
-            "rosrescue   {} {mode}, process {}, up {}, guarded by {}",
+            "rosrescue   {} {mode}, process {}, up {}{}, guarded by {}",
             self.version,
             self.pid,
             clock::span(self.uptime),
+            died(self.worker_restarts),
             self.guarded_by
         )?;
         writeln!(f, "serves      {}", self.uri)?;
@@ -177,6 +214,7 @@ impl fmt::Display for Status {
             cluster.lines(until, f)?;
         }
         writeln!(f, "state       {}", self.state)?;
+        self.nodes_line(f)?;
         writeln!(
             f,
             "calls       {}, {:.1} a second; {} answered without the master, {} in vain",
@@ -202,17 +240,34 @@ impl fmt::Display for Status {
                 self.pending_writes
             )?;
         }
-        if !self.unreachable.is_empty() {
-            writeln!(
-                f,
-                "no answer   from {} (kept, and asked again)",
-                self.unreachable.join(", ")
-            )?;
-        }
         match self.last_rescues.last() {
             Some(report) => write!(f, "rescues     {}, the last:\n{report}", self.rescues),
             None => writeln!(f, "rescues     none needed so far"),
         }
+    }
+}
+
+/// How often something has died.
+fn died(times: u64) -> String {
+    match times {
+        0 => String::new(),
+        1 => ", died once".to_owned(),
+        times => format!(", died {times} times"),
+    }
+}
+
+/// Names for people, not all of very many.
+pub(crate) fn some(names: &[String]) -> String {
+    const MOST: usize = 10;
+    let shown = names
+        .iter()
+        .take(MOST)
+        .cloned()
+        .collect::<Vec<_>>()
+        .join(", ");
+    match names.len().saturating_sub(MOST) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
     }
 }
 

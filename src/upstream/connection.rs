@@ -10,15 +10,20 @@ use std::{
 use bytes::Bytes;
 use http_body_util::{BodyExt, Collected, Full, Limited};
 use hyper::{
-    Request,
+    HeaderMap, Request, Version,
     body::Body,
     client::conn::http1::{self, SendRequest},
-    header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT},
+    header::{
+        CONNECTION, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE, HOST, HeaderValue, SERVER,
+        USER_AGENT,
+    },
 };
 use hyper_util::rt::TokioIo;
-use tokio::{net::TcpStream, sync::watch};
+use tokio::{net::TcpStream, time::timeout};
 
-use super::{CallError, Head, INSTANCE_HEADER, RawReply, Writer, is_local};
+use super::{
+    CONNECT_LIMIT, CallError, Head, INSTANCE_HEADER, RawReply, Silence, Writer, keeps_order,
+};
 use crate::{
     ros_env::MasterUri,
     xmlrpc::{self, Call, Reply},
@@ -30,29 +35,30 @@ const LONG: usize = 256 << 10;
 /// Sends and receives what hyper's handle is given.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
-/// A keep-alive connection to the master, for one call at a time.
+/// A connection to the master, for one call at a time.
 ///
 /// The caller drives it, in its own task: another task would have to be woken twice for
 /// each call. So nobody notices its end between two calls; [`Self::is_closed`] looks.
+///
+/// A server that closes its end after one answer, as one that speaks HTTP/1.0, gets a new connection for the
+/// next call. Another process may listen there by then.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
     driver: Drive,
-    local: bool,
     peer: SocketAddr,
     host: HeaderValue,
     instance: HeaderValue,
     max_reply: usize,
+    silence: Option<Silence>,
+    /// What the last answer said.
+    keeps_alive: Option<bool>,
+    server: Option<HeaderValue>,
 }
 
-/// Who drives a connection.
+/// The caller's part of a connection; none if it has ended. With it ends the count of connections for writes.
 #[derive(Debug)]
-enum Drive {
-    /// The caller; none if it has ended. With it ends the count of connections for writes.
-    Caller(Option<(Box<Driver>, Option<Writer>)>),
-    /// A task, whose end is the connection's.
-    Task(watch::Receiver<()>),
-}
+struct Drive(Option<(Box<Driver>, Option<Writer>)>);
 
 impl Drive {
     /// Runs `work`, which waits for the connection.
@@ -70,12 +76,11 @@ impl Drive {
     }
 
     fn poll(&mut self, context: &mut Context<'_>) {
-        if let Self::Caller(driven) = self
-            && let Some((driver, _)) = driven
+        if let Some((driver, _)) = &mut self.0
             && Pin::new(driver).poll(context).is_ready()
         {
             // The call under way gets its error, if any.
-            *driven = None;
+            self.0 = None;
         }
     }
 }
@@ -89,7 +94,7 @@ impl Connection {
         instance: HeaderValue,
         max_reply: usize,
     ) -> io::Result<Self> {
-        Self::open(stream, address, instance, max_reply, None).await
+        Self::open(stream, address, instance, max_reply, None, None).await
     }
 
     pub(super) async fn open(
@@ -97,25 +102,31 @@ impl Connection {
         address: &MasterUri,
         instance: HeaderValue,
         max_reply: usize,
+        silence: Option<Silence>,
         writer: Option<Writer>,
     ) -> io::Result<Self> {
-        stream.set_nodelay(true)?;
-        let (local, peer) = (is_local(&stream)?, stream.peer_addr()?);
-        let (sender, driver) = http1::Builder::new()
-            .title_case_headers(true)
-            .handshake(TokioIo::new(stream))
-            .await
-            .map_err(io::Error::other)?;
+        let peer = stream.peer_addr()?;
+        let (sender, driver) = handshake(stream, silence).await?;
         let host = HeaderValue::from_str(&address.authority()).map_err(io::Error::other)?;
         Ok(Self {
             sender,
-            driver: Drive::Caller(Some((Box::new(driver), writer))),
-            local,
+            driver: Drive(Some((driver, writer))),
             peer,
             host,
             instance,
             max_reply,
+            silence,
+            keeps_alive: None,
+            server: None,
         })
+    }
+
+    /// The next connection to the same address.
+    async fn reopen(&mut self) -> io::Result<()> {
+        let connecting = timeout(CONNECT_LIMIT, TcpStream::connect(self.peer));
+        let (sender, driver) = handshake(connecting.await??, self.silence).await?;
+        (self.sender, self.driver) = (sender, Drive(Some((driver, None))));
+        Ok(())
     }
 
     /// Whether the connection has ended.
@@ -124,37 +135,19 @@ impl Connection {
         self.sender.is_closed()
     }
 
-    /// Whether the other end is on this computer, or seems to be: a tunnel's end is here too.
-    pub fn is_local(&self) -> bool {
-        self.local
+    /// Whether the other end answers more than one call on a connection. None before its first answer.
+    pub fn keeps_alive(&self) -> Option<bool> {
+        self.keeps_alive
     }
 
-    /// The other end's address.
-    pub fn peer(&self) -> SocketAddr {
-        self.peer
+    /// Whether the other end's dictionaries have an order, as its last answer shows.
+    pub fn keeps_order(&self) -> bool {
+        keeps_order(self.server())
     }
 
-    /// Has the connection driven by a task from now on. Returns when it has ended.
-    pub fn ended(&mut self) -> impl Future<Output = ()> + Send + 'static {
-        let mut ended = match &mut self.driver {
-            Drive::Task(ended) => ended.clone(),
-            Drive::Caller(driven) => {
-                let (end, ended) = watch::channel(());
-                let driven = driven.take();
-                tokio::spawn(async move {
-                    if let Some((driver, _writer)) = driven {
-                        let _ = driver.await;
-                    }
-                    drop(end);
-                });
-                self.driver = Drive::Task(ended.clone());
-                ended
-            }
-        };
-        async move {
-            // Nothing is ever sent: it ends when the sender is dropped.
-            while ended.changed().await.is_ok() {}
-        }
+    /// The `Server` header of the last answer.
+    pub fn server(&self) -> Option<&str> {
+        self.server.as_ref()?.to_str().ok()
     }
 
     /// Sends `body` unchanged and returns the reply unchanged.
@@ -179,6 +172,9 @@ impl Connection {
         body: Bytes,
         predicted: Option<&Bytes>,
     ) -> Result<RawReply, CallError> {
+        if self.keeps_alive == Some(false) {
+            self.reopen().await.map_err(CallError::NotConnected)?;
+        }
         // No Accept-Encoding: rosmaster would gzip replies, in Python.
         let mut request = Request::post(head.path.as_str())
             .header(HOST, &self.host)
@@ -210,13 +206,17 @@ impl Connection {
                 None => body.collect().await.map(Collected::to_bytes),
             };
             Ok(RawReply {
+                keeps_alive: keeps_alive(parts.version, &parts.headers),
                 status: parts.status,
                 reason: parts.extensions.get().cloned(),
                 headers: parts.headers,
                 body: body.map_err(CallError::BrokenReply)?,
             })
         };
-        self.driver.run(exchange).await
+        let reply = self.driver.run(exchange).await?;
+        self.keeps_alive = Some(reply.keeps_alive);
+        self.server = reply.headers.get(SERVER).cloned();
+        Ok(reply)
     }
 
     pub async fn call(&mut self, call: &Call) -> Result<Reply, CallError> {
@@ -226,6 +226,34 @@ impl Connection {
             true => tokio::task::block_in_place(|| reply.decode()),
             false => reply.decode(),
         }
+    }
+}
+
+async fn handshake(
+    stream: TcpStream,
+    silence: Option<Silence>,
+) -> io::Result<(SendRequest<Full<Bytes>>, Box<Driver>)> {
+    stream.set_nodelay(true)?;
+    if let Some(silence) = silence {
+        // Best effort: the connection works without it.
+        let _ = silence.bound(&stream);
+    }
+    let (sender, driver) = http1::Builder::new()
+        .title_case_headers(true)
+        .handshake(TokioIo::new(stream))
+        .await
+        .map_err(io::Error::other)?;
+    Ok((sender, Box::new(driver)))
+}
+
+/// Whether a server that answers so takes another request on the connection.
+fn keeps_alive(version: Version, headers: &HeaderMap) -> bool {
+    let values = headers.get_all(CONNECTION).into_iter();
+    let mut words = values.flat_map(|value| value.to_str().unwrap_or_default().split(','));
+    let mut says = |word: &str| words.any(|said| said.trim().eq_ignore_ascii_case(word));
+    match version {
+        Version::HTTP_11 => !says("close"),
+        _ => says("keep-alive"),
     }
 }
 
@@ -275,6 +303,21 @@ mod tests {
             let piece = self.0.next();
             Poll::Ready(piece.map(|piece| Ok(Frame::data(Bytes::from(piece)))))
         }
+    }
+
+    #[test]
+    fn the_first_answer_shows_whether_a_connection_is_kept() {
+        let of = |version, connection: Option<&'static str>| {
+            let value = connection.map(|value| (CONNECTION, HeaderValue::from_static(value)));
+            keeps_alive(version, &value.into_iter().collect())
+        };
+        assert!(of(Version::HTTP_11, None));
+        assert!(of(Version::HTTP_11, Some("keep-alive")));
+        assert!(!of(Version::HTTP_11, Some("Close")));
+        assert!(!of(Version::HTTP_11, Some("x-other, close")));
+        assert!(!of(Version::HTTP_10, None));
+        assert!(!of(Version::HTTP_10, Some("close")));
+        assert!(of(Version::HTTP_10, Some("Keep-Alive")));
     }
 
     #[tokio::test]

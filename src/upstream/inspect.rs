@@ -25,13 +25,13 @@ pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
 ) -> Result<Inspection, InspectError> {
-    let whole = look(connection, Inspection::call(token)).await;
+    let whole = look(connection, Inspection::call(token), token).await;
     match whole {
         Err(InspectError::NotAMaster(
             NotAMaster::ParamsUnreadable { .. } | NotAMaster::Form { .. },
-        )) => look(connection, Inspection::call_without_params(token)).await,
+        )) => look(connection, Inspection::call_without_params(token), token).await,
         Err(error) if is_broken_document(&error) => {
-            let rest = look(connection, Inspection::call_without_params(token)).await;
+            let rest = look(connection, Inspection::call_without_params(token), token).await;
             // A server that does not speak XML-RPC may have closed the connection.
             rest.map_err(|_| error)
         }
@@ -39,8 +39,13 @@ pub(crate) async fn first(
     }
 }
 
-async fn look(connection: &mut Connection, call: Request) -> Result<Inspection, InspectError> {
-    Ok(Inspection::decode(&connection.call(&call.into()).await?)?)
+async fn look(
+    connection: &mut Connection,
+    call: Request,
+    token: &Token,
+) -> Result<Inspection, InspectError> {
+    let reply = connection.call(&call.into()).await?;
+    Ok(Inspection::decode(&reply, token)?)
 }
 
 /// Whether a parameter may have broken the document: a master does not escape the text of a date.

@@ -27,6 +27,14 @@ pub(crate) fn term_of(path: &str) -> Option<u64> {
 /// The status of an answer by one that does not lead in the term.
 pub(crate) const NOT_LEADING: StatusCode = StatusCode::MISDIRECTED_REQUEST;
 
+/// In a leader's answer: the number of the last record that was acknowledged then. Who has the answer may know of
+/// it, and must not be given an older state.
+pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
+
+/// In a leader's answer: its number. The leader is told when the caller has it, because nodes may be notified of
+/// something later only then.
+pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
+
 /// Why another computer has not answered.
 #[derive(Debug, Error)]
 #[non_exhaustive]

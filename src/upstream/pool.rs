@@ -9,8 +9,7 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::sync::Semaphore;
 
-use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream};
-use crate::replay::Token;
+use super::{CallError, Connection, Head, RawReply, Upstream, VerifyError, verify};
 use crate::{
     gate::{self, State},
     ledger::Ledger,
@@ -27,39 +26,6 @@ pub enum ReadError {
     /// The gate was shut meanwhile.
     #[error("the gate was shut")]
     Shut,
-}
-
-/// Why there is no connection to the served incarnation.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum VerifyError {
-    #[error(transparent)]
-    Connect(#[from] ConnectError),
-    #[error(transparent)]
-    Call(#[from] CallError),
-    /// It is another incarnation, which does not hold the state yet.
-    #[error("the master behind a new connection does not bear the present incarnation's token")]
-    OtherIncarnation,
-}
-
-/// Connects and verifies that the incarnation is the one that holds the mirror's state. Must be the first
-/// call on a new connection: the master may have restarted unnoticed.
-pub(crate) async fn connect_verified(
-    upstream: &Upstream,
-    token: &Token,
-) -> Result<Connection, VerifyError> {
-    verified(upstream.connect().await?, token).await
-}
-
-/// Returns `connection` if its incarnation bears `token`.
-pub(crate) async fn verified(
-    mut connection: Connection,
-    token: &Token,
-) -> Result<Connection, VerifyError> {
-    match Token::is_found(&connection.call(&token.lookup().into()).await?) {
-        true => Ok(connection),
-        false => Err(VerifyError::OtherIncarnation),
-    }
 }
 
 /// Connections for reads. Few: a Python master is slow with many.
@@ -137,9 +103,13 @@ impl Pool {
                 self.put_idle(incarnation, connection, &reply);
                 return Ok(reply);
             }
-            let mut connection = connect_verified(&self.upstream, &self.ledger.token()).await?;
-            let reply = connection.forward(head, body.clone()).await?;
-            self.put_idle(incarnation, connection, &reply);
+            let connection = self.upstream.connect().await.map_err(VerifyError::from)?;
+            let (upstream, token) = (&self.upstream, self.ledger.token());
+            let mut verified = verify::connection(connection, upstream, &token).await?;
+            let reply = verified
+                .forward(upstream, &token, head, body.clone())
+                .await?;
+            self.put_idle(incarnation, verified.connection, &reply);
             Ok(reply)
         };
         let mut gate = self.gate.clone();

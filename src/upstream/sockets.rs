@@ -12,7 +12,9 @@
 //! computer gets no more time than that; see `docs/decisions/0003-no-call-in-flight.md`.
 
 use std::{
-    fs,
+    collections::HashSet,
+    fs::{self, File},
+    io::{BufRead, BufReader},
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
 };
 
@@ -21,6 +23,8 @@ const FIN_WAIT1: u8 = 0x04;
 const FIN_WAIT2: u8 = 0x05;
 const CLOSE_WAIT: u8 = 0x08;
 const CLOSING: u8 = 0x0b;
+const LISTEN: u8 = 0x0a;
+const ESTABLISHED: u8 = 0x01;
 
 /// Whether the master at `master` may still be running a call of a connection that was closed on this side.
 pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
@@ -29,6 +33,60 @@ pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
         let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
         is_in_table(&table, master)
     })
+}
+
+/// The addresses at which processes listen, in this network namespace. IPv4 ones are never mapped.
+pub(crate) fn listening() -> HashSet<SocketAddr> {
+    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
+    let sockets = tables.into_iter().flatten().flat_map(|table| {
+        // The kernel lists those that listen first. There may be ten thousands of others.
+        let lines = BufReader::new(table).lines().skip(1);
+        lines.map_while(|line| listens_at(&line.ok()?))
+    });
+    sockets.collect()
+}
+
+/// One end of a connection, in this network namespace.
+#[derive(Clone, Debug)]
+pub(crate) struct Established {
+    pub(crate) local: SocketAddr,
+    pub(crate) remote: SocketAddr,
+    pub(crate) user: u32,
+    /// Identifies the socket.
+    pub(crate) inode: u64,
+}
+
+/// The ends of all connections. IPv4 addresses are never mapped. Blocks for as long as the kernel makes up the table.
+pub(crate) fn established() -> Vec<Established> {
+    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
+    let sockets = tables.into_iter().flatten().flat_map(|table| {
+        let lines = BufReader::new(table).lines().skip(1);
+        lines.map_while(Result::ok).filter_map(|line| end_in(&line))
+    });
+    sockets.collect()
+}
+
+/// The end of a connection in a table's line.
+fn end_in(line: &str) -> Option<Established> {
+    let mut columns = line.split_whitespace().skip(1);
+    let (local, remote, state) = (columns.next()?, columns.next()?, columns.next()?);
+    if u8::from_str_radix(state, 16).ok()? != ESTABLISHED {
+        return None;
+    }
+    Some(Established {
+        local: address(local)?,
+        remote: address(remote)?,
+        user: columns.nth(3)?.parse().ok()?,
+        inode: columns.nth(1)?.parse().ok()?,
+    })
+}
+
+/// The address of a table's line, if its socket listens.
+fn listens_at(line: &str) -> Option<SocketAddr> {
+    let mut columns = line.split_whitespace().skip(1);
+    let (local, state) = (columns.next()?, columns.nth(1)?);
+    let listens = u8::from_str_radix(state, 16).ok()? == LISTEN;
+    address(local).filter(|_| listens)
 }
 
 fn is_in_table(table: &str, master: SocketAddr) -> bool {

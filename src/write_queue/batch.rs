@@ -1,16 +1,15 @@
 //! Queued writes, how a batch becomes one request, and how its reply is unpacked.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{collections::VecDeque, sync::Arc, time::Instant};
 
 use bytes::Bytes;
 use tokio::sync::oneshot;
 
 use crate::{
-    ledger::activity::LastCalls,
-    upstream::{Head, RawReply},
-};
-use crate::{
+    ledger::{activity::LastCalls, delivery::Delivery},
     master::{Entry, Kind, Method, Request, entry_reply},
+    order::{BySubject, Concern, Order},
+    upstream::{Head, RawReply},
     xmlrpc::{self, Reply, Value},
 };
 
@@ -38,12 +37,19 @@ pub(crate) struct Item {
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
-    pub answer: oneshot::Sender<Answer>,
+    answer: oneshot::Sender<Answered>,
+    /// What it has to do with what nodes hear.
+    concern: Concern,
+    /// Its answer, once it is on its way to the master, or answered by the mirror.
+    pub delivery: Option<Delivery>,
     /// For a call of our own: when it is still right.
     pub condition: Option<Condition>,
     /// Whether those whose ports it takes have been dealt with.
     pub way_made: bool,
 }
+
+/// An answer, and what is to be dropped when the caller has it.
+pub(crate) type Answered = (Answer, Option<Delivery>);
 
 /// A node and its last calls at the time of the decision to register or unregister something for it. The
 /// condition fails if the node does the opposite itself meanwhile.
@@ -64,6 +70,48 @@ impl Condition {
 }
 
 impl Item {
+    /// A client's call, or one of our own if there is no `raw`, and where its answer comes.
+    pub(crate) fn new(
+        raw: Option<(Head, Bytes)>,
+        call: Option<Arc<Request>>,
+    ) -> (Self, oneshot::Receiver<Answered>) {
+        let (answer, answered) = oneshot::channel();
+        let item = Self {
+            concern: Concern::of(call.as_deref()),
+            raw,
+            call,
+            answer,
+            delivery: None,
+            condition: None,
+            way_made: false,
+        };
+        (item, answered)
+    }
+
+    pub(super) fn concern(&self) -> &Concern {
+        &self.concern
+    }
+
+    /// As if no node heard of anything.
+    #[cfg(test)]
+    pub(super) fn forget_concern(&mut self) {
+        self.concern = Concern::default();
+    }
+
+    pub(super) fn reply(self, answer: Answer) {
+        let _ = self.answer.send((answer, self.delivery));
+    }
+
+    /// Whether nobody waits for the answer: the call is answered, or its client has gone.
+    pub(super) fn is_dropped(&self) -> bool {
+        self.answer.is_closed()
+    }
+
+    /// Whether it stays behind all that was queued before it: it may do anything, or was decided on what was.
+    fn is_last(&self) -> bool {
+        self.raw.is_none() || self.call.is_none()
+    }
+
     /// Method and caller id, for messages.
     pub(crate) fn describe(&self) -> String {
         let Some(call) = &self.call else {
@@ -92,20 +140,62 @@ impl Item {
     }
 }
 
-/// Takes the next batch from the front of `queue`: one call, or several that may share a batch.
-pub(crate) fn pack(queue: &mut VecDeque<Item>) -> Vec<Item> {
-    let mut items: Vec<_> = queue.pop_front().into_iter().collect();
-    let mut bytes = items.first().map_or(0, Item::weight);
-    while items.first().is_some_and(Item::may_share)
-        && items.len() < CALLS_MAX
-        && let Some(next) = queue.front()
-        && next.may_share()
-        && bytes + next.weight() <= BYTES_MAX
+/// The next batch.
+#[derive(Debug, Default)]
+pub(crate) struct Batch {
+    pub(crate) items: Vec<Item>,
+    /// When to try again because of calls that were passed over; none if a change will be reported.
+    pub(crate) until: Option<Instant>,
+}
+
+/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over calls that have
+/// to [wait](Order::hold), and over later ones about the same subjects.
+pub(crate) fn pack(
+    queue: &mut VecDeque<Item>,
+    order: &mut Order,
+    now: Instant,
+    delivery: impl Fn(u64) -> Delivery,
+) -> Batch {
+    let mut batch = Batch::default();
+    let mut passed_over = BySubject::default();
+    let (mut index, mut bytes) = (0, 0);
+    while batch.items.len() < CALLS_MAX
+        && let Some(item) = queue.get(index)
     {
-        bytes += next.weight();
-        items.extend(queue.pop_front());
+        let fits = item.may_share() && bytes + item.weight() <= BYTES_MAX;
+        if !batch.items.is_empty() && !fits {
+            break;
+        }
+        let is_about_passed = || item.concern.subjects().any(|it| passed_over.has(it));
+        let is_behind = index > 0 && (item.is_last() || is_about_passed());
+        let held = match is_behind {
+            true => None,
+            false => order.hold(now, &item.concern),
+        };
+        if is_behind || held.is_some() {
+            let until = held.and_then(|held| held.until);
+            batch.until = batch.until.into_iter().chain(until).min();
+            if item.is_last() {
+                break;
+            }
+            for subject in item.concern.subjects() {
+                passed_over.add(subject, ());
+            }
+            index += 1;
+            continue;
+        }
+        let is_alone = !item.may_share();
+        let Some(mut item) = queue.remove(index) else {
+            break;
+        };
+        bytes += item.weight();
+        item.delivery = order.begin(now, item.concern.heard()).map(&delivery);
+        batch.items.push(item);
+        if is_alone {
+            break;
+        }
     }
-    items
+    batch
 }
 
 /// The request for `items`: the client's own bytes if it is a single call.

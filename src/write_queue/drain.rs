@@ -7,19 +7,19 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{mpsc, watch};
 use tracing::Instrument;
 
 use super::batch::{self, Answer, Item};
 use super::{
-    Link, evict,
+    Link, Signals, evict,
     outdated::is_outdated,
     resync::ResyncSchedule,
     round_trip::{Done, Received, RoundTripError, round_trip},
 };
 use crate::{
     gate::{self, State},
-    ledger::Mark,
+    ledger::{Ledger, Mark, delivery::Delivery},
     limit::rarely,
     master::{Master, Method, Request},
     status::stats::Stats,
@@ -40,6 +40,12 @@ struct InFlight {
     /// The mirror's version when it was sent.
     version: u64,
     items: Vec<Item>,
+    /// Whether the mirror can answer these items.
+    answerable: bool,
+    /// Whether it was reported as late.
+    told_late: bool,
+    /// The mirror has answered them, and the master has not.
+    late: bool,
     sent: tokio::time::Instant,
     done: Pin<Box<dyn Future<Output = Done> + Send>>,
 }
@@ -57,12 +63,19 @@ pub(crate) struct Drain {
     grace: Option<tokio::time::Instant>,
     /// A batch was lost, and the gate has not changed since.
     lost: bool,
-    tell_lost: Arc<Notify>,
+    signals: Arc<Signals>,
+    /// When the batch in flight is late.
+    late_at: Option<tokio::time::Instant>,
+    /// The master, which was late, has answered. The gate follows.
+    late_over: bool,
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     /// The incarnation for which the gate was open last.
     incarnation: u64,
     resync: ResyncSchedule,
     retry_at: Option<tokio::time::Instant>,
+    /// When calls that wait for answers to others are tried again at the latest.
+    pub(super) held_until: Option<tokio::time::Instant>,
+    order_changed: watch::Receiver<()>,
     /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
     /// read from the master again and holds their effects.
     opaque: Opaque,
@@ -84,10 +97,12 @@ impl Drain {
         gate: gate::Rx,
         stats: &'static Stats,
         resync_interval: Option<Duration>,
-        tell_lost: Arc<Notify>,
+        signals: Arc<Signals>,
         tell_sent: watch::Sender<Option<tokio::time::Instant>>,
     ) -> Self {
         Self {
+            held_until: None,
+            order_changed: link.ledger.order_changed(),
             link,
             gate,
             stats,
@@ -98,7 +113,9 @@ impl Drain {
             in_flight: None,
             grace: None,
             lost: false,
-            tell_lost,
+            signals,
+            late_at: None,
+            late_over: false,
             tell_sent,
             incarnation: 0,
             resync: ResyncSchedule::default(),
@@ -128,7 +145,16 @@ impl Drain {
                     self.done(done);
                 }
                 () = wait::until(self.retry_at) => self.retry_at = None,
+                () = wait::until(self.held_until) => {}
+                // The ledger lives as long.
+                _ = self.order_changed.changed() => {}
                 () = wait::until(self.grace) => {}
+                () = wait::until(self.late_at) => {
+                    if let Some(batch) = &mut self.in_flight {
+                        batch.told_late = true;
+                    }
+                    self.signals.is_late.notify_one();
+                }
                 () = wait::tick(&mut interval) => {
                     if self.in_flight.as_ref().is_none_or(|batch| !batch.items.is_empty()) {
                         self.resync.request();
@@ -140,21 +166,39 @@ impl Drain {
                 self.queue.push_back(item);
             }
             // Drops calls that are answered, or whose client has gone.
-            self.queue.retain(|item| !item.answer.is_closed());
+            self.queue.retain(|item| !item.is_dropped());
             // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = gate.look_changed();
             if changed || unseen {
                 (self.retry_at, self.lost) = (None, false);
             }
+            self.late_over &= state == State::Late;
             match state {
                 State::Open { incarnation } => self.send(incarnation),
                 State::StandingIn => self.stand_in(),
+                State::Late => self.stand_in_for_late(),
                 State::Injecting | State::Unknown => self.grace = None,
                 State::Elsewhere => self.send_elsewhere(),
             }
+            self.late_at = self.late_at(state);
             self.tell_sent
                 .send_replace(self.in_flight.as_ref().map(|batch| batch.sent));
         }
+    }
+
+    /// When the mirror is to answer for the master. It waits for the probes' verdict while it is in doubt itself,
+    /// and while something is under way that only a master can answer.
+    fn late_at(&self, state: State) -> Option<tokio::time::Instant> {
+        let batch = self
+            .in_flight
+            .as_ref()
+            .filter(|batch| state.is_open() && batch.answerable && !batch.told_late)?;
+        if batch.items.is_empty() && self.queue.is_empty() || self.link.ledger.is_doubted() {
+            return None;
+        }
+        let now = Instant::now();
+        let patience = self.signals.patience.borrow().clone().at(now);
+        Some(batch.sent + patience)
     }
 
     /// Sends the next batch, if none is in flight and something is to be sent.
@@ -166,6 +210,7 @@ impl Drain {
         {
             // The new master never got these calls.
             self.take_back(batch.items);
+            self.link.ledger.settled_calls();
         }
         if self.opaque.incarnation != incarnation {
             let opaque = std::mem::take(&mut self.opaque).answers;
@@ -184,8 +229,9 @@ impl Drain {
             && is_outdated(&self.link.ledger, own)
             && let Some(own) = self.queue.pop_front()
         {
-            let _ = own.answer.send(Answer::Close);
+            own.reply(Answer::Close);
         }
+        self.held_until = None;
         let inspects = self.resync.begin(tokio::time::Instant::now());
         let items = match inspects {
             true => Vec::new(),
@@ -198,11 +244,20 @@ impl Drain {
         connection.take_if(|(of, connection)| *of != incarnation || connection.is_closed());
         self.stats.write_batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
+        self.link.ledger.with_order(|order, _| {
+            let tells = items.iter().flat_map(|item| item.concern().tells());
+            let answers = items.iter().filter_map(|item| item.delivery.as_ref());
+            order.sent(tells, answers.map(Delivery::number).collect());
+        });
         let span = tracing::debug_span!("batch", incarnation, calls = items.len());
         let done = round_trip(self.link.clone(), incarnation, connection, request);
+        let answerable = |item: &Item| item.call.as_ref().is_some_and(|call| call.is_answerable());
         self.in_flight = Some(InFlight {
             incarnation,
             version: self.link.ledger.version(),
+            answerable: items.iter().all(answerable),
+            told_late: false,
+            late: false,
             items,
             sent: tokio::time::Instant::now(),
             done: Box::pin(done.instrument(span)),
@@ -214,6 +269,7 @@ impl Drain {
             incarnation,
             version,
             items,
+            late,
             sent,
             ..
         }) = self.in_flight.take()
@@ -221,6 +277,9 @@ impl Drain {
             return;
         };
         self.connection = done.connection;
+        if late {
+            return self.late_done(done.result.map(|_| ()));
+        }
         let connected = !matches!(done.result, Err(RoundTripError::Connect(_)));
         if items.is_empty() && connected {
             self.resync
@@ -231,6 +290,24 @@ impl Drain {
             Ok(Received::Reply(raw)) => self.deliver(incarnation, items, raw),
             Err(error) => self.failed(items, &error),
         }
+        self.link.ledger.settled_calls();
+    }
+
+    /// The master has answered what the mirror has answered long ago, or will not.
+    fn late_done(&mut self, result: Result<(), RoundTripError>) {
+        self.late_over = true;
+        match result {
+            Ok(()) => {
+                self.link.ledger.late_answered(Instant::now());
+                self.signals.has_answered.notify_one();
+            }
+            Err(error) => {
+                tracing::debug!(%error, "a late batch failed");
+                self.link.ledger.abandon_batch();
+                self.signals.lost.notify_one();
+            }
+        }
+        self.link.ledger.settled_calls();
     }
 
     fn resync(&mut self, incarnation: u64, version: u64, state: Master) {
@@ -276,14 +353,15 @@ impl Drain {
             self.link.ledger.abandon_batch();
             // Whether it ran is known only when the master is back. Until then the mirror answers.
             self.lost = true;
-            self.tell_lost.notify_one();
+            self.signals.lost.notify_one();
         } else {
             self.retry_at = Some(now + RETRY_PAUSE);
         }
     }
 
     pub(super) fn take_back(&mut self, items: Vec<Item>) {
-        for item in items.into_iter().rev() {
+        for mut item in items.into_iter().rev() {
+            item.delivery = None;
             self.queue.push_front(item);
         }
     }
@@ -361,7 +439,7 @@ impl Drain {
         );
         self.link.ledger.doubt();
         for item in items {
-            let _ = item.answer.send(Answer::Close);
+            item.reply(Answer::Close);
         }
     }
 
@@ -373,7 +451,8 @@ impl Drain {
             return;
         }
         self.grace = None;
-        if self.in_flight.is_some() {
+        let was_in_flight = self.in_flight.is_some();
+        if was_in_flight {
             self.link.ledger.abandon_batch();
         }
         // A master that comes back waits for this end: then it runs no call of this connection any more.
@@ -391,39 +470,81 @@ impl Drain {
             );
             self.take_back(batch.items);
         }
-        let (mut last, mut answers) = (Mark::default(), Vec::new());
-        let mut waiting = VecDeque::new();
-        for item in self.queue.drain(..) {
-            if is_outdated(&self.link.ledger, &item) {
-                let _ = item.answer.send(Answer::Close);
+        self.answer_queue();
+        if was_in_flight {
+            self.link.ledger.settled_calls();
+        }
+    }
+
+    /// Answers from the mirror what the master is late with, then the queue. The batch goes on: the master is
+    /// given the rest when it has answered it.
+    fn stand_in_for_late(&mut self) {
+        self.grace = None;
+        let ledger = self.link.ledger.clone();
+        match &mut self.in_flight {
+            Some(batch) if batch.late => {}
+            Some(batch) => {
+                batch.late = true;
+                if batch.items.is_empty() {
+                    // A look, which is made again.
+                    self.resync.request();
+                }
+                let mut answers = Answers::default();
+                let mut tells = Vec::new();
+                for mut item in std::mem::take(&mut batch.items) {
+                    item.delivery = None;
+                    tells.extend_from_slice(item.concern().tells());
+                    if let Some(item) = answers.add(&ledger, item) {
+                        self.queue.push_front(item);
+                    }
+                }
+                ledger.fall_behind(tells);
+                self.stats.calls_without_master.add(answers.count());
+                self.answer(answers.mark, None, answers.made);
+            }
+            // It has answered just now.
+            None if !self.late_over => {
+                ledger.fall_behind(Vec::new());
+                self.late_done(Ok(()));
+            }
+            None => {}
+        }
+        self.answer_queue();
+    }
+
+    /// Answers the queue from the mirror. Calls that only a master can answer wait.
+    fn answer_queue(&mut self) {
+        let ledger = self.link.ledger.clone();
+        let mut answers = Answers::default();
+        for item in std::mem::take(&mut self.queue) {
+            if is_outdated(&ledger, &item) {
+                item.reply(Answer::Close);
                 continue;
             }
             let call = item.call.as_deref().filter(|call| call.is_answerable());
             if let Some(call) = call.filter(|_| self.evicts && item.raw.is_some()) {
-                evict::while_standing_in(&self.link.ledger, call);
+                evict::while_standing_in(&ledger, call);
             }
-            match call.and_then(|call| self.link.ledger.stand_in(Instant::now(), call)) {
-                Some((reply, mark)) => {
-                    self.stats.calls_without_master.count();
-                    last = last.max(mark);
-                    answers.push((item, Answer::Made(reply)));
-                }
-                None => waiting.push_back(item),
+            if let Some(item) = answers.add(&ledger, item) {
+                self.queue.push_back(item);
             }
         }
-        self.queue = waiting;
-        self.answer(last, None, answers);
+        self.stats.calls_without_master.add(answers.count());
+        self.answer(answers.mark, None, answers.made);
     }
 
     /// Another computer has the master: all calls are to go there.
     fn send_elsewhere(&mut self) {
         (self.grace, self.connection) = (None, None);
         let in_flight = self.in_flight.take().map(|batch| batch.items);
+        if in_flight.is_some() {
+            self.link.ledger.settled_calls();
+        }
         let opaque = std::mem::take(&mut self.opaque).answers;
         let items = in_flight.into_iter().flatten();
         let items = items.chain(opaque.into_iter().map(|(item, _)| item));
         for item in items.chain(self.queue.drain(..)) {
-            let _ = item.answer.send(Answer::Elsewhere);
+            item.reply(Answer::Elsewhere);
         }
     }
 
@@ -433,7 +554,7 @@ impl Drain {
         let mark = self.link.ledger.to_await(mark);
         let send = move |is_safe: bool| {
             for (item, answer) in answers {
-                let _ = item.answer.send(match is_safe {
+                item.reply(match is_safe {
                     true => answer,
                     false => Answer::Elsewhere,
                 });
@@ -453,6 +574,33 @@ impl Drain {
             }
             send(is_safe);
         });
+    }
+}
+
+/// Answers of the mirror.
+#[derive(Default)]
+struct Answers {
+    made: Vec<(Item, Answer)>,
+    /// Where the last record is.
+    mark: Mark,
+}
+
+impl Answers {
+    /// Answers `item`, or returns it if only a master can.
+    fn add(&mut self, ledger: &Arc<Ledger>, mut item: Item) -> Option<Item> {
+        let call = item.call.as_deref().filter(|call| call.is_answerable());
+        let answer = |call| ledger.stand_in_for(Instant::now(), call, item.concern());
+        let Some((reply, mark, delivery)) = call.and_then(answer) else {
+            return Some(item);
+        };
+        item.delivery = delivery;
+        self.mark = self.mark.max(mark);
+        self.made.push((item, Answer::Made(reply)));
+        None
+    }
+
+    fn count(&self) -> u64 {
+        self.made.len() as u64
     }
 }
 

@@ -3,22 +3,25 @@
 
 use std::{sync::Arc, time::Instant};
 
-use tokio::sync::oneshot;
-
 use super::{
-    batch::{self, Answer, Item},
+    batch::{self, Answer, Batch, Item},
     drain::Drain,
 };
 use crate::{
     health::{Eviction, first_taking},
-    ledger::Ledger,
+    ledger::{Ledger, delivery::Delivery},
     master::Request,
 };
 
 impl Drain {
     /// The next batch. A call that takes a port is the first of its batch, and the eviction goes before it.
     pub(super) fn pack(&mut self) -> Vec<Item> {
-        let mut items = batch::pack(&mut self.queue);
+        let ledger = self.link.ledger.clone();
+        let Batch { mut items, until } = ledger.with_order(|order, _| {
+            let delivery = |number| Delivery::new(&ledger, number);
+            batch::pack(&mut self.queue, order, Instant::now(), delivery)
+        });
+        self.held_until = until.map(Into::into);
         if !self.evicts {
             return items;
         }
@@ -62,19 +65,13 @@ pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
 }
 
 fn own(eviction: Eviction, by: String) -> Item {
-    let (answer, answered) = oneshot::channel();
+    let (item, answered) = Item::new(None, Some(Arc::new(eviction.call)));
     tokio::spawn(async move {
-        if let Ok(Answer::Raw(_) | Answer::Made(_)) = answered.await {
+        if let Ok((Answer::Raw(_) | Answer::Made(_), _)) = answered.await {
             say(&eviction.nodes, &by);
         }
     });
-    Item {
-        raw: None,
-        call: Some(Arc::new(eviction.call)),
-        answer,
-        condition: None,
-        way_made: false,
-    }
+    item
 }
 
 fn say(nodes: &[String], by: &str) {

@@ -6,10 +6,11 @@ use thiserror::Error;
 use super::Link;
 use crate::{
     master::Master,
+    replay::Token,
     upstream::{
-        CallError, Connection, Head, RawReply,
+        CallError, Connection, Head, RawReply, VerifyError,
         inspect::{self, InspectError},
-        pool::{VerifyError, verified},
+        verify::{self, Verified},
     },
 };
 
@@ -42,7 +43,9 @@ pub(super) enum RoundTripError {
 impl RoundTripError {
     /// Whether the master may have run what was sent.
     pub(super) fn may_have_run(&self) -> bool {
-        matches!(self, Self::Call(error) if !matches!(error, CallError::NotSent(_)))
+        let is_unsent =
+            |error: &CallError| matches!(error, CallError::NotSent(_) | CallError::NotConnected(_));
+        matches!(self, Self::Call(error) if !is_unsent(error))
     }
 }
 
@@ -54,12 +57,13 @@ pub(super) async fn round_trip(
     connection: Option<(u64, Connection)>,
     request: Option<(Head, Bytes)>,
 ) -> Done {
+    let token = link.ledger.token();
     let connected = match connection {
-        Some((_, connection)) => Ok(connection),
-        None => connect(&link).await,
+        Some((_, connection)) => Ok(Verified::before(connection)),
+        None => connect(&link, &token).await,
     };
-    let mut connection = match connected {
-        Ok(connection) => connection,
+    let mut verified = match connected {
+        Ok(verified) => verified,
         Err(error) => {
             return Done {
                 connection: None,
@@ -69,11 +73,11 @@ pub(super) async fn round_trip(
     };
     let result = match request {
         Some((head, body)) => {
-            let reply = connection.forward(&head, body).await;
+            let reply = verified.forward(&link.upstream, &token, &head, body).await;
             reply.map(Received::Reply).map_err(Into::into)
         }
         None => {
-            let held = held(&link, &mut connection).await;
+            let held = held(&link, &token, &mut verified).await;
             held.map(|held| Received::Held(held.into()))
                 .map_err(Into::into)
         }
@@ -84,19 +88,24 @@ pub(super) async fn round_trip(
         Err(_) => false,
     };
     Done {
-        connection: usable.then_some((incarnation, connection)),
+        connection: usable.then_some((incarnation, verified.connection)),
         result,
     }
 }
 
-async fn connect(link: &Link) -> Result<Connection, VerifyError> {
+async fn connect(link: &Link, token: &Token) -> Result<Verified, VerifyError> {
     let connection = link.upstream.connect_for_writes().await?;
-    verified(connection, &link.ledger.token()).await
+    verify::connection(connection, &link.upstream, token).await
 }
 
-/// The state of the master behind `connection`.
-async fn held(link: &Link, connection: &mut Connection) -> Result<Master, InspectError> {
+/// The state of the master behind a connection.
+async fn held(link: &Link, token: &Token, verified: &mut Verified) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
-    let first = inspect::first(connection, &link.ledger.token()).await?;
-    inspect::second(first, connection, &previous).await
+    let mut first = inspect::first(&mut verified.connection, token).await?;
+    if !verified.connection.keeps_order() {
+        first.arrange_like(&previous);
+    }
+    let state = inspect::second(first, &mut verified.connection, &previous).await?;
+    verified.confirm(&link.upstream, token).await?;
+    Ok(state)
 }

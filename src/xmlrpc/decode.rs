@@ -5,7 +5,7 @@
 
 use std::borrow::Cow;
 
-use super::error::DecodeError;
+use super::error::{DecodeError, NO_METHOD, NOTHING, TEXT_MOST};
 use super::number;
 use super::prolog::text_of;
 use super::scan::{Event, LineEnds, Scanner};
@@ -46,7 +46,7 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
         return Err(DecodeError::Shape { wanted, what });
     }
     let Some(method) = document.method else {
-        let what = "it names no method";
+        let what = NO_METHOD;
         return Err(DecodeError::Shape { wanted, what });
     };
     Ok(Call::new(method, document.values))
@@ -134,7 +134,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
         }
     }
     let Some(kind) = machine.kind else {
-        let what = "it has no params, fault or methodName";
+        let what = NOTHING;
         return Err(DecodeError::Shape { wanted, what });
     };
     Ok(Document {
@@ -319,6 +319,6 @@ fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
 }
 
 fn bad_text(tag: &'static str, text: &str, at: usize) -> DecodeError {
-    let text = text.chars().take(40).collect();
+    let text = text.chars().take(TEXT_MOST).collect();
     DecodeError::BadText { at, tag, text }
 }

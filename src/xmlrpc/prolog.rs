@@ -44,6 +44,34 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     Ok(text)
 }
 
+/// The document without its document type, if that is a name alone, which declares nothing; none if it has no such
+/// document type.
+pub(crate) fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
+    const DOCTYPE: &[u8] = b"<!DOCTYPE";
+    let declared = match body.starts_with(b"<?xml") {
+        true => body.windows(2).position(|it| it == b"?>")? + 2,
+        false => 0,
+    };
+    let blank = body.get(declared..)?.iter();
+    let begin = declared + blank.take_while(|byte| byte.is_ascii_whitespace()).count();
+    let doctype = body.get(begin..)?;
+    let end = doctype.iter().position(|&byte| byte == b'>')?;
+    let name = doctype.get(..end)?.strip_prefix(DOCTYPE)?;
+    let is_name = |name: &[u8]| {
+        name.first().is_some_and(u8::is_ascii_alphabetic)
+            && name.iter().all(u8::is_ascii_alphanumeric)
+    };
+    let is_plain = name.first().is_some_and(u8::is_ascii_whitespace) && is_name(name.trim_ascii());
+    is_plain.then(|| {
+        [body.get(..begin), doctype.get(end + 1..)]
+            .into_iter()
+            .flatten()
+            .flatten()
+            .copied()
+            .collect()
+    })
+}
+
 /// The encoding in `<?xml version="…" encoding="…" standalone="…"?>`.
 fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> {
     let tag = BytesStart::from_content(&**declaration, "xml".len());

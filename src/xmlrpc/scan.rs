@@ -13,7 +13,10 @@ use quick_xml::events::attributes::Attribute;
 use quick_xml::events::{BytesEnd, BytesRef, BytesStart, Event as Markup};
 use quick_xml::reader::Reader;
 
-use super::error::DecodeError;
+use super::error::{
+    BAD_MARKUP, BAD_REFERENCE, DecodeError, LATE_DECLARATION, NO_ELEMENT, NOT_CLOSED, OTHER_END,
+    SECOND_ROOT, TEXT_AFTER_ROOT, TEXT_BEFORE_ROOT,
+};
 
 /// One event. An empty element gives a start and an end.
 pub(super) enum Event<'a> {
@@ -72,7 +75,7 @@ impl<'a> Scanner<'a> {
             let markup = self.reader.read_event().map_err(|e| self.broken(&e))?;
             let is_outside = self.open == 0;
             let what = match markup {
-                Markup::Start(_) if is_outside && self.seen_root => "a second root element",
+                Markup::Start(_) if is_outside && self.seen_root => SECOND_ROOT,
                 Markup::Start(_) if self.open >= self.max_open => {
                     let limit = self.max_open;
                     return Err(DecodeError::TooDeep { at, limit });
@@ -91,7 +94,9 @@ impl<'a> Scanner<'a> {
                     return Ok(Some(Event::End(tag)));
                 }
                 Markup::Text(text) if is_outside && text.bytes().all(is_space) => continue,
-                Markup::Text(_) | Markup::CData(_) | Markup::GeneralRef(_) if is_outside => {
+                Markup::Text(_) if is_outside && self.seen_root => TEXT_AFTER_ROOT,
+                Markup::Text(_) if is_outside => TEXT_BEFORE_ROOT,
+                Markup::CData(_) | Markup::GeneralRef(_) if is_outside => {
                     "text outside of the root element"
                 }
                 // Searching for one character is much faster, and encoders write `&gt;`.
@@ -110,10 +115,10 @@ impl<'a> Scanner<'a> {
                 }
                 Markup::GeneralRef(reference) => match character(&reference) {
                     Some(text) => return Ok(Some(Event::Reference(reference, text))),
-                    None => "a reference to nothing",
+                    None => BAD_REFERENCE,
                 },
                 Markup::Decl(_) if at == 0 => continue,
-                Markup::Decl(_) => "an XML declaration that is not at the start",
+                Markup::Decl(_) => LATE_DECLARATION,
                 Markup::PI(it) if it.target().eq_ignore_ascii_case("xml") => {
                     "an XML declaration in capitals"
                 }
@@ -125,8 +130,8 @@ impl<'a> Scanner<'a> {
                     let what = "a document type";
                     return Err(DecodeError::Unsupported { at, what });
                 }
-                Markup::Eof if !is_outside => "an element is not closed",
-                Markup::Eof if !self.seen_root => "there is no element",
+                Markup::Eof if !is_outside => NOT_CLOSED,
+                Markup::Eof if !self.seen_root => NO_ELEMENT,
                 Markup::Eof => return Ok(None),
                 // Empty elements are reported as a start and an end.
                 Markup::Comment(_) | Markup::Empty(_) => continue,
@@ -140,8 +145,9 @@ impl<'a> Scanner<'a> {
         let what = match error {
             Error::IllFormed(IllFormedError::UnclosedReference) => "a reference without semicolon",
             Error::IllFormed(IllFormedError::DoubleHyphenInComment) => "-- in a comment",
-            Error::IllFormed(_) => "an end tag that closes another element",
-            _ => "markup that is not closed or has no place here",
+            Error::IllFormed(IllFormedError::MismatchedEndTag { .. }) => OTHER_END,
+            Error::IllFormed(_) => "an end tag without an element",
+            _ => BAD_MARKUP,
         };
         let at = offset(self.reader.error_position());
         DecodeError::Syntax { at, what }

@@ -187,6 +187,21 @@ impl Value {
         }
     }
 
+    /// The name of the Python type with which CPython decodes it.
+    pub(crate) fn python_type(&self) -> &'static str {
+        match self {
+            Self::Nil => "NoneType",
+            Self::Bool(_) => "bool",
+            Self::Int(_) | Self::BigInt(_) => "int",
+            Self::Double(_) => "float",
+            Self::String(_) => "str",
+            Self::DateTime(_) => "DateTime",
+            Self::Base64(_) => "Binary",
+            Self::Array(_) => "list",
+            Self::Struct(_) => "dict",
+        }
+    }
+
     pub fn as_int(&self) -> Option<i32> {
         match self {
             Self::Int(number) => Some(*number),

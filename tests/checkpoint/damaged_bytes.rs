@@ -31,6 +31,7 @@ fn checkpoint(seq: u64) -> Checkpoint {
             ..Snapshot::default()
         },
         pending: Vec::new(),
+        displaced: Vec::new(),
     }
 }
 

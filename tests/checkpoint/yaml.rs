@@ -11,7 +11,7 @@ use rosrescue::checkpoint::format::{
     Checkpoint, DEPTH_MAX, EncodeError, Entry, Record, Session, decode, encode_checkpoint,
     encode_record,
 };
-use rosrescue::master::{ServiceEntry, Snapshot, SnapshotNode};
+use rosrescue::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use rosrescue::xmlrpc::{Call, Struct, Value};
 
 fn nested(levels: usize, wrap: impl Fn(Value) -> Value) -> Value {
@@ -52,6 +52,7 @@ fn with_params(params: Struct) -> Checkpoint {
             incarnation: 3,
             delivered: 4_999_999_999,
             term: 1_800_000,
+            port: 11_312,
         },
         snapshot: Snapshot {
             nodes: IndexMap::from([
@@ -85,6 +86,20 @@ fn with_params(params: Struct) -> Checkpoint {
             params,
         },
         pending: Vec::new(),
+        displaced: vec![
+            Displaced {
+                node: "/b".to_owned(),
+                api: "http://h:9/".to_owned(),
+                pid: Some(7),
+                topics: ids(&["/t", "yes"]),
+            },
+            Displaced {
+                node: "/c".to_owned(),
+                api: "http://h:8/".to_owned(),
+                pid: None,
+                topics: Vec::new(),
+            },
+        ],
     }
 }
 

@@ -46,6 +46,7 @@ impl Leader {
             guard,
             claim: 1,
             seq,
+            settled: true,
         };
         let answer = replica.run(&settings("a"), &claim, None).await.unwrap();
         let Answer::Applied { revision, .. } = answer else {
@@ -77,6 +78,7 @@ impl Leader {
                 beat: self.beat,
                 seq: last.seq,
                 released: None,
+                settled: true,
             };
             let entry = journal::pack(&self.replica.keys, rest).unwrap().entry;
             let settings = settings("a");
@@ -240,6 +242,7 @@ async fn a_state_can_replace_the_one_before_in_the_middle_of_the_journal() {
         beat: leader.beat,
         seq: 3,
         released: None,
+        settled: true,
     };
     let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
     let Answer::Applied { revision, seq: 3 } = answer.unwrap() else {

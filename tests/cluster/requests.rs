@@ -24,6 +24,7 @@ fn beat(guard: Guard, beat: u64, seq: u64) -> Op {
         beat,
         seq,
         released: None,
+        settled: true,
     }
 }
 
@@ -35,6 +36,7 @@ async fn one_claims_and_what_is_sent_twice_is_made_once() {
         guard: Guard::default(),
         claim,
         seq: 0,
+        settled: false,
     };
     let a = settings("a");
     let first = client.run(&keys, &a, &claim(1), None, LIMIT).await.unwrap();

@@ -57,6 +57,10 @@ fn run(
                     Action::CatchUp(seq) => drop(inward.try_send(Input::Followed(seq))),
                     Action::Become(role) => {
                         let at = Instant::now();
+                        if role == Role::CatchingUp {
+                            let (seq, goes_on) = (0, true);
+                            let _ = inward.try_send(Input::Decided { seq, goes_on });
+                        }
                         let _ = tell.try_send(Became { name, role, at });
                     }
                     _ => {}

@@ -2,6 +2,7 @@
 
     call HEX    what rosmaster makes of a request: `ok METHOD VALUES`, or `raise WHY`
     reply HEX   what a Python client makes of an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
+    fault HEX   the text of the fault that a server answers to a request
     echo HEX    the answer, in hex, of a server whose method `echo` returns its parameter
 """
 import struct
@@ -75,6 +76,14 @@ server = xmlrpc.server.SimpleXMLRPCDispatcher()
 server.register_function(lambda value: value, "echo")
 
 
+def fault(body):
+    try:
+        xmlrpc.client.loads(server._marshaled_dispatch(body))
+    except xmlrpc.client.Fault as fault:
+        return fault.faultString
+    return "no fault"
+
+
 def echo(body):
     return server._marshaled_dispatch(body).hex()
 
@@ -82,7 +91,7 @@ def echo(body):
 for line in sys.stdin:
     verb, _, document = line.strip().partition(" ")
     try:
-        answer = {"call": call, "reply": reply, "echo": echo}[verb](bytes.fromhex(document))
+        answer = {"call": call, "reply": reply, "fault": fault, "echo": echo}[verb](bytes.fromhex(document))
     except Exception as error:
         answer = "raise %s %r" % (type(error).__name__, str(error)[:100])
     print(answer, flush=True)

@@ -15,8 +15,9 @@ pub(crate) const TTL: Duration = Duration::from_secs(2);
 /// machine that others use as well this may take longer.
 pub(crate) const TAKEOVER: Duration = Duration::from_secs(5);
 
-/// No read waits longer, on a machine that others use as well.
-pub(crate) const READ: Duration = Duration::from_secs(1);
+/// No read waits longer, on a machine that others use as well: alone on it, 0.1 s. One that waited for another
+/// leader would take longer than this.
+pub(crate) const READ: Duration = TTL;
 
 #[derive(Debug)]
 pub(crate) struct Fleet {

@@ -1,6 +1,7 @@
 use rosrescue::xmlrpc::Value;
 
 use crate::alone;
+use crate::computer::NAMES;
 use crate::fleet::Fleet;
 use crate::network::COUNT;
 use crate::support::eventually;
@@ -61,6 +62,45 @@ fn the_session_goes_on_where_nodes_live_and_begins_anew_when_all_are_booted() {
     fleet.assert_streams_whole(&[0, 1, 2], &mark);
     fleet.assert_nodes_live();
 
+    switch_off_and_on(&mut fleet);
+    fleet.await_whole();
+    let state = fleet.await_same_state();
+    for (index, computer) in fleet.computers.iter().enumerate() {
+        assert_eq!(computer.param("/of_this_session"), None, "{index}");
+    }
+    assert!(!state.knows("/talker_a"), "{state}");
+    fleet.start_all_nodes();
+    fleet.await_same_state();
+}
+
+#[test]
+fn a_new_session_goes_on_when_its_first_leader_leads_again() {
+    let _alone = alone();
+    let mut fleet = Fleet::empty(&[]);
+    for index in 0..COUNT {
+        fleet.computers[index].start_rescue();
+    }
+    fleet.computers[0].await_answers();
+    fleet.computers[0].set_param("/of_the_old_session", 1);
+    switch_off_and_on(&mut fleet);
+    let first = fleet.await_whole();
+    fleet.computers[0].set_param("/of_the_new_session", 1);
+    for to in [(first + 1) % COUNT, first] {
+        let leader = fleet.await_whole();
+        let (status, said) = fleet.computers[leader].rosrescue(&["handover", "--to", NAMES[to]]);
+        assert_eq!(status, Some(0), "{said}");
+        eventually("it leads", || fleet.leader() == Some(to));
+    }
+    fleet.await_same_state();
+    for (index, computer) in fleet.computers.iter().enumerate() {
+        assert_eq!(computer.param("/of_the_old_session"), None, "{index}");
+        let kept = computer.param("/of_the_new_session");
+        assert_eq!(kept, Some(Value::Int(1)), "{index}");
+    }
+}
+
+/// The power of all computers fails, and comes back.
+fn switch_off_and_on(fleet: &mut Fleet) {
     for index in 0..COUNT {
         fleet.computers[index].power_off();
     }
@@ -73,12 +113,4 @@ fn the_session_goes_on_where_nodes_live_and_begins_anew_when_all_are_booted() {
     for index in 0..COUNT {
         fleet.computers[index].await_answers();
     }
-    fleet.await_whole();
-    let state = fleet.await_same_state();
-    for (index, computer) in fleet.computers.iter().enumerate() {
-        assert_eq!(computer.param("/of_this_session"), None, "{index}");
-    }
-    assert!(!state.knows("/talker_a"), "{state}");
-    fleet.start_all_nodes();
-    fleet.await_same_state();
 }

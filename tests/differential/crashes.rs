@@ -177,9 +177,9 @@ pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) ->
     let mut model = Master::default();
     while !complete(&model) {
         assert!(Instant::now() < deadline, "core is never complete");
-        let look = Inspection::call(&Token::new("none", 1));
-        let look = wire.call(&look.into()).unwrap();
-        let look = Inspection::decode(&look).unwrap();
+        let token = Token::new("none", 1);
+        let look = wire.call(&Inspection::call(&token).into()).unwrap();
+        let look = Inspection::decode(&look, &token).unwrap();
         let nothing = Master::default();
         let second = look
             .second_call(&nothing)
@@ -190,8 +190,7 @@ pub(crate) fn read_state(wire: &mut Wire, complete: impl Fn(&Master) -> bool) ->
             .unwrap_or_default();
         std::thread::sleep(Duration::from_millis(5));
     }
-    let (pid, uri) = wire.identity();
-    model.set_identity(pid, uri);
+    wire.identify(&mut model);
     model
 }
 
@@ -239,6 +238,7 @@ pub(crate) fn run(
     let model = rig.state();
     let wires = (0..CLIENTS).map(|_| rig.wire()).collect();
     let mut stage = Stage::new(nodes, wires, model);
+    stage.allow_repeats();
     stage.callbacks = !script.unreturnable;
     let mut in_flight = false;
     for (nth, step) in script.steps.iter().enumerate() {

@@ -9,6 +9,7 @@ use crate::nodes::Node;
 use crate::real::{Rosmaster, Wire};
 use crate::script::{Script, Step, node_api};
 use crate::stage::{CLIENTS, Failure, Stage};
+use crate::support::unordered;
 
 /// Calls that a successor has answered before the state is brought to it, if any.
 const FOUND: usize = 15;
@@ -54,8 +55,7 @@ pub(crate) fn run(script: &Script, nodes: &[Node], spare: &mut Rosmaster) -> Res
         let mut wires = vec![real.ready()];
         wires.extend((1..CLIENTS).map(|_| Wire::connect(real.port).unwrap()));
         let mut model = Master::default();
-        let (pid, uri) = wires[0].identity();
-        model.set_identity(pid, uri);
+        wires[0].identify(&mut model);
         (real, wires, model)
     };
     let (mut real, wires, model) = fresh();
@@ -111,8 +111,11 @@ fn succeed(
     let plan = Plan::new(&target, &stage.model, &Token::new("test", 1));
     let call = decode_call(plan.request()).map_err(|error| error.to_string())?;
     let reply = stage.wires[0].call(&call)?;
-    plan.verify(&reply)
-        .map_err(|mismatches| format!("the injection: {mismatches:?}"))?;
+    let verdict = match unordered() {
+        true => plan.verify_in_any_order(&reply),
+        false => plan.verify(&reply),
+    };
+    verdict.map_err(|mismatches| format!("the injection: {mismatches:?}"))?;
     let notices = stage.model.clone().apply(&call.into()).notices;
     let is_complete = |notice: &Notice| match notice {
         Notice::PublisherUpdate {
@@ -139,9 +142,8 @@ fn succeed(
         }
     }
     stage.note(&notices, false);
-    let (pid, uri) = stage.wires[0].identity();
     stage.model = plan.expected().clone();
-    stage.model.set_identity(pid, uri);
+    stage.wires[0].identify(&mut stage.model);
     Ok(())
 }
 
@@ -150,13 +152,16 @@ fn look(wire: &mut Wire, model: &Master) -> Result<(), Failure> {
     let mark = Token::new("none", 1);
     let mut look = |call: Request| {
         wire.call(&call.into())
-            .map(|reply| Inspection::decode(&reply))
+            .map(|reply| Inspection::decode(&reply, &mark))
     };
     let look = match look(Inspection::call(&mark))? {
         Err(NotAMaster::ParamsUnreadable { .. }) => look(Inspection::call_without_params(&mark))?,
         look => look,
     };
-    let look = look.map_err(|error| error.to_string())?;
+    let mut look = look.map_err(|error| error.to_string())?;
+    if unordered() {
+        look.arrange_like(model);
+    }
     if look.bears() != Bears::Nothing {
         return Err("a mark that nobody left".to_owned());
     }

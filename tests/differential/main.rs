@@ -39,9 +39,10 @@ mod takeovers;
 mod together;
 mod unreturnable;
 
+use std::io::Write;
 use std::path::Path;
 use std::sync::atomic::Ordering;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crashes::Tally;
 use nodes::Node;
@@ -63,8 +64,10 @@ const THREE_EACH: u64 = 3;
 const READS: [&str; 2] = ["master", "mirror"];
 /// Nodes that listen.
 const NODES: usize = 5;
-/// Runs that are worth a shorter script.
+/// Runs that are worth a shorter script,
 const PATIENCE: usize = 300;
+/// and time. One run of a sequence with takeovers may take half a minute.
+const SHRINKING: Duration = Duration::from_secs(120);
 
 fn number(name: &str, default: u64) -> u64 {
     match std::env::var(name) {
@@ -95,13 +98,32 @@ fn nodes() -> Vec<Node> {
 /// Plays `script`, and if that fails a shorter one and panics.
 fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), Failure>) {
     let Err(first) = run(script) else { return };
-    eprintln!("{what} fails, and is made shorter now: {first}");
-    nodes::HURRIED.store(true, Ordering::Relaxed);
+    // At once, and not with the test's output: whoever waits has to know what for.
+    let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
+    say(format!(
+        "{what} fails: {first}\n\n{}\nIt is made shorter now, for at most {SHRINKING:?}.",
+        script.print()
+    ));
+    let deadline = Instant::now() + SHRINKING;
+    // Another failure that a busy machine causes is no shorter form of this one.
+    let is_late = |why: &Failure| why.contains("there is never");
+    let late = is_late(&first);
+    nodes::HURRIED.store(!late, Ordering::Relaxed);
     let mut why = first;
     let steps = shrink(&script.steps, simpler, PATIENCE, |steps: &[Step]| {
         let steps = steps.to_vec();
         let shorter = Script { steps, ..*script };
-        run(&shorter).map_err(|failure| why = failure).is_err()
+        let failure = (Instant::now() < deadline).then(|| run(&shorter).err());
+        let failure = failure.flatten().filter(|it| is_late(it) == late);
+        let fails = failure.is_some();
+        if let Some(failure) = failure {
+            why = failure;
+            say(format!(
+                "{what} fails with {} steps, too",
+                shorter.steps.len()
+            ));
+        }
+        fails
     });
     let shortest = Script { steps, ..*script };
     panic!(

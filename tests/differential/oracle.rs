@@ -1,12 +1,13 @@
 //! What a node may hear.
 //!
-//! Without a crash it is exactly what the model says, in order. A crash of the master may do this,
-//! and nothing else:
+//! Without a crash it is exactly what the model says, in order; through rosrescue, with what is so told once more here
+//! and there (`docs/decisions/0031`). A crash of the master may do this, and nothing else:
 //!
 //! * The callbacks of the one call that was under way may be lost, or come once more: the master
 //!   may have run it before it died, its successor runs it again, and it was never answered twice.
 //! * So may those of unregistrations that are answered while no master is there. Several of them
 //!   are told with the one list that is true in the end.
+//! * While the mirror stands in, what is out of date when it would be sent may be left out.
 //! * Whoever misses a list by that is sent one that is true after it.
 //! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
 //!   crash before the last one (the letter may cross a change). So may a subscriber of a parameter be

@@ -3,6 +3,7 @@
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_reply, encode_call};
 
 use crate::support::{self, Client, PATIENCE, Scratch, find_program, free_port, http_request};
@@ -111,6 +112,14 @@ impl Wire {
         };
         let (pid, uri) = (ask("getPid"), ask("getUri"));
         (pid.as_int().unwrap(), uri.as_str().unwrap().to_owned())
+    }
+
+    /// Makes the model answer and notify as this master does.
+    pub(crate) fn identify(&mut self, model: &mut Master) {
+        let (pid, uri) = self.identity();
+        model.set_identity(pid, uri);
+        let answer = self.call(&Master::ask_if_old().into()).unwrap();
+        model.set_old(Master::shows_old(&answer));
     }
 }
 

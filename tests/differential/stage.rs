@@ -13,6 +13,7 @@ use crate::nodes::{self, Node};
 use crate::oracle::{Expected, TrueLists, judge};
 use crate::real::Wire;
 use crate::script::with_real_apis;
+use crate::support::{sorted, unordered};
 
 /// Clients of a run, each with a connection of its own. Their calls take turns.
 pub(crate) const CLIENTS: usize = 3;
@@ -57,6 +58,11 @@ impl<'n> Stage<'n> {
         with_real_apis(call, &self.apis)
     }
 
+    /// Through rosrescue a node may be told once more what is so: `docs/decisions/0031`.
+    pub(crate) fn allow_repeats(&mut self) {
+        self.repeats.get_or_insert_default().add(&self.model);
+    }
+
     /// Makes a call, which both must answer alike.
     pub(crate) fn call(&mut self, by: usize, call: &Call) -> Result<(), Failure> {
         let reply = self.wires[by].call(call)?;
@@ -99,15 +105,15 @@ impl<'n> Stage<'n> {
     pub(crate) fn note(&mut self, notices: &[Notice], risky: bool) {
         for notice in notices {
             let (to, call) = nodes::as_call(notice);
-            // rosrescue tells nobody to shut down without evidence that it is the one who is meant, and
-            // these nodes give none.
-            let risky = risky || self.away && matches!(notice, Notice::Shutdown { .. });
+            // The mirror leaves out what is out of date when it is sent. rosrescue tells nobody to shut down without
+            // evidence that it is the one who is meant, and these nodes give none.
+            let risky = risky || self.away;
             if let Some(index) = self.apis.iter().position(|api| api == to) {
                 self.told[index].push(Expected { call, risky });
             }
         }
         match &mut self.repeats {
-            Some(repeats) if risky => repeats.answered(&self.model),
+            Some(repeats) if risky || self.away => repeats.answered(&self.model),
             Some(repeats) => repeats.add(&self.model),
             None => {}
         }
@@ -164,10 +170,16 @@ impl<'n> Stage<'n> {
 
     /// Compares what a node heard, and waits until what a crash has swallowed is made good.
     fn judge(&self, node: &Node, expected: &[Expected], heard: Vec<Call>) -> Result<(), Failure> {
-        let heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
+        let mut heard: Vec<Call> = heard.into_iter().map(nodes::blank).collect();
+        let mut expected = expected.to_vec();
+        if unordered() {
+            // Whom rosmaster tells first is the order of a dictionary, too.
+            heard.sort_by_key(|call| format!("{call:?}"));
+            expected.sort_by_key(|it| format!("{:?}", it.call));
+        }
         let nothing = TrueLists::default();
         let lists = self.repeats.as_ref().unwrap_or(&nothing);
-        let swallowed = judge(expected, &heard, |call| lists.has(&node.api, call))?;
+        let swallowed = judge(&expected, &heard, |call| lists.has(&node.api, call))?;
         let deadline = Instant::now() + nodes::patience();
         let mut news = heard;
         while let Some(owed) = swallowed.iter().find(|it| lists.owes(&node.api, it, &news)) {
@@ -244,11 +256,21 @@ fn blank(value: &Value) -> Value {
             [code @ Value::Int(-1 | 0), Value::String(_), value] => {
                 vec![code.clone(), "".into(), value.clone()].into()
             }
-            elements => elements.iter().map(blank).collect::<Vec<_>>().into(),
+            elements => in_order(elements.iter().map(blank).collect()).into(),
         },
         Value::Struct(members) if members.contains_key("faultString") => {
             members.get("faultCode").cloned().unwrap_or(Value::Nil)
         }
+        value if unordered() => sorted(value),
         value => value.clone(),
     }
+}
+
+/// Lists and names in one order, if the master's dictionaries have none.
+fn in_order(mut elements: Vec<Value>) -> Vec<Value> {
+    let is_one = |it: &Value| matches!(it, Value::Array(_) | Value::String(_));
+    if unordered() && elements.iter().all(is_one) {
+        elements.sort_by_key(|it| format!("{it:?}"));
+    }
+    elements
 }

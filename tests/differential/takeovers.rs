@@ -4,6 +4,7 @@
 //! Each client calls the computer that it was given, or another one while that one is dead. So calls come to
 //! the leader and to those that follow it.
 
+use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -18,7 +19,7 @@ use crate::nodes::{Node, patience};
 use crate::real::Wire;
 use crate::script::{Script, Step};
 use crate::stage::{CLIENTS, Failure, Stage};
-use crate::support::{Client, Rescue, Scratch, Servers, Setup, free_port, signal};
+use crate::support::{Client, Rescue, Scratch, Servers, Setup, eventually, free_port, signal};
 
 /// On a busy computer a shorter one is over before etcd has answered.
 const TTL: &str = "1.5";
@@ -95,6 +96,11 @@ impl Computer {
             all.iter().for_each(|(pid, _)| signal(*pid, Signal::KILL));
             let _ = self.rescue.exited();
         }
+        // A process that is killed has no environment any more before its sockets are closed.
+        let port = self.rescue.port();
+        eventually("nobody listens at its port", || {
+            TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
+        });
     }
 
     fn revive(&mut self) {
@@ -308,6 +314,7 @@ fn steps(
 ) -> Result<(), Failure> {
     let wires = (0..CLIENTS).map(|_| rig.computers[0].wire().unwrap());
     let mut stage = Stage::new(nodes, wires.collect(), model);
+    stage.allow_repeats();
     stage.callbacks = !script.unreturnable;
     let mut next_end = None;
     for (nth, step) in script.steps.iter().enumerate() {

@@ -16,15 +16,21 @@
     again TEXT              late node: its user has to make the call again
     failed TEXT             something that should have worked did not
 
+Nodes run with Python 2.7, too: tests/field takes them to old releases.
+
 The roscpp nodes say the same (lines.h). `tests/support/node.rs` reads it.
 """
 
 import sys
 import threading
+import time
 
 import rospy
 
-_lock = threading.Lock()
+# A signal may end the node, and with it its links, while it says something.
+_lock = threading.RLock()
+# Python 2 has no monotonic clock.
+now = getattr(time, "monotonic", time.time)
 
 
 def say(*words):

@@ -8,14 +8,13 @@ rospy has no call-back for links of a subscriber, so this wraps the places where
 """
 
 import threading
-import time
 
 import rospy
 import rospy.impl.masterslave
 import rospy.impl.tcpros_base
 from std_msgs.msg import String
 
-from lines import say
+from lines import now, say
 
 
 class Summary:
@@ -27,16 +26,16 @@ class Summary:
 
     def on_message(self, message):
         name, _, number = message.data.partition(" ")
-        number, now = int(number), time.monotonic()
-        before, at, longest = self.last.get(name, (number - 1, now, 0.0))
-        longest = max(longest, now - at)
+        number, moment = int(number), now()
+        before, at, longest = self.last.get(name, (number - 1, moment, 0.0))
+        longest = max(longest, moment - at)
         if number != before + 1:
             say("gap", name, before, number)
         if number % self.every == 0 or name not in self.last:
             say("got", name, number)
             say("pause", name, "%.3f" % (longest * 1e3))
             longest = 0.0
-        self.last[name] = (number, now, longest)
+        self.last[name] = (number, moment, longest)
 
 
 def watch_updates():
@@ -69,9 +68,10 @@ def watch_links(subscriber):
     def watched(original):
         def method(connection):
             answer = original(connection)
-            # Two threads at once would say their numbers in any order.
+            # Two threads at once would say their numbers in any order. Without rospy's own lock: rospy may
+            # hold it while it removes a connection, and would wait for ours for ever.
             with saying:
-                say("links", impl.get_num_connections())
+                say("links", len(impl.connections or ()))
             return answer
 
         return method

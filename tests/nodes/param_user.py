@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Says what `get_param_cached` holds for a parameter, whenever it changes. Usage: param_user.py KEY
 
-After the first look only a paramUpdate of the master changes the cache.
+After the first look only a paramUpdate of the master changes the cache. rospy before 1.14.4 has none: it asks.
 """
 
 import json
@@ -11,15 +11,18 @@ import rospy
 from lines import say, ticks
 
 
+look = getattr(rospy, "get_param_cached", rospy.get_param)
+
+
 def main():
     key = rospy.myargv()[1]
     rospy.init_node("param_user")
-    rospy.get_param_cached(key, None)
+    look(key, None)
     say("ready", rospy.get_name())
     seen = object()
     for _ in ticks(50):
         try:
-            value = rospy.get_param_cached(key, None)
+            value = look(key, None)
             if value != seen:
                 say("value", json.dumps(value))
                 seen = value

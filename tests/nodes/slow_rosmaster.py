@@ -4,7 +4,11 @@ that names a method too, for requests in which it occurs."""
 
 import os
 import time
-from xmlrpc.server import SimpleXMLRPCDispatcher
+
+try:
+    from xmlrpc.server import SimpleXMLRPCDispatcher
+except ImportError:
+    from SimpleXMLRPCServer import SimpleXMLRPCDispatcher
 
 import rosmaster
 
@@ -15,10 +19,10 @@ def slow_dispatch(self, data, *arguments, **options):
     """Waits, then does what is to be done."""
     try:
         with open(os.path.join(os.environ["ROS_HOME"], "slow")) as seconds:
-            seconds, *method = (seconds.read() or "0").split()
-        if not method or method[0].encode() in data:
-            time.sleep(float(seconds))
-    except OSError:
+            words = (seconds.read() or "0").split()
+        if len(words) == 1 or words[1].encode() in data:
+            time.sleep(float(words[0]))
+    except (IOError, OSError):  # one in Python 3
         pass
     return _dispatch(self, data, *arguments, **options)
 

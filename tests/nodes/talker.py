@@ -14,7 +14,7 @@ class Links(rospy.SubscribeListener):
     """Says how many subscribers are connected whenever that changes."""
 
     def __init__(self):
-        super().__init__()
+        rospy.SubscribeListener.__init__(self)
         self.publisher = None
 
     def peer_subscribe(self, _topic, _publish, _peer_publish):

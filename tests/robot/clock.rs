@@ -248,12 +248,14 @@ fn names_of_files_do_not_depend_on_it() {
         robot.failing.rescue.start_again();
         robot.failing.rescue.wait_serving();
     }
+    let checkpoint = robot.failing.rescue.checkpoint();
+    let stem = checkpoint.file_name().unwrap().to_string_lossy() + ".";
     let mut names: Vec<_> = fs::read_dir(robot.scratch.log_dir())
         .unwrap()
         .flatten()
         .filter_map(|file| {
             let name = file.file_name().into_string().unwrap();
-            name.strip_prefix("latest-chkpt.yaml.").map(str::to_owned)
+            name.strip_prefix(&*stem).map(str::to_owned)
         })
         .filter(|name| name.starts_with("session-"))
         .collect();
@@ -263,7 +265,7 @@ fn names_of_files_do_not_depend_on_it() {
     for number in 1..=3 {
         let key = format!("\"session{number}\": {number}");
         let kept = names.iter().filter(|name| {
-            let path = format!("latest-chkpt.yaml.{name}");
+            let path = format!("{stem}{name}");
             let text = fs::read_to_string(robot.scratch.log_dir().join(path)).unwrap();
             text.contains(&key)
         });

@@ -24,6 +24,7 @@ mod outage {
     mod calls;
     mod durability;
     mod first_start;
+    mod leaving;
     mod long;
     mod many_clients;
     mod nodes;
@@ -31,14 +32,27 @@ mod outage {
     mod same_name;
 }
 
+/// What a node hears of a topic, a parameter or its own name comes in the order of the state.
+mod order {
+    mod answers;
+    mod links;
+    mod values;
+}
+
 /// Masters that hang, are far away, crash in a loop, answer garbage, or differ from the mirror.
 mod master {
+    mod bypass;
     mod crash_loop;
     mod divergence;
     mod far;
     mod garbage;
+    mod http_1_0;
     mod hung;
+    mod late;
+    mod old;
+    mod python_2;
     mod returns;
+    mod stranger;
     mod unreturnable_values;
 }
 
@@ -47,10 +61,12 @@ mod recovery {
     mod health_check;
     mod host_names;
     mod injection;
+    mod liveness;
     mod no_shutdown;
     mod reconciliation;
     mod spare_master;
     mod taken_port;
+    mod two_robots;
     mod unreachable;
 }
 
@@ -104,6 +120,7 @@ mod commands {
     mod drill;
     mod handover;
     mod history;
+    mod live_links;
     mod params;
     mod restore;
     mod status;
@@ -114,8 +131,11 @@ mod commands {
 /// The checkpoint as the whole program keeps it.
 mod checkpoint {
     mod at_the_start;
+    mod by_port;
     mod full_disk;
+    mod hung_disk;
     mod moved;
+    mod planted;
     mod readable;
     mod unreadable;
 }
@@ -123,7 +143,9 @@ mod checkpoint {
 /// rosrescue itself dies, and is started again.
 mod restart {
     mod guardian;
+    mod older_checkpoint;
     mod sessions;
+    mod story;
     mod systemd;
     mod worker;
 }
@@ -136,6 +158,9 @@ mod service {
     mod install;
     mod package;
 }
+
+/// Random deaths on a disk that fails at random.
+mod soak;
 
 /// The wall clock jumps.
 mod clock;

@@ -73,3 +73,59 @@ impl SmallDisk {
             .start()
     }
 }
+
+/// A disk that misbehaves on demand (`tests/failing/disk.c`), for the checkpoint of a rosrescue that runs
+/// [on](Self::under) it.
+pub(crate) struct FailingDisk {
+    library: PathBuf,
+    state: PathBuf,
+}
+
+/// What is the matter with a [`FailingDisk`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Trouble {
+    /// Nothing is answered until that is over.
+    Hangs,
+    /// Each operation takes 0.2 s.
+    Slow,
+    Full,
+    ReadOnly,
+}
+
+impl FailingDisk {
+    pub(crate) fn new(scratch: &Scratch) -> Self {
+        let library = scratch.path("disk.so");
+        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/disk.c");
+        let mut compiler = Command::new("gcc");
+        compiler.args(["-shared", "-fPIC", "-o"]);
+        let compiled = compiler.arg(&library).arg(source).status();
+        assert!(compiled.expect("gcc runs").success());
+        let state = scratch.path("disk.state");
+        Self { library, state }
+    }
+
+    /// `setup` on this disk.
+    pub(crate) fn under(&self, setup: Setup) -> Setup {
+        setup
+            .env("LD_PRELOAD", &self.library)
+            .env("DISK_PATH", "latest-chkpt")
+            .env("DISK_STATE", &self.state)
+    }
+
+    pub(crate) fn begin(&self, trouble: Trouble) {
+        let letter = match trouble {
+            Trouble::Hangs => "h",
+            Trouble::Slow => "s",
+            Trouble::Full => "f",
+            Trouble::ReadOnly => "r",
+        };
+        let half = self.state.with_extension("half");
+        fs::write(&half, letter).unwrap();
+        fs::rename(half, &self.state).unwrap();
+    }
+
+    /// All is well again.
+    pub(crate) fn heal(&self) {
+        let _ = fs::remove_file(&self.state);
+    }
+}

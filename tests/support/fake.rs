@@ -12,6 +12,7 @@ use rosrescue::xmlrpc::{self, Reply, Value};
 
 use super::params;
 use super::rpc::Client;
+use super::scratch::free_port;
 
 /// A call that a fake node was sent.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,6 +32,12 @@ struct Inner {
     subscriptions: Mutex<BTreeMap<String, String>>,
     /// The process id that it says, if that is not the test's.
     pid: Mutex<Option<i32>>,
+    /// Its process id is another one each time.
+    restless: AtomicBool,
+    /// The master that it names.
+    master: Mutex<Option<String>>,
+    /// A method that it never answers.
+    ignored: Mutex<Option<String>>,
 }
 
 /// A node without TCPROS: an XML-RPC server that answers what a node must answer, truthfully, and
@@ -79,6 +86,22 @@ impl FakeNode {
     /// It says that it is this process.
     pub(crate) fn claim_pid(&self, pid: i32) {
         *lock(&self.inner.pid) = Some(pid);
+    }
+
+    /// From now on it says another process id each time.
+    pub(crate) fn claim_restless_pid(&self) {
+        self.claim_pid(5000);
+        self.inner.restless.store(true, Ordering::SeqCst);
+    }
+
+    /// It says that this is its master.
+    pub(crate) fn claim_master(&self, uri: &str) {
+        *lock(&self.inner.master) = Some(uri.to_owned());
+    }
+
+    /// From now on it never answers `method`, and everything else.
+    pub(crate) fn ignore(&self, method: &str) {
+        *lock(&self.inner.ignored) = Some(method.to_owned());
     }
 
     /// What the master (or rosrescue) sent, without the questions that everybody asks.
@@ -215,6 +238,9 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
             params: call.params,
             from_rosrescue: head.contains("\nuser-agent: rosrescue/"),
         });
+        if lock(&inner.ignored).as_ref() == Some(&call.method) {
+            continue;
+        }
         let mut holding = lock(&inner.holding);
         while *holding {
             holding = inner
@@ -235,8 +261,16 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
         let value = match call.method.as_str() {
             "getPid" => {
                 let own = i32::try_from(std::process::id()).unwrap();
-                Value::Int(lock(&inner.pid).unwrap_or(own))
+                let mut claimed = lock(&inner.pid);
+                let pid = claimed.unwrap_or(own);
+                if inner.restless.load(Ordering::SeqCst) {
+                    *claimed = Some(pid + 1);
+                }
+                Value::Int(pid)
             }
+            "getMasterUri" => lock(&inner.master)
+                .clone()
+                .map_or(Value::Int(0), Value::from),
             "getPublications" => pairs(&inner.publications),
             "getSubscriptions" => pairs(&inner.subscriptions),
             "requestTopic" => Value::Array(Vec::new()),
@@ -301,7 +335,7 @@ fn http_reply(body: &[u8]) -> Vec<u8> {
 }
 
 /// Head and body of the next request; nothing at the end of the connection.
-fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String, Vec<u8>)> {
+pub(crate) fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String, Vec<u8>)> {
     let mut head = String::new();
     loop {
         let mut line = String::new();
@@ -343,6 +377,11 @@ impl Server {
         port: u16,
         serve: impl Fn(TcpStream) + Send + Sync + 'static,
     ) -> Self {
+        // The kernel could give a port of its own to a connection while nobody listens there.
+        let port = match port {
+            0 => free_port(),
+            port => port,
+        };
         let listener = TcpListener::bind((address, port))
             .unwrap_or_else(|error| panic!("port {port}: {error}"));
         let port = listener.local_addr().unwrap().port();

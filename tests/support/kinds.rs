@@ -1,5 +1,7 @@
 //! Parameter values of every kind.
 
+use std::sync::OnceLock;
+
 use rosrescue::xmlrpc::Value;
 
 use super::tree;
@@ -29,6 +31,12 @@ pub(crate) fn kinds() -> Value {
     }
 }
 
+/// Whether the dictionaries of the master under test have no order (`ROSRESCUE_UNORDERED`): those of Python 2.
+pub(crate) fn unordered() -> bool {
+    static UNORDERED: OnceLock<bool> = OnceLock::new();
+    *UNORDERED.get_or_init(|| std::env::var_os("ROSRESCUE_UNORDERED").is_some())
+}
+
 /// Keys in the order of the alphabet, at every level: for what was sent in an order of its own.
 pub(crate) fn sorted(value: &Value) -> Value {
     match value {
@@ -40,6 +48,7 @@ pub(crate) fn sorted(value: &Value) -> Value {
             members.sort_by(|a, b| a.0.cmp(&b.0));
             Value::Struct(members.into_iter().collect())
         }
+        Value::Array(elements) => elements.iter().map(sorted).collect::<Vec<_>>().into(),
         other => other.clone(),
     }
 }

@@ -4,6 +4,9 @@ use std::ffi::OsStr;
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
+
+use rosrescue::guardian::handover::TUNABLES;
 
 use super::patience::eventually;
 use super::process::{Process, behind};
@@ -12,6 +15,9 @@ use super::scratch::{Scratch, free_port};
 
 /// Set, rosrescue is a single process.
 const NO_GUARDIAN: &str = "ROSRESCUE_NO_GUARDIAN";
+
+/// The rosrescue that is started: this build's, unless another one is set before.
+pub(crate) static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
 /// How to start rosrescue; the same again after a crash.
 #[derive(Debug)]
@@ -27,23 +33,28 @@ impl Setup {
         scratch: &Scratch,
         arguments: impl IntoIterator<Item = I>,
     ) -> Self {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_rosrescue"));
+        let own = || PathBuf::from(env!("CARGO_BIN_EXE_rosrescue"));
+        let mut command = Command::new(PROGRAM.get_or_init(own));
         scratch.prepare(&mut command);
         command.args(arguments).current_dir(scratch.path(""));
-        // Most tests are about the process that serves: it is the one that they signal and measure.
-        command.env(NO_GUARDIAN, "1");
+        // Most tests are about the worker: it is the process that they signal and measure. Its memory is
+        // managed as under a guardian.
+        let (name, value) = TUNABLES;
+        command.env(NO_GUARDIAN, "1").env(name, value);
+        // On a busy computer any master is late at times. Tests of that give the time themselves.
+        command.env("ROSRESCUE_STAND_IN_AFTER", "5000");
         Self {
             command,
             port: 0,
-            checkpoint: scratch.log_dir().join("latest-chkpt.yaml"),
+            checkpoint: scratch.log_dir().join("unknown"),
         }
     }
 
     /// `rosrescue core` on a free port, its rosmaster on `master_port`.
     pub(crate) fn core(scratch: &Scratch, master_port: u16) -> Self {
         let port = free_port();
-        let mut setup = Self::bare(scratch, ["core", "-p", &port.to_string()]);
-        setup.port = port;
+        let setup = Self::bare(scratch, ["core", "-p", &port.to_string()]);
+        let setup = setup.at_port(port);
         setup.arg("--master-port").arg(master_port.to_string())
     }
 
@@ -52,9 +63,7 @@ impl Setup {
         let port = free_port();
         let master = format!("http://127.0.0.1:{master_port}");
         let listen = format!("127.0.0.1:{port}");
-        let mut setup = Self::bare(scratch, ["proxy", "--master", &master, "--listen", &listen]);
-        setup.port = port;
-        setup
+        Self::bare(scratch, ["proxy", "--master", &master, "--listen", &listen]).at_port(port)
     }
 
     pub(crate) fn arg(mut self, argument: impl AsRef<OsStr>) -> Self {
@@ -80,12 +89,14 @@ impl Setup {
 
     /// With its guardian, as a person runs it: the process that is started is the guardian then.
     pub(crate) fn guarded(mut self) -> Self {
-        self.command.env_remove(NO_GUARDIAN);
+        self.command.env_remove(NO_GUARDIAN).env_remove(TUNABLES.0);
         self
     }
 
     pub(crate) fn at_port(mut self, port: u16) -> Self {
         self.port = port;
+        self.checkpoint
+            .set_file_name(format!("latest-chkpt-{port}.yaml"));
         self
     }
 

@@ -1,7 +1,7 @@
 //! A client of a master: calls, and raw bytes.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
 use rosrescue::xmlrpc::{self, Call, Reply, Value};
@@ -155,10 +155,12 @@ impl Client {
     }
 }
 
-/// One connection.
+/// One connection; the next one after an answer of HTTP/1.0.
 #[derive(Debug)]
 pub(crate) struct Wire {
     stream: BufReader<TcpStream>,
+    address: SocketAddr,
+    spent: bool,
 }
 
 impl Wire {
@@ -167,16 +169,30 @@ impl Wire {
             .to_socket_addrs()?
             .next()
             .ok_or_else(|| io::Error::other(format!("{host} has no address")))?;
+        Self::to(address)
+    }
+
+    fn to(address: SocketAddr) -> io::Result<Self> {
         let stream = TcpStream::connect_timeout(&address, ANSWER)?;
         stream.set_read_timeout(Some(ANSWER))?;
         stream.set_write_timeout(Some(ANSWER))?;
         stream.set_nodelay(true)?;
         Ok(Self {
             stream: BufReader::new(stream),
+            address,
+            spent: false,
         })
     }
 
+    /// The same connection, to look at.
+    pub(crate) fn stream(&self) -> TcpStream {
+        self.stream.get_ref().try_clone().expect("a connection")
+    }
+
     pub(crate) fn send(&mut self, bytes: &[u8]) -> io::Result<()> {
+        if self.spent {
+            *self = Self::to(self.address)?;
+        }
         self.stream.get_mut().write_all(bytes)
     }
 
@@ -241,6 +257,7 @@ impl Wire {
                 self.stream.read_to_end(&mut response.body)?;
             }
         }
+        self.spent = response.status.starts_with("HTTP/1.0");
         Ok(response)
     }
 

@@ -16,6 +16,11 @@ use super::process::signal;
 /// The variable that marks every process of a test.
 const TOKEN: &str = "ROSRESCUE_SCRATCH_TOKEN";
 
+/// Set, every rosmaster and rospy node speaks HTTP/1.0, as on a kernel before 4.16.
+const HTTP_1_0: &str = "ROSRESCUE_HTTP_1_0";
+/// A folder with a `sitecustomize.py` that shows an old kernel.
+const OLD_KERNEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/nodes/old_kernel");
+
 /// A folder for one test. On drop everything that was started in it is killed; the folder is removed
 /// unless the test failed.
 #[derive(Debug)]
@@ -65,6 +70,9 @@ impl Scratch {
             .env("ROS_IP", "127.0.0.1")
             .env("PYTHONUNBUFFERED", "1")
             .env("PYTHONDONTWRITEBYTECODE", "1");
+        if std::env::var_os(HTTP_1_0).is_some() {
+            command.env("PYTHONPATH", OLD_KERNEL);
+        }
     }
 
     /// Processes that this test started, directly or not, and that are still there: id and command.

@@ -14,6 +14,7 @@ use super::scratch::{Scratch, free_port};
 /// How long an answer may take on two busy cores.
 pub(crate) const LIMIT: Duration = Duration::from_secs(20);
 
+#[derive(Debug)]
 pub(crate) struct Servers {
     pub(crate) scratch: Scratch,
     members: Vec<Member>,
@@ -21,6 +22,7 @@ pub(crate) struct Servers {
     scheme: &'static str,
 }
 
+#[derive(Debug)]
 struct Member {
     client: u16,
     peer: u16,

@@ -5,9 +5,11 @@ use std::io;
 
 use rosrescue::xmlrpc::Value;
 
+use super::kinds::{sorted, unordered};
 use super::rpc::Client;
 
-/// The state of a master as its clients see it. Every list keeps the master's order.
+/// The state of a master as its clients see it. Every list keeps the master's order, unless that is
+/// [`unordered`].
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct State {
     /// Publishers, subscribers and service providers: name and node names.
@@ -68,7 +70,7 @@ impl State {
             service_apis.push((service.clone(), text(&ask("lookupService", Some(service))?)));
         }
         let types = ask("getTopicTypes", None)?;
-        Ok(Self {
+        let mut state = Self {
             topic_types: list(&types)
                 .iter()
                 .map(|pair| (text(&list(pair)[0]), text(&list(pair)[1])))
@@ -83,7 +85,22 @@ impl State {
             services,
             nodes,
             service_apis,
-        })
+        };
+        if unordered() {
+            state.sort();
+        }
+        Ok(state)
+    }
+
+    /// Puts what comes out of dictionaries into the order of the alphabet.
+    fn sort(&mut self) {
+        self.publishers.sort();
+        self.subscribers.sort();
+        self.services.sort();
+        self.topic_types.sort();
+        self.service_apis.sort();
+        self.params = sorted(&self.params);
+        self.param_names.sort();
     }
 
     /// This state without one node: what is left when it has gone. Topic types stay.

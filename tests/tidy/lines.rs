@@ -37,10 +37,15 @@ fn messages() -> Vec<String> {
     let mut messages = Vec::new();
     for file in rust_files(&root().join("src")) {
         let Some(code) = code(&file) else { continue };
-        for name in ["tracing::warn!", "tracing::error!", "rarely!", "log_once"] {
+        let limited = ["rarely!", "alarm!", "all_clear!"];
+        let always = ["tracing::warn!", "tracing::error!", "log_once"];
+        for name in limited.into_iter().chain(always) {
             for arguments in arguments(&code, name) {
                 let level = arguments.trim_start();
-                if name == "rarely!" && !level.starts_with("warn") && !level.starts_with("error") {
+                if limited.contains(&name)
+                    && !level.starts_with("warn")
+                    && !level.starts_with("error")
+                {
                     continue;
                 }
                 messages.extend(text(arguments));

@@ -14,7 +14,7 @@ use crate::{
         journal::{Progress, Put},
         replica::ReplicaError,
     },
-    limit::rarely,
+    limit::{Pair, alarm, all_clear, rarely},
     status::cluster::MemberFacts,
 };
 
@@ -28,6 +28,9 @@ const LIMIT: Duration = Duration::from_secs(5);
 /// Why etcd does not give what is asked, and when it has given anything last.
 #[derive(Debug)]
 pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
+
+/// That etcd does not answer, and that it does again.
+static TROUBLE: Pair = Pair::new();
 
 impl Default for Trouble {
     fn default() -> Self {
@@ -49,8 +52,9 @@ impl Trouble {
         match trouble {
             Some((_, said)) => *said = text,
             None => {
-                rarely!(
+                alarm!(
                     warn,
+                    TROUBLE,
                     error = text,
                     "etcd does not give what is asked; it is asked again"
                 );
@@ -76,7 +80,7 @@ impl Trouble {
         let (trouble, heard) = &mut *self.lock();
         *heard = Instant::now();
         if let Some((since, _)) = trouble.take() {
-            rarely!(info, after = ?since.elapsed(), "etcd answers again");
+            all_clear!(info, TROUBLE, after = ?since.elapsed(), "etcd answers again");
         }
     }
 

@@ -7,11 +7,15 @@ use crate::{
     checkpoint::{
         format::{Checkpoint, Entry},
         session,
-        store::Store,
+        store::{Store, StoreError},
     },
-    ledger::Change,
+    ledger::{
+        Change,
+        journal::{DISK_PATIENCE, SILENT},
+    },
     limit::rarely,
     master::{Master, Request},
+    wait,
 };
 
 pub(super) struct CutOff {
@@ -35,30 +39,30 @@ impl CutOff {
     /// another name.
     pub(super) async fn left(checkpoint: &Path, goes_on: bool) -> Option<Self> {
         let path = path_of(checkpoint);
-        let opened = tokio::task::spawn_blocking(move || {
+        let opened = wait::within(DISK_PATIENCE, move || {
             if !path.exists() {
                 return None;
             }
-            Some(Store::open(&path))
+            let mut opened = Store::open(&path);
+            if let (Ok((store, Some(_))), false) = (&mut opened, goes_on) {
+                keep_of_session(store);
+                return None;
+            }
+            Some(opened)
         });
-        let (mut store, loaded) = match opened.await.ok()?? {
-            Ok((store, loaded)) => (store, loaded?),
-            Err(error) => {
-                tracing::error!(%error, "the writes of a time alone cannot be read, and are not sent");
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "the writes of a time alone cannot be read, and are not sent");
+        let (store, loaded) = match opened.await {
+            Some(None) => return None,
+            Some(Some(Ok((store, loaded)))) => (store, loaded?),
+            Some(Some(Err(error))) => {
+                unread(&error);
+                return None;
+            }
+            None => {
+                unread(&SILENT);
                 return None;
             }
         };
-        if !goes_on {
-            match store.set_aside("session") {
-                Ok(Some(kept)) => tracing::warn!(
-                    kept = %kept.display(),
-                    "writes of a time alone belong to a session that is over; they are kept, and not sent"
-                ),
-                Ok(None) => {}
-                Err(error) => tracing::error!(%error, "the writes of a time alone cannot be kept"),
-            }
-            return None;
-        }
         let base = session::rebuild(loaded.checkpoint, Vec::new()).mirror;
         let calls = loaded.records.into_iter();
         let calls: Vec<Request> = calls
@@ -74,7 +78,7 @@ impl CutOff {
             store: None,
         };
         this.begin(store).await;
-        this.append(calls);
+        this.append(calls).await;
         tracing::info!(
             calls = this.calls.len(),
             "an earlier process was alone; its writes are sent when a computer leads"
@@ -91,11 +95,10 @@ impl CutOff {
             earlier: 0,
             store: None,
         };
-        let opened = tokio::task::spawn_blocking(move || Store::open_over(&path)).await;
-        match opened {
-            Ok(Ok(store)) => this.begin(store).await,
-            Ok(Err(error)) => say_unkept(&error),
-            Err(_) => {}
+        match wait::within(DISK_PATIENCE, move || Store::open_over(&path)).await {
+            Some(Ok(store)) => this.begin(store).await,
+            Some(Err(error)) => say_unkept(&error),
+            None => say_unkept(&SILENT),
         }
         this
     }
@@ -106,16 +109,22 @@ impl CutOff {
             snapshot: self.base.snapshot(),
             ..Checkpoint::default()
         };
-        let begun = tokio::task::spawn_blocking(move || {
-            let begun = store.begin(&checkpoint);
-            (store, begun)
-        });
-        if let Ok((store, begun)) = begun.await {
-            if let Err(error) = begun {
-                say_unkept(&error);
-            }
-            self.store = Some(store);
+        let begin = move || (store.begin(&checkpoint), store);
+        self.keep(begin).await;
+    }
+
+    /// Has `work` done, and takes the store back. No store is left of a disk that is silent.
+    async fn keep(
+        &mut self,
+        work: impl FnOnce() -> (Result<(), StoreError>, Store) + Send + 'static,
+    ) {
+        let Some((done, store)) = wait::within(DISK_PATIENCE, work).await else {
+            return say_unkept(&SILENT);
+        };
+        if let Err(error) = done {
+            say_unkept(&error);
         }
+        self.store = Some(store);
     }
 
     /// Another time alone begins, before the writes of the last one were sent.
@@ -124,7 +133,7 @@ impl CutOff {
     }
 
     /// Keeps what was answered.
-    pub(super) fn add<'a>(&mut self, changes: impl IntoIterator<Item = &'a Change>) {
+    pub(super) async fn add<'a>(&mut self, changes: impl IntoIterator<Item = &'a Change>) {
         let calls = changes.into_iter().filter_map(|change| match change {
             Change::Call(record) => match &record.entry {
                 Entry::Call { call, .. } => Some(Request::from(call.clone())),
@@ -133,19 +142,21 @@ impl CutOff {
             // It comes from a master, not from a node.
             Change::State { .. } => None,
         });
-        self.append(calls.collect());
+        self.append(calls.collect()).await;
     }
 
-    fn append(&mut self, calls: Vec<Request>) {
+    async fn append(&mut self, calls: Vec<Request>) {
+        if calls.is_empty() {
+            return;
+        }
         let entries: Vec<_> = calls
             .iter()
             .cloned()
             .map(|call| Entry::call(call.into()))
             .collect();
-        if let Some(store) = self.store.as_mut().filter(|_| !entries.is_empty())
-            && let Err(error) = store.append(&entries)
-        {
-            say_unkept(&error);
+        if let Some(mut store) = self.store.take() {
+            let append = move || (store.append(&entries).map(|_| ()), store);
+            self.keep(append).await;
         }
         self.calls.extend(calls);
     }
@@ -158,8 +169,13 @@ impl CutOff {
 }
 
 /// Removes what was kept beside `checkpoint`: all of it has been sent.
-pub(super) fn remove(checkpoint: &Path) {
+pub(super) async fn remove(checkpoint: &Path) {
     let path = path_of(checkpoint);
+    // Late is in time for the next start.
+    wait::within(DISK_PATIENCE, move || remove_files(path)).await;
+}
+
+fn remove_files(path: PathBuf) {
     let previous = crate::checkpoint::store::previous_of(&path);
     for path in [path, previous] {
         if let Err(error) = std::fs::remove_file(&path)
@@ -171,6 +187,18 @@ pub(super) fn remove(checkpoint: &Path) {
                 "writes that were sent cannot be removed and would be sent again; remove the file"
             );
         }
+    }
+}
+
+/// Keeps the writes of a session that is over under another name.
+fn keep_of_session(store: &mut Store) {
+    match store.set_aside("session") {
+        Ok(Some(kept)) => tracing::warn!(
+            kept = %kept.display(),
+            "writes of a time alone belong to a session that is over; they are kept, and not sent"
+        ),
+        Ok(None) => {}
+        Err(error) => tracing::error!(%error, "the writes of a time alone cannot be kept"),
     }
 }
 
@@ -219,17 +247,19 @@ mod tests {
         let checkpoint = folder.path().join("chkpt.yaml");
         let calls = [set("/a", 1), set("/b", 2)];
         let mut cut_off = CutOff::new(&checkpoint, base()).await;
-        cut_off.add(&[change(5, calls[0].clone())]);
+        cut_off.add(&[change(5, calls[0].clone())]).await;
         // It was read from a master.
         let state = Box::new(Master::default());
-        cut_off.add(&[Change::State { seq: 6, state }, change(7, calls[1].clone())]);
+        cut_off
+            .add(&[Change::State { seq: 6, state }, change(7, calls[1].clone())])
+            .await;
         drop(cut_off);
         for _ in 0..2 {
             let left = CutOff::left(&checkpoint, true).await.unwrap();
             assert!(left.base == base());
             assert_eq!(left.calls, calls);
         }
-        remove(&checkpoint);
+        remove(&checkpoint).await;
         assert_eq!(files(&checkpoint), [""; 0]);
         assert!(CutOff::left(&checkpoint, true).await.is_none());
     }
@@ -239,7 +269,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("chkpt.yaml");
         let mut cut_off = CutOff::new(&checkpoint, base()).await;
-        cut_off.add(&[change(5, set("/a", 1))]);
+        cut_off.add(&[change(5, set("/a", 1))]).await;
         drop(cut_off);
         assert!(CutOff::left(&checkpoint, false).await.is_none());
         let kept = files(&checkpoint);
@@ -257,9 +287,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join("chkpt.yaml");
         let mut cut_off = CutOff::new(&checkpoint, base()).await;
-        cut_off.add(&[change(5, set("/a", 1))]);
+        cut_off.add(&[change(5, set("/a", 1))]).await;
         cut_off.again();
-        cut_off.add(&[change(6, set("/b", 2))]);
+        cut_off.add(&[change(6, set("/b", 2))]).await;
         // etcd has the second after all.
         let left = cut_off.resumed().unwrap();
         assert_eq!(left.calls, [set("/a", 1)]);
@@ -271,7 +301,7 @@ mod tests {
     async fn what_cannot_be_kept_is_still_sent() {
         let folder = tempfile::tempdir().unwrap();
         let mut cut_off = CutOff::new(&folder.path().join("no/folder.yaml"), base()).await;
-        cut_off.add(&[change(5, set("/a", 1))]);
+        cut_off.add(&[change(5, set("/a", 1))]).await;
         assert_eq!(cut_off.calls, [set("/a", 1)]);
     }
 }

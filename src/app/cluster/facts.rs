@@ -49,8 +49,8 @@ impl Known {
         }
     }
 
-    /// Looks at the keys. Returns whether the leader has given another sign since the first look.
-    pub(super) fn look(&mut self, view: &View) -> bool {
+    /// Looks at the keys.
+    pub(super) fn look(&mut self, view: &View) {
         let now = Instant::now();
         if let Some(leader) = &view.leader
             && self.leader.as_ref().is_none_or(|of| of.term != leader.term)
@@ -72,11 +72,9 @@ impl Known {
             }
         }
         let revision = view.alive.as_ref().map_or(0, |alive| alive.revision);
-        let before = self.sign.map(|(before, _)| before);
-        if before != Some(revision) {
+        if self.sign.is_none_or(|(before, _)| before != revision) {
             self.sign = Some((revision, now));
         }
-        before.is_some_and(|before| before != revision)
     }
 
     /// A key has changed; `kv` is none if it was deleted.
@@ -173,8 +171,9 @@ impl Known {
         Some((leader.name.clone(), self.sign?.1))
     }
 
-    pub(super) fn set_role(&mut self, role: Role) {
-        self.role = (role, Instant::now());
+    /// Returns the role before.
+    pub(super) fn set_role(&mut self, role: Role) -> Role {
+        std::mem::replace(&mut self.role, (role, Instant::now())).0
     }
 }
 

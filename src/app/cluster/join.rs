@@ -9,7 +9,7 @@ use std::{
 use hyper::header::HeaderValue;
 use tokio::{
     sync::{mpsc, watch},
-    task::JoinSet,
+    task::{JoinSet, block_in_place},
 };
 use tokio_util::sync::CancellationToken;
 
@@ -83,15 +83,20 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let post = &given.post;
     post.ledger.leave();
     // One that an earlier process left may hold what others have changed since.
-    given.rosmaster.left_behind(None);
+    block_in_place(|| given.rosmaster.left_behind(None));
     let known = given.restored;
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
+    let followed = watch::Sender::new(0);
     let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
     let others = Others {
         way: way_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
+        passing: Arc::default(),
+        followed: followed.subscribe(),
+        // A restored mirror may be old: it shows nothing before etcd's journal has been read.
+        told: Arc::new(u64::from(given.restored).into()),
         // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
         hold: given.hold.max(2 * config.ttl),
     };
@@ -111,6 +116,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         leads: watch::Sender::new(Way::Nobody { known }),
         way,
         peers,
+        followed,
         handovers,
         inbox: VecDeque::new(),
         start_by: Some(Instant::now() + START_BY),
@@ -134,9 +140,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         was_released: false,
         led: false,
         namesake: None,
-        seen_leading: false,
         deciding: None,
-        goes_on: None,
         probe: None,
         probe_at: None,
         released: None,

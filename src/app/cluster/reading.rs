@@ -19,14 +19,12 @@ impl Member {
     pub(super) fn catch_up(&mut self) {
         let wanted = self.wanted.unwrap_or_default();
         let news = self.wanted.is_some() || self.reported != self.progress.seq;
-        if news
-            && self.loaded
-            && !self.has_master()
-            && self.progress.seq >= wanted
-            && !self.must_decide()
-        {
+        if news && self.loaded && !self.has_master() && self.progress.seq >= wanted {
             (self.wanted, self.reported) = (None, self.progress.seq);
             self.inbox.push_back(Input::Followed(self.progress.seq));
+        }
+        if self.loaded && self.progress.seq >= self.view.seq() {
+            self.decide();
         }
         if self.wanted.is_some() && self.progress.seq < self.wanted.unwrap_or(0) {
             self.load_at.get_or_insert_with(Instant::now);
@@ -109,7 +107,7 @@ impl Member {
     pub(super) fn look_at_view(&mut self) {
         let leader = self.view.leader.as_ref();
         let other = leader.filter(|leader| leader.id != self.settings.id);
-        self.seen_leading |= self.known.look(&self.view) && other.is_some();
+        self.known.look(&self.view);
         if self.ours && other.is_some_and(|leader| !self.was_self(leader)) {
             self.ours = false;
             self.adopt_held();

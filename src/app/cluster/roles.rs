@@ -10,12 +10,12 @@ use crate::{
     app::life,
     checkpoint::session::{self, Decision, Evidence},
     cluster::{
-        machine::{Leader, WhenAlone},
+        machine::{Leader, Session, WhenAlone},
         way::Way,
     },
     gate::State,
     ledger::Change,
-    limit::rarely,
+    limit::{Pair, alarm, all_clear, rarely},
     master::Master,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
@@ -24,6 +24,9 @@ use crate::{
 
 /// How often the leader's rosrescue is asked within the time to live.
 const PROBES: u32 = 4;
+
+/// That this computer is cut off, and that it is not any more.
+static ALONE: Pair = Pair::new();
 
 impl Member {
     /// Whether calls pass to a master of this computer, or are answered for it.
@@ -36,6 +39,11 @@ impl Member {
         self.loaded && !self.ours && !self.has_master()
     }
 
+    /// Whether the mirror's answers hold: its state is not that of a session which may be over.
+    fn knows(&self) -> bool {
+        self.given.restored || self.loaded && self.machine.session() == Session::GoesOn
+    }
+
     /// Brings the ledger to the journal's state, if it follows it.
     pub(super) fn adopt_held(&mut self) {
         let ledger = &self.given.post.ledger;
@@ -46,9 +54,12 @@ impl Member {
     }
 
     pub(super) async fn become_role(&mut self, role: Role) {
-        self.known.set_role(role);
+        let before = self.known.set_role(role);
+        if before == Role::Alone && role != Role::Alone {
+            all_clear!(info, ALONE, role = role.as_str(), "not alone any more");
+        }
         match role {
-            Role::Leading => self.lead(),
+            Role::Leading => self.lead().await,
             Role::Alone => self.be_alone().await,
             Role::Joining | Role::Following | Role::CatchingUp => {
                 if self.has_master() {
@@ -62,12 +73,11 @@ impl Member {
         self.background.say_now();
     }
 
-    fn lead(&mut self) {
+    async fn lead(&mut self) {
         let term = self.machine.term().unwrap_or_default();
         if !self.has_master() {
-            let (ledger, fresh) = (&self.given.post.ledger, self.goes_on == Some(false));
-            if fresh {
-                let _ = ledger.follow_state(Master::default());
+            if matches!(self.machine.session(), Session::Over(_)) {
+                let _ = self.given.post.ledger.follow_state(Master::default());
             }
             let cause = match self.known.taken_over(self.before.take(), self.was_released) {
                 true => TAKEN_OVER,
@@ -83,7 +93,7 @@ impl Member {
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
             // What is being sent is in the file until it has arrived.
             if self.cut_off.is_none() && self.merging.is_none() {
-                cut_off::remove(&self.given.post.checkpoint);
+                cut_off::remove(&self.given.post.checkpoint).await;
             }
         }
         let ledger = &self.given.post.ledger;
@@ -104,8 +114,9 @@ impl Member {
             (_, Some((_, why))) => format!("etcd: {why}"),
             (_, None) => "etcd has answered too late".to_owned(),
         };
-        rarely!(
+        alarm!(
             error,
+            ALONE,
             why,
             serves,
             "ALONE: this computer is cut off from the others or from etcd's majority; with --alone serve its own \
@@ -128,7 +139,7 @@ impl Member {
         }
         if self.has_master() {
             if let Some(cut_off) = &mut self.cut_off {
-                cut_off.add(self.outgoing.changes());
+                cut_off.add(self.outgoing.changes()).await;
             }
         } else {
             let seq = self.machine.committed();
@@ -151,8 +162,9 @@ impl Member {
     pub(super) async fn give_up_duty(&mut self) {
         let post = &self.given.post;
         post.ledger.leave();
-        let known = self.loaded || self.given.restored;
-        self.set_way(Way::Nobody { known });
+        self.set_way(Way::Nobody {
+            known: self.knows(),
+        });
         if let Some(duty) = self.duty.take() {
             let ending = duty.end().await;
             self.endings.spawn(ending);
@@ -175,7 +187,7 @@ impl Member {
             let answered: Vec<_> = lost.iter().filter(answered).collect();
             if !answered.is_empty() {
                 let mut cut_off = CutOff::new(&self.given.post.checkpoint, self.held.clone()).await;
-                cut_off.add(answered);
+                cut_off.add(answered).await;
                 self.cut_off = Some(cut_off);
             }
         }
@@ -200,11 +212,11 @@ impl Member {
     }
 
     /// The ledger has changed.
-    pub(super) fn take_changes(&mut self) {
+    pub(super) async fn take_changes(&mut self) {
         let changes = self.given.post.ledger.take_changes();
         let is_alone = self.machine.role() == Role::Alone;
         if let Some(cut_off) = self.cut_off.as_mut().filter(|_| is_alone) {
-            cut_off.add(&changes);
+            cut_off.add(&changes).await;
         }
         self.outgoing.add(changes);
         if is_alone {
@@ -256,49 +268,53 @@ impl Member {
         self.prepare();
     }
 
-    /// Whether it must be found out first if the session in etcd goes on: nobody was seen leading it.
-    pub(super) fn must_decide(&mut self) -> bool {
-        if self.seen_leading
-            || self.ours
-            || self.goes_on.is_some()
-            || self.progress.seq == 0
-            || self.led
-        {
-            return false;
+    /// Begins to find out whether the session in etcd goes on, if the machine waits for that.
+    pub(super) fn decide(&mut self) {
+        let waits = self.machine.role() == Role::CatchingUp
+            && self.machine.session() == Session::Unknown
+            && self.deciding.is_none();
+        if !waits {
+            return;
         }
-        if self.deciding.is_none() && self.machine.role() == Role::CatchingUp {
-            let (restore, state) = (self.given.restore, self.held.clone());
+        let seq = self.progress.seq;
+        if self.ours || seq == 0 {
+            let goes_on = true;
+            return self.inbox.push_back(Input::Decided { seq, goes_on });
+        }
+        let (restore, state) = (self.given.restore, self.held.clone());
+        let evidence = Evidence {
+            same_boot: self.given.restored,
+            closed: self.was_released,
+            node_alive: false,
+        };
+        self.deciding = Some(Box::pin(async move {
+            let node_alive = session::depends_on_nodes(restore, evidence)
+                && life::any_alive(&state, evidence.same_boot).await;
             let evidence = Evidence {
-                same_boot: self.given.restored,
-                closed: self.was_released,
-                node_alive: false,
+                node_alive,
+                ..evidence
             };
-            self.deciding = Some(Box::pin(async move {
-                let node_alive = session::depends_on_nodes(restore, evidence)
-                    && life::any_alive(&state, evidence.same_boot).await;
-                let evidence = Evidence {
-                    node_alive,
-                    ..evidence
-                };
-                match session::decide(restore, evidence) {
-                    Decision::Restore(why) => {
-                        tracing::info!(why, "the session in etcd goes on: {}", state.counts());
-                        true
-                    }
-                    Decision::Fresh(why) => {
-                        tracing::info!(why, "a new session begins; the one in etcd is over");
-                        false
-                    }
+            let goes_on = match session::decide(restore, evidence) {
+                Decision::Restore(why) => {
+                    tracing::info!(why, "the session in etcd goes on: {}", state.counts());
+                    true
                 }
-            }));
-        }
-        true
+                Decision::Fresh(why) => {
+                    tracing::info!(why, "a new session begins; the one in etcd is over");
+                    false
+                }
+            };
+            Input::Decided { seq, goes_on }
+        }));
     }
 
     /// What follows from all that has happened.
     pub(super) fn tend(&mut self) {
         let now = Instant::now();
         let role = self.machine.role();
+        let seq = self.progress.seq;
+        self.followed
+            .send_if_modified(|now| std::mem::replace(now, seq) != seq);
         self.look_for_namesake();
         let alive = self.view.alive.as_ref();
         let other = self
@@ -318,7 +334,9 @@ impl Member {
         if role == Role::Following {
             self.set_way(match leader.clone() {
                 Some((uri, term)) => Way::Leader { uri, term },
-                None => Way::Nobody { known: self.loaded },
+                None => Way::Nobody {
+                    known: self.knows(),
+                },
             });
         }
         self.ask_leader(
@@ -380,13 +398,13 @@ impl Member {
     }
 
     /// The writes of a time alone have been sent; so many did not hold.
-    pub(super) fn merged(&mut self, lost: u64) {
+    pub(super) async fn merged(&mut self, lost: u64) {
         self.merging = None;
         let leads = self.leads.borrow().clone();
         self.set_way(leads);
         self.known.lost_writes += lost;
         if self.cut_off.is_none() {
-            cut_off::remove(&self.given.post.checkpoint);
+            cut_off::remove(&self.given.post.checkpoint).await;
         }
     }
 }

@@ -4,7 +4,7 @@ use indexmap::IndexMap;
 
 use super::emit::{block, block_key, decimal, flow, flow_list, quoted};
 use super::{Checkpoint, EncodeError, Entry, Session, frame, yaml};
-use crate::master::{ServiceEntry, Snapshot, SnapshotNode};
+use crate::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
 /// The document up to and including the line `journal:`.
@@ -14,6 +14,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
         session,
         snapshot,
         pending,
+        displaced,
     } = checkpoint;
     let mut out = Vec::with_capacity(64 * 1024);
     let out = &mut out;
@@ -68,6 +69,14 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
             out.extend_from_slice(b"- {");
             write_call(out, call)?;
             out.extend_from_slice(b"}\n");
+        }
+    }
+    if !displaced.is_empty() {
+        out.extend_from_slice(b"displaced:\n");
+        for node in displaced {
+            out.extend_from_slice(b"- ");
+            flow(out, &displaced_value(node), 0)?;
+            out.push(b'\n');
         }
     }
     if snapshot.params.is_empty() {
@@ -156,6 +165,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("incarnation", session.incarnation),
         ("delivered", session.delivered),
         ("term", session.term),
+        ("port", session.port.into()),
     ];
     // A missing count is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
@@ -237,11 +247,44 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
             .collect::<Result<_, _>>()?,
         Some(_) => return Err("`pending` is no list".to_owned()),
     };
+    let displaced = match document.swap_remove("displaced") {
+        None => Vec::new(),
+        Some(Value::Array(nodes)) => nodes
+            .into_iter()
+            .map(|node| read_displaced(node).ok_or("`displaced` has a malformed entry"))
+            .collect::<Result<_, _>>()?,
+        Some(_) => return Err("`displaced` is no list".to_owned()),
+    };
     Ok(Checkpoint {
         seq,
         session,
         snapshot,
         pending,
+        displaced,
+    })
+}
+
+fn displaced_value(node: &Displaced) -> Value {
+    let topics = node.topics.iter().map(|topic| topic.as_str().into());
+    let mut members = Struct::from([
+        ("node".to_owned(), node.node.as_str().into()),
+        ("api".to_owned(), node.api.as_str().into()),
+        ("topics".to_owned(), Value::Array(topics.collect())),
+    ]);
+    if let Some(pid) = node.pid {
+        members.insert("pid".to_owned(), pid.into());
+    }
+    Value::Struct(members)
+}
+
+/// Reverses [`displaced_value`].
+fn read_displaced(value: Value) -> Option<Displaced> {
+    let mut node = structure(value)?;
+    Some(Displaced {
+        pid: node.get("pid").and_then(Value::as_int),
+        topics: texts(node.shift_remove("topics")?)?,
+        node: text(&mut node, "node").ok()?,
+        api: text(&mut node, "api").ok()?,
     })
 }
 
@@ -282,6 +325,9 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         incarnation: count(session, "incarnation")?.unwrap_or(0),
         delivered: count(session, "delivered")?.unwrap_or(0),
         term: count(session, "term")?.unwrap_or(0),
+        port: count(session, "port")?
+            .and_then(|port| u16::try_from(port).ok())
+            .unwrap_or(0),
     })
 }
 

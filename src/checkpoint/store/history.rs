@@ -9,11 +9,15 @@ use super::generation::append_all;
 use super::names::{previous, with};
 use super::{Disk, Names, Storage};
 use crate::checkpoint::format::{self, Checkpoint};
+use crate::xmlrpc::Value;
 
 /// Earlier sessions that are kept.
 const SESSIONS_MOST: usize = 5;
 /// Rescues that are kept.
 const RESCUES_MOST: usize = 20;
+
+/// Names of the nodes and parameters of `rosrescue drill` begin with this. The process id follows.
+pub(crate) const DRILLS: &str = "/rosrescue_drill_";
 
 /// Why a checkpoint is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,18 +77,30 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
     Ok(kept)
 }
 
-/// Keeps `checkpoint`, the state of a rescue, beside the checkpoint at `path`. It is not synced: it is a copy, and
-/// a memory card wears out.
+/// The last number of a rescue's state beside the checkpoint at `path`; 0 if there is none.
+pub fn last_rescue(path: &Path) -> u64 {
+    let numbers = names_of(path).numbers(&Disk, Kind::Rescue.name());
+    numbers
+        .ok()
+        .and_then(|mut numbers| numbers.pop())
+        .unwrap_or(0)
+}
+
+/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. It is not synced: it is a copy, and
+/// a memory card wears out. Drills are left out: `rosrescue restore` must not set what they had set.
 ///
 /// # Errors
 ///
 /// If it cannot be written; nothing is left of it then.
-pub fn keep_rescue(path: &Path, checkpoint: &Checkpoint) -> io::Result<PathBuf> {
+pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
+    checkpoint.snapshot.remove_named(DRILLS);
+    checkpoint.pending.retain(|call| {
+        let caller = call.params.first().and_then(Value::as_str);
+        caller.is_none_or(|caller| !caller.starts_with(DRILLS))
+    });
     let names = names_of(path);
-    let last = names.numbers(&Disk, Kind::Rescue.name())?.pop();
-    let number = last.unwrap_or(0).saturating_add(1);
     let kept = names.numbered(Kind::Rescue.name(), number);
-    let encoded = format::encode_checkpoint(checkpoint, 1).map_err(io::Error::other)?;
+    let encoded = format::encode_checkpoint(&checkpoint, 1).map_err(io::Error::other)?;
     // The next start removes what a crash leaves of it.
     let fresh = with(&kept, ".new");
     let written = Disk
@@ -138,6 +154,7 @@ fn names_of(path: &Path) -> Names {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{master::SnapshotNode, xmlrpc::Call};
 
     fn place() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
@@ -192,14 +209,14 @@ mod tests {
     }
 
     #[test]
-    fn a_rescue_is_a_whole_checkpoint_with_a_new_number() {
+    fn a_rescue_is_a_whole_checkpoint_with_its_number() {
         let (_folder, path) = place();
         let checkpoint = Checkpoint {
             seq: 7,
             ..Checkpoint::default()
         };
         for number in 1..=2 {
-            let kept = keep_rescue(&path, &checkpoint).unwrap();
+            let kept = keep_rescue(&path, number, checkpoint.clone()).unwrap();
             assert_eq!(kept, with(&path, &format!(".rescue-{number}")));
             let loaded = super::super::read(&kept).unwrap().unwrap();
             assert!(loaded.exact && loaded.damage.is_empty());
@@ -207,6 +224,60 @@ mod tests {
         }
         assert_eq!(listed(&path), ["rescue-2", "rescue-1"]);
         let nowhere = path.join("nowhere/c.yaml");
-        assert!(keep_rescue(&nowhere, &checkpoint).is_err());
+        assert!(keep_rescue(&nowhere, 1, checkpoint).is_err());
+    }
+
+    #[test]
+    fn a_rescue_is_kept_without_the_drill_that_caused_it() {
+        let (_folder, path) = place();
+        let list = |nodes: &[&str]| nodes.iter().map(|node| (*node).to_owned()).collect();
+        let robot = || {
+            let mut checkpoint = Checkpoint::default();
+            let snapshot = &mut checkpoint.snapshot;
+            snapshot
+                .nodes
+                .insert("/n".to_owned(), SnapshotNode::default());
+            snapshot
+                .subscribers
+                .insert("/scan".to_owned(), list(&["/n"]));
+            snapshot.params.insert("speed".to_owned(), 3.into());
+            checkpoint.pending = vec![Call::new(
+                "setParam",
+                vec!["/n".into(), "/speed".into(), 3.into()],
+            )];
+            checkpoint
+        };
+        let mut with_drill = robot();
+        let drill = format!("{DRILLS}7");
+        let snapshot = &mut with_drill.snapshot;
+        snapshot
+            .nodes
+            .insert(drill.clone(), SnapshotNode::default());
+        snapshot
+            .subscribers
+            .insert("/scan".to_owned(), list(&["/n", &drill]));
+        snapshot
+            .subscribers
+            .insert("/odom".to_owned(), list(&[&drill]));
+        snapshot
+            .publishers
+            .insert(format!("{drill}/topic"), list(&[&drill]));
+        snapshot
+            .topic_types
+            .insert(format!("{drill}/topic"), "x/Y".to_owned());
+        snapshot
+            .param_subscribers
+            .insert("/".to_owned(), list(&[&drill]));
+        snapshot
+            .params
+            .insert("rosrescue_drill_7".to_owned(), 1.into());
+        let write = Call::new(
+            "setParam",
+            vec![drill.as_str().into(), drill.as_str().into(), 1.into()],
+        );
+        with_drill.pending.push(write);
+        let kept = keep_rescue(&path, 1, with_drill).unwrap();
+        let loaded = super::super::read(&kept).unwrap().unwrap();
+        assert_eq!(loaded.checkpoint, Some(robot()));
     }
 }

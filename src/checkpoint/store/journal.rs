@@ -110,6 +110,15 @@ impl<S: Storage> Store<S> {
         }
     }
 
+    /// Stops recording to the present file for good: records are missing in it, because the disk was silent.
+    /// `reason`: in words.
+    pub fn give_up(&mut self, reason: &str) {
+        self.latch(failed("write", &self.names.path)(io::Error::new(
+            io::ErrorKind::TimedOut,
+            reason,
+        )));
+    }
+
     /// Stops recording to the present file for good.
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());

@@ -5,12 +5,11 @@
 //! folder, in other containers too. A socket in the abstract namespace, named after the checkpoint, cannot be
 //! removed while rosrescue lives. The checkpoint itself is locked too, see [`claim`].
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Read, Write};
 use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -18,6 +17,7 @@ use std::time::{Duration, Instant};
 use rustix::fs::FlockOperation;
 
 use super::storage::FileId;
+use crate::regular_file;
 
 /// Locks of a process that is killed while it starts another one last until that one has closed its inherited
 /// descriptors. A rosrescue that starts at that moment must not be refused.
@@ -48,12 +48,12 @@ impl DiskLock {
     fn try_take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
         let name = match bind(checkpoint) {
             Err(error) if error.kind() == io::ErrorKind::AddrInUse => {
-                return Ok(Err(File::open(path).ok().and_then(holder)));
+                return Ok(Err(holder_in(path)));
             }
             other => other.ok(),
         };
         if is_claimed(checkpoint) {
-            return Ok(Err(File::open(path).ok().and_then(holder)));
+            return Ok(Err(holder_in(path)));
         }
         Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
     }
@@ -81,11 +81,7 @@ pub(super) fn claim(file: &File) {
 
 /// Whether another rosrescue has this file open.
 fn is_claimed(checkpoint: &Path) -> bool {
-    // Opening a pipe would block.
-    if !fs::metadata(checkpoint).is_ok_and(|metadata| metadata.is_file()) {
-        return false;
-    }
-    let Ok(file) = File::open(checkpoint) else {
+    let Ok(file) = regular_file::open(checkpoint) else {
         return false;
     };
     let tried = rustix::fs::flock(file, FlockOperation::NonBlockingLockShared);
@@ -96,18 +92,11 @@ fn is_claimed(checkpoint: &Path) -> bool {
 pub(crate) fn holder_of(checkpoint: &Path) -> Option<Option<u32>> {
     let mut path = checkpoint.as_os_str().to_owned();
     path.push(".lock");
-    is_claimed(checkpoint).then(|| File::open(path).ok().and_then(holder))
+    is_claimed(checkpoint).then(|| holder_in(Path::new(&path)))
 }
 
 fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
-    let mut options = OpenOptions::new();
-    let mut file = options
-        .mode(0o600)
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .open(path)?;
+    let mut file = regular_file::open_or_create(path)?;
     match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {
             // For people and for error messages; the lock holds without it.
@@ -119,6 +108,11 @@ fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
         Err(rustix::io::Errno::WOULDBLOCK) => Ok(Err(holder(file))),
         Err(error) => Err(error.into()),
     }
+}
+
+/// The process id in the lock file at `path`.
+fn holder_in(path: &Path) -> Refused {
+    regular_file::open(path).ok().and_then(holder)
 }
 
 /// The process id in a lock file.

@@ -9,6 +9,7 @@ use rustix::fs::{CWD, RenameFlags};
 use rustix::io::Errno;
 
 use super::lock::{self, DiskLock};
+use crate::regular_file;
 
 /// Identifies a file, whatever its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -153,18 +154,12 @@ impl Storage for Disk {
     }
 
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>> {
-        let metadata = fs::metadata(path)?;
-        // Opening a pipe would block.
-        if !metadata.is_file() {
-            return Err(io::Error::other("it is not a regular file"));
-        }
-        if metadata.len() > limit {
+        let file = regular_file::open(path)?;
+        if file.metadata()?.len() > limit {
             return Err(io::Error::other("it is larger than any checkpoint"));
         }
         let mut bytes = Vec::new();
-        File::open(path)?
-            .take(limit.saturating_add(1))
-            .read_to_end(&mut bytes)?;
+        file.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
         Ok(bytes)
     }
 
@@ -202,7 +197,7 @@ impl Storage for Disk {
         remove_if_there(&aside)?;
         let linked = fs::hard_link(from, &aside).is_ok();
         if !linked {
-            let mut original = File::open(from)?;
+            let mut original = regular_file::open(from)?;
             let copy = self.create(&aside)?;
             io::copy(&mut original, &mut &copy)?;
             copy.sync_data()?;
@@ -246,7 +241,7 @@ impl Storage for Disk {
     }
 
     fn checksum(&self, path: &Path, length: u64) -> io::Result<u32> {
-        let mut rest = File::open(path)?.take(length);
+        let mut rest = regular_file::open(path)?.take(length);
         let mut buffer = vec![0; 64 * 1024];
         let mut crc = 0;
         loop {

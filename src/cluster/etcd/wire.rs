@@ -37,6 +37,13 @@ struct AliveValue {
     beat: u64,
     seq: u64,
     released: Option<String>,
+    /// A version that does not write it settles the session when it leads.
+    #[serde(default = "settled_before")]
+    settled: bool,
+}
+
+fn settled_before() -> bool {
+    true
 }
 
 fn base64(bytes: impl AsRef<[u8]>) -> String {
@@ -98,7 +105,7 @@ pub(super) fn request(
     op: &Op,
     entry: Option<&Put>,
 ) -> (Value, u64) {
-    let alive = |beat, seq, released: &Option<String>| {
+    let alive = |beat, seq, released: &Option<String>, settled| {
         let released = released.clone();
         json_put(
             keys.alive(),
@@ -106,6 +113,7 @@ pub(super) fn request(
                 beat,
                 seq,
                 released,
+                settled,
             },
         )
     };
@@ -118,7 +126,12 @@ pub(super) fn request(
     };
     match op {
         Op::Read => (read(keys), 0),
-        Op::Claim { guard, claim, seq } => {
+        Op::Claim {
+            guard,
+            claim,
+            seq,
+            settled,
+        } => {
             let Settings {
                 name,
                 id,
@@ -134,7 +147,8 @@ pub(super) fn request(
                 uri,
                 version,
             };
-            let changes = vec![json_put(keys.leader(), &leader), alive(0, *seq, &None)];
+            let alive = alive(0, *seq, &None, *settled);
+            let changes = vec![json_put(keys.leader(), &leader), alive];
             (txn(guard, changes), *seq)
         }
         Op::Beat {
@@ -142,11 +156,13 @@ pub(super) fn request(
             beat,
             seq,
             released,
+            settled,
         } => {
             let last = entry.and_then(|entry| keys.seq_of(&entry.key));
             let seq = last.unwrap_or(*seq);
             let entry = entry.map(put);
-            let changes = entry.into_iter().chain([alive(*beat, seq, released)]);
+            let alive = alive(*beat, seq, released, *settled);
+            let changes = entry.into_iter().chain([alive]);
             (txn(guard, changes.collect()), seq)
         }
     }
@@ -306,6 +322,7 @@ pub(super) fn absorb(
                     beat: value.beat,
                     seq: value.seq,
                     released: value.released,
+                    settled: value.settled,
                 })
             }
         };

@@ -3,7 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::{
-    Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, Reign, Role, Settings,
+    Action, BEATS, COMMIT_INTERVAL, Commit, Flight, Machine, Op, PATIENCE, Reign, Role, Session,
+    Settings,
 };
 
 impl Machine {
@@ -18,6 +19,7 @@ impl Machine {
     pub(super) fn review(&mut self, now: Instant, actions: &mut Vec<Action>) {
         if self.role == Role::CatchingUp
             && self.has_caught_up()
+            && self.session != Session::Unknown
             && self.is_sole(now)
             && let Some(reign) = &mut self.reign
         {
@@ -61,13 +63,19 @@ impl Machine {
                     beat: reign.beat + 1,
                     seq,
                     released: self.releasing.clone().filter(|_| whole),
+                    settled: self.session.settled_by(seq),
                 }
             }
             None if self.observed.is_none() => Op::Read,
             None => {
                 self.claims += 1;
                 let (claim, seq) = (self.claims, self.view.seq());
-                Op::Claim { guard, claim, seq }
+                Op::Claim {
+                    guard,
+                    claim,
+                    seq,
+                    settled: self.session.settled_by(seq),
+                }
             }
         };
         Flight {

@@ -38,6 +38,7 @@ fn led(name: &str, term: u64, revision: u64) -> View {
             beat: revision - term,
             seq: 10,
             released: None,
+            settled: true,
         }),
     }
 }
@@ -78,13 +79,20 @@ fn leading(alone: WhenAlone) -> (Machine, Instant) {
         },
     );
     let (number, op) = sent(&claimed);
-    let guard = Guard::default();
-    let (claim, seq) = (1, 0);
-    assert_eq!(op, Op::Claim { guard, claim, seq });
+    let claim = Op::Claim {
+        guard: Guard::default(),
+        claim: 1,
+        seq: 0,
+        settled: false,
+    };
+    assert_eq!(op, claim);
     let (revision, seq) = (1, 0);
     let answer = Answer::Applied { revision, seq };
-    let actions = machine.on(now, Input::Answer { number, answer });
-    assert_eq!(actions.last(), Some(&Action::Become(Role::Leading)));
+    machine.on(now, Input::Answer { number, answer });
+    assert_eq!(machine.role(), Role::CatchingUp);
+    let goes_on = true;
+    let actions = machine.on(now, Input::Decided { seq, goes_on });
+    assert_eq!(actions, [Action::Become(Role::Leading)]);
     assert_eq!(machine.deadline(), Some(now + TTL / BEATS));
     (machine, now)
 }
@@ -96,12 +104,17 @@ fn a_silent_leader_is_succeeded_after_its_time_and_not_before() {
     assert_eq!(machine.on(later, Input::View(led("b", 5, 7))), []);
     assert_eq!(machine.on(later + TTL - ms(1), Input::Wake), []);
     let (_, op) = sent(&machine.on(later + TTL, Input::Wake));
-    let guard = Guard {
-        leader: 5,
-        alive: 7,
+    let claim = Op::Claim {
+        guard: Guard {
+            leader: 5,
+            alive: 7,
+        },
+        claim: 1,
+        seq: 10,
+        // It has seen the one before lead.
+        settled: true,
     };
-    let (claim, seq) = (1, 10);
-    assert_eq!(op, Op::Claim { guard, claim, seq });
+    assert_eq!(op, claim);
 }
 
 #[test]
@@ -288,4 +301,103 @@ fn who_gives_up_commits_all_first_and_takes_no_more() {
     assert_eq!(actions.last(), Some(&Action::Released));
     // It does not take it back while another one may.
     assert_eq!(machine.on(now + TTL - ms(1), Input::Wake), []);
+}
+
+/// One that was switched on with all others, and whose claim at revision 7 has been made: the journal is that of
+/// the session before, and the keys show it.
+fn claimed() -> (Machine, Instant) {
+    let (mut machine, now) = machine(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let answer = Answer::Is(led("b", 5, 6));
+    machine.on(now, Input::Answer { number, answer });
+    machine.on(now, Input::Followed(10));
+    let (number, op) = sent(&machine.on(now + TTL, Input::Wake));
+    assert!(matches!(op, Op::Claim { settled: false, .. }), "{op:?}");
+    let (revision, seq) = (7, 10);
+    let answer = Answer::Applied { revision, seq };
+    machine.on(now + TTL, Input::Answer { number, answer });
+    (machine, now + TTL)
+}
+
+/// The keys as a computer has written them that has not decided about the session.
+fn undecided(name: &str, term: u64, revision: u64) -> View {
+    let mut view = led(name, term, revision);
+    view.alive.as_mut().unwrap().settled = false;
+    view
+}
+
+#[test]
+fn who_claims_leads_when_it_is_decided_whether_the_session_goes_on_and_not_before() {
+    for (goes_on, session) in [(true, Session::GoesOn), (false, Session::Over(10))] {
+        let (mut machine, now) = claimed();
+        // The watch shows its own claim; and it has all that there is.
+        let mut view = undecided("a", 7, 7);
+        view.alive.as_mut().unwrap().beat = 0;
+        assert_eq!(machine.on(now, Input::View(view)), []);
+        assert_eq!(machine.on(now, Input::Followed(10)), []);
+        let (_, op) = sent(&machine.on(now + TTL / BEATS, Input::Wake));
+        assert!(matches!(op, Op::Beat { settled: false, .. }), "{op:?}");
+        let decided = Input::Decided { seq: 10, goes_on };
+        let actions = machine.on(now + TTL / BEATS, decided);
+        assert_eq!(actions, [Action::Become(Role::Leading)]);
+        assert_eq!(machine.session(), session);
+    }
+}
+
+#[test]
+fn a_session_that_is_over_ends_once() {
+    let (mut machine, now) = claimed();
+    let (seq, goes_on) = (10, false);
+    machine.on(now, Input::Decided { seq, goes_on });
+    let (number, op) = sent(&machine.on(now, Input::Recorded(11)));
+    // The empty state is the next record.
+    assert!(matches!(op, Op::Beat { settled: true, .. }), "{op:?}");
+    let (revision, seq) = (8, 11);
+    let answer = Answer::Applied { revision, seq };
+    machine.on(now, Input::Answer { number, answer });
+    assert_eq!(machine.session(), Session::GoesOn);
+    // Another one leads for a while.
+    let mut view = led("b", 9, 10);
+    view.alive.as_mut().unwrap().seq = 11;
+    machine.on(now, Input::View(view));
+    machine.on(now, Input::Followed(11));
+    let (number, op) = sent(&machine.on(now + TTL, Input::Wake));
+    assert!(matches!(op, Op::Claim { settled: true, .. }), "{op:?}");
+    let (revision, seq) = (11, 11);
+    let answer = Answer::Applied { revision, seq };
+    let actions = machine.on(now + TTL, Input::Answer { number, answer });
+    assert_eq!(actions.last(), Some(&Action::Become(Role::Leading)));
+    assert_eq!(machine.session(), Session::GoesOn);
+}
+
+#[test]
+fn what_was_not_decided_before_another_one_leads_is_decided_by_that_one() {
+    let (mut machine, now) = claimed();
+    let (seq, goes_on) = (10, false);
+    machine.on(now, Input::Decided { seq, goes_on });
+    // Deposed before the empty state was in the journal, by one that has not decided either.
+    machine.on(now, Input::View(undecided("b", 8, 8)));
+    assert_eq!(machine.session(), Session::Over(10));
+    machine.on(now, Input::View(undecided("b", 8, 9)));
+    assert_eq!(machine.session(), Session::Over(10));
+    machine.on(now, Input::View(led("b", 8, 10)));
+    assert_eq!(machine.session(), Session::GoesOn);
+}
+
+#[test]
+fn a_claim_of_another_computer_does_not_say_that_the_session_goes_on() {
+    let (mut machine, now) = machine(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    // Of yesterday.
+    let answer = Answer::Is(led("b", 5, 6));
+    machine.on(now, Input::Answer { number, answer });
+    machine.on(now, Input::View(undecided("c", 7, 7)));
+    machine.on(now, Input::View(undecided("c", 7, 8)));
+    assert_eq!(machine.session(), Session::Unknown);
+    machine.on(now, Input::View(led("c", 7, 9)));
+    assert_eq!(machine.session(), Session::GoesOn);
+    // A decision that comes late changes nothing.
+    let (seq, goes_on) = (10, false);
+    machine.on(now, Input::Decided { seq, goes_on });
+    assert_eq!(machine.session(), Session::GoesOn);
 }

@@ -62,6 +62,8 @@ pub struct Alive {
     pub seq: u64,
     /// The leader has given up leading in favour of this computer, or of any if it is empty.
     pub released: Option<String>,
+    /// The session goes on that the journal holds. If not, that is still to be decided.
+    pub settled: bool,
 }
 
 /// Both keys at one revision of etcd.
@@ -100,7 +102,12 @@ pub enum Op {
     /// Read both keys; not from a member that may be behind.
     Read,
     /// Write `leader` with this claim, and `alive` with beat 0 and the journal's last record `seq`.
-    Claim { guard: Guard, claim: u64, seq: u64 },
+    Claim {
+        guard: Guard,
+        claim: u64,
+        seq: u64,
+        settled: bool,
+    },
     /// Write `alive`, and the records after the last beat up to `seq`, or up to an earlier one if they are too
     /// many. One that is sent again may have other records: at most one of them is made.
     Beat {
@@ -108,6 +115,7 @@ pub enum Op {
         beat: u64,
         seq: u64,
         released: Option<String>,
+        settled: bool,
     },
 }
 
@@ -133,6 +141,9 @@ pub enum Input {
     View(View),
     /// The mirror holds the journal up to this record.
     Followed(u64),
+    /// Whether the session goes on that the journal holds up to record `seq`. It is needed when this computer
+    /// catches up and [`Machine::session`](super::Machine::session) is unknown.
+    Decided { seq: u64, goes_on: bool },
     /// The ledger holds calls of this computer up to this record, to be committed, or made while alone.
     Recorded(u64),
     /// Whether the rosrescue of the leader answers this one, and says that it leads.
@@ -150,7 +161,7 @@ pub enum Role {
     Joining,
     /// Calls go to the leader. While there is none, reads are answered by the mirror and writes wait.
     Following,
-    /// It has claimed with success, and reads the rest of the journal.
+    /// It has claimed with success, reads the rest of the journal, and decides whether its session goes on.
     CatchingUp,
     Leading,
     /// Cut off from the majority, or from the leader.

@@ -46,7 +46,12 @@ impl Etcd {
         let revision = self.view.revision;
         match &request.op {
             Op::Read => {}
-            Op::Claim { claim, seq, .. } => {
+            Op::Claim {
+                claim,
+                seq,
+                settled,
+                ..
+            } => {
                 assert_eq!(
                     *seq,
                     self.journal.len() as u64,
@@ -61,23 +66,29 @@ impl Etcd {
                     uri: String::new(),
                     version: String::new(),
                 });
-                self.set_alive(0, None);
+                self.set_alive(0, None, *settled);
             }
-            Op::Beat { beat, released, .. } => {
+            Op::Beat {
+                beat,
+                released,
+                settled,
+                ..
+            } => {
                 self.journal.extend(&request.records);
-                self.set_alive(*beat, released.clone());
+                self.set_alive(*beat, released.clone(), *settled);
             }
         }
         let seq = self.journal.len() as u64;
         Answer::Applied { revision, seq }
     }
 
-    fn set_alive(&mut self, beat: u64, released: Option<String>) {
+    fn set_alive(&mut self, beat: u64, released: Option<String>, settled: bool) {
         self.view.alive = Some(Alive {
             revision: self.view.revision,
             beat,
             seq: self.journal.len() as u64,
             released,
+            settled,
         });
     }
 

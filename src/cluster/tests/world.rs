@@ -12,7 +12,9 @@ mod calls;
 mod faults;
 
 pub(super) use faults::{Counts, Plan};
-use faults::{Dice, Fault, Network};
+use faults::{Fault, Network};
+
+use crate::dice::Dice;
 
 const COMPUTERS: usize = 3;
 const MS: u64 = 1000;
@@ -30,6 +32,8 @@ enum Event {
     Answer(usize, u64, u64, Answer),
     Watch(usize, u64, super::super::machine::View, u64),
     Load(usize, u64),
+    /// Whether the session goes on is decided.
+    Decided(usize, u64),
     /// A node of this computer writes.
     Write(usize),
     /// A call of the first reaches the second.
@@ -135,6 +139,7 @@ impl World {
             | Event::Answer(at, ..)
             | Event::Watch(at, ..) => Some(*at),
             Event::Load(at, _)
+            | Event::Decided(at, _)
             | Event::Write(at)
             | Event::Done(at, _)
             | Event::Forward(_, at, _) => Some(*at),
@@ -196,6 +201,12 @@ impl World {
                     self.loaded(at, self.etcd.journal.len() as u64);
                 } else {
                     self.after(100 * MS, Event::Load(at, life));
+                }
+            }
+            Event::Decided(at, life) => {
+                if self.lives(at, life) {
+                    let (seq, goes_on) = (self.computers[at].followed, true);
+                    self.input(at, Input::Decided { seq, goes_on });
                 }
             }
             Event::Write(at) => {
@@ -315,6 +326,10 @@ impl World {
                 self.counts.alone += u64::from(role == Role::Alone);
                 self.counts.reigns += u64::from(role == Role::Leading);
                 self.after(0, Event::Flush(at));
+                if role == Role::CatchingUp {
+                    let (delay, life) = (self.delay(), self.computers[at].life);
+                    self.after(delay, Event::Decided(at, life));
+                }
             }
             Action::Acknowledge(seq) => self.acknowledge(at, seq),
             Action::Yield {

@@ -1,8 +1,9 @@
 //! What is so on this computer. Gathers and judges nothing.
 
 use std::{
+    collections::BTreeSet,
     fs, io,
-    net::{IpAddr, UdpSocket},
+    net::IpAddr,
     path::{Path, PathBuf},
     time::{Duration, Instant},
 };
@@ -14,15 +15,19 @@ use rustix::{
 use tokio::{task::JoinSet, time::timeout};
 
 use super::{
+    launch::{self, Launches},
     ros::{self, Program},
     units::{self, Unit},
 };
 use crate::{
     checkpoint::store,
     cli::CheckArgs,
-    clock,
-    config::CHECKPOINT_NAME,
-    process::{self, Rosout, listeners},
+    clock, config,
+    process::{
+        self, Rosout,
+        bypass::{Bypass, Place},
+        listeners,
+    },
     resolver,
     ros_env::{self, MasterUri, UriError},
     server::listener::{self, ListenError},
@@ -30,6 +35,8 @@ use crate::{
 
 /// How long a look-up of a name may take. A name server that does not answer takes longer.
 const LOOKUP_LIMIT: Duration = Duration::from_secs(6);
+/// Most addresses in launch files that are looked up.
+const LOOKUPS_MOST: usize = 4;
 /// Programs that set the clock.
 const CLOCKS: [&str; 6] = [
     "systemd-timesyn",
@@ -46,6 +53,10 @@ pub(super) struct Facts {
     pub(super) version: &'static str,
     /// The master of `proxy`, and what answers there; none for `core`.
     pub(super) proxied: Option<(MasterUri, ros::Server)>,
+    /// What the master of `proxy` speaks, if it answers.
+    pub(super) proxied_speaks: Option<String>,
+    /// The release of the kernel.
+    pub(super) kernel: String,
     pub(super) env: Environment,
     /// The port that nodes use, or what is wrong with `ROS_MASTER_URI`.
     pub(super) port: Result<Port, UriError>,
@@ -53,6 +64,10 @@ pub(super) struct Facts {
     pub(super) own: Host,
     /// The host of `ROS_MASTER_URI`.
     pub(super) master_host: Option<Host>,
+    /// What answers at `ROS_MASTER_URI`, if that is another computer.
+    pub(super) elsewhere: Option<ros::Server>,
+    /// The host that the rosrescue there gives as its own.
+    pub(super) elsewhere_host: Option<Host>,
     /// Hosts of registered nodes, and some of the nodes, when rosrescue runs.
     pub(super) node_hosts: Vec<(Host, Vec<String>)>,
     pub(super) disk: Disk,
@@ -65,8 +80,16 @@ pub(super) struct Facts {
     /// The python3 on the PATH, if it lacks ROS.
     pub(super) strange_python: Option<PathBuf>,
     pub(super) units: Vec<Unit>,
+    /// The launch files, with those settings that lead to another master.
+    pub(super) launches: Launches,
     /// Free memory, in bytes.
     pub(super) memory: Option<u64>,
+    /// Processes that listen and were started with another `ROS_MASTER_URI` than this one.
+    pub(super) strays: Vec<(Process, String)>,
+    /// What may change the address in `ROS_IP`.
+    pub(super) lease: Option<Lease>,
+    /// The master behind rosrescue, and what goes past it.
+    pub(super) behind: Option<Behind>,
     /// Masters that run beside rosrescue.
     pub(super) masters: Vec<Process>,
 }
@@ -103,7 +126,7 @@ impl Host {
         let mut all = addresses.iter().flatten();
         Self {
             name: name.to_owned(),
-            is_here: all.any(|address| is_here(*address)),
+            is_here: all.any(|address| resolver::is_own(*address)),
             addresses,
             took: start.elapsed(),
         }
@@ -113,11 +136,6 @@ impl Host {
         let addresses = self.addresses.as_deref().unwrap_or_default();
         !addresses.is_empty() && addresses.iter().all(IpAddr::is_loopback)
     }
-}
-
-/// The kernel lets us send from our own addresses only.
-fn is_here(address: IpAddr) -> bool {
-    UdpSocket::bind((address, 0)).is_ok()
 }
 
 #[derive(Clone, Debug)]
@@ -162,6 +180,8 @@ pub(super) struct Disk {
     pub(super) folder: PathBuf,
     /// Free bytes, and whether it is mounted read-only; or why that is not known.
     pub(super) space: Result<(u64, bool), String>,
+    /// Files that can still be created; none if the file system has no such limit.
+    pub(super) inodes: Option<u64>,
     /// Why nothing can be written there.
     pub(super) refused: Option<String>,
     /// Type and source of the file system, as `ext4` and `/dev/sda1`.
@@ -194,8 +214,6 @@ impl Facts {
         let hostname = rustix::system::uname();
         let hostname = hostname.nodename().to_string_lossy().into_owned();
         let own = ros_env::advertised_host(&env, &hostname, listener::local_address());
-        let checkpoint = args.checkpoint.clone();
-        let checkpoint = checkpoint.unwrap_or_else(|| ros_env::log_dir(&env).join(CHECKPOINT_NAME));
         let master_uri = environment.master_uri.as_deref().map(MasterUri::parse);
         let port = match (args.port, &master_uri) {
             (Some(port), _) => Ok(port),
@@ -203,35 +221,99 @@ impl Facts {
             (None, Some(Err(error))) => Err(UriError::clone(error)),
             (None, None) => Ok(ros_env::DEFAULT_MASTER_PORT),
         };
+        let served = port
+            .as_ref()
+            .map_or(ros_env::DEFAULT_MASTER_PORT, |port| *port);
+        let checkpoint = config::checkpoint_path(args.checkpoint.as_deref(), served, &env);
         let port = match port {
             Ok(number) => Ok(Port::look(number).await),
             Err(error) => Err(error),
         };
-        let proxied = match master {
-            Some(uri) => {
-                let server = ros::Server::ask(&uri).await;
-                Some((uri, server))
+        let (mut proxied, mut proxied_speaks) = (None, None);
+        if let Some(uri) = master {
+            let server = ros::Server::ask(&uri).await;
+            if matches!(server, ros::Server::Master(_)) {
+                proxied_speaks = ros::speaks(&uri).await;
             }
+            proxied = Some((uri, server));
+        }
+        let running = port.as_ref().ok().and_then(|port| port.taken.as_ref());
+        let master_uri = master_uri.and_then(Result::ok);
+        let master_host = match &master_uri {
+            Some(uri) => Some(Host::find(&uri.host).await),
             None => None,
         };
-        let running = port.as_ref().ok().and_then(|port| port.taken.as_ref());
+        let is_far = |host: &Host| host.addresses.is_ok() && !host.is_here;
+        let far = master_uri.filter(|_| master_host.as_ref().is_some_and(is_far));
+        let elsewhere = match &far {
+            Some(uri) if proxied.is_none() => Some(ros::Server::ask(uri).await),
+            _ => None,
+        };
+        let (mut nodes_of, mut elsewhere_host) = (None, None);
+        match (running.map(|taken| &taken.server), &elsewhere, &far) {
+            (Some(ros::Server::Rosrescue { uri, .. }), _, _) => nodes_of = Some(uri.clone()),
+            (_, Some(ros::Server::Rosrescue { uri, .. }), Some(far)) => {
+                nodes_of = Some(far.to_string());
+                if let Ok(own) = MasterUri::parse(uri) {
+                    elsewhere_host = Some(Host::find(&own.host).await);
+                }
+            }
+            (_, Some(ros::Server::Master(_)), Some(far)) => nodes_of = Some(far.to_string()),
+            _ => {}
+        }
         let mut node_hosts = Vec::new();
-        if let Some(ros::Server::Rosrescue { uri, .. }) = running.map(|taken| &taken.server) {
+        if let Some(uri) = nodes_of {
             let mut lookups = JoinSet::new();
-            for (host, nodes) in ros::hosts_of_nodes(uri).await {
+            for (host, nodes) in ros::hosts_of_nodes(&uri).await {
                 lookups.spawn(async move { (Host::find(&host).await, nodes) });
             }
             node_hosts = lookups.join_all().await;
             node_hosts.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
         }
-        let uri_host = master_uri.and_then(Result::ok).map(|uri| uri.host);
+        let mut others = Vec::new();
+        for (process, uri) in environment
+            .master_uri
+            .as_deref()
+            .map(strays)
+            .unwrap_or_default()
+        {
+            if !leads_to(&uri, far.as_ref(), port.as_ref().ok()).await {
+                others.push((process, uri));
+            }
+        }
+        let launches = set("ROS_PACKAGE_PATH").map(|path| launch::find(&path));
+        let mut launches = launches.unwrap_or_default();
+        let uris = launches.settings.iter().map(|one| one.uri.clone());
+        let uris: BTreeSet<_> = uris.collect();
+        for uri in uris.iter().take(LOOKUPS_MOST) {
+            if leads_to(uri, far.as_ref(), port.as_ref().ok()).await {
+                launches.settings.retain(|one| one.uri != *uri);
+            }
+        }
+        let (behind, known) = match running.map(|taken| &taken.server) {
+            Some(ros::Server::Rosrescue {
+                proxied, bypassing, ..
+            }) => (proxied.clone(), bypassing.clone()),
+            _ => (proxied.as_ref().map(|(uri, _)| uri.clone()), Vec::new()),
+        };
+        let behind = match behind {
+            Some(uri) => Some(Behind::look(uri, known).await),
+            None => None,
+        };
+        let lease = match &environment.ip {
+            Some(ip) => Lease::find(ip).await,
+            None => None,
+        };
         Self {
+            strays: others,
+            behind,
+            launches,
+            lease,
             version: env!("CARGO_PKG_VERSION"),
             own: Host::find(&own).await,
-            master_host: match uri_host {
-                Some(host) => Some(Host::find(&host).await),
-                None => None,
-            },
+            master_host,
+            elsewhere,
+            elsewhere_host,
             node_hosts,
             env: environment,
             port,
@@ -239,6 +321,11 @@ impl Facts {
                 Some(_) => None,
                 None => Some(Program::find(args.rosmaster.as_deref()).await),
             },
+            proxied_speaks,
+            kernel: rustix::system::uname()
+                .release()
+                .to_string_lossy()
+                .into_owned(),
             proxied,
             has_rosout: Rosout::find(&checkpoint).is_some(),
             strange_python: ros::strange_python().await,
@@ -286,6 +373,33 @@ impl Port {
     }
 }
 
+/// The master behind a `proxy`.
+#[derive(Clone, Debug)]
+pub(super) struct Behind {
+    pub(super) uri: MasterUri,
+    /// What talks to it directly.
+    pub(super) bypassing: Vec<String>,
+    /// Whether it is on this computer and takes connections from others.
+    pub(super) is_open: bool,
+}
+
+impl Behind {
+    /// `known` is what the running rosrescue has seen.
+    async fn look(uri: MasterUri, known: Vec<String>) -> Self {
+        let place = timeout(LOOKUP_LIMIT, Place::of(&uri)).await.ok().flatten();
+        let mut bypass = Bypass::default();
+        if let Some(place) = &place {
+            bypass.look(place);
+        }
+        let all: BTreeSet<_> = bypass.all().into_iter().chain(known).collect();
+        Self {
+            uri,
+            bypassing: all.into_iter().collect(),
+            is_open: place.is_some_and(|place| place.is_open()),
+        }
+    }
+}
+
 impl Disk {
     fn look(checkpoint: PathBuf) -> Self {
         let whole = std::path::absolute(&checkpoint).unwrap_or_else(|_| checkpoint.clone());
@@ -294,6 +408,8 @@ impl Disk {
         let folder = folder.unwrap_or_else(|| Path::new("/")).to_owned();
         let folder = folder.canonicalize().unwrap_or(folder);
         let space = rustix::fs::statvfs(&folder).map_err(|error| error.to_string());
+        let inodes = space.as_ref().ok().filter(|space| space.f_files > 0);
+        let inodes = inodes.map(|space| space.f_favail);
         let space = space.map(|space| {
             let is_read_only = space.f_flag.contains(StatVfsMountFlags::RDONLY);
             (space.f_bavail.saturating_mul(space.f_frsize), is_read_only)
@@ -310,6 +426,7 @@ impl Disk {
             checkpoint: whole,
             folder,
             space,
+            inodes,
             refused: refused.map(|error| io::Error::from(error).to_string()),
         }
     }
@@ -360,8 +477,7 @@ impl Clock {
 
 impl Process {
     fn of_name(pid: u32) -> String {
-        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        name.trim_end().to_owned()
+        process::name_of(pid)
     }
 }
 
@@ -372,6 +488,79 @@ fn masters() -> Vec<Process> {
         .filter(|pid| process::is_in_our_network(*pid) && !process::is_of_any(*pid))
         .map(Process::of)
         .collect()
+}
+
+/// Processes in our network namespace that listen and were started with another `ROS_MASTER_URI` than `own`. Those of
+/// other users are seen by root only.
+fn strays(own: &str) -> Vec<(Process, String)> {
+    const NAME: &[u8] = b"ROS_MASTER_URI=";
+    let strays = process::all().filter_map(|pid| {
+        let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+        let mut variables = environment.split(|byte| *byte == 0);
+        let uri = variables.find_map(|variable| variable.strip_prefix(NAME))?;
+        let uri = String::from_utf8_lossy(uri).into_owned();
+        let is_stray = !uri.is_empty() && uri.trim_end_matches('/') != own.trim_end_matches('/');
+        if !is_stray || !process::is_in_our_network(pid) || process::is_of_any(pid) {
+            return None;
+        }
+        let process = Process::of(pid);
+        // Shells have the variable, too.
+        (!process.ports.is_empty() && process.name != "rosrescue").then_some((process, uri))
+    });
+    strays.collect()
+}
+
+/// Whether `uri` is another way to write the address of the master: `far`, or `port` of this computer.
+async fn leads_to(uri: &str, far: Option<&MasterUri>, port: Option<&Port>) -> bool {
+    let Ok(uri) = MasterUri::parse(uri) else {
+        return false;
+    };
+    let host = Host::find(&uri.host).await;
+    match far {
+        Some(far) => {
+            far.port == uri.port && host.addresses == Host::find(&far.host).await.addresses
+        }
+        None => host.is_here && port.is_some_and(|port| port.number == uri.port),
+    }
+}
+
+/// Why an address may be another one tomorrow.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Lease {
+    pub(super) interface: String,
+    /// It was given by DHCP, and not for ever.
+    pub(super) is_leased: bool,
+    pub(super) is_wireless: bool,
+}
+
+impl Lease {
+    /// By what `ip` of iproute2 says; none where there is no such program.
+    async fn find(address: &str) -> Option<Self> {
+        let mut ip = tokio::process::Command::new("ip");
+        let ip = ip.args(["-o", "addr", "show"]).kill_on_drop(true).output();
+        let output = timeout(LOOKUP_LIMIT, ip).await.ok()?.ok()?;
+        let (interface, is_leased) =
+            interface_of(&String::from_utf8_lossy(&output.stdout), address)?;
+        let is_wireless = Path::new("/sys/class/net")
+            .join(&interface)
+            .join("phy80211")
+            .exists();
+        (is_leased || is_wireless).then_some(Self {
+            interface,
+            is_leased,
+            is_wireless,
+        })
+    }
+}
+
+/// The interface with `address` in the output of `ip -o addr show`, and whether the address is leased.
+fn interface_of(output: &str, address: &str) -> Option<(String, bool)> {
+    output.lines().find_map(|line| {
+        let words: Vec<_> = line.split_whitespace().collect();
+        let (own, _) = words.get(3)?.split_once('/')?;
+        let found = ((*words.get(1)?).to_owned(), words.contains(&"dynamic"));
+        (own == address).then_some(found)
+    })
 }
 
 fn free_memory() -> Option<u64> {
@@ -396,6 +585,21 @@ mod tests {
         assert!(!far.is_here && !far.is_loopback());
         let nobody = Host::find("nobody.invalid").await;
         assert!(!nobody.is_here && !nobody.is_loopback() && nobody.addresses.is_err());
+    }
+
+    #[test]
+    fn a_leased_address_is_known() {
+        let output = "1: lo    inet 127.0.0.1/8 scope host lo\\       valid_lft forever\n\
+             2: wlan0    inet 10.0.0.7/24 brd 10.0.0.255 scope global dynamic wlan0\\       valid_lft 3600sec\n";
+        assert_eq!(
+            interface_of(output, "127.0.0.1"),
+            Some(("lo".to_owned(), false))
+        );
+        assert_eq!(
+            interface_of(output, "10.0.0.7"),
+            Some(("wlan0".to_owned(), true))
+        );
+        assert_eq!(interface_of(output, "10.0.0.8"), None);
     }
 
     #[test]

@@ -8,15 +8,36 @@ mod tests;
 use super::{
     Finding, Severity,
     facts::{Facts, Process},
+    ros::Server,
 };
 
 /// Judges everything.
 pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
+    if let (Some(Server::Rosrescue { .. } | Server::Master(_)), Some(uri)) =
+        (&facts.elsewhere, &facts.env.master_uri)
+    {
+        // Only nodes run here: what serves the robot is checked where it runs.
+        found.elsewhere(facts, uri);
+        found.address(facts);
+        found.own_name(facts);
+        found.lease(facts);
+        found.strays(facts);
+        found.launches(&facts.launches);
+        found.nodes(facts);
+        found.files(facts.files);
+        found.clock(&facts.clock);
+        found.memory(facts.memory);
+        return found.0;
+    }
     found.port(facts);
     found.master_uri(facts);
     found.address(facts);
     found.own_name(facts);
+    found.lease(facts);
+    found.strays(facts);
+    found.bypass(facts);
+    found.launches(&facts.launches);
     found.nodes(facts);
     found.disk(&facts.disk, facts.port.as_ref().ok());
     found.files(facts.files);

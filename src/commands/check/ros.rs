@@ -7,14 +7,18 @@ use std::{
     time::Duration,
 };
 
+use hyper::header::HeaderValue;
 use serde::Deserialize;
+use tokio::net::TcpStream;
 
 use crate::{
     commands::running::Running,
     master,
     nodes::client::{self, Sign},
-    process,
+    process, resolver,
     ros_env::MasterUri,
+    status::software,
+    upstream::Connection,
     xmlrpc::{Call, Value},
 };
 
@@ -22,6 +26,8 @@ use crate::{
 const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 /// How long Python may take to import a module.
 const IMPORT_LIMIT: Duration = Duration::from_secs(20);
+/// Largest answer to getPid, in bytes.
+const MAX_REPLY: usize = 64 << 10;
 /// Some names of nodes stand for all at a host.
 const SOME: usize = 3;
 
@@ -32,6 +38,10 @@ pub(super) enum Server {
         version: String,
         uri: String,
         unprotected: Option<String>,
+        /// The master behind it; none for `core`.
+        proxied: Option<MasterUri>,
+        /// What goes past it.
+        bypassing: Vec<String>,
     },
     /// A master, with the process id that it says.
     Master(Option<i32>),
@@ -49,6 +59,10 @@ struct Page {
     version: String,
     uri: String,
     unprotected: Option<String>,
+    mode: String,
+    master: String,
+    #[serde(default)]
+    bypassing: Vec<String>,
 }
 
 impl Server {
@@ -64,6 +78,10 @@ impl Server {
                 version: page.version,
                 uri: page.uri,
                 unprotected: page.unprotected,
+                proxied: MasterUri::parse(&page.master)
+                    .ok()
+                    .filter(|_| page.mode == "proxy"),
+                bypassing: page.bypassing,
             };
         }
         let (uri, get_pid) = (address.to_string(), master::get_pid());
@@ -74,6 +92,23 @@ impl Server {
             (Sign::Silent, _) => Self::Other,
         }
     }
+}
+
+/// What the master at `address` speaks, if it answers.
+pub(super) async fn speaks(address: &MasterUri) -> Option<String> {
+    let ask = async {
+        let addresses = resolver::addresses(&address.host, address.port).await;
+        let stream = TcpStream::connect(&*addresses.ok()?).await.ok()?;
+        let name = HeaderValue::from_static("a-command");
+        let connection = Connection::over(stream, address, name, MAX_REPLY).await;
+        let mut connection = connection.ok()?;
+        connection.call(&master::get_pid()).await.ok()?;
+        Some(software::speaks(
+            connection.keeps_alive()?,
+            connection.server(),
+        ))
+    };
+    tokio::time::timeout(ANSWER_LIMIT, ask).await.ok()?
 }
 
 /// The hosts of the nodes that the master at `uri` knows, with some of the nodes.
@@ -140,11 +175,15 @@ impl Program {
     }
 }
 
-/// The version in the `package.xml` that belongs to `program`.
+/// The version in the `package.xml` that belongs to `program`. Ubuntu 16.04 leaves it out; rosgraph, without which no
+/// rosmaster runs, is released with it under the same number.
 fn version(program: &Path) -> Option<String> {
     let real = program.canonicalize().ok()?;
     let prefix = real.parent()?.parent()?;
-    let package = fs::read_to_string(prefix.join("share/rosmaster/package.xml")).ok()?;
+    let mut packages = ["rosmaster", "rosgraph"].into_iter().filter_map(|name| {
+        fs::read_to_string(prefix.join("share").join(name).join("package.xml")).ok()
+    });
+    let package = packages.next()?;
     let (_, rest) = package.split_once("<version>")?;
     Some(rest.split_once('<')?.0.trim().to_owned())
 }
@@ -183,4 +222,26 @@ pub(super) async fn strange_python() -> Option<PathBuf> {
     let name = python.to_string_lossy().into_owned();
     let broken = import(&name, &[], "rosgraph", Path::new("/")).await;
     broken.map(|_| python)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As in Ubuntu 16.04 the first time.
+    #[test]
+    fn the_version_is_that_of_rosmaster_or_else_of_rosgraph() {
+        let folder = tempfile::tempdir().unwrap();
+        let program = folder.path().join("bin/rosmaster");
+        fs::create_dir(folder.path().join("bin")).unwrap();
+        fs::write(&program, "").unwrap();
+        assert_eq!(version(&program), None);
+        for (name, number) in [("rosgraph", "1.11.16"), ("rosmaster", "1.12.17")] {
+            let share = folder.path().join("share").join(name);
+            fs::create_dir_all(&share).unwrap();
+            let package = format!("<package><version> {number}</version></package>");
+            fs::write(share.join("package.xml"), package).unwrap();
+            assert_eq!(version(&program).as_deref(), Some(number));
+        }
+    }
 }

@@ -65,7 +65,7 @@ fn in_folders(folders: &[PathBuf]) -> Vec<Unit> {
 }
 
 /// The text of a small file.
-fn read(path: &Path) -> String {
+pub(super) fn read(path: &Path) -> String {
     match fs::metadata(path) {
         Ok(metadata) if metadata.is_file() && metadata.len() < MOST => {
             let text = fs::read(path).unwrap_or_default();

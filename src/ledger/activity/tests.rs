@@ -75,17 +75,15 @@ fn changes_are_collected_only_while_a_master_may_be_late() {
     assert_eq!(changes, IndexSet::from([Change::Topic("/t".to_owned())]));
     assert_eq!(activity.take_owed(now).topics, ["/t"]);
     assert_eq!(activity.take_owed(now).topics, Vec::<String>::new());
-    // While no master is there, it is told at once and in the master's words.
-    assert!(apply(&mut activity, true));
-    let outbox = activity.take_outbox();
-    assert!(outbox.changes.is_empty());
-    let [(to, call)] = &outbox.calls[..] else {
-        panic!("{outbox:?}")
+    // While no master is there, the notifications are ours, in a master's words.
+    let mut noticed = Noticed::new(true);
+    master.apply_telling(&publish, &mut noticed);
+    let calls = noticed.take_calls().unwrap();
+    let [(to, subject, call)] = &calls[..] else {
+        panic!("{calls:?}")
     };
-    assert_eq!(
-        (to.as_str(), call.method.as_str()),
-        ("http://s:1/", "publisherUpdate")
-    );
+    assert_eq!(to, "http://s:1/");
+    assert_eq!(*subject, Subject::Topic("/t".to_owned()));
     assert_eq!(**call, master.publisher_update("/t"));
 }
 
@@ -113,6 +111,53 @@ fn who_is_displaced_is_known_with_what_it_did() {
     }
     assert_eq!(activity.take_owed(now).displaced.len(), 2);
     assert_eq!(activity.take_owed(now).displaced, []);
+}
+
+#[test]
+fn who_was_displaced_by_the_journal_is_told_unless_the_name_is_its_own_again() {
+    let now = Instant::now();
+    let mut activity = Activity::default();
+    let mut master = Master::default();
+    master.apply(&publish("/a", "/t"));
+    let at = |node: &str, api: &str| Displaced {
+        node: node.to_owned(),
+        api: api.to_owned(),
+        pid: None,
+        topics: vec!["/t".to_owned()],
+    };
+    let taken = at("/a", "http://n:2/");
+    let displaced = [
+        taken.clone(),
+        at("/a", "http://n:1/"),
+        at("/gone", "http://n:3/"),
+    ];
+    activity.restore_displaced(displaced.to_vec());
+    // Not before the master was examined.
+    assert_eq!(activity.take_owed(now).displaced, []);
+    activity.notice_all(&master, now);
+    assert_eq!(activity.take_owed(now).displaced, [taken]);
+    activity.notice_all(&master, now);
+    assert_eq!(activity.take_owed(now).displaced, []);
+}
+
+#[test]
+fn what_was_unregistered_is_remembered_and_nothing_else() {
+    let mut activity = Activity::default();
+    let mut master = Master::default();
+    master.apply(&publish("/n", "/t"));
+    master.apply(&publish("/n", "/kept"));
+    let api = master.api_of("/n").unwrap().to_owned();
+    let gone = |topic: &str| call("unregisterPublisher", &["/n", topic, &api]);
+    activity.note_lost(&master, &Request::multicall([gone("t"), gone("/never")]));
+    assert!(activity.has_lost("/n", &api, true, "/t"));
+    assert!(!activity.has_lost("/n", "http://other:1/", true, "/t"));
+    assert!(!activity.has_lost("/n", &api, false, "/t"));
+    assert!(!activity.has_lost("/n", &api, true, "/never"));
+    assert!(!activity.has_lost("/n", &api, true, "/kept"));
+    for _ in 0..NOTICES {
+        activity.note_lost(&master, &gone("/kept"));
+    }
+    assert!(!activity.has_lost("/n", &api, true, "/t"), "bounded");
 }
 
 #[test]

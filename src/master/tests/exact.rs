@@ -71,3 +71,34 @@ fn a_state_that_is_kept_otherwise_is_not_answered_exactly() {
         assert_eq!(master.exact_answer(&get), None);
     }
 }
+
+#[test]
+fn what_shows_the_order_of_dictionaries_is_not_answered_exactly_for_one_that_has_none() {
+    let tree = Value::Struct(Struct::from_iter([
+        ("b".to_owned(), 1.into()),
+        ("a".to_owned(), 2.into()),
+    ]));
+    let mut master = Master::default();
+    master.apply(&Request::new(
+        Method::SetParam,
+        ["/n".into(), "/t".into(), tree],
+    ));
+    master.apply(&call("registerPublisher", &["/n", "/x", "a/B", &api("/n")]));
+    master.set_unordered(true);
+    let state = call("getSystemState", &["/c"]);
+    for exact in [&state, &call("getParam", &["/c", "/t/a"])] {
+        assert!(master.exact_answer(exact).is_some(), "{exact:?}");
+    }
+    master.apply(&call("registerPublisher", &["/n", "/y", "a/B", &api("/n")]));
+    for shown in [
+        state,
+        call("getTopicTypes", &["/c"]),
+        call("getPublishedTopics", &["/c", ""]),
+        call("getParamNames", &["/c"]),
+        call("getParam", &["/c", "/t"]),
+        call("getParam", &["/c", "/"]),
+        Request::multicall([call("getParam", &["/c", "/t"])]),
+    ] {
+        assert_eq!(master.exact_answer(&shown), None, "{shown:?}");
+    }
+}

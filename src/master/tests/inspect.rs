@@ -5,10 +5,10 @@ use crate::replay::{Bears, Inspection, NotAMaster, Token, difference};
 fn look(master: &mut Master, previous: &Master) -> Master {
     let token = Token::new("m", 1);
     let reply = master.apply(&Inspection::call(&token)).reply;
-    let look = match Inspection::decode(&reply) {
+    let look = match Inspection::decode(&reply, &token) {
         Err(NotAMaster::ParamsUnreadable { .. }) => {
             let reply = master.apply(&Inspection::call_without_params(&token)).reply;
-            Inspection::decode(&reply).unwrap()
+            Inspection::decode(&reply, &token).unwrap()
         }
         look => look.unwrap(),
     };
@@ -79,7 +79,7 @@ fn an_empty_master_is_empty_and_bears_no_token() {
     let mut master = Master::default();
     master.set_identity(42, "http://h/".to_owned());
     let look = |master: &mut Master| {
-        Inspection::decode(&master.apply(&Inspection::call(&token)).reply).unwrap()
+        Inspection::decode(&master.apply(&Inspection::call(&token)).reply, &token).unwrap()
     };
     let first = look(&mut master);
     assert_eq!(
@@ -94,6 +94,14 @@ fn an_empty_master_is_empty_and_bears_no_token() {
     }
     master.apply(&set("/a", 1));
     assert!(!look(&mut master).is_empty());
+    // Also while it bears an earlier number.
+    let [session, _] = Token::new("m", 12).leave();
+    master.apply(&session);
+    assert_eq!(look(&mut master).bears(), Bears::Later(12));
+    let [session, _] = Token::new("m", 0).leave();
+    master.apply(&session);
+    master.apply(&token.remove());
+    assert_eq!(look(&mut master).bears(), Bears::Earlier);
 }
 
 #[test]
@@ -108,7 +116,7 @@ fn poisoned_params_come_from_the_previous_state() {
 fn what_vanishes_between_the_looks_is_left_out() {
     let mut master = busy();
     let token = Token::new("m", 1);
-    let first = Inspection::decode(&master.apply(&Inspection::call(&token)).reply).unwrap();
+    let first = Inspection::decode(&master.apply(&Inspection::call(&token)).reply, &token).unwrap();
     for call in master.unregister_calls("/q") {
         master.apply(&call);
     }
@@ -121,7 +129,7 @@ fn what_vanishes_between_the_looks_is_left_out() {
 
 #[test]
 fn what_is_no_master_is_said_to_be_none() {
-    let form = |reply| Inspection::decode(&reply).unwrap_err();
+    let form = |reply| Inspection::decode(&reply, &Token::new("m", 1)).unwrap_err();
     assert!(matches!(
         form(Reply::Value(1.into())),
         NotAMaster::Form { .. }

@@ -370,6 +370,28 @@ fn a_type_without_a_topic_keeps_its_place_in_a_master_that_is_emptied_first() {
     assert_eq!(plan.expected(), &target);
 }
 
+/// As of topics that were registered with another type while the master hung.
+#[test]
+fn a_type_that_has_changed_is_changed_in_a_master_that_is_emptied_first() {
+    let before = [
+        publish("/p", "/published", "a/B"),
+        publish("/p", "/subscribed", "a/B"),
+        publish("/p", "/gone", "a/B"),
+        subscribe("/s", "/subscribed", "a/B"),
+    ];
+    let held = after(before.clone());
+    let mut target = after(before);
+    for topic in ["/published", "/subscribed", "/gone"] {
+        target.apply(&publish("/p", topic, "a/C"));
+    }
+    for topic in ["/subscribed", "/gone"] {
+        target.apply(&call("unregisterPublisher", &["/p", topic, &api("/p")]));
+    }
+    let plan = Plan::replace(&target, &held, &Token::new("m", 0), &token());
+    assert_eq!(plan.expected(), &target);
+    assert_eq!(run(&plan, &held).1, []);
+}
+
 #[test]
 fn a_refusal_in_other_words_is_as_predicted() {
     // Some members have slashes in their names, and somebody subscribes there.

@@ -267,3 +267,54 @@ fn unregistering_everything_a_node_has_makes_the_master_forget_it() {
     assert_eq!(master.counts().nodes, 0);
     assert_eq!(master.unregister_calls("/nobody"), []);
 }
+
+/// rosmaster 1.14.3 and before: 0 in place of an empty list or name, and who sets a parameter is told of it.
+#[test]
+fn an_old_master_refuses_and_notifies_in_its_own_way() {
+    let value = |old, call: &Request| {
+        let mut master = Master::default();
+        master.set_old(Some(old));
+        match master.apply(call).reply {
+            Reply::Value(Value::Array(mut answer)) => answer.pop(),
+            other => panic!("{other:?}"),
+        }
+    };
+    let empty = Value::Array(Vec::new());
+    for (call, new) in [
+        (publish("/n", "t", ""), empty.clone()),
+        (
+            call("registerSubscriber", &["/n", "t", "", "http://n"]),
+            empty,
+        ),
+        (Master::ask_if_old(), "".into()),
+    ] {
+        assert_eq!(value(true, &call), Some(0.into()), "{call:?}");
+        assert_eq!(value(false, &call), Some(new), "{call:?}");
+    }
+    for old in [None, Some(false), Some(true)] {
+        let mut master = Master::default();
+        master.set_old(old);
+        assert_eq!(
+            Master::shows_old(&master.apply(&Master::ask_if_old()).reply),
+            Some(old == Some(true))
+        );
+        for node in ["/n", "/m"] {
+            master.apply(&call("subscribeParam", &[node, &api(node), "/gain"]));
+        }
+        let notices = master
+            .apply(&call("setParam", &["/n", "/gain", "2"]))
+            .notices;
+        let told: Vec<_> = notices.iter().map(Notice::to).collect();
+        let own = api("/n");
+        let first = (old == Some(true)).then_some(own.as_str());
+        assert_eq!(
+            told,
+            first.into_iter().chain([&*api("/m")]).collect::<Vec<_>>()
+        );
+    }
+    let fault = Reply::Fault {
+        code: 1,
+        text: String::new(),
+    };
+    assert_eq!(Master::shows_old(&fault), None);
+}

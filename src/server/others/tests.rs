@@ -2,7 +2,10 @@
 
 use http_body_util::BodyExt;
 use hyper::{StatusCode, header::HeaderValue};
-use tokio::{io::AsyncWriteExt, net::TcpListener};
+use tokio::{
+    io::{AsyncReadExt, AsyncWriteExt},
+    net::TcpListener,
+};
 
 use super::*;
 use crate::{
@@ -24,6 +27,8 @@ const TERM: u64 = 7;
 struct Computer {
     calls: Calls,
     way: watch::Sender<Way>,
+    /// The last record that its mirror holds.
+    followed: watch::Sender<u64>,
     handovers: mpsc::Receiver<Handover>,
 }
 
@@ -64,15 +69,18 @@ impl Computer {
             stats,
             None,
             false,
+            crate::lifecycle::Patience::new(second),
         );
         let (way, way_rx) = watch::channel(way);
         let (handovers_tx, handovers) = mpsc::channel(1);
+        let (tell_followed, followed) = watch::channel(0);
         let calls = Calls {
             pool: Arc::new(Pool::new(1, upstream, ledger.clone(), gate.clone())),
             gate,
             ledger,
             reads: Reads::Mirror,
             last_large: Default::default(),
+            compared: Default::default(),
             write_queue,
             slow: Arc::default(),
             stats,
@@ -82,12 +90,16 @@ impl Computer {
                 way: way_rx,
                 peers: Arc::new(Peers::new(instance(), second)),
                 handovers: handovers_tx,
+                passing: Arc::default(),
+                followed,
+                told: Arc::default(),
                 hold: second,
             }),
         };
         Self {
             calls,
             way,
+            followed: tell_followed,
             handovers,
         }
     }
@@ -250,4 +262,109 @@ async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
     let answer = answer.as_array().unwrap();
     assert_eq!(answer[0], 0.into());
     assert_eq!(answer[1], "the leader does not answer".into());
+}
+
+/// Tells when it is dropped.
+struct Told(mpsc::Sender<u64>, u64);
+
+impl Drop for Told {
+    fn drop(&mut self) {
+        let _ = self.0.try_send(self.1);
+    }
+}
+
+#[test]
+fn an_answer_is_held_until_its_follower_has_passed_it_on_or_says_nothing() {
+    let (tell, mut told) = mpsc::channel(8);
+    let passing = Passing::default();
+    let now = Instant::now();
+    let keep = |at, number| passing.keep(at, UntilWritten::new(Told(tell.clone(), number)));
+    let first = keep(now, 1);
+    let second = keep(now, 2);
+    assert!(told.try_recv().is_err());
+    passing.end(second);
+    passing.end(second);
+    assert_eq!(told.try_recv(), Ok(2));
+    assert_ne!(first, second);
+    keep(now + 2 * ANSWER_LIMIT, 3);
+    assert_eq!(told.try_recv(), Ok(1));
+    assert!(told.try_recv().is_err());
+}
+
+/// A follower passes on to its caller what a leader answers, and tells the leader when the caller has it.
+#[tokio::test]
+async fn a_follower_tells_its_leader_when_the_caller_has_the_answer() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let (tell, mut bodies) = mpsc::channel(8);
+    tokio::spawn(async move {
+        while let Ok((mut stream, _)) = listener.accept().await {
+            let tell = tell.clone();
+            tokio::spawn(async move {
+                while let Some(body) = request_body(&mut stream).await {
+                    let _ = tell.send(body).await;
+                    let reply = xmlrpc::encode_reply(&made_by(&get()));
+                    let head = format!(
+                        "HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n{}: 42\r\nContent-Length: {}\r\n\r\n",
+                        peer::ANSWER_HEADER,
+                        reply.len()
+                    );
+                    let _ = stream.write_all(&[head.into_bytes(), reply].concat()).await;
+                }
+            });
+        }
+    });
+    let uri = MasterUri::parse(&format!("http://127.0.0.1:{port}/")).unwrap();
+    let computer = Computer::new(Way::Leader { uri, term: TERM });
+    let mut answer = computer.ask("/", &get()).await.unwrap();
+    assert!(bodies.recv().await.unwrap().contains("getParam"));
+    let held: UntilWritten = answer.extensions_mut().remove().unwrap();
+    tokio::task::yield_now().await;
+    assert!(bodies.try_recv().is_err());
+    drop(held);
+    let told = bodies.recv().await.unwrap();
+    assert!(told.contains(PASSED_ON) && told.contains("42"), "{told}");
+}
+
+/// The body of the next request on `stream`.
+async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
+    let mut text = Vec::new();
+    loop {
+        let mut byte = [0];
+        stream.read_exact(&mut byte).await.ok()?;
+        text.extend(byte);
+        if text.ends_with(b"\r\n\r\n") {
+            break;
+        }
+    }
+    let head = String::from_utf8(text).ok()?.to_lowercase();
+    let (_, length) = head.split_once("content-length: ")?;
+    let length = length.lines().next()?.trim().parse().ok()?;
+    let mut body = vec![0; length];
+    stream.read_exact(&mut body).await.ok()?;
+    String::from_utf8(body).ok()
+}
+
+/// On one computer a caller sees what it was told of: a mirror that is behind catches up first.
+#[tokio::test(start_paused = true)]
+async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
+    let computer = Computer::new(Way::Nobody { known: true });
+    let others = computer.calls.others.clone().unwrap();
+    others.told.store(7, Ordering::Relaxed);
+    let start = Instant::now();
+    let behind = async {
+        tokio::time::sleep(CATCH_UP_LIMIT / 2).await;
+        computer.followed.send_replace(7);
+    };
+    let get = get();
+    let (answer, ()) = tokio::join!(computer.ask("/", &get), behind);
+    assert_eq!(reply(answer.unwrap()).await, made_by(&get));
+    assert_eq!(start.elapsed(), CATCH_UP_LIMIT / 2);
+    // What the leader has taken with it is waited for once.
+    others.told.store(8, Ordering::Relaxed);
+    for waits in [CATCH_UP_LIMIT, Duration::ZERO] {
+        let start = Instant::now();
+        computer.ask("/", &get).await.unwrap();
+        assert_eq!(start.elapsed(), waits);
+    }
 }

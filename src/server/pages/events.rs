@@ -2,22 +2,27 @@
 //! listens, and it is done once for all of them.
 
 use std::{
+    collections::VecDeque,
     sync::{
-        Arc,
+        Arc, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
 use hyper::{Response, StatusCode};
 use serde::Serialize;
 use serde_json::{Map, Value};
-use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::{
+    sync::{mpsc, watch},
+    task::AbortHandle,
+};
 
 use super::robot::Robot;
 use crate::{
     gate::State,
+    health::Health,
     server::{
         Server,
         replies::{Content, HttpReply, text},
@@ -26,6 +31,9 @@ use crate::{
 
 /// Most listeners. Each holds a connection; more pages ask for the status now and then.
 const LISTENERS: usize = 16;
+/// After this time a listener gives its place to one that has none. The kernel takes many events for a peer that never
+/// reads, so a write does not show whether a listener reads. A browser that is ended comes again.
+const TURN: Duration = Duration::from_secs(15);
 /// Pause between two looks.
 const PAUSE: Duration = Duration::from_millis(500);
 /// Shortest pause, when the gate moves.
@@ -67,7 +75,8 @@ const DISK_STEP: u64 = 100_000_000;
 #[derive(Debug)]
 pub(crate) struct Feed {
     latest: watch::Sender<Latest>,
-    places: Arc<Semaphore>,
+    /// The listeners and their beginnings, the oldest first.
+    listeners: Mutex<VecDeque<(Instant, AbortHandle)>>,
     /// Somebody looks for news.
     running: AtomicBool,
 }
@@ -76,7 +85,7 @@ impl Default for Feed {
     fn default() -> Self {
         Self {
             latest: watch::Sender::default(),
-            places: Arc::new(Semaphore::new(LISTENERS)),
+            listeners: Mutex::default(),
             running: AtomicBool::new(false),
         }
     }
@@ -85,24 +94,32 @@ impl Default for Feed {
 /// The reply to somebody who wants to listen.
 pub(super) fn listen(server: &Arc<Server>) -> HttpReply {
     let feed = &server.pages.desk.feed;
-    let Ok(place) = feed.places.clone().try_acquire_owned() else {
-        return text(
-            StatusCode::SERVICE_UNAVAILABLE,
-            format!("{LISTENERS} listen already; ask for /status.json now and then\n"),
-        );
-    };
+    let listeners = feed.listeners.lock();
+    let mut listeners = listeners.unwrap_or_else(PoisonError::into_inner);
+    listeners.retain(|(_, task)| !task.is_finished());
+    if listeners.len() >= LISTENERS {
+        let oldest = listeners.front();
+        let Some((_, task)) = oldest.filter(|(begin, _)| begin.elapsed() >= TURN) else {
+            return text(
+                StatusCode::SERVICE_UNAVAILABLE,
+                format!("{LISTENERS} listen already; ask for /status.json now and then\n"),
+            );
+        };
+        task.abort();
+        listeners.pop_front();
+    }
     let (events, body) = mpsc::channel(1);
     let mut latest = feed.latest.subscribe();
     latest.mark_changed();
     let stop = server.pages.stop.clone();
-    tokio::spawn(async move {
-        let _place = place;
+    let task = tokio::spawn(async move {
         tokio::select! {
             () = tell(latest, &events) => {}
             () = events.closed() => {}
             () = stop.cancelled() => {}
         }
     });
+    listeners.push_back((Instant::now(), task.abort_handle()));
     if !feed.running.swap(true, Ordering::AcqRel) {
         tokio::spawn(look(server.clone()));
     }
@@ -182,7 +199,7 @@ async fn look(server: Arc<Server>) {
 #[derive(Default)]
 struct Known {
     version: Option<u64>,
-    unreachable: Vec<String>,
+    health: Vec<Health>,
     removed: usize,
     registrations: u64,
 }
@@ -191,15 +208,16 @@ impl Known {
     fn look(&mut self, server: &Server, gate: State) -> Latest {
         let pages = &server.pages;
         let version = pages.ledger.version();
-        let unreachable = pages.nodes.unreachable();
+        let lives = pages.nodes.lives();
+        let health: Vec<_> = lives.values().map(|life| life.health).collect();
         let removed = pages.nodes.removed.list().len();
-        let is_same = self.version == Some(version)
-            && (&self.unreachable, self.removed) == (&unreachable, removed);
+        let is_same =
+            self.version == Some(version) && (&self.health, self.removed) == (&health, removed);
         if !is_same {
             let robot = Robot::read(&pages.ledger, &pages.nodes);
             self.registrations = robot.digest();
         }
-        (self.version, self.unreachable, self.removed) = (Some(version), unreachable, removed);
+        (self.version, self.health, self.removed) = (Some(version), health, removed);
         let mut status = serde_json::to_value(pages.status()).unwrap_or_default();
         settle(&mut status);
         let Value::Object(mut status) = status else {
@@ -219,7 +237,7 @@ impl Known {
         let now = Now {
             gate: match gate {
                 State::Open { .. } => "open",
-                State::StandingIn => "standing_in",
+                State::StandingIn | State::Late => "standing_in",
                 State::Injecting => "injecting",
                 State::Elsewhere => "elsewhere",
                 State::Unknown => "unknown",

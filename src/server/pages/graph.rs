@@ -9,7 +9,8 @@ use bytes::Bytes;
 use tokio::sync::Mutex;
 
 use self::layout::Size;
-use super::robot::{Health, Robot};
+use super::robot::Robot;
+use crate::health::Health;
 
 /// Most boxes and lines of a picture. 400 boxes with 1,600 lines take 0.03 s, and nobody can read more.
 const BOXES: usize = 400;

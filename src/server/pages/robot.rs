@@ -1,31 +1,20 @@
 //! Who is registered, as the page shows it.
 
 use std::{
-    collections::{BTreeMap, HashSet},
+    collections::BTreeMap,
     hash::{DefaultHasher, Hash, Hasher},
 };
 
 use serde::Serialize;
 
-use crate::{clock, ledger::Ledger, master::Snapshot, nodes::Nodes, replay::Token};
-
-/// What is known of a node's life. Nodes are asked after a rescue, when they do not take a notification, and
-/// with `--reap-dead-nodes`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum Health {
-    /// Nothing is known against it.
-    Alive,
-    /// It does not answer, and is not known to be dead. It stays registered.
-    Unreachable,
-    /// It was found dead and taken out, and has not come back.
-    Dead,
-}
+use crate::{clock, health::Health, ledger::Ledger, master::Snapshot, nodes::Nodes, replay::Token};
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
 pub(super) struct Node {
     pub(super) name: String,
     pub(super) health: Health,
+    /// When there was evidence of that last: seconds since 1970.
+    pub(super) checked_at: Option<u64>,
     /// Its own XML-RPC address.
     pub(super) api: String,
     /// Its process on its computer, if it has been asked.
@@ -64,7 +53,7 @@ pub(super) struct Robot {
 impl Robot {
     /// What the mirror holds now.
     pub(super) fn read(ledger: &Ledger, nodes: &Nodes) -> Self {
-        let unreachable: HashSet<String> = nodes.unreachable().into_iter().collect();
+        let lives = nodes.lives();
         let (snapshot, pids) = ledger.with_activity(|mirror, activity| {
             let pids = mirror.nodes().filter_map(|(name, api)| {
                 let (pid, _) = activity.pid_of(name, api)?;
@@ -76,8 +65,10 @@ impl Robot {
         let mut robot = Self::of(snapshot);
         for node in &mut robot.nodes {
             node.pid = pids.get(&node.name).copied();
-            if unreachable.contains(&node.name) {
-                node.health = Health::Unreachable;
+            if let Some(life) = lives.get(&node.name) {
+                node.health = life.health;
+                let at = life.checked.map(clock::wall_time_of);
+                node.checked_at = at.map(|at| at.round() as u64);
             }
         }
         for (name, at) in nodes.removed.list() {
@@ -173,7 +164,8 @@ impl Node {
         Self {
             name,
             api,
-            health: Health::Alive,
+            health: Health::Unchecked,
+            checked_at: None,
             pid: None,
             publishes: Vec::new(),
             subscribes: Vec::new(),
@@ -206,9 +198,9 @@ mod tests {
         let shown = serde_json::to_value(&robot).unwrap();
         let expected = serde_json::json!({
             "nodes": [
-                {"name": "/camera", "health": "alive", "api": api, "pid": null, "publishes": ["/image"],
+                {"name": "/camera", "health": "unchecked", "checked_at": null, "api": api, "pid": null, "publishes": ["/image"],
                  "subscribes": ["/trigger"], "serves": ["/capture"], "removed_at": null},
-                {"name": "/viewer", "health": "alive", "api": "http://robot:3/", "pid": null, "publishes": [],
+                {"name": "/viewer", "health": "unchecked", "checked_at": null, "api": "http://robot:3/", "pid": null, "publishes": [],
                  "subscribes": ["/image"], "serves": [], "removed_at": null},
             ],
             "topics": [

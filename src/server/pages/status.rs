@@ -9,6 +9,8 @@ use super::Pages;
 use crate::{
     clock,
     gate::State,
+    health::Health,
+    ledger::journal::Seen,
     master::Master,
     status::{
         Disk,
@@ -65,7 +67,7 @@ impl Pages {
         let counters = counters.map(|(name, _, value)| (name.to_owned(), value.into()));
         let gate = self.gate.state();
         let gate_since = self.gate.since().into_std();
-        let stands_in = matches!(gate, State::StandingIn | State::Injecting);
+        let stands_in = matches!(gate, State::StandingIn | State::Late | State::Injecting);
         let facts = self.board.read();
         let unprotected = self.ledger.unprotected();
         let master = self.upstream.address().to_string();
@@ -76,7 +78,14 @@ impl Pages {
             master: master.clone(),
         };
         let rescues = facts.reports.iter().filter(|report| report.is_rescue());
-        let last = facts.reports.back();
+        let last = (facts.recoveries > 0)
+            .then(|| facts.reports.back())
+            .flatten();
+        let lives = self.nodes.lives();
+        let of = |health| {
+            let names = lives.iter().filter(|(_, life)| life.health == health);
+            names.map(|(name, _)| name.clone()).collect::<Vec<_>>()
+        };
         Status {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -88,6 +97,9 @@ impl Pages {
             condition: condition(&situation, &facts),
             master,
             master_pid: last.map(|report| report.master_pid),
+            master_speaks: last.map(|report| report.master_speaks.clone()),
+            bypassing: facts.bypassing.clone(),
+            master_is_open: facts.master_is_open,
             open: gate.is_open(),
             ready: facts.answers(gate),
             elsewhere: gate == State::Elsewhere,
@@ -95,13 +107,20 @@ impl Pages {
             pending_writes: self.ledger.pending(),
             crash_loop: facts.crash_loop.is_some(),
             deaths: facts.deaths,
+            worker_restarts: facts.earlier.worker_restarts,
             checkpoint: self.checkpoint.clone(),
             unprotected,
             journal: self.journal(&facts.disk),
             guarded: facts.guarded.is_guarded(),
             guarded_by: facts.guarded.to_string(),
             state: self.ledger.with_mirror(Master::counts),
-            unreachable: self.nodes.unreachable(),
+            unreachable: of(Health::Unreachable),
+            dead_nodes: of(Health::Dead),
+            unchecked_nodes: of(Health::Unchecked),
+            alive_nodes: lives
+                .values()
+                .filter(|life| life.health == Health::Alive)
+                .count(),
             recoveries: facts.recoveries,
             last_recovery: last.cloned(),
             rescues: facts.rescues,
@@ -115,10 +134,13 @@ impl Pages {
     }
 
     fn journal(&self, disk: &Disk) -> Journal {
-        let sizes = self
-            .ledger
-            .with_store(|store, _| (store.seq(), store.journal_bytes(), store.snapshot_bytes()));
-        let (seq, bytes, snapshot_bytes) = sizes.unwrap_or_default();
+        let seen = self.ledger.seen_store().unwrap_or_default();
+        let Seen {
+            seq,
+            journal_bytes: bytes,
+            snapshot_bytes,
+            ..
+        } = seen;
         let (at, from) = disk.compacted.unzip();
         Journal {
             records: seq.saturating_sub(from.unwrap_or(seq)),

@@ -1,15 +1,11 @@
 use super::*;
-use crate::xmlrpc::Struct;
+use crate::{
+    checkpoint::format::Session, cli::SyncPolicy, ledger::Ledger, master::Master, xmlrpc::Struct,
+};
 
 fn item(call: Request) -> Item {
     let body = Bytes::from(xmlrpc::encode_call(&call.clone().into()));
-    Item {
-        raw: Some((Head::default(), body)),
-        call: Some(Arc::new(call)),
-        answer: oneshot::channel().0,
-        condition: None,
-        way_made: false,
-    }
+    Item::new(Some((Head::default(), body)), Some(Arc::new(call))).0
 }
 
 #[test]
@@ -42,10 +38,98 @@ fn set(key: &str, value: impl Into<Value>) -> Request {
 fn packed(calls: Vec<Request>) -> Vec<usize> {
     let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
     let mut sizes = Vec::new();
+    let ledger = ledger();
     while !queue.is_empty() {
-        sizes.push(pack(&mut queue).len());
+        let batch = next(&ledger, &mut queue);
+        sizes.push(batch.items.len());
     }
     sizes
+}
+
+fn ledger() -> Arc<Ledger> {
+    let (session, sync) = (Session::default(), SyncPolicy::Interval);
+    let stats = Box::leak(Box::default());
+    let ledger = Ledger::new(Master::default(), session, Vec::new(), None, sync, stats);
+    Arc::new(ledger)
+}
+
+fn next(ledger: &Arc<Ledger>, queue: &mut VecDeque<Item>) -> Batch {
+    let delivery = |number| Delivery::new(ledger, number);
+    ledger.with_order(|order, _| pack(queue, order, Instant::now(), delivery))
+}
+
+fn publish(node: &str, topic: &str) -> Request {
+    let params = [node, topic, "std_msgs/String", &format!("http://{node}:1/")];
+    Request::new(Method::RegisterPublisher, params)
+}
+
+fn subscribe(node: &str, topic: &str) -> Request {
+    let params = [node, topic, "*", &format!("http://{node}:1/")];
+    Request::new(Method::RegisterSubscriber, params)
+}
+
+/// The callers and methods of a batch.
+fn described(batch: &Batch) -> Vec<String> {
+    batch.items.iter().map(Item::describe).collect()
+}
+
+#[test]
+fn a_publisher_waits_for_the_answers_to_subscribers_and_nothing_else_does() {
+    let ledger = ledger();
+    let calls = [
+        subscribe("/a", "/t"),
+        publish("/b", "/t"),
+        subscribe("/c", "/t"),
+        publish("/d", "/u"),
+    ];
+    let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
+    let first = next(&ledger, &mut queue);
+    // Who comes later about the same topic waits behind the publisher.
+    let both = ["registerSubscriber of /a", "registerPublisher of /d"];
+    assert_eq!(described(&first), both);
+    assert!(next(&ledger, &mut queue).items.is_empty());
+    let mut changed = ledger.order_changed();
+    assert!(!changed.has_changed().unwrap());
+    drop(first);
+    assert!(changed.has_changed().unwrap());
+    changed.mark_unchanged();
+    let second = next(&ledger, &mut queue);
+    let both = ["registerPublisher of /b", "registerSubscriber of /c"];
+    assert_eq!(described(&second), both);
+}
+
+#[test]
+fn an_answer_that_its_client_does_not_read_holds_nobody_up_for_long() {
+    let ledger = ledger();
+    let mut queue = VecDeque::from([item(subscribe("/a", "/t")), item(publish("/b", "/t"))]);
+    let first = next(&ledger, &mut queue);
+    first.items[0].delivery.as_ref().unwrap().ready();
+    let waits = next(&ledger, &mut queue);
+    assert!(waits.items.is_empty());
+    let until = waits.until.unwrap();
+    let later = ledger.with_order(|order, _| {
+        let delivery = |number| Delivery::new(&ledger, number);
+        pack(&mut queue, order, until, delivery)
+    });
+    assert_eq!(described(&later), ["registerPublisher of /b"]);
+}
+
+#[test]
+fn calls_of_our_own_and_those_that_cannot_be_read_overtake_nothing() {
+    let ledger = ledger();
+    let unreadable = || Item::new(Some((Head::default(), Bytes::new())), None).0;
+    let own = || Item::new(None, Some(Arc::new(set("/x", 1)))).0;
+    for last in [own, unreadable] {
+        let calls = [subscribe("/a", "/t"), publish("/b", "/t")];
+        let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
+        queue.extend([last(), item(set("/y", 1))]);
+        let first = next(&ledger, &mut queue);
+        assert_eq!(first.items.len(), 1);
+        assert!(next(&ledger, &mut queue).items.is_empty());
+        drop(first);
+        let second = next(&ledger, &mut queue);
+        assert_eq!(described(&second)[0], "registerPublisher of /b");
+    }
 }
 
 #[test]

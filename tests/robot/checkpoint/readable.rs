@@ -31,8 +31,7 @@ fn pyyaml_reads_what_the_master_holds() {
     let master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
     let client = rescue.client();
-    // By default the paper's place and name.
-    let checkpoint = scratch.log_dir().join("latest-chkpt.yaml");
+    let checkpoint = rescue.checkpoint();
     let bare = master.client();
     client.set_param("/kinds", kinds());
     assert_eq!(compared(&checkpoint, &bare.uri()), "same");

@@ -3,7 +3,9 @@
 use std::fs::{self, File};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 
-use crate::support::{Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, request};
+use crate::support::{
+    Mode, Robot, Rosmaster, Scratch, Setup, behind, eventually, in_both_modes, request,
+};
 
 /// Standard error is a file, as it may be a socket of journald: it is known by device and inode.
 #[test]
@@ -65,6 +67,47 @@ fn what_comes_by_the_hundred_is_logged_ten_times() {
         .filter(|line| line.contains("refused a request"))
         .count();
     assert_eq!(said, 10, "{log:?}");
+}
+
+in_both_modes!(after_many_deaths_the_last_lines_say_that_the_master_is_back);
+
+fn after_many_deaths_the_last_lines_say_that_the_master_is_back(mode: Mode) {
+    let mut robot = Robot::start(mode);
+    // A core pauses for 10 s after each further one.
+    let deaths = if mode == Mode::Core { 12 } else { 15 };
+    for _ in 0..deaths {
+        robot.crash_master();
+    }
+    eventually("the crash loop is over", || {
+        let log = robot.rescue.stderr();
+        log.iter()
+            .any(|line| line.contains("the crash loop is over"))
+    });
+    let log = robot.rescue.stderr();
+    let is_waiting = [
+        "the master is away",
+        "waiting for the master",
+        "could not be read or restored",
+    ];
+    for (all_clear, alarms) in [
+        ("calls pass to the master", &is_waiting[..]),
+        ("started rosmaster", &["rosmaster has ended"]),
+        ("the crash loop is over", &["crash loop: the master"]),
+    ] {
+        let lines = log.iter().filter_map(|line| {
+            let is_alarm = alarms.iter().any(|alarm| line.contains(alarm));
+            (is_alarm || line.contains(all_clear)).then_some(is_alarm)
+        });
+        let lines: Vec<_> = lines.collect();
+        if lines.is_empty() && mode == Mode::Proxy {
+            continue;
+        }
+        assert_eq!(lines.last(), Some(&false), "{all_clear}: {lines:?}");
+        let unasked = lines.windows(2).any(|pair| pair == [false, false]);
+        assert!(!unasked, "an all-clear without an alarm: {lines:?}");
+        let told = log.iter().filter(|line| line.contains(alarms[0])).count();
+        assert!(told < deaths, "limited: {told}");
+    }
 }
 
 #[test]

@@ -184,6 +184,19 @@ fn an_address_that_cannot_be_served_is_named() {
     }
 }
 
+/// The sockets of a rosrescue that was killed are closed a moment after its end.
+#[test]
+fn a_port_that_becomes_free_soon_is_waited_for() {
+    let scratch = Scratch::new();
+    let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
+    let taken = TcpListener::bind(("0.0.0.0", setup.port)).unwrap();
+    let mut rescue = setup.spawn();
+    // It ends at once otherwise.
+    holds(Duration::from_millis(300), || rescue.exited().is_none());
+    drop(taken);
+    rescue.wait_serving();
+}
+
 #[test]
 fn a_master_that_is_none_or_rosrescue_itself_is_refused() {
     let scratch = Scratch::new();

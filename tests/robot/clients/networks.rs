@@ -119,6 +119,8 @@ fn nodes_that_were_refused_go_on_when_they_are_let_in() {
     let mut rescue = core("192.0.2.0/24");
     let nodes = [Library::Rospy, Library::Roscpp].map(|library| {
         let mut command = library.command(&scratch, port, "talker");
+        // A namesake would be shut down.
+        command.arg(format!("__name:={library:?}"));
         command.env("ROS_MASTER_URI", Client::at(&net.near(), port).uri());
         command.env("ROS_IP", net.far(2));
         Process::start(format!("{library:?}"), &mut net.inside(&command))

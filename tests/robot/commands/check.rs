@@ -5,7 +5,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::support::{Process, Rosmaster, Scratch, Setup, behind, free_port};
+use crate::support::{Library, Mode, Process, Robot, Rosmaster, Scratch, Setup, behind, free_port};
 
 /// A check of port `port` in an environment that is in order.
 fn check(scratch: &Scratch, port: u16) -> Command {
@@ -127,8 +127,7 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
         .iter()
         .map(|one| one["subject"].clone())
         .collect();
-    // The checkpoint is that of the running one.
-    assert_eq!(problems, ["checkpoint", "master"]);
+    assert_eq!(problems, ["master"]);
 }
 
 #[test]
@@ -141,6 +140,46 @@ fn a_node_at_a_host_without_an_address_is_found() {
     rescue.client().ok("registerSubscriber", register);
     let found = Found::by(&mut check(&scratch, rescue.port()));
     found.assert_problem("nodes", "/lost registered at nobody.invalid");
+}
+
+#[test]
+fn a_launch_file_that_names_another_master_is_found() {
+    let scratch = Scratch::new();
+    let launch = scratch.path("packages").join("arm.launch");
+    fs::create_dir_all(launch.parent().unwrap()).unwrap();
+    let port = free_port();
+    let env = |uri: &str| format!("<env name=\"ROS_MASTER_URI\" value=\"{uri}\"/>\n");
+    // The first one is another way to write the robot's own.
+    let own = env(&format!("http://localhost:{port}/"));
+    let text = format!(
+        "<launch>\n{own}{}</launch>\n",
+        env("http://192.0.2.1:11311")
+    );
+    fs::write(&launch, text).unwrap();
+    let packages = launch.parent().unwrap();
+    let found = Found::by(check(&scratch, port).env("ROS_PACKAGE_PATH", packages));
+    found.assert_no_problem();
+    let said = found.said("launch files");
+    let line = "arm.launch:3 sets ROS_MASTER_URI to http://192.0.2.1:11311";
+    assert!(said.ends_with(line) && said.lines().count() == 1, "{said}");
+}
+
+#[test]
+fn a_node_of_another_master_is_found() {
+    let robot = Robot::start(Mode::Core);
+    let node = robot.node(Library::Rospy, "listener", &[]);
+    let stray = format!("(process {}, port ", node.pid());
+    let found = Found::by(&mut check(&robot.scratch, free_port()));
+    let said = found.said("ROS_MASTER_URI");
+    assert!(said.contains(&stray), "{said}");
+    // At its own master it is at home, however that is written.
+    let mut own = check(&robot.scratch, robot.port());
+    own.env(
+        "ROS_MASTER_URI",
+        format!("http://localhost:{}/", robot.port()),
+    );
+    let said = Found::by(&mut own).said("ROS_MASTER_URI");
+    assert!(!said.contains(&stray), "{said}");
 }
 
 #[test]

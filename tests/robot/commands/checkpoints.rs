@@ -134,6 +134,7 @@ fn file(at: &Path) -> [usize; 3] {
             ..Snapshot::default()
         },
         pending: Vec::new(),
+        displaced: Vec::new(),
     };
     let encoded = format::encode_checkpoint(&checkpoint, 1).unwrap();
     let mut bytes = encoded.bytes;
@@ -244,4 +245,19 @@ fn no_name_commands_the_terminal() {
     });
     let text = Tool::rosrescue(&robot.scratch, robot.port(), &["inspect"]).ended(0);
     assert!(text.contains("31m") && !text.contains('\u{9b}'));
+    // In JSON the name stays what it is.
+    let api = "http://127.0.0.1:9/";
+    let call = params!["/node\u{9b}\u{202e}", "/topic", "std_msgs/String", api];
+    robot.client().ok("registerPublisher", call);
+    let name = "/node\\u009b\\u202e";
+    for command in [
+        &["inspect", "--json"][..],
+        &["top", "--count", "1", "--json"],
+    ] {
+        let json = Tool::rosrescue(&robot.scratch, robot.port(), command).ended(0);
+        assert!(
+            json.contains(name) && !json.contains(['\u{9b}', '\u{202e}']),
+            "{json}"
+        );
+    }
 }

@@ -1,5 +1,6 @@
 //! `rosrescue drill` on real robots.
 
+use std::fs;
 use std::process::Command;
 
 use rustix::process::Signal;
@@ -7,7 +8,7 @@ use serde_json::Value;
 
 use crate::support::{
     FakeNode, LIBRARIES, Library, Mode, Netns, Node, Process, Robot, Scratch, Setup, alive,
-    eventually, find_program, free_port, ros_command,
+    eventually, eventually_some, find_program, free_port, ros_command,
 };
 
 /// A drill at `port`.
@@ -104,8 +105,15 @@ fn a_master_is_killed_and_nobody_notices() {
         assert!(topic["messages"].as_u64().unwrap() > 100, "{found:#}");
     }
     assert_eq!(found["nodes"], 4, "the talkers, the log and rosout");
-    // It has left nothing behind.
+    // It has left nothing behind, not even in the state that the rescue keeps for `restore`.
     robot.await_state(&before, "after the drill");
+    let mut kept = robot.rescue.checkpoint().to_owned().into_os_string();
+    kept.push(".rescue-1");
+    let kept = eventually_some("the rescue is kept", || fs::read_to_string(&kept).ok());
+    assert!(
+        kept.contains("wheels") && !kept.contains("rosrescue_drill_"),
+        "{kept}"
+    );
     drop((nodes, log));
 }
 
@@ -292,7 +300,7 @@ fn a_person_is_asked() {
             r#"tail -n +1 -f "$1" | script --quiet --return --command "$0" /dev/null"#,
         ]);
         let typed = robot.scratch.path(format!("typed-{answer}"));
-        std::fs::write(&typed, format!("{answer}\n")).unwrap();
+        fs::write(&typed, format!("{answer}\n")).unwrap();
         Process::start("a drill on a terminal", command.arg(line).arg(typed))
     };
     let mut no = ask("n");

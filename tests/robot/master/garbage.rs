@@ -41,6 +41,9 @@ impl Garbled {
         });
         let rescue = Setup::proxy(&scratch, fake.port())
             .args(["--hold", "2", "--probe-interval", "100", "--reads", reads])
+            // On a busy computer a probe may take long. It must not shut the gate: what the mirror would
+            // answer then, this master could never be given.
+            .args(["--probe-timeout", "30000"])
             .start();
         Self {
             rescue,

@@ -1,7 +1,9 @@
 //! Values that a master takes and that spoil its answers, or that XML changes on their way: rosrescue
 //! serves such a master, and knows what else it holds.
 
-use crate::support::{FakeNode, Rosmaster, Scratch, Setup, eventually, params, tree};
+use crate::support::{
+    FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, http_request, params, tree,
+};
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 /// CPython writes a carriage return as it is, and whoever reads that as XML gets a line feed.
@@ -129,6 +131,37 @@ fn parameters_that_cannot_be_read_back_are_kept_as_they_are_known() {
     rescue.wait_line("what was left out", |line| {
         line.contains("the parameter `/ns/huge`")
     });
+}
+
+/// rosmaster takes them, rosrescue cannot decode them, and no client can read them.
+#[test]
+fn what_nobody_can_read_is_deleted_without_a_divergence() {
+    let robot = Robot::start(Mode::Proxy);
+    let (client, bare) = (robot.client(), robot.bare());
+    let nil = "<array><data><value><nil/></value></data></array>";
+    let numbered = "<struct><member><value><int>1</int></value><value>x</value></member></struct>";
+    for (prolog, value) in [
+        ("", "<bigdecimal>1.5</bigdecimal>"),
+        ("<!DOCTYPE methodCall>", nil),
+        ("<!DOCTYPE methodCall>", "<i8>99999999999</i8>"),
+        // A dictionary with a number for a key.
+        ("", numbered),
+    ] {
+        let document = format!(
+            "{prolog}<methodCall><methodName>setParam</methodName><params><param><value>/n</value></param>\
+             <param><value>/v</value></param><param><value>{value}</value></param></params></methodCall>"
+        );
+        client.exchange(&http_request(document.as_bytes())).unwrap();
+        let reply = bare.call("getParam", params!["/n", "/v"]).unwrap();
+        assert!(matches!(reply, Reply::Fault { .. }), "{value}: {reply:?}");
+        client.set_param("/known", 1);
+        client.ok("deleteParam", params!["/n", "/v"]);
+        assert_eq!(robot.counter("divergences"), 0, "{value}");
+        eventually("the parameters can be read again", || {
+            client.param("/") == bare.param("/") && client.param("/known") == Some(1.into())
+        });
+        client.ok("deleteParam", params!["/n", "/known"]);
+    }
 }
 
 /// rosmaster takes a date for a type if it reads `*`, and gives it back as a date.

@@ -191,6 +191,8 @@ fn a_realistic_robot_notices_nothing() {
     let robot = Example::start();
     let (mut before, processes) = (robot.state(), robot.processes());
     assert!(processes.len() >= 28, "{processes:?}");
+    // A link that is made while the robot starts may be made twice, by two notifications in a row.
+    let at_the_start = robot.witness.said("gap");
     let (first_death, start) = (wall(), Instant::now());
     for (round, deaths) in DEATHS.into_iter().enumerate() {
         for death in 0..deaths {
@@ -228,7 +230,7 @@ fn a_realistic_robot_notices_nothing() {
     robot.at_work();
 
     assert_eq!(robot.processes(), processes);
-    assert_eq!(robot.witness.said("gap"), Vec::<String>::new());
+    assert_eq!(robot.witness.said("gap"), at_the_start);
     let lost = |drive: &String| !drive.starts_with("driving to ") && !drive.starts_with("at ");
     assert!(!robot.drives().iter().any(lost), "{:?}", robot.drives());
     // What was set during outages is kept, and nothing else has changed.

@@ -5,10 +5,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::support::{
-    FakeNode, Mode, Robot, State, encode_call, eventually, holds, http_request, in_both_modes,
-    kinds, params, tree, unreadable,
+    FakeNode, Mode, Robot, Rosmaster, State, encode_call, eventually, holds, http_request,
+    in_both_modes, kinds, params, tree, unreadable,
 };
-use rosrescue::xmlrpc::Value;
+use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
 fn calls_in_the_gap_get_what_their_senders_need() {
@@ -83,28 +83,23 @@ fn told(node: &FakeNode, key: &str) -> Vec<i32> {
     of_key.map(|update| update[2].as_int().unwrap()).collect()
 }
 
-/// Only a master knows what it would answer.
+/// A request in UTF-16: only a master knows what it would answer.
 #[test]
-fn a_call_outside_the_master_api_is_not_held_for_ever_and_never_answered_falsely() {
+fn a_call_that_cannot_be_decoded_is_not_held_for_ever_and_never_answered_falsely() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);
     robot.kill_master();
-    for request in [
-        http_request(&encode_call("setLocation", params!["/test", "here"])),
-        unreadable("/late", 1),
-    ] {
-        let start = Instant::now();
-        let error = robot
-            .client()
-            .exchange(&request)
-            .expect_err("no answer is right here");
-        let waited = start.elapsed();
-        // Closed without a byte: that is what nodes take for a lost connection and try again.
-        assert!(error.to_string().contains("closed after []"), "{error}");
-        assert!(
-            waited >= Duration::from_millis(1400),
-            "it was held only {waited:?}"
-        );
-    }
+    let start = Instant::now();
+    let error = robot
+        .client()
+        .exchange(&unreadable("/late", 1))
+        .expect_err("no answer is right here");
+    let waited = start.elapsed();
+    // Closed without a byte: that is what nodes take for a lost connection and try again.
+    assert!(error.to_string().contains("closed after []"), "{error}");
+    assert!(
+        waited >= Duration::from_millis(1400),
+        "it was held only {waited:?}"
+    );
     robot.revive_master();
     robot.await_gate();
     assert_eq!(robot.bare().param("/late"), None);
@@ -113,31 +108,122 @@ fn a_call_outside_the_master_api_is_not_held_for_ever_and_never_answered_falsely
 }
 
 #[test]
-fn a_call_outside_the_master_api_waits_for_the_next_master_and_gets_its_answer() {
+fn a_call_that_cannot_be_decoded_waits_for_the_next_master_and_gets_its_answer() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "60"]);
     let client = robot.client();
     robot.kill_master();
-    let requests = [
-        http_request(&encode_call("setLocation", params!["/test", "here"])),
-        unreadable("/waited", 1),
-    ];
-    let waiting: Vec<_> = requests
-        .clone()
-        .into_iter()
-        .map(|request| {
-            let client = client.clone();
-            thread::spawn(move || client.exchange(&request).expect("an answer").reply())
-        })
-        .collect();
-    assert!(holds(Duration::from_secs(1), || {
-        waiting.iter().all(|call| !call.is_finished())
-    }));
+    let request = unreadable("/waited", 1);
+    let waiting = {
+        let request = request.clone();
+        thread::spawn(move || client.exchange(&request).expect("an answer").reply())
+    };
+    assert!(holds(Duration::from_secs(1), || !waiting.is_finished()));
     robot.revive_master();
-    for (waiting, request) in waiting.into_iter().zip(requests) {
-        let of_a_master = robot.bare().exchange(&request).unwrap().reply();
-        assert_eq!(waiting.join().unwrap(), of_a_master);
-    }
+    let answer = waiting.join().unwrap();
     assert_eq!(robot.bare().param("/waited"), Some(Value::Int(1)));
+    let of_a_master = robot.bare().exchange(&request).unwrap().reply();
+    assert_eq!(answer, of_a_master);
+}
+
+/// Calls that no ROS node sends: tools, scanners, other libraries of XML-RPC. Each is answered at once, with the bytes
+/// of a rosmaster that nobody killed.
+#[test]
+fn foreign_calls_in_the_gap_get_the_bytes_of_a_rosmaster() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1"]);
+    let bare = Rosmaster::start(&robot.scratch);
+    robot.take_master_away();
+    let client = robot.client();
+    let mut requests = Vec::new();
+    for method in [
+        "system.listMethods",
+        "getMasterUri",
+        "_shutdown",
+        "",
+        "uri",
+        "services",
+    ] {
+        requests.push(encode_call(method, params!["/n"]));
+    }
+    for params in [
+        params![],
+        params!["/n"],
+        params!["/n", "reason", "more"],
+        params![1, "reason"],
+    ] {
+        requests.push(encode_call("shutdown", params));
+    }
+    let entry = |method: &str| Call::new(method, params!["/n"]).into_entry();
+    let set = Call::new("setParam", params!["/n", "/first", 1]).into_entry();
+    for list in [
+        Value::Int(1),
+        Value::Array(vec![Value::Int(1)]),
+        Value::Array(vec![Value::Array(vec![])]),
+        Value::Array(vec![tree! {}]),
+        Value::Array(vec![tree! { "methodName" => "getPid" }]),
+        Value::Array(vec![entry("noSuchMethod"), entry("getParamNames")]),
+        Value::Array(vec![entry("shutdown")]),
+        Value::Array(vec![set, tree! {}]),
+    ] {
+        requests.push(encode_call("system.multicall", vec![list]));
+    }
+    requests.push(encode_call("hasParam", params!["/n", "/first"]));
+    let document = |value: &str| {
+        format!(
+            "<methodCall><methodName>setParam</methodName><params><param><value>/n</value></param>\
+             <param><value>/v</value></param><param><value>{value}</value></param></params></methodCall>"
+        )
+    };
+    for value in [
+        "<nil/>",
+        "<array><data><value><nil/></value></data></array>",
+        "<i8>99999999999</i8>",
+        "<int>-2147483649</int>",
+        "<int>five</int>",
+        "<int></int>",
+        "<double>1,5</double>",
+        "<boolean>true</boolean>",
+        "<unknown>1</unknown>",
+        "<struct><member><name>a</name></member></struct>",
+        "&nbsp;",
+        "&#0;",
+        "<string>1</int>",
+    ] {
+        requests.push(document(value).into_bytes());
+        requests.push(encode_call("getParam", params!["/n", "/v"]));
+    }
+    let whole = document("1");
+    for text in [
+        format!("<!DOCTYPE methodCall>{whole}"),
+        format!("<?xml version='1.0'?>\n<!DOCTYPE methodCall >\n{whole}"),
+        String::new(),
+        "\n ".to_owned(),
+        "garbage".to_owned(),
+        "<".to_owned(),
+        "<methodCall>".to_owned(),
+        "<methodCall/>".to_owned(),
+        format!("{whole}<more/>"),
+        format!("{whole}more"),
+        format!(" <?xml version='1.0'?>{whole}"),
+        "<methodResponse><params/></methodResponse>".to_owned(),
+    ] {
+        requests.push(text.into_bytes());
+    }
+    for key in [Value::Nil, 0.into(), 1.into(), Value::Array(vec![])] {
+        requests.push(encode_call("getParam", params!["/n", key]));
+    }
+    requests.push(encode_call("deleteParam", params!["/n", "/v"]));
+    let mut differences = Vec::new();
+    for body in requests {
+        let request = http_request(&body);
+        let theirs = bare.client().exchange(&request).unwrap().text();
+        let ours = client.exchange(&request);
+        let ours = ours.map_or_else(|error| error.to_string(), |answer| answer.text());
+        if ours != theirs {
+            let body = String::from_utf8_lossy(&body).into_owned();
+            differences.push(format!("{body}\n{theirs}\n{ours}"));
+        }
+    }
+    assert!(differences.is_empty(), "{}", differences.join("\n\n"));
 }
 
 in_both_modes!(parameters_of_every_kind_come_back);

@@ -1,6 +1,7 @@
-//! The whole life of rospy and roscpp nodes while there is no master.
+//! The whole life of rospy and roscpp nodes while there is no master, which stays away for
+//! `ROSRESCUE_AWAY_SECONDS` at least.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 
@@ -34,6 +35,7 @@ fn nodes_live_without_a_master(mode: Mode) {
     let dead = robot.master_pid();
     robot.settled_state();
     robot.take_master_away();
+    let away = Instant::now();
 
     // They start, find each other and exchange messages.
     let during = Streams::start(&robot, "during", HZ, EVERY);
@@ -77,6 +79,9 @@ fn nodes_live_without_a_master(mode: Mode) {
     displace(&robot);
     // Others end by themselves, and take their registrations with them.
     end(&robot);
+    let seconds = std::env::var("ROSRESCUE_AWAY_SECONDS").map_or(0, |text| text.parse().unwrap());
+    let rest = Duration::from_secs(seconds).saturating_sub(away.elapsed());
+    assert!(holds(rest, || !robot.is_open()));
 
     assert_no_failure(&servers);
     assert_no_failure(&clients);

@@ -130,6 +130,69 @@ fn assert_unharmed(other: &FakeNode) {
     );
 }
 
+in_both_modes!(
+    a_displaced_node_is_told_by_the_next_worker_if_master_and_worker_died,
+    a_displaced_node_is_told_by_the_next_worker_if_the_master_lives,
+);
+
+/// The master had told no node, and the worker died with it.
+fn a_displaced_node_is_told_by_the_next_worker_if_master_and_worker_died(mode: Mode) {
+    displaced_before_the_worker_dies(mode, true);
+}
+
+/// The master that goes on is not the one that owed it, perhaps.
+fn a_displaced_node_is_told_by_the_next_worker_if_the_master_lives(mode: Mode) {
+    displaced_before_the_worker_dies(mode, false);
+}
+
+fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
+    let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
+    let client = robot.client();
+    // The name of the last two is its first holder's again.
+    let nodes = ["/twin", "/twin", "/back", "/back"].map(FakeNode::start);
+    let [first, second, owner, taker] = &nodes;
+    for node in [owner, taker, owner, first, second] {
+        node.publish(
+            &client,
+            &format!("{}/chatter", node.name),
+            "std_msgs/String",
+        );
+    }
+    let master = robot.master_pid();
+    robot.rescue.kill();
+    if master_dies {
+        robot.kill_master_at_once(master);
+    }
+    robot.rescue.start_again();
+    if master_dies {
+        robot.revive_proxied_master();
+        robot.await_recovery(master);
+    } else {
+        robot.rescue.wait_serving();
+        assert_eq!(robot.master_pid(), master);
+    }
+    let heard = || nodes.each_ref().map(|node| node.heard("shutdown"));
+    let none = Vec::<Vec<Value>>::new;
+    let wanted = [
+        vec![goodbye("/twin")],
+        none(),
+        none(),
+        vec![goodbye("/back")],
+    ];
+    eventually("the displaced ones are told", || heard() == wanted);
+    assert!(
+        holds(Duration::from_secs(1), || heard() == wanted),
+        "{:?}",
+        heard()
+    );
+    for node in [second, owner] {
+        let api = robot
+            .bare()
+            .ok("lookupNode", params!["/test", node.name.as_str()]);
+        assert_eq!(api, Value::from(node.api.as_str()));
+    }
+}
+
 /// Exactly once, and in a master's words.
 #[test]
 fn a_node_that_is_displaced_without_a_master_is_told_once() {

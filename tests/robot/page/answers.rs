@@ -184,6 +184,16 @@ fn a_few_may_listen_and_hear_of_every_change() {
     assert!(robot.rescue.terminate().success(), "nobody is waited for");
 }
 
+/// What is sent lies in the buffers of the kernel, which take hours of it.
+#[test]
+fn listeners_that_never_read_do_not_keep_others_out() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    let _listeners: Vec<_> = (0..16).map(|_| listen(robot.port())).collect();
+    eventually("there is room for another one", || {
+        listen(robot.port()).1.code == 200
+    });
+}
+
 /// A dashboard with a metric that is not there shows nothing, and an alert never comes.
 #[test]
 fn every_metric_of_the_examples_exists() {

@@ -297,6 +297,15 @@ fn sick_nodes_are_shown_as_such() {
         browser.shows(&format!("{name} is {health}"), &row);
     }
     browser.shows(
+        "problems come first",
+        "[...document.querySelectorAll('#list tbody .health')].map((of) => of.dataset.is).join() \
+         === 'dead,unreachable,alive'",
+    );
+    browser.shows(
+        "and are counted",
+        "document.querySelector('#sick').innerText === '1 dead, 1 unreachable'",
+    );
+    browser.shows(
         "it is drawn, too",
         "document.querySelector('#picture .unreachable[data-node=\"/silent\"]')",
     );

@@ -1,5 +1,5 @@
 //! The paper's case 2 at every point: the master dies after it has changed its state, before or while it
-//! tells the subscribers. All of them get to know the full list, once, from rosrescue.
+//! tells the subscribers. All of them get to know the full list from rosrescue, once or once more.
 
 use std::ops::RangeInclusive;
 use std::thread;
@@ -129,7 +129,12 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
         // Everything that was sent to a fake because of this change.
         for (fake, heard) in audience.fakes.iter().zip(heard) {
             let calls = &fake.calls()[heard..];
-            let lists = lists(calls);
+            let mut lists = lists(calls);
+            // The list before the change, told once more before it.
+            let again = lists
+                .iter()
+                .take_while(|(list, ours)| *ours && *list == before);
+            lists.drain(..again.count());
             let full = |(list, _): &&(Vec<&str>, bool)| *list == now;
             // Never a part of the list, and never an old one again.
             assert!(
@@ -142,8 +147,9 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
             assert!(lists.len() - ours <= 2, "{lists:?}");
             assert!(ours >= 1, "{lists:?}");
             // Who has not answered 300 ms after the change may hold up the master: then we tell it again.
+            // What the dead master may have told at the same time is told once more, too.
             if check_ms.is_some_and(|ms| ms < 250.0) {
-                assert_eq!(ours, 1, "point {point}: {lists:?}");
+                assert!(ours <= 2, "point {point}: {lists:?}");
                 once += 1;
             }
         }

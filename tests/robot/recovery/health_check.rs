@@ -74,7 +74,8 @@ fn another_process_at_the_port_is_another_node() {
     let [old, same] = [("/old", 4001), ("/same", 4002)].map(|(name, pid)| {
         let node = FakeNode::start(name);
         node.claim_pid(pid);
-        node.publish(&client, "/topic", "std_msgs/String");
+        // Topics that all nodes have tell nothing.
+        node.publish(&client, "/rosout", "rosgraph_msgs/Log");
         node.offer(&client, &format!("{name}/service"));
         node
     });
@@ -84,10 +85,9 @@ fn another_process_at_the_port_is_another_node() {
         });
     }
     let after = robot.settled_state().without_node("/old");
-    // What it says of its topics would fit.
     let taker = take_port(old, "/taker");
     taker.claim_pid(4003);
-    taker.claim_publication("/topic", Some("std_msgs/String"));
+    taker.claim_publication("/rosout", Some("rosgraph_msgs/Log"));
     robot.crash_master();
     robot.await_state(&after, "when the old node has been taken out");
     report(&robot, "who was removed", |report| {
@@ -95,6 +95,49 @@ fn another_process_at_the_port_is_another_node() {
     });
     assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
     assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
+}
+
+/// Such as that of a node library that makes it up.
+#[test]
+fn topics_that_match_outweigh_a_process_id_that_changes() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let node = FakeNode::start("/restless");
+    node.claim_restless_pid();
+    node.publish(&client, "/topic", "std_msgs/String");
+    node.offer(&client, "/service");
+    eventually("it is asked for its process id", || {
+        !node.heard("getPid").is_empty()
+    });
+    let before = robot.settled_state();
+    for _ in 0..2 {
+        assert_kept(&mut robot, &before);
+    }
+}
+
+/// Crashes the master: its state is `before` again, also after the health check.
+#[track_caller]
+fn assert_kept(robot: &mut Robot, before: &State) {
+    let dead = robot.master_pid();
+    robot.crash_master();
+    report(robot, "that the health check is over", |report| {
+        report["master_pid"] != dead && report["health_check_ms"].is_number()
+    });
+    before.assert_same(&robot.state(), "after the health check");
+}
+
+/// Its answers to `getPublications` and `getSubscriptions` are empty lists.
+#[test]
+fn a_node_that_cannot_list_its_topics_keeps_them() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let client = robot.client();
+    let stub = FakeNode::start("/stub");
+    stub.publish(&client, "/published", "std_msgs/String");
+    stub.subscribe(&client, "/subscribed", "std_msgs/String");
+    stub.claim_publication("/published", None);
+    stub.claim_subscription("/subscribed", None);
+    let before = robot.settled_state();
+    assert_kept(&mut robot, &before);
 }
 
 /// Nobody has asked the old one for its process id.

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use crate::support::{
-    FakeNode, Library, Netns, Node, Scratch, Setup, eventually, free_port, holds, names, status,
+    FakeNode, Library, Mode, Netns, Node, Robot, Scratch, Setup, eventually, free_port, holds,
+    names, status,
 };
 
 /// Real nodes behind a cable that is cut during an outage, and mended later.
@@ -48,4 +49,36 @@ fn a_node_that_can_be_reached_again_is_whole() {
     eventually("nobody is unreachable any more", || {
         unreachable().is_empty()
     });
+}
+
+/// As a node of rosnodejs, which answers everything else.
+#[test]
+fn a_node_that_never_answers_a_parameter_update_hears_of_publishers() {
+    let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
+    let client = robot.client();
+    client.set_param("/gain", 0);
+    let node = FakeNode::start("/node");
+    node.ignore("paramUpdate");
+    node.subscribe(&client, "/topic", "std_msgs/String");
+    node.watch_param(&client, "/gain");
+    robot.take_master_away();
+    let mut publishers = Vec::new();
+    for value in 1..=3 {
+        client.set_param("/gain", value);
+        eventually("it is told of the parameter", || {
+            let told = node.heard("paramUpdate");
+            told.iter().any(|told| told[2] == value.into())
+        });
+        let publisher = FakeNode::start(&format!("/publisher{value}"));
+        publisher.publish(&client, "/topic", "std_msgs/String");
+        publishers.push(publisher);
+        let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
+        let reachable = holds(Duration::from_secs(30), || {
+            names(&status(&client)["unreachable"]).is_empty()
+                && node.updates("/topic").last() != Some(&all)
+        });
+        assert!(!reachable, "it is not told of publisher {value}");
+        let unreachable = names(&status(&client)["unreachable"]);
+        assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
+    }
 }

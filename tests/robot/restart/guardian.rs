@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::ErrorKind;
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -199,53 +200,97 @@ fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
     assert!(kib < 3072, "{kib} KiB");
 }
 
-/// Kills one worker after the other until the guardian pauses.
+/// A `rosrescue core` that has lost its rosmaster program and its worker, so that no worker gets as far as to serve. It
+/// comes with the program's path, once the guardian pauses.
 #[track_caller]
-fn kill_until_paused(scratch: &Scratch, rescue: &Rescue) {
-    let paused = || {
-        let lines = rescue.stderr().into_iter();
-        lines
-            .filter(|line| line.contains("again and again"))
-            .count()
-            > 0
-    };
-    let mut dead = 0;
-    eventually("it is said", || {
-        dead = worker_after(scratch, dead);
-        signal(dead, Signal::KILL);
-        // Those before the sixth are followed by another worker at once.
-        eventually("it is followed by another, or by a pause", || {
-            let next = process_with(scratch, "ROSRESCUE_GUARDIAN=");
-            paused() || next.is_some_and(|next| next != dead)
-        });
-        paused()
-    });
+fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
+    let program = scratch.path("rosmaster");
+    symlink("/usr/bin/rosmaster", &program).unwrap();
+    let setup = Setup::core(scratch, free_port()).guarded();
+    let mut rescue = setup.arg("--rosmaster").arg(&program).start();
+    rescue.client().set_param("/kept", "yes");
+    fs::remove_file(&program).unwrap();
+    signal(worker(scratch), Signal::KILL);
+    rescue.wait_line("that it pauses", |line| line.contains("pause=500ms"));
+    (rescue, program)
 }
 
 #[test]
-fn workers_that_die_again_and_again_are_started_after_a_pause() {
+fn workers_that_fail_before_they_serve_are_started_after_a_pause() {
     let scratch = Scratch::new();
-    let mut rescue = core(&scratch);
-    kill_until_paused(&scratch, &rescue);
-    let said = rescue.stderr().join("\n");
-    assert!(said.contains("500ms"), "{said}");
-    assert_eq!(
-        said.matches("another one is started at once").count(),
-        5,
-        "{said}"
-    );
+    let (mut rescue, program) = paused(&scratch);
+    symlink("/usr/bin/rosmaster", program).unwrap();
     // Whoever calls in the pause waits for its end.
-    assert!(rescue.client().master_pid().is_some());
+    assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     assert_eq!(rescue.terminate().code(), Some(0));
+}
+
+#[test]
+fn workers_that_have_served_are_started_again_at_once_however_many_die() {
+    let scratch = Scratch::new();
+    let rescue = core(&scratch);
+    let client = rescue.client();
+    let mut dead = 0;
+    for _ in 0..8 {
+        let next = worker_after(&scratch, dead);
+        eventually("it answers", || {
+            status(&client)["pid"].as_u64() == Some(next.into())
+        });
+        signal(next, Signal::KILL);
+        dead = next;
+    }
+    worker_after(&scratch, dead);
+    assert!(client.master_pid().is_some());
+    let said = rescue.stderr().join("\n");
+    assert_eq!(said.matches("started at once").count(), 5, "{said}");
+    assert_eq!(said.matches("again and again").count(), 3, "{said}");
+    assert_eq!(said.matches("pause=0ns").count(), 3, "{said}");
 }
 
 #[test]
 fn a_stop_in_a_pause_ends_everything() {
     let scratch = Scratch::new();
-    let mut rescue = core(&scratch);
-    kill_until_paused(&scratch, &rescue);
+    let (mut rescue, program) = paused(&scratch);
+    symlink("/usr/bin/rosmaster", program).unwrap();
     assert_eq!(rescue.terminate().code(), Some(0));
     assert_eq!(scratch.survivors(), vec![]);
+}
+
+/// Ctrl-Z in a terminal: the guardian is there and starts nothing.
+#[test]
+fn a_guardian_that_is_stopped_does_not_count_as_one() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.client().port());
+    let mut rescue = setup.guarded().start();
+    let client = rescue.client();
+    let by = || status(&client)["guarded_by"].as_str().unwrap().to_owned();
+    assert!(by().contains("which nothing starts again"), "{}", by());
+    crate::support::stop(rescue.pid());
+    rescue.wait_line("that it is stopped", |line| line.contains("unguarded"));
+    assert_eq!(status(&client)["guarded"], false);
+    assert!(by().contains("is stopped"), "{}", by());
+    rescue.signal(Signal::CONT);
+    rescue.wait_line("that it goes on", |line| line.contains("runs again"));
+    assert_eq!(status(&client)["guarded"], true);
+}
+
+/// Where the system permits it, the kernel ends nodes first when memory runs out.
+#[test]
+fn a_guardian_is_ended_last_when_memory_runs_out() {
+    const SCORE: &str = "oom_score_adj";
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let setup = Setup::proxy(&scratch, master.client().port());
+    let rescue = setup.guarded().start();
+    let own = fs::read_to_string(format!("/proc/self/{SCORE}")).unwrap();
+    let script = format!(
+        "[ $(cat /proc/$$/{SCORE}) != 0 ] || echo -500 2>&- >/proc/$$/{SCORE}; cat /proc/$$/{SCORE}"
+    );
+    let permitted = Command::new("sh").args(["-c", &script]).output().unwrap();
+    let expected = String::from_utf8(permitted.stdout).unwrap();
+    let score = fs::read_to_string(format!("/proc/{}/{SCORE}", rescue.pid())).unwrap();
+    assert_eq!(score, expected, "it was {own}");
 }
 
 #[test]

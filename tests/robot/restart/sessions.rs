@@ -16,7 +16,7 @@ use crate::support::{
 use rustix::process::Signal;
 
 /// The id of another boot, as the kernel shows it.
-fn another_boot(scratch: &Scratch) -> PathBuf {
+pub(super) fn another_boot(scratch: &Scratch) -> PathBuf {
     let file = scratch.path("boot_id");
     fs::write(&file, "01234567-89ab-4cde-8f01-23456789abcd\n").unwrap();
     file

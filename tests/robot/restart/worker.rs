@@ -4,12 +4,13 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpListener;
+use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
 use crate::support::{
-    Client, FakeNode, Library, Mode, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State, alive,
-    eventually, eventually_some, free_port, in_both_modes, signal, status,
+    Client, FakeNode, Library, Mode, NODES, Node, Rescue, Robot, Rosmaster, Scratch, Setup, State,
+    alive, eventually, eventually_some, free_port, in_both_modes, signal, status,
 };
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
@@ -302,7 +303,10 @@ fn the_old_port_of_the_master_may_become_our_own() {
         !alive(master) && TcpListener::bind(("0.0.0.0", port)).is_ok()
     });
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
-    let rescue = Setup::bare(&scratch, arguments).at_port(port).start();
+    // By default each port has a checkpoint of its own.
+    let checkpoint = rescue.checkpoint();
+    let setup = Setup::bare(&scratch, arguments).at_port(port);
+    let rescue = setup.at_checkpoint(checkpoint).start();
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
 }
 
@@ -349,4 +353,109 @@ fn a_master_that_was_left_empty_serves_or_is_ended() {
         assert_eq!(rescue.terminate().code(), Some(0));
         assert_eq!(scratch.survivors(), vec![]);
     }
+}
+
+/// How often `rescue` has said that it started a rosmaster.
+fn started(rescue: &Rescue) -> usize {
+    let lines = rescue.stderr().into_iter();
+    let lines = lines.filter(|line| line.contains("started rosmaster"));
+    lines.count()
+}
+
+/// Kills the master of `rescue`, and then `rescue` itself, once it has started the next master and `after` has
+/// passed. Gives the process id of the one that died.
+#[track_caller]
+fn kill_master_and_rescue(rescue: &mut Rescue, after: Duration) -> u32 {
+    let (dead, before) = (master_of(rescue).0, started(rescue));
+    signal(dead, Signal::KILL);
+    eventually("the next master is started", || started(rescue) > before);
+    thread::sleep(after);
+    rescue.kill();
+    dead
+}
+
+/// The rosmaster that runs, if there is exactly one.
+fn only_master(scratch: &Scratch) -> Option<u32> {
+    let all = scratch.survivors().into_iter();
+    let mut all = all.filter(|(pid, words)| {
+        words.contains("rosmaster") && words.contains(" --core ") && alive(*pid)
+    });
+    let (pid, _) = all.next()?;
+    all.next().is_none().then_some(pid)
+}
+
+/// Its masters do not listen while the file `away` is there.
+fn core_that_waits(scratch: &Scratch) -> Rescue {
+    let port = free_port();
+    let waiting = Path::new(NODES).join("waiting_rosmaster.py");
+    let setup = Setup::bare(scratch, ["core", "--no-rosout", "-p", &port.to_string()]);
+    let setup = setup.arg("--rosmaster").arg(waiting);
+    setup.at_port(port).start()
+}
+
+/// Killed when the master that it has just started does not listen yet.
+#[test]
+fn a_master_that_is_still_starting_is_adopted_and_calls_are_answered_meanwhile() {
+    let scratch = Scratch::new();
+    let mut rescue = core_that_waits(&scratch);
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    fs::write(scratch.path("away"), "").unwrap();
+    kill_master_and_rescue(&mut rescue, Duration::ZERO);
+    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+
+    rescue.start_again();
+    eventually("rosrescue listens", || client.connect().is_ok());
+    assert_eq!(client.param("/kept"), Some(1.into()));
+    client.set_param("/kept", 2);
+    assert_eq!(status(&client)["open"], false, "there is no master yet");
+    fs::remove_file(scratch.path("away")).unwrap();
+    rescue.wait_serving();
+    assert_eq!(client.master_pid(), Some(starting), "it is adopted");
+    assert_eq!(only_master(&scratch), Some(starting));
+    assert_eq!(started(&rescue), 0);
+    let (_, at) = master_of(&rescue);
+    assert_eq!(Client::new(at).param("/kept"), Some(2.into()));
+
+    // It is watched as a child would be.
+    signal(starting, Signal::KILL);
+    eventually("another master serves", || {
+        client.master_pid().is_some_and(|pid| pid != starting)
+    });
+    assert_eq!(client.param("/kept"), Some(2.into()));
+}
+
+/// Master and rosrescue die within 200 ms: whatever the next master has come to by then, it is used.
+#[test]
+fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
+    let scratch = Scratch::new();
+    let mut rescue = core(&scratch);
+    for millis in (0..200).step_by(10) {
+        let dead = kill_master_and_rescue(&mut rescue, Duration::from_millis(millis));
+        let next = eventually_some("the next master runs alone", || {
+            only_master(&scratch).filter(|pid| *pid != dead)
+        });
+        rescue.start_again();
+        rescue.wait_serving();
+        assert_eq!(master_of(&rescue).0, next, "killed after {millis} ms");
+        assert_eq!(started(&rescue), 0, "killed after {millis} ms");
+    }
+}
+
+/// Somebody else has taken the port: the master that was to listen there never will.
+#[test]
+fn a_master_that_is_still_starting_and_has_lost_its_port_is_ended() {
+    let scratch = Scratch::new();
+    let mut rescue = core_that_waits(&scratch);
+    rescue.client().set_param("/kept", 1);
+    let (_, master_port) = master_of(&rescue);
+    fs::write(scratch.path("away"), "").unwrap();
+    kill_master_and_rescue(&mut rescue, Duration::ZERO);
+    let starting = eventually_some("there is one rosmaster", || only_master(&scratch));
+    squat(master_port, "closes");
+    fs::remove_file(scratch.path("away")).unwrap();
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/kept"), Some(1.into()));
+    eventually("it is ended", || !alive(starting));
 }

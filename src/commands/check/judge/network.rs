@@ -11,6 +11,10 @@ use crate::ros_env;
 
 /// A name that takes longer to look up delays every call to its node.
 const SLOW: u128 = 1000;
+/// Of what goes past rosrescue.
+const BYPASS: &str = "unprotected";
+const AGAIN: &str =
+    "start it again with the ROS_MASTER_URI of rosrescue: what it writes is not recorded";
 
 impl Findings {
     pub(super) fn port(&mut self, facts: &Facts) {
@@ -141,6 +145,32 @@ impl Findings {
         }
     }
 
+    /// The master is on another computer, and answers.
+    pub(super) fn elsewhere(&mut self, facts: &Facts, uri: &str) {
+        const SUBJECT: &str = "ROS_MASTER_URI";
+        match &facts.elsewhere {
+            Some(Server::Rosrescue { version, .. }) => self.ok(
+                SUBJECT,
+                format!("{uri} is rosrescue {version} on another computer; here run nodes only"),
+            ),
+            _ => self.warn(
+                SUBJECT,
+                format!("{uri} is a master without rosrescue on another computer"),
+                "run `rosrescue check` on that computer",
+            ),
+        }
+        if let Some(host) = &facts.elsewhere_host
+            && let Err(why) = &host.addresses
+        {
+            let name = &host.name;
+            self.warn(
+                SUBJECT,
+                format!("the master calls itself {name}, which has no address here ({why})"),
+                format!("add `ADDRESS {name}` to /etc/hosts of this computer"),
+            );
+        }
+    }
+
     /// `ROS_IP` and `ROS_HOSTNAME`.
     pub(super) fn address(&mut self, facts: &Facts) {
         let env = &facts.env;
@@ -217,6 +247,68 @@ impl Findings {
             Ok(_) => self.ok(subject, leads(own)),
         }
         self.slow(subject, own);
+    }
+
+    /// An address in `ROS_IP` that may change.
+    pub(super) fn lease(&mut self, facts: &Facts) {
+        let Some(lease) = &facts.lease else { return };
+        let how = match (lease.is_leased, lease.is_wireless) {
+            (true, true) => "a leased (DHCP) address of Wi-Fi",
+            (true, false) => "a leased (DHCP) address",
+            _ => "an address of Wi-Fi",
+        };
+        let ip = facts.env.ip.as_deref().unwrap_or_default();
+        self.warn(
+            "ROS_IP",
+            format!(
+                "{ip} is {how} ({}): when it changes, no node reaches this computer's nodes",
+                lease.interface
+            ),
+            "give the interface a fixed address, or use ROS_HOSTNAME with a name that follows it",
+        );
+    }
+
+    /// Running nodes of another master.
+    pub(super) fn strays(&mut self, facts: &Facts) {
+        for (process, uri) in &facts.strays {
+            let port = ros_env::MasterUri::parse(uri).ok().map(|uri| uri.port);
+            if facts.behind.as_ref().map(|behind| behind.uri.port) == port && port.is_some() {
+                self.warn(
+                    BYPASS,
+                    format!(
+                        "{} was started with ROS_MASTER_URI={uri}, the master behind rosrescue",
+                        named(process)
+                    ),
+                    AGAIN,
+                );
+                continue;
+            }
+            self.warn(
+                "ROS_MASTER_URI",
+                format!("{} was started with ROS_MASTER_URI={uri}", named(process)),
+                "if it is a node of this robot, start it again with the URI of this robot",
+            );
+        }
+    }
+
+    /// What talks to the master behind a `proxy`.
+    pub(super) fn bypass(&mut self, facts: &Facts) {
+        let Some(behind) = &facts.behind else { return };
+        let uri = &behind.uri;
+        for who in &behind.bypassing {
+            self.warn(
+                BYPASS,
+                format!("{who} talks to the master at {uri} directly"),
+                AGAIN,
+            );
+        }
+        if behind.is_open {
+            self.warn(
+                BYPASS,
+                format!("the master at {uri} takes connections from other computers, which can go past rosrescue"),
+                "start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME",
+            );
+        }
     }
 
     fn slow(&mut self, subject: &'static str, host: &Host) {

@@ -3,21 +3,27 @@
 use super::{
     super::{
         facts::{Clock, Disk, Facts, Port},
+        launch::Launches,
         ros::Server,
         units::Kind,
     },
     Findings, named,
 };
-use crate::clock;
+use crate::{clock, status::software};
 
 /// Less free space than this is used up by a checkpoint and ROS's logs in no time, in bytes.
 const LITTLE_SPACE: u64 = 500 << 20;
 const NO_SPACE: u64 = 20 << 20;
+/// Checkpoint, reports and logs are some ten files for each start and each rescue.
+const FEW_INODES: u64 = 1000;
+const NO_INODES: u64 = 10;
 /// With fewer open files connections of clients become scarce; with fewer still rosrescue hardly works.
 const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
 /// A rosmaster and rosrescue with a spare take some 60 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
+/// More settings in launch files than this hide the other findings.
+const SETTINGS_MOST: usize = 10;
 /// 2024-01-01: this program is younger.
 const EARLIEST: f64 = 1_704_067_200.0;
 /// A clock that is so far behind its own files has been set back.
@@ -52,6 +58,14 @@ impl Findings {
                 "chown it to the user of rosrescue, or choose another --checkpoint than {path}"
             );
             return self.bad(SUBJECT, format!("{folder} cannot be written: {why}"), todo);
+        }
+        if let Some(files) = disk.inodes.filter(|files| *files < FEW_INODES) {
+            let what = format!("{folder}: {files} more files can be created (inodes, `df -i`)");
+            let todo = "delete small files, such as old logs (rosclean purge)";
+            return match files {
+                ..NO_INODES => self.bad(SUBJECT, what, todo),
+                _ => self.warn(SUBJECT, what, todo),
+            };
         }
         let mib = free >> 20;
         let (of, source) = disk.mount.clone().unwrap_or_default();
@@ -130,7 +144,12 @@ impl Findings {
                         "take conda, pyenv or the venv off the PATH (conda deactivate), and source \
                          ROS's setup.bash",
                     ),
-                    None => self.ok("rosmaster", format!("{path}, {version}")),
+                    None => {
+                        let http = software::keeps_alive(version, &facts.kernel);
+                        let http = http.map(|keeps| software::speaks(keeps, None));
+                        let speaks = http.map(|http| format!(", {http}")).unwrap_or_default();
+                        self.ok("rosmaster", format!("{path}, {version}{speaks}"));
+                    }
                 }
                 if !facts.has_rosout {
                     let todo = "apt-get install rosout (ros-noetic-rosout), or --no-rosout";
@@ -149,7 +168,13 @@ impl Findings {
             return;
         };
         match server {
-            Server::Master(_) => self.ok("master", format!("{uri} answers")),
+            Server::Master(_) => {
+                let speaks = facts.proxied_speaks.as_deref();
+                let speaks = speaks
+                    .map(|speaks| format!(": {speaks}"))
+                    .unwrap_or_default();
+                self.ok("master", format!("{uri} answers{speaks}"));
+            }
             Server::Rosrescue { .. } => self.bad(
                 "master",
                 format!("--master {uri} is a rosrescue"),
@@ -224,6 +249,37 @@ impl Findings {
         if own == 0 && facts.units.iter().all(|unit| unit.kind != Kind::Rosrescue) {
             let todo = "`rosrescue install` makes one, for a robot that starts by itself";
             self.note("systemd", "rosrescue has no unit here", todo);
+        }
+    }
+
+    /// Launch files that send nodes to another master.
+    pub(super) fn launches(&mut self, launches: &Launches) {
+        const SUBJECT: &str = "launch files";
+        let count = launches.settings.len();
+        for one in launches.settings.iter().take(SETTINGS_MOST) {
+            self.warn(
+                SUBJECT,
+                format!("{}:{} sets ROS_MASTER_URI to {}", one.file.display(), one.line, one.uri),
+                "remove this <env>, if its nodes belong to this robot: they use that master, not rosrescue",
+            );
+        }
+        if count > SETTINGS_MOST {
+            let what = format!("{} more set ROS_MASTER_URI", count - SETTINGS_MOST);
+            self.warn(SUBJECT, what, "repair the first ones, and check again");
+        }
+        let files = launches.files;
+        if launches.is_cut {
+            let todo = "check again with a ROS_PACKAGE_PATH that has the robot's own packages only";
+            self.note(
+                SUBJECT,
+                format!("{files} were read, and there are more"),
+                todo,
+            );
+        } else if count == 0 && files > 0 {
+            self.ok(
+                SUBJECT,
+                format!("{files} were read; none sets another ROS_MASTER_URI"),
+            );
         }
     }
 

@@ -7,6 +7,7 @@ use super::{
     super::{
         Finding, Severity,
         facts::{Clock, Disk, Environment, Facts, Host, Port, Process, Taken},
+        launch::Launches,
         ros::{Program, Server},
         units::{Kind, Unit},
     },
@@ -33,6 +34,8 @@ fn robot() -> Facts {
     Facts {
         version: "1.0.0",
         proxied: None,
+        proxied_speaks: None,
+        kernel: "6.1.0".to_owned(),
         env: Environment {
             master_uri: Some("http://robot:11311/".to_owned()),
             ..Environment::default()
@@ -44,11 +47,14 @@ fn robot() -> Facts {
         }),
         own: host("robot", "10.0.0.7", true),
         master_host: Some(host("robot", "10.0.0.7", true)),
+        elsewhere: None,
+        elsewhere_host: None,
         node_hosts: Vec::new(),
         disk: Disk {
             checkpoint: PathBuf::from("/home/r/.ros/log/latest-chkpt.yaml"),
             folder: PathBuf::from("/home/r"),
             space: Ok((10 << 30, false)),
+            inodes: Some(1 << 20),
             refused: None,
             mount: Some(("ext4".to_owned(), "/dev/sda1".to_owned())),
             holder: None,
@@ -69,7 +75,11 @@ fn robot() -> Facts {
         has_rosout: true,
         strange_python: None,
         units: vec![unit("rosrescue.service", Kind::Rosrescue, true)],
+        launches: Launches::default(),
         memory: Some(4 << 30),
+        strays: Vec::new(),
+        lease: None,
+        behind: None,
         masters: Vec::new(),
     }
 }
@@ -102,6 +112,8 @@ fn rosrescue(unprotected: Option<&str>) -> Server {
         version: "1.0.0".to_owned(),
         uri: "http://robot:11311/".to_owned(),
         unprotected: unprotected.map(str::to_owned),
+        proxied: None,
+        bypassing: Vec::new(),
     }
 }
 

@@ -3,10 +3,10 @@
 use std::{borrow::Cow, fmt::Write};
 
 use super::{
-    super::robot::Health,
     Graph, Shape,
     layout::{self, Placed, Point, Size},
 };
+use crate::health::Health;
 
 /// Width of a character, as all fonts of one width have it at 12 px.
 const CHARACTER: f64 = 7.25;
@@ -98,6 +98,7 @@ fn write(
             Shape::Topic { .. } => ("topic", "topic", "#f3f4f6", "#8a94a6"),
             Shape::Node { health, .. } => match health {
                 Health::Alive => ("node", "node alive", "#dbeafe", "#2563eb"),
+                Health::Unchecked => ("node", "node unchecked", "#f3f4f6", "#6b7280"),
                 Health::Unreachable => ("node", "node unreachable", "#fef3c7", "#b45309"),
                 Health::Dead => ("node", "node dead", "#fee2e2", "#b91c1c"),
             },

@@ -29,6 +29,9 @@ const OUTCOMES = {
   resumed: "the same master goes on",
 };
 
+/** What keeps a node from being called alive, the worst first. */
+const ILL = { dead: "dead", unreachable: "unreachable", unchecked: "not checked" };
+
 let status = null;
 let now = null;
 let robot = null;
@@ -275,13 +278,14 @@ function showCounts() {
   if (!status) return;
   const deaths = status.deaths ? `, died ${status.deaths === 1 ? "once" : `${status.deaths} times`}` : "";
   say("master-more", status.elsewhere ? "on the leading computer" : `${status.master_pid ? `process ${status.master_pid}` : ""}${deaths}`);
-  const sick = robot ? robot.nodes.filter((node) => node.health === "unreachable").length : 0;
-  const dead = robot ? robot.nodes.filter((node) => node.health === "dead").length : 0;
-  say("count-nodes", robot ? String(robot.totals.nodes - dead) : "–");
-  const parts = [];
-  if (sick) parts.push(`${sick} unreachable`);
-  if (dead) parts.push(`${dead} dead`);
+  const gone = robot ? robot.nodes.filter((node) => node.removed_at).length : 0;
+  say("count-nodes", robot ? String(robot.totals.nodes - gone) : "–");
+  const parts = Object.keys(ILL).map((name) => {
+    const count = robot ? robot.nodes.filter((node) => node.health === name).length : 0;
+    return count ? `${count} ${ILL[name]}` : "";
+  }).filter(Boolean);
   say("sick", parts.length ? parts.join(", ") : robot ? "all alive" : "");
+  $("sick").dataset.is = robot?.nodes.some((node) => node.health in ILL && node.health !== "unchecked") ? "bad" : "";
 }
 
 function showRescues() {
@@ -297,10 +301,12 @@ function showRescues() {
       el("span", { class: "total" }, span(robotTime() - status.standing_in_since)),
       el("span", { class: "what" }, `under way: ${what}, ${plural(now.pending_writes ?? 0, "change")} to be handed over`)));
   }
-  rows.push(...rescues.slice(0, 8).map(rescueRow));
+  const longest = Math.max(...rescues.map((rescue) => rescue.phases.total_ms), 1);
+  const row = (rescue) => rescueRow(rescue, longest);
+  rows.push(...rescues.slice(0, 8).map(row));
   const rest = rescues.slice(8);
   if (rest.length) {
-    const older = el("li", {}, el("button", { type: "button", onclick: () => older.replaceWith(...rest.map(rescueRow)) }, `${rest.length} older`));
+    const older = el("li", {}, el("button", { type: "button", onclick: () => older.replaceWith(...rest.map(row)) }, `${rest.length} older`));
     rows.push(older);
   }
   $("rescues-list").replaceChildren(...rows);
@@ -309,7 +315,8 @@ function showRescues() {
   say("rescues-count", status?.rescues ? `${status.rescues} since the start` : "");
 }
 
-function rescueRow(rescue) {
+/** All bars have one scale: the longest rescue fills its track. */
+function rescueRow(rescue, longest) {
   const { absence_ms: absence, inspection_ms: inspection, injection_ms: injection, total_ms: total } = rescue.phases;
   const check = rescue.health_check_ms;
   const parts = [
@@ -317,13 +324,11 @@ function rescueRow(rescue) {
     ["inspection", inspection, "to read it"],
     ["injection", injection, "to restore it"],
     ["rest", Math.max(0, total - absence - inspection - injection), "until calls passed"],
-    // It goes on beside the calls, and for longer: not to scale.
-    ["check", check === null ? 0 : Math.min(check, total / 2), "nodes asked, calls pass"],
   ].filter(([, length]) => length > 0.05);
   const track = el("div", { class: "track", role: "img" });
   for (const [name, length, words] of parts) {
-    const part = el("i", { class: name, title: `${ms(name === "check" ? check : length)} ${words}` });
-    part.style.flexGrow = length;
+    const part = el("i", { class: name, title: `${ms(length)} ${words}` });
+    part.style.width = `${(100 * length) / longest}%`;
     track.append(part);
   }
   const phases = `${ms(absence)} without a master, ${ms(inspection)} to read it, ${ms(injection)} to restore it` +
@@ -378,10 +383,10 @@ const picture = $("picture");
 let view = null;
 let whole = null;
 let drawing = 0;
-/** The smallest scale at which a picture is shown at first: on a phone its height, and a part of its width. */
-const least = () => (isTall() && whole ? Math.min(0.7, picture.clientHeight / whole.height) : 0.4);
+/** The smallest scale at which a picture is shown at first: one can read it. */
+const least = () => (isTall() ? 0.75 : 0.4);
 
-const isTall = () => picture.clientHeight > picture.clientWidth;
+const isTall = () => window.innerHeight > window.innerWidth;
 
 function graphQuery() {
   const query = new URLSearchParams();
@@ -413,6 +418,9 @@ async function readGraph() {
   const [x, y, width, height] = svg.getAttribute("viewBox").split(" ").map(Number);
   const isSame = whole?.width === width && whole?.height === height;
   whole = { x, y, width, height };
+  // On a wide screen as high as the graph needs, so that none of it is cut off.
+  const needed = height * Math.max(least(), Math.min(1, picture.clientWidth / width));
+  picture.style.height = isTall() ? "" : `max(min(62vh, 620px), ${Math.min(Math.ceil(needed), 1600)}px)`;
   svg.removeAttribute("width");
   svg.removeAttribute("height");
   picture.replaceChildren(svg);
@@ -577,8 +585,9 @@ function showDetails() {
 function health(node) {
   const texts = {
     alive: "alive",
+    unchecked: node.checked_at ? `not checked since ${moment(node.checked_at)}` : "not checked yet",
     unreachable: "unreachable: kept, and asked again",
-    dead: `dead, taken out ${node.removed_at ? moment(node.removed_at) : ""}`,
+    dead: node.removed_at ? `dead, taken out ${moment(node.removed_at)}` : "dead: its port refuses connections; still registered",
   };
   return el("span", { class: "health", "data-is": node.health }, texts[node.health] ?? node.health);
 }
@@ -610,7 +619,7 @@ function showList() {
   if (tab === "params") return showParams(text);
   const has = (...words) => !text || words.flat().some((word) => word.toLowerCase().includes(text));
   const rows = {
-    nodes: () => robot.nodes.filter((of) => has(of.name, of.publishes, of.subscribes, of.serves)).map((of) => [
+    nodes: () => worstFirst(robot.nodes.filter((of) => has(of.name, of.publishes, of.subscribes, of.serves))).map((of) => [
       nameButton("node", of.name), health(of), where(of), names(of.publishes), names(of.subscribes), names(of.serves)]),
     topics: () => robot.topics.filter((of) => has(of.name, of.type)).map((of) => [
       nameButton("topic", of.name), typeOf(of), names(of.publishers), names(of.subscribers)]),
@@ -631,6 +640,13 @@ function showList() {
   const note = rows.length === 0 ? `no ${tab} ${text ? "match" : "are registered"}` : left > 0 ? `${left} more: search for a name` : null;
   const shown = rows.length ? [table] : [];
   $("list").replaceChildren(...shown, ...(note ? [el("p", { class: "quiet" }, note)] : []));
+}
+
+/** Nodes with problems come first; the others stay sorted by name. */
+function worstFirst(nodes) {
+  const ranks = Object.keys(ILL);
+  const rank = (node) => (node.health in ILL ? ranks.indexOf(node.health) : ranks.length);
+  return [...nodes].sort((a, b) => rank(a) - rank(b));
 }
 
 function where(node) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
-        facts::{Facts, Taken},
+        facts::{Behind, Facts, Lease, Taken},
         ros::Server,
     },
     host, judge, nowhere, one, port, process, robot, rosrescue, said, taken,
@@ -213,6 +213,134 @@ fn names_that_lead_nowhere_or_elsewhere() {
         |facts| {
             let nodes = ["/a", "/b"].map(str::to_owned).to_vec();
             facts.node_hosts = vec![(nowhere("arm"), nodes)];
+        },
+    );
+}
+
+/// Where only nodes run, what serves the robot is not missed.
+#[test]
+fn another_computer_of_the_robot() {
+    let elsewhere = |facts: &mut Facts| {
+        facts.env.master_uri = Some("http://base:11311/".to_owned());
+        facts.master_host = Some(host("base", "10.0.0.9", false));
+        facts.elsewhere = Some(rosrescue(None));
+        facts.elsewhere_host = Some(host("base", "10.0.0.9", false));
+        facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+        facts.disk.refused = Some("denied".to_owned());
+        facts.units.clear();
+    };
+    assert_eq!(said(elsewhere), []);
+    one(
+        Warning,
+        "ROS_MASTER_URI",
+        "calls itself robot, which has no address here",
+        |facts| {
+            elsewhere(facts);
+            facts.elsewhere_host = Some(nowhere("robot"));
+        },
+    );
+    one(
+        Problem,
+        "nodes",
+        "/a registered at arm, which has no address here",
+        |facts| {
+            elsewhere(facts);
+            facts.node_hosts = vec![(nowhere("arm"), vec!["/a".to_owned()])];
+        },
+    );
+    one(
+        Problem,
+        "host name",
+        "only this computer reaches, and base takes part",
+        |facts| {
+            elsewhere(facts);
+            facts.own = host("arm", "127.0.1.1", true);
+        },
+    );
+    one(
+        Warning,
+        "ROS_MASTER_URI",
+        "a master without rosrescue",
+        |facts| {
+            elsewhere(facts);
+            facts.elsewhere = Some(Server::Master(None));
+            facts.elsewhere_host = None;
+        },
+    );
+    one(
+        Problem,
+        "ROS_MASTER_URI",
+        "is another computer (10.0.0.9)",
+        |facts| {
+            elsewhere(facts);
+            facts.elsewhere = Some(Server::Nobody);
+            facts.rosmaster = robot().rosmaster;
+            facts.disk.refused = None;
+            facts.units = robot().units;
+        },
+    );
+}
+
+#[test]
+fn addresses_that_may_change_and_nodes_of_another_master() {
+    one(
+        Warning,
+        "ROS_IP",
+        "10.0.0.7 is a leased (DHCP) address (eth0)",
+        |facts| {
+            facts.env.ip = Some("10.0.0.7".to_owned());
+            facts.own = host("10.0.0.7", "10.0.0.7", true);
+            facts.lease = Some(Lease {
+                interface: "eth0".to_owned(),
+                is_leased: true,
+                is_wireless: false,
+            });
+        },
+    );
+    one(
+        Warning,
+        "ROS_MASTER_URI",
+        "camera (process 9, port 40000) was started with ROS_MASTER_URI=http://other:11311",
+        |facts| {
+            facts.strays = vec![(
+                process(9, "camera", 40_000),
+                "http://other:11311".to_owned(),
+            )];
+        },
+    );
+}
+
+#[test]
+fn what_goes_past_rosrescue_is_warned_of() {
+    let behind = |bypassing: &[&str], is_open| {
+        Some(Behind {
+            uri: MasterUri::parse("http://robot:11312").unwrap(),
+            bypassing: bypassing.iter().map(|&who| who.to_owned()).collect(),
+            is_open,
+        })
+    };
+    one(
+        Warning,
+        "unprotected",
+        "rosout (process 9) talks to the master at http://robot:11312/ directly",
+        |facts| facts.behind = behind(&["rosout (process 9)"], false),
+    );
+    one(
+        Warning,
+        "unprotected",
+        "takes connections from other computers",
+        |facts| facts.behind = behind(&[], true),
+    );
+    one(
+        Warning,
+        "unprotected",
+        "camera (process 9, port 40000) was started with ROS_MASTER_URI=http://localhost:11312, the master behind",
+        |facts| {
+            facts.behind = behind(&[], false);
+            facts.strays = vec![(
+                process(9, "camera", 40_000),
+                "http://localhost:11312".to_owned(),
+            )];
         },
     );
 }

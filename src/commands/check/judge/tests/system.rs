@@ -6,6 +6,7 @@ use super::{
     super::super::{
         Severity::{Note, Problem, Warning},
         facts::Facts,
+        launch::Setting,
         ros::Server,
         units::Kind,
     },
@@ -176,4 +177,43 @@ fn units_of_systemd() {
             facts.units[0].is_enabled = false;
         },
     );
+}
+
+#[test]
+fn a_file_system_without_inodes_takes_no_checkpoint() {
+    one(
+        Problem,
+        "checkpoint",
+        "0 more files can be created",
+        |facts| {
+            facts.disk.inodes = Some(0);
+        },
+    );
+    one(
+        Warning,
+        "checkpoint",
+        "500 more files can be created",
+        |facts| {
+            facts.disk.inodes = Some(500);
+        },
+    );
+    assert_eq!(said(|facts| facts.disk.inodes = None), []);
+}
+
+#[test]
+fn a_launch_file_with_a_master_of_its_own_is_said_with_its_line() {
+    let setting = Setting {
+        file: PathBuf::from("/ws/src/arm/arm.launch"),
+        line: 7,
+        uri: "http://arm:11311".to_owned(),
+    };
+    let words = "/ws/src/arm/arm.launch:7 sets ROS_MASTER_URI to http://arm:11311";
+    one(Warning, "launch files", words, |facts| {
+        facts.launches.settings = vec![setting.clone()];
+    });
+    one(Note, "launch files", "there are more", |facts| {
+        facts.launches.is_cut = true;
+    });
+    let found = said(|facts| facts.launches.settings = vec![setting.clone(); 30]);
+    assert_eq!(found.len(), 11);
 }

@@ -1,0 +1,69 @@
+//! The checkpoint of an earlier version, in which every port had the same default.
+
+use std::{fs, io, path::Path};
+
+use crate::{
+    checkpoint::{session, store},
+    config::{CHECKPOINT_NAME, Config},
+    process::{PID_FILES, beside},
+    regular_file,
+};
+
+/// Copies the old default to the checkpoint of `config`, if that is the default of another port, does not exist, and
+/// the old one may be of this port. What is copied stays where it is.
+pub(super) fn take_over(config: &Config) {
+    let own = &config.checkpoint;
+    if config.checkpoint_is_given || own.exists() || store::previous_of(own).exists() {
+        return;
+    }
+    let old = own.with_file_name(CHECKPOINT_NAME);
+    if old == *own || !may_be_of(&old, config.advertised.port) {
+        return;
+    }
+    match copy_all(&old, own) {
+        Ok(()) => tracing::warn!(
+            from = %old.display(), to = %own.display(),
+            "copied the checkpoint of an earlier version: each port has a checkpoint of its own now. Remove the old one \
+             if no rosrescue serves port 11311"
+        ),
+        Err(error) => tracing::error!(
+            %error, from = %old.display(), to = %own.display(),
+            "could not copy the checkpoint of an earlier version. If it is of this port, stop rosrescue, copy it, and \
+             start rosrescue again"
+        ),
+    }
+}
+
+/// Whether no running rosrescue uses the checkpoint at `old`, and an earlier version or a rosrescue at `port` has
+/// written it.
+fn may_be_of(old: &Path, port: u16) -> bool {
+    if store::holder_of(old).is_some() {
+        return false;
+    }
+    let Ok(Some(loaded)) = store::read(old) else {
+        return false;
+    };
+    let session = session::rebuild(loaded.checkpoint, loaded.records).session;
+    session.is_some_and(|session| [0, port].contains(&session.port))
+}
+
+/// Copies the checkpoint and its companions. The checkpoint itself is last: without it, the next start begins anew.
+fn copy_all(old: &Path, own: &Path) -> io::Result<()> {
+    let previous = (store::previous_of(old), store::previous_of(own));
+    let pid_files = PID_FILES.map(|suffix| (beside(old, suffix), beside(own, suffix)));
+    for (from, to) in pid_files.into_iter().chain([previous]) {
+        if from.exists() {
+            copy(&from, &to)?;
+        }
+    }
+    copy(old, own)
+}
+
+fn copy(from: &Path, to: &Path) -> io::Result<()> {
+    // The next start removes what a crash leaves of it.
+    let fresh = beside(to, ".new");
+    let mut file = regular_file::create(&fresh)?;
+    io::copy(&mut regular_file::open(from)?, &mut file)?;
+    file.sync_all()?;
+    fs::rename(&fresh, to)
+}

@@ -1,0 +1,21 @@
+//! Whether other users may plant files beside the checkpoint.
+
+use std::path::Path;
+
+use super::{Finding, Severity};
+use crate::checkpoint::folder;
+
+/// The finding for the checkpoint at `path`; none if its folders are safe.
+pub(super) fn look(path: &Path) -> Option<Finding> {
+    let (folder, why) = folder::open_to_others(path)?;
+    Some(Finding {
+        severity: Severity::Warning,
+        subject: "checkpoint",
+        what: format!(
+            "other users may change the robot's state in {}: {why}",
+            folder.display()
+        ),
+        todo: "choose a folder that only the user of rosrescue can write to, with --checkpoint"
+            .to_owned(),
+    })
+}

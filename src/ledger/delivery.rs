@@ -1,0 +1,132 @@
+//! Answers on their way to nodes, and what waits for them: the [order](crate::order) beside the mirror.
+
+use std::{sync::Arc, time::Instant};
+
+use tokio::sync::watch;
+
+use super::{Inner, Ledger};
+use crate::{
+    master::{Master, Request},
+    order::{Next, Order, heard_by_read},
+};
+
+/// An answer on its way to its caller. Dropped when it has been written, or never will be.
+pub(crate) struct Delivery {
+    /// None in simulations, where time is another one.
+    ledger: Option<Arc<Ledger>>,
+    number: u64,
+}
+
+impl std::fmt::Debug for Delivery {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Delivery").field(&self.number).finish()
+    }
+}
+
+impl Delivery {
+    /// The answer with this number in the [`Order`] of `ledger`. Not to be dropped under the ledger's lock.
+    pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
+        let ledger = Some(ledger.clone());
+        Self { ledger, number }
+    }
+
+    pub(crate) fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// The answer is ready to be written.
+    pub(crate) fn ready(&self) {
+        if let Some(ledger) = &self.ledger {
+            ledger.lock().order.ready(Instant::now(), self.number);
+        }
+    }
+
+    /// Its number. What is done with it is not noticed any more.
+    #[cfg(test)]
+    pub(crate) fn into_number(mut self) -> u64 {
+        self.ledger = None;
+        self.number
+    }
+}
+
+impl Drop for Delivery {
+    fn drop(&mut self) {
+        if let Some(ledger) = &self.ledger {
+            let awaited = ledger.lock().order.written(Instant::now(), self.number);
+            ledger.report(awaited);
+        }
+    }
+}
+
+/// A read has to wait: what the master does now may concern its caller.
+#[derive(Debug)]
+pub(crate) struct Held;
+
+impl Ledger {
+    /// Runs `work` on the order and the mirror.
+    pub(crate) fn with_order<T>(&self, work: impl FnOnce(&mut Order, &Master) -> T) -> T {
+        let mut inner = self.lock();
+        let Inner { mirror, order, .. } = &mut *inner;
+        let result = work(order, mirror);
+        let repeats = order.has_new_repeat();
+        drop(inner);
+        if repeats {
+            self.outbox_changed.notify_one();
+        }
+        result
+    }
+
+    /// Changes when something may have ended that others [wait](Order) for.
+    pub(crate) fn order_changed(&self) -> watch::Receiver<()> {
+        self.order_changed.subscribe()
+    }
+
+    fn report(&self, awaited: bool) {
+        if awaited {
+            self.order_changed.send_replace(());
+        }
+    }
+
+    /// The answer to a read; none if nodes are not notified of what it shows.
+    pub(crate) fn begin_read(
+        self: &Arc<Self>,
+        now: Instant,
+        read: Option<&Request>,
+    ) -> Result<Option<Delivery>, Held> {
+        let Some(read) = read else { return Ok(None) };
+        let begun = self.with_order(|order, mirror| {
+            let heard = heard_by_read(read, mirror);
+            match order.holds_read(&heard) {
+                true => Err(Held),
+                false => Ok(order.begin(now, heard)),
+            }
+        });
+        Ok(begun?.map(|number| Delivery::new(self, number)))
+    }
+
+    /// As [`Self::begin_read`], but does not wait for the master.
+    pub(crate) fn begin_read_now(self: &Arc<Self>, read: &Request) -> Option<Delivery> {
+        let begun = self.with_order(|order, mirror| {
+            let heard = heard_by_read(read, mirror);
+            order.begin(Instant::now(), heard)
+        });
+        Some(Delivery::new(self, begun?))
+    }
+
+    /// The master has no unanswered calls any more.
+    pub(crate) fn settled_calls(&self) {
+        let awaited = self.lock().order.settled();
+        self.report(awaited);
+    }
+
+    /// What to do next for the node at `port`.
+    pub(crate) fn next_notification(&self, port: &str) -> Next {
+        self.with_order(|order, mirror| order.next(Instant::now(), port, mirror))
+    }
+
+    /// The notification with this number has been taken, or has not.
+    pub(crate) fn notification_ended(&self, number: u64) {
+        let awaited = self.lock().order.taken(Instant::now(), number);
+        self.report(awaited);
+    }
+}

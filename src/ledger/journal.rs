@@ -1,0 +1,250 @@
+//! What is done to the checkpoint's files, in the order in which it was given. One thread at a time does it, and never
+//! under the ledger's lock: a disk that hangs stops neither calls nor the mirror.
+
+use std::{
+    collections::VecDeque,
+    path::PathBuf,
+    sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError},
+    time::Duration,
+};
+
+use tokio::sync::{oneshot, watch};
+
+use crate::{
+    checkpoint::{
+        format::{Checkpoint, Entry},
+        store::Store,
+    },
+    cli::SyncPolicy,
+};
+
+/// Longest silence of the disk that calls wait for. A memory card may be busy for 0.5 s with one write, and a few
+/// can queue up; calls without an answer stop a robot.
+pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
+
+/// Why nothing is recorded after such a silence.
+pub(crate) const SILENT: &str = "the disk has not answered for 5 s";
+
+/// Most jobs that wait for a disk: about one for each client that waits for an answer.
+const JOBS_MAX: usize = 2048;
+
+type Job = Box<dyn FnOnce(&mut Store) + Send>;
+
+/// The store, seen from the ledger. Its methods wait for no disk.
+pub(super) struct Journal {
+    shared: Arc<Shared>,
+    /// Number of the last record, recorded or not.
+    seq: u64,
+    /// Whether the store is given records. Not after a silence of the disk, until the next whole checkpoint.
+    gives: bool,
+}
+
+/// The store, and what is to be done with it.
+pub(super) struct Shared {
+    jobs: Mutex<VecDeque<Job>>,
+    store: Mutex<Store>,
+    seen: Mutex<Seen>,
+    /// The last record that an answer need not wait for.
+    durable: watch::Sender<u64>,
+    sync: SyncPolicy,
+}
+
+/// The store after its last job.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Seen {
+    pub path: PathBuf,
+    /// Number of the last record, recorded or not.
+    pub seq: u64,
+    pub journal_bytes: u64,
+    pub snapshot_bytes: u64,
+    /// Why nothing is recorded; none if records are written.
+    pub unprotected: Option<String>,
+    /// Whether the journal is large enough for a new generation.
+    pub outgrown: bool,
+    /// Where a file was kept that was found at the path.
+    kept: Option<PathBuf>,
+    /// How often records were withheld from the store,
+    gaps: u64,
+    /// and how many of these times a whole checkpoint has followed.
+    gaps_over: u64,
+}
+
+impl Shared {
+    /// Runs all jobs, unless another thread does so already. May take as long as the disk does.
+    pub(super) fn work(&self) {
+        loop {
+            let mut store = match self.store.try_lock() {
+                Ok(store) => store,
+                Err(TryLockError::Poisoned(store)) => store.into_inner(),
+                Err(TryLockError::WouldBlock) => return,
+            };
+            while let Some(job) = self.next() {
+                job(&mut store);
+            }
+            drop(store);
+            // A job that came before the lock was free was left to us.
+            if self.jobs().is_empty() {
+                return;
+            }
+        }
+    }
+
+    fn next(&self) -> Option<Job> {
+        self.jobs().pop_front()
+    }
+
+    fn jobs(&self) -> MutexGuard<'_, VecDeque<Job>> {
+        self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn seen(&self) -> MutexGuard<'_, Seen> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn look(&self, store: &mut Store) {
+        let mut seen = self.seen();
+        seen.seq = store.seq();
+        seen.journal_bytes = store.journal_bytes();
+        seen.snapshot_bytes = store.snapshot_bytes();
+        seen.outgrown = store.wants_compaction();
+        seen.kept = store.take_kept().or_else(|| seen.kept.take());
+        let unprotected = match seen.gaps > seen.gaps_over {
+            true => Some(SILENT),
+            false => store.unprotected(),
+        };
+        if seen.unprotected.as_deref() != unprotected {
+            seen.unprotected = unprotected.map(str::to_owned);
+        }
+        drop(seen);
+        // No answer waits for a disk that has failed.
+        let waits = self.sync == SyncPolicy::Always && store.unprotected().is_none();
+        self.reach(if waits {
+            store.synced_seq()
+        } else {
+            store.seq()
+        });
+    }
+
+    fn reach(&self, seq: u64) {
+        super::durability::raise(&self.durable, seq);
+    }
+}
+
+impl Journal {
+    /// The journal of `store`. `durable`: raised to the last record that an answer need not wait for with this
+    /// `sync`.
+    pub(super) fn new(store: Store, durable: watch::Sender<u64>, sync: SyncPolicy) -> Self {
+        let seq = store.seq();
+        let seen = Seen {
+            path: store.path().to_owned(),
+            unprotected: store.unprotected().map(str::to_owned),
+            ..Seen::default()
+        };
+        let shared = Shared {
+            jobs: Mutex::default(),
+            store: Mutex::new(store),
+            seen: Mutex::new(seen),
+            durable,
+            sync,
+        };
+        shared.reach(seq);
+        Self {
+            shared: Arc::new(shared),
+            seq,
+            gives: true,
+        }
+    }
+
+    /// What runs the jobs.
+    pub(super) fn worker(&self) -> Arc<Shared> {
+        Arc::clone(&self.shared)
+    }
+
+    /// Number of the last record, recorded or not.
+    pub(super) fn seq(&self) -> u64 {
+        self.seq
+    }
+
+    /// The store as it was after its last job.
+    pub(super) fn seen(&self) -> Seen {
+        self.shared.seen().clone()
+    }
+
+    /// Where a file was kept that was found at the path; returned once.
+    pub(super) fn take_kept(&self) -> Option<PathBuf> {
+        self.shared.seen().kept.take()
+    }
+
+    /// Records `entries`. A failure is kept by the store.
+    pub(super) fn append(&mut self, entries: Vec<Entry>) {
+        self.seq += entries.len() as u64;
+        if !self.gives {
+            return self.shared.reach(self.seq);
+        }
+        let given = self.run(move |store| {
+            if let Err(error) = store.append(&entries) {
+                tracing::debug!(%error, "append");
+            }
+        });
+        if given.is_none() {
+            self.give_up();
+        }
+    }
+
+    /// Runs `work` after what was given before. None if too much waits for the disk already.
+    pub(super) fn run<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&mut Store) -> T + Send + 'static,
+    ) -> Option<oneshot::Receiver<T>> {
+        let (done, result) = oneshot::channel();
+        let shared = Arc::clone(&self.shared);
+        let job = move |store: &mut Store| {
+            let result = work(store);
+            shared.look(store);
+            // The other end may have been dropped.
+            let _ = done.send(result);
+        };
+        let mut jobs = self.shared.jobs();
+        (jobs.len() < JOBS_MAX).then(|| {
+            jobs.push_back(Box::new(job));
+            result
+        })
+    }
+
+    /// As [`Self::run`], where `work` writes the whole `checkpoint` of this moment. From now on the store is
+    /// given records again.
+    pub(super) fn run_whole<T: Send + 'static>(
+        &mut self,
+        checkpoint: Checkpoint,
+        work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
+    ) -> Option<oneshot::Receiver<T>> {
+        self.gives = true;
+        let gaps = self.shared.seen().gaps;
+        let shared = Arc::clone(&self.shared);
+        let given = self.run(move |store| {
+            if shared.seen().gaps_over < gaps {
+                // Records are missing in its file.
+                store.give_up(SILENT);
+                shared.seen().gaps_over = gaps;
+            }
+            work(store, checkpoint)
+        });
+        if given.is_none() {
+            self.give_up();
+        }
+        given
+    }
+
+    /// The disk is silent: answers wait for it no more, and it gets no records before the next whole checkpoint.
+    pub(super) fn give_up(&mut self) {
+        if std::mem::take(&mut self.gives) {
+            let mut seen = self.shared.seen();
+            seen.gaps += 1;
+            seen.unprotected = Some(SILENT.to_owned());
+        }
+        self.shared.reach(self.seq);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,177 @@
+use super::*;
+use crate::{
+    master::{Master, Method, Request, Snapshot},
+    xmlrpc::Value,
+};
+
+struct Disk {
+    folder: tempfile::TempDir,
+    durable: watch::Sender<u64>,
+}
+
+impl Disk {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let durable = watch::channel(0).0;
+        Self { folder, durable }
+    }
+
+    /// A journal that records.
+    fn journal(&self, sync: SyncPolicy) -> Journal {
+        let path = self.folder.path().join("c");
+        let mut store = Store::open(&path).unwrap().0;
+        store.begin(&Checkpoint::default()).unwrap();
+        Journal::new(store, self.durable.clone(), sync)
+    }
+
+    fn reached(&self) -> u64 {
+        *self.durable.borrow()
+    }
+
+    /// The state that the next start finds.
+    fn found(&self, journal: Journal) -> Snapshot {
+        drop(journal);
+        let path = self.folder.path().join("c");
+        let loaded = Store::open(&path).unwrap().1.unwrap();
+        crate::checkpoint::session::rebuild(loaded.checkpoint, loaded.records)
+            .mirror
+            .snapshot()
+    }
+}
+
+fn set(value: i32) -> Request {
+    let key = format!("/p{value}");
+    let params = [Value::from("/n"), key.as_str().into(), value.into()];
+    Request::new(Method::SetParam, params)
+}
+
+fn entry(value: i32) -> Vec<Entry> {
+    vec![Entry::call(set(value).into())]
+}
+
+/// The whole state after these values were set, as of the last record.
+fn whole(journal: &Journal, values: std::ops::Range<i32>) -> Checkpoint {
+    let mut state = Master::default();
+    for value in values {
+        state.apply(&set(value));
+    }
+    Checkpoint {
+        seq: journal.seq(),
+        snapshot: state.snapshot(),
+        ..Checkpoint::default()
+    }
+}
+
+/// Has the whole state written.
+fn rewrite(journal: &mut Journal, values: std::ops::Range<i32>) {
+    let checkpoint = whole(journal, values);
+    let done = journal.run_whole(checkpoint, |store, checkpoint| store.begin(&checkpoint));
+    journal.worker().work();
+    done.unwrap().try_recv().unwrap().unwrap();
+}
+
+fn unprotected(journal: &Journal) -> Option<String> {
+    journal.seen().unprotected
+}
+
+#[test]
+fn a_record_is_awaited_until_it_is_written_or_synced() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    journal.append(entry(0));
+    assert_eq!((journal.seq(), disk.reached()), (1, 0));
+    journal.worker().work();
+    assert_eq!(disk.reached(), 1);
+
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Always);
+    journal.append(entry(0));
+    journal.worker().work();
+    assert_eq!(disk.reached(), 0);
+    journal.run(|store| {
+        let done = store.sync_job().unwrap().run();
+        store.synced(done).unwrap();
+    });
+    journal.worker().work();
+    assert_eq!(disk.reached(), 1);
+    let state = whole(&journal, 0..1).snapshot;
+    assert_eq!(disk.found(journal), state);
+}
+
+#[test]
+fn what_a_silent_disk_was_not_given_is_in_the_next_whole_checkpoint() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    journal.append(entry(0));
+    // Nothing has been written yet.
+    journal.give_up();
+    assert_eq!(disk.reached(), 1);
+    journal.append(entry(1));
+    assert_eq!((journal.seq(), disk.reached()), (2, 2));
+    // It answers again: only the first record is written.
+    journal.worker().work();
+    assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
+    rewrite(&mut journal, 0..2);
+    assert_eq!(unprotected(&journal), None);
+    journal.append(entry(2));
+    journal.worker().work();
+    let state = whole(&journal, 0..3).snapshot;
+    assert_eq!(disk.found(journal), state);
+}
+
+#[test]
+fn a_whole_checkpoint_from_before_the_second_silence_protects_nothing() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    journal.give_up();
+    journal.append(entry(0));
+    let checkpoint = whole(&journal, 0..1);
+    let _done = journal.run_whole(checkpoint, |store, checkpoint| store.begin(&checkpoint));
+    journal.append(entry(1));
+    journal.give_up();
+    journal.append(entry(2));
+    journal.worker().work();
+    assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
+    rewrite(&mut journal, 0..3);
+    assert_eq!(unprotected(&journal), None);
+    let state = whole(&journal, 0..3).snapshot;
+    assert_eq!(disk.found(journal), state);
+}
+
+#[test]
+fn a_disk_that_is_given_too_much_is_given_up() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    for value in 0..=2048 {
+        journal.append(entry(value));
+    }
+    assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
+    assert!(journal.run(|_| ()).is_none());
+    journal.worker().work();
+    rewrite(&mut journal, 0..2049);
+    assert_eq!(unprotected(&journal), None);
+    let state = whole(&journal, 0..2049).snapshot;
+    assert_eq!(disk.found(journal), state);
+}
+
+/// One thread runs all jobs; another one that comes meanwhile does not wait for the disk.
+#[test]
+fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
+    let disk = Disk::new();
+    let mut journal = disk.journal(SyncPolicy::Interval);
+    let (go_on, hangs) = std::sync::mpsc::sync_channel::<()>(1);
+    let (began, begins) = std::sync::mpsc::sync_channel::<()>(1);
+    journal.run(move |_| {
+        began.send(()).unwrap();
+        hangs.recv().unwrap();
+    });
+    let worker = journal.worker();
+    let first = std::thread::spawn(move || worker.work());
+    begins.recv().unwrap();
+    journal.append(entry(0));
+    journal.worker().work();
+    assert_eq!(disk.reached(), 0);
+    go_on.send(()).unwrap();
+    first.join().unwrap();
+    assert_eq!(disk.reached(), 1);
+}

@@ -1,0 +1,330 @@
+//! Whether a master that does not answer hangs, by what the kernel tells of its process.
+//!
+//! Silence alone is no evidence: on a busy computer a healthy master gets no processor, or rosrescue gets
+//! none and its probes are late. A process that hangs has no use for the processor: it is stopped, or its threads
+//! get the processor when they want it, use little of it, and wait for something else.
+
+use std::time::{Duration, Instant};
+
+/// Silence must have been watched for this long, or nothing is known.
+pub const WATCHED_LEAST: Duration = Duration::from_millis(300);
+/// For this long, if it was not stopped.
+const IDLE_LEAST: Duration = Duration::from_millis(900);
+/// A master that has used the processor for this long since its last answer is in an endless loop.
+pub const BUSY_LIMIT: Duration = Duration::from_secs(30);
+/// One part in so many of the time: a process that has used more of the processor is busy. The threads of an idle
+/// rosmaster wake a hundred times a second, and use one part in two hundred, in thirty on a small computer.
+const BUSY_PART: u32 = 10;
+/// A process whose threads wait for longer than this each time they want the processor is starved. An answer takes
+/// some ten such turns.
+const STARVED_WAIT: Duration = Duration::from_millis(10);
+/// One that wants the processor and had fewer turns than this is starved, too.
+const TURNS_LEAST: u64 = 5;
+/// One part in so many of the time: if rosrescue has waited for the processor for longer, its probes had no fair
+/// chance.
+const UNFAIR_PART: u32 = 2;
+
+/// What the threads of a process do, together with those of its children.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Effort {
+    /// A thread runs, or waits for the processor.
+    pub runnable: bool,
+    /// A thread waits for a disk, and for nothing else.
+    pub on_disk: bool,
+    /// Every thread was stopped, by SIGSTOP or a debugger.
+    pub stopped: bool,
+    /// How long they have run since they were started.
+    pub ran: Duration,
+    /// How long they have waited for the processor. The kernel adds a wait when it ends.
+    pub waited: Duration,
+    /// How often they were given the processor.
+    pub turns: u64,
+}
+
+/// What was seen at one moment.
+#[derive(Clone, Copy, Debug)]
+pub struct Sample {
+    pub at: Instant,
+    /// None if the system does not show it.
+    pub master: Option<Effort>,
+    /// How long rosrescue's own threads have waited for the processor, and how late its timers were.
+    pub own_wait: Duration,
+}
+
+/// What follows from a silence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// The master hangs, or the system does not show what it does.
+    Hung,
+    /// Not proved, and why.
+    Unproved(&'static str),
+    /// It has not been watched for long enough.
+    Unknown,
+}
+
+/// What was seen of a master since its last answer.
+#[derive(Debug, Default)]
+pub struct Evidence {
+    /// The first sample since the last answer.
+    silent: Option<Sample>,
+    /// The first sample of those that are judged.
+    first: Option<Sample>,
+    last: Option<Sample>,
+    /// The first of the latest samples in a row that show it stopped, without progress in between.
+    stopped: Option<Sample>,
+    /// Any of the judged samples shows a thread that wants the processor,
+    runnable: bool,
+    /// or one that waits for a disk,
+    on_disk: bool,
+    /// or that all were stopped.
+    was_stopped: bool,
+}
+
+impl Evidence {
+    /// Adds what was seen.
+    pub fn add(&mut self, sample: Sample) {
+        let before = self.last.replace(sample);
+        self.silent.get_or_insert(sample);
+        self.first.get_or_insert(sample);
+        let Some(effort) = sample.master else { return };
+        self.runnable |= effort.runnable;
+        self.on_disk |= effort.on_disk;
+        self.was_stopped |= effort.stopped;
+        let same = |before: Effort| before.stopped && before.ran == effort.ran;
+        let went_on = before.and_then(|before| before.master).is_some_and(same);
+        self.stopped = match (effort.stopped, self.stopped) {
+            (true, Some(since)) if went_on => Some(since),
+            (true, _) => Some(sample),
+            (false, _) => None,
+        };
+    }
+
+    /// When the last sample was taken.
+    pub fn last_at(&self) -> Option<Instant> {
+        self.last.map(|sample| sample.at)
+    }
+
+    /// The master has answered.
+    pub fn clear(&mut self) {
+        *self = Self::default();
+    }
+
+    /// What follows from the samples if the master has been silent all the time. One that has used the
+    /// processor for `busy_limit` without an answer hangs. After a verdict without proof only later samples are
+    /// judged, and the last one.
+    pub fn judge(&mut self, busy_limit: Duration) -> Verdict {
+        let verdict = self.verdict(busy_limit);
+        if verdict != Verdict::Unknown
+            && let Some(last) = self.last
+        {
+            self.first = Some(last);
+            let effort = last.master.unwrap_or_default();
+            (self.runnable, self.on_disk) = (effort.runnable, effort.on_disk);
+            self.was_stopped = effort.stopped;
+        }
+        verdict
+    }
+
+    fn verdict(&self, busy_limit: Duration) -> Verdict {
+        let (Some(first), Some(last)) = (self.first, self.last) else {
+            return Verdict::Hung;
+        };
+        let (Some(before), Some(now)) = (first.master, last.master) else {
+            return Verdict::Hung;
+        };
+        let watched = last.at.duration_since(first.at);
+        if watched < WATCHED_LEAST {
+            return Verdict::Unknown;
+        }
+        let stopped = self
+            .stopped
+            .map_or(Duration::ZERO, |since| last.at.duration_since(since.at));
+        if stopped >= watched / 5 * 3 {
+            return Verdict::Hung;
+        }
+        if watched < IDLE_LEAST {
+            return Verdict::Unknown;
+        }
+        let silent = self.silent.and_then(|sample| sample.master);
+        let spent = now.ran.saturating_sub(silent.unwrap_or(before).ran);
+        if spent >= busy_limit {
+            return Verdict::Hung;
+        }
+        let ran = now.ran.saturating_sub(before.ran);
+        if ran > watched / BUSY_PART {
+            return Verdict::Unproved("it is busy");
+        }
+        let waited = now.waited.saturating_sub(before.waited);
+        let turns = now.turns.saturating_sub(before.turns);
+        let each = waited / u32::try_from(turns).unwrap_or(u32::MAX).max(1);
+        if self.runnable && turns < TURNS_LEAST || each > STARVED_WAIT {
+            return Verdict::Unproved("it gets too little of the processor");
+        }
+        if self.on_disk {
+            return Verdict::Unproved("it waits for a disk");
+        }
+        if self.was_stopped {
+            return Verdict::Unproved("it was stopped for a part of the time only");
+        }
+        if last.own_wait.saturating_sub(first.own_wait) > watched / UNFAIR_PART {
+            return Verdict::Unproved("rosrescue gets too little of the processor to ask it");
+        }
+        Verdict::Hung
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ms(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
+    /// Idle for so many milliseconds, as a rosmaster is, all in all.
+    fn idle(at: u64) -> (Effort, Duration) {
+        let effort = Effort {
+            ran: Duration::from_secs(1) + ms(at) / 200,
+            // It wakes a hundred times a second.
+            turns: at / 10,
+            waited: Duration::from_secs(1) + ms(at) / 20,
+            ..Effort::default()
+        };
+        (effort, ms(at) / 500)
+    }
+
+    /// The verdict after samples at 0, 500 and 1,000 ms, of what `seen` makes of an idle master's.
+    fn verdict(seen: impl Fn(u64, &mut Effort, &mut Duration)) -> Verdict {
+        let start = Instant::now();
+        let mut evidence = Evidence::default();
+        for at in [0, 500, 1000] {
+            let (mut effort, mut own_wait) = idle(at);
+            seen(at, &mut effort, &mut own_wait);
+            evidence.add(Sample {
+                at: start + ms(at),
+                master: Some(effort),
+                own_wait,
+            });
+        }
+        evidence.judge(BUSY_LIMIT)
+    }
+
+    fn is_unproved(verdict: Verdict, word: &str) {
+        let Verdict::Unproved(why) = verdict else {
+            panic!("{verdict:?} instead of {word}")
+        };
+        assert!(why.contains(word), "{why}");
+    }
+
+    #[test]
+    fn a_master_that_is_stopped_or_wants_nothing_hangs() {
+        assert_eq!(verdict(|_, _, _| {}), Verdict::Hung);
+        let stop = |effort: &mut Effort| {
+            effort.stopped = true;
+            effort.ran = ms(7);
+        };
+        assert_eq!(verdict(|_, effort, _| stop(effort)), Verdict::Hung);
+        // Whatever rosrescue gets of the processor.
+        let starved = |at: u64, effort: &mut Effort, own: &mut Duration| {
+            stop(effort);
+            *own = ms(at);
+        };
+        assert_eq!(verdict(starved), Verdict::Hung);
+    }
+
+    #[test]
+    fn a_master_that_is_starved_or_busy_does_not_hang() {
+        for moment in [0, 500, 1000] {
+            let waits = |at: u64, effort: &mut Effort, _: &mut Duration| {
+                effort.runnable = at == moment;
+                effort.turns = 0;
+            };
+            is_unproved(verdict(waits), "too little of the processor");
+            // Threads that look for work are runnable at times.
+            let found = verdict(|at, effort, _| effort.runnable = at == moment);
+            assert_eq!(found, Verdict::Hung);
+        }
+        let found = verdict(|at, effort, _| {
+            effort.turns /= 10;
+            effort.waited += ms(at) / 5;
+        });
+        is_unproved(found, "too little of the processor");
+        let found = verdict(|at, effort, _| effort.ran += ms(at) / 5);
+        is_unproved(found, "busy");
+        is_unproved(verdict(|_, effort, _| effort.on_disk = true), "disk");
+        let found = verdict(|at, _, own| *own += ms(at) / 3 * 2);
+        is_unproved(found, "rosrescue gets too little");
+        // Stopped and continued in turns: at each moment stopped, and it goes on in between.
+        for going_on in [500, 1000, 2000] {
+            let found = verdict(|at, effort, _| effort.stopped = at != going_on);
+            is_unproved(found, "part of the time");
+        }
+    }
+
+    #[test]
+    fn an_endless_loop_is_no_progress_for_ever() {
+        let start = Instant::now();
+        let mut evidence = Evidence::default();
+        let mut verdicts = Vec::new();
+        for second in 0..40 {
+            let at = Duration::from_secs(second);
+            let master = Some(Effort {
+                runnable: true,
+                ran: at,
+                ..Effort::default()
+            });
+            let (at, own_wait) = (start + at, Duration::ZERO);
+            evidence.add(Sample {
+                at,
+                master,
+                own_wait,
+            });
+            verdicts.push(evidence.judge(BUSY_LIMIT));
+        }
+        let hung = verdicts.iter().position(|it| *it == Verdict::Hung);
+        assert_eq!(hung, Some(30));
+    }
+
+    #[test]
+    fn nothing_is_known_at_first_and_what_cannot_be_seen_hangs() {
+        let mut evidence = Evidence::default();
+        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+        let mut sample = Sample {
+            at: Instant::now(),
+            master: None,
+            own_wait: Duration::ZERO,
+        };
+        evidence.add(sample);
+        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+        evidence.clear();
+        sample.master = Some(Effort::default());
+        evidence.add(sample);
+        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Unknown);
+        sample.at += IDLE_LEAST;
+        evidence.add(sample);
+        assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
+    }
+
+    /// A start: busy for five seconds, then it waits for nothing for ever.
+    #[test]
+    fn progress_of_long_ago_does_not_count() {
+        let start = Instant::now();
+        let mut evidence = Evidence::default();
+        let sample = |evidence: &mut Evidence, seconds: u64| {
+            let ran = Duration::from_secs(seconds.min(5));
+            let master = Some(Effort {
+                ran,
+                ..Effort::default()
+            });
+            evidence.add(Sample {
+                at: start + Duration::from_secs(seconds),
+                master,
+                own_wait: Duration::ZERO,
+            });
+            evidence.judge(BUSY_LIMIT)
+        };
+        assert_eq!(sample(&mut evidence, 0), Verdict::Unknown);
+        is_unproved(sample(&mut evidence, 30), "busy");
+        assert_eq!(sample(&mut evidence, 31), Verdict::Hung);
+    }
+}

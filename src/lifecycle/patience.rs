@@ -1,0 +1,107 @@
+//! How long a write may wait for the master before the mirror answers it.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+/// Older false alarms do not count.
+const MEMORY: Duration = Duration::from_secs(60);
+/// So many within [`MEMORY`] cost nothing; each further one doubles the patience.
+const FREE: usize = 5;
+/// The longest patience.
+const LONGEST: Duration = Duration::from_secs(10);
+
+/// The patience with the master. It grows when the mirror stands in again and again for a master that was only
+/// late, and shrinks when those times lie a minute back.
+#[derive(Clone, Debug)]
+pub struct Patience {
+    base: Duration,
+    /// When the master was late and answered, the oldest first.
+    alarms: VecDeque<Instant>,
+}
+
+impl Patience {
+    /// With `base` while the master is mostly in time.
+    pub fn new(base: Duration) -> Self {
+        Self {
+            base,
+            alarms: VecDeque::new(),
+        }
+    }
+
+    /// The mirror stood in for a master that has answered now.
+    pub fn was_late(&mut self, now: Instant) {
+        self.forget(now);
+        self.alarms.push_back(now);
+    }
+
+    /// How long a write waits now.
+    pub fn at(&mut self, now: Instant) -> Duration {
+        self.forget(now);
+        let further = self.alarms.len().saturating_sub(FREE);
+        let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
+        (self.base * 2_u32.pow(doublings)).min(LONGEST.max(self.base))
+    }
+
+    fn forget(&mut self, now: Instant) {
+        while let Some(at) = self.alarms.front()
+            && now.duration_since(*at) > MEMORY
+        {
+            self.alarms.pop_front();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BASE: Duration = Duration::from_millis(100);
+
+    #[test]
+    fn it_grows_with_false_alarms_and_shrinks_again() {
+        let mut patience = Patience::new(BASE);
+        let mut now = Instant::now();
+        for _ in 0..FREE {
+            assert_eq!(patience.at(now), BASE);
+            patience.was_late(now);
+        }
+        assert_eq!(patience.at(now), BASE);
+        for doublings in 1..=6 {
+            patience.was_late(now);
+            assert_eq!(patience.at(now), BASE * 2_u32.pow(doublings));
+        }
+        (0..100).for_each(|_| patience.was_late(now));
+        assert_eq!(patience.at(now), LONGEST);
+        now += MEMORY + Duration::from_secs(1);
+        assert_eq!(patience.at(now), BASE);
+    }
+
+    /// However late it answers: how often the mirror stands in within any minute.
+    #[test]
+    fn the_gate_does_not_flap_without_bounds() {
+        const MOST: usize = 18;
+        for late in [101, 110, 150, 199, 250, 401, 900, 1700, 3300, 7000, 10_001] {
+            let late = Duration::from_millis(late);
+            let mut patience = Patience::new(BASE);
+            let mut now = Instant::now();
+            let end = now + 10 * MEMORY;
+            let mut flaps = Vec::new();
+            while now < end {
+                if patience.at(now) < late {
+                    flaps.push(now);
+                    now += late;
+                    patience.was_late(now);
+                } else {
+                    now += late;
+                }
+            }
+            for from in &flaps {
+                let minute = *from..*from + MEMORY;
+                let count = flaps.iter().filter(|at| minute.contains(at)).count();
+                assert!(count <= MOST, "{count} within a minute: {late:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,209 @@
+//! Finds out which nodes live, for reports. A node of this computer lives as long as a process listens at its
+//! port, by the kernel's table of sockets. Others are asked every 30 s.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashSet},
+    net::SocketAddr,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use tokio::{
+    sync::Semaphore,
+    time::{MissedTickBehavior, interval, timeout},
+};
+
+use super::{
+    Nodes,
+    client::{self, Sign},
+};
+use crate::{
+    gate::State,
+    health::{self, Health, port_of},
+    limit::rarely,
+    master,
+    replay::Token,
+    resolver,
+    ros_env::MasterUri,
+    upstream::sockets,
+};
+
+/// Pause between two looks at the table of sockets.
+const LOOK_AGAIN: Duration = Duration::from_secs(2);
+/// Nodes asked at the same time.
+const AT_ONCE: usize = 8;
+
+/// The evidence so far.
+#[derive(Debug)]
+pub(super) struct Liveness {
+    known: Mutex<Known>,
+    permits: Semaphore,
+}
+
+#[derive(Debug, Default)]
+struct Known {
+    liveness: health::Liveness,
+    /// The addresses of ports on this computer.
+    here: BTreeMap<String, Vec<SocketAddr>>,
+}
+
+/// What is known of a registered node's life.
+#[derive(Clone, Debug)]
+pub(crate) struct Life {
+    pub(crate) health: Health,
+    /// When there was evidence last; none if there was none.
+    pub(crate) checked: Option<Instant>,
+}
+
+impl Default for Liveness {
+    fn default() -> Self {
+        Self {
+            known: Mutex::default(),
+            permits: Semaphore::new(AT_ONCE),
+        }
+    }
+}
+
+impl Liveness {
+    fn lock(&self) -> MutexGuard<'_, Known> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Nodes {
+    /// What is known of the life of each registered node, by name.
+    pub(crate) fn lives(&self) -> BTreeMap<String, Life> {
+        let now = Instant::now();
+        // Never hold two locks here.
+        let unreachable = self.lock().clone();
+        let nodes: Vec<_> = self.ledger.with_mirror(|mirror| {
+            let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
+            nodes
+                .map(|(name, api)| (name.to_owned(), port_of(api).to_owned()))
+                .collect()
+        });
+        let known = self.liveness.lock();
+        let lives = nodes.into_iter().map(|(name, port)| {
+            let seen = known.liveness.seen(&port);
+            let life = Life {
+                health: Health::of(seen, unreachable.contains(&port), now),
+                checked: seen.map(|seen| seen.at),
+            };
+            (name, life)
+        });
+        lives.collect()
+    }
+}
+
+/// Watches the nodes as long as it is polled.
+pub(crate) async fn watch(nodes: Arc<Nodes>) {
+    let mut looks = interval(LOOK_AGAIN);
+    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        looks.tick().await;
+        let registered: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
+            let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
+            nodes.map(|(_, api)| port_of(api).to_owned()).collect()
+        });
+        // A blocking read of some kilobytes that the kernel makes up, in less than a millisecond.
+        let listening = match registered.is_empty() {
+            true => HashSet::new(),
+            false => sockets::listening(),
+        };
+        let due = {
+            let mut known = nodes.liveness.lock();
+            let Known { liveness, here } = &mut *known;
+            here.retain(|port, _| registered.contains(port));
+            let listens = |port: &str| here.get(port).map(|at| is_among(at, &listening));
+            liveness.round(&registered, listens, Instant::now())
+        };
+        let listening = Arc::new(listening);
+        for port in due {
+            tokio::spawn(ask(nodes.clone(), port, listening.clone()));
+        }
+    }
+}
+
+/// Whether any of `addresses` is among those where processes listen.
+fn is_among(addresses: &[SocketAddr], listening: &HashSet<SocketAddr>) -> bool {
+    addresses.iter().any(|address| {
+        let port = address.port();
+        let any = [([0; 4], port).into(), ([0; 16], port).into()];
+        listening.contains(address) || any.iter().any(|any| listening.contains(any))
+    })
+}
+
+/// Asks the node at `port`, unless a process on this computer listens there.
+async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>>) {
+    // Never closed.
+    let permit = nodes.liveness.permits.acquire().await;
+    let here = addresses_here(&port, nodes.timeout).await;
+    let sign = match &here {
+        None => None,
+        Some(here) if is_among(here, &listening) => Some(Sign::Alive),
+        Some(_) => match nodes.visits.admit(&port, nodes.timeout).await {
+            Some(_admitted) => Some(client::ask(&port, &master::get_pid(), nodes.timeout).await),
+            None => None,
+        },
+    };
+    drop(permit);
+    let has_died = {
+        let mut known = nodes.liveness.lock();
+        if let Some(here) = here.filter(|here| !here.is_empty()) {
+            known.here.insert(port.clone(), here);
+        }
+        known.liveness.answered(&port, sign, Instant::now())
+    };
+    // While the mirror stands in, the health check after it tells of the dead.
+    if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
+        let names: Vec<_> = nodes.ledger.with_mirror(|mirror| {
+            let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
+            nodes.map(|(name, _)| name.to_owned()).collect()
+        });
+        rarely!(
+            info,
+            ?names,
+            "a registered node is dead: its port refuses connections. It stays registered until it is started \
+             again, unregistered, or found by a health check (--reap-dead-nodes)"
+        );
+    }
+}
+
+/// Those of the addresses of `api` that belong to this computer. None if it gets no address within `limit`.
+async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
+    let MasterUri { host, port } = MasterUri::parse(api).ok()?;
+    let found = timeout(limit, resolver::addresses(&host, port)).await;
+    let mut found = found.ok()?.ok()?;
+    for address in &mut found {
+        address.set_ip(address.ip().to_canonical());
+    }
+    found.retain(|address| resolver::is_own(address.ip()));
+    Some(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn the_table_of_sockets_tells_who_listens_on_this_computer() {
+        let limit = Duration::from_secs(60);
+        for host in ["127.0.0.1", "0.0.0.0"] {
+            let listener = std::net::TcpListener::bind((host, 0)).unwrap();
+            let api = format!("http://127.0.0.1:{}", listener.local_addr().unwrap().port());
+            let here = addresses_here(&api, limit).await.unwrap();
+            assert!(is_among(&here, &sockets::listening()), "{host}");
+            drop(listener);
+            assert!(!is_among(&here, &sockets::listening()), "{host}");
+        }
+        // Reserved for documentation, and for names that do not exist.
+        assert_eq!(
+            addresses_here("http://192.0.2.1:80", limit).await,
+            Some(Vec::new())
+        );
+        assert_eq!(
+            addresses_here("http://nobody.invalid:80", limit).await,
+            None
+        );
+    }
+}

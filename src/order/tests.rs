@@ -1,0 +1,273 @@
+//! Single situations. `write_queue/tests` plays the whole with nodes, masters and deaths at random.
+
+use super::*;
+use crate::{
+    health::port_of,
+    master::{Method, Request},
+    xmlrpc::Value,
+};
+
+const A: &str = "http://a:1";
+
+fn call(method: &str, params: &[&str]) -> Request {
+    Request::new(Method::named(method), params.iter().copied())
+}
+
+fn subscribe(node: &str, topic: &str) -> Request {
+    let api = format!("http:/{node}:1/");
+    call("registerSubscriber", &[node, topic, "*", &api])
+}
+
+fn publish(node: &str, topic: &str) -> Request {
+    let api = format!("http:/{node}:1/");
+    call("registerPublisher", &[node, topic, "x/Y", &api])
+}
+
+fn topic(name: &str) -> Subject {
+    Subject::Topic(name.to_owned())
+}
+
+fn param(key: &str) -> Subject {
+    Subject::Param(key.to_owned())
+}
+
+fn begin(order: &mut Order, now: Instant, call: &Request) -> u64 {
+    let heard = Concern::of(Some(call)).heard();
+    order.begin(now, heard).unwrap()
+}
+
+fn holds(order: &mut Order, now: Instant, call: &Request) -> bool {
+    order.hold(now, &Concern::of(Some(call))).is_some()
+}
+
+/// The list of publishers in a `publisherUpdate` that is to be sent.
+fn sent(next: Next) -> (Value, u64) {
+    match next {
+        Next::Send { call, number } => (call.params[2].clone(), number),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn what_notifies_a_node_waits_for_its_answer_about_the_same_subject() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    let subscribed = begin(&mut order, now, &subscribe("/a", "/t"));
+    let gone = call("unregisterPublisher", &["/b", "/t", "http://b:1/"]);
+    for (write, waits) in [
+        (publish("/b", "/t"), true),
+        (publish("/b", "t"), true),
+        (gone, true),
+        (publish("/b", "/u"), false),
+        (subscribe("/b", "/t"), false),
+        (call("setParam", &["/b", "/t", "1"]), false),
+        (
+            Request::multicall([publish("/b", "/u"), publish("/b", "/t")]),
+            true,
+        ),
+        // It takes the node's name at another address.
+        (call("subscribeParam", &["/a", "http://a:2/", "/k"]), true),
+        (call("subscribeParam", &["/a", "http://a:1/", "/k"]), false),
+    ] {
+        assert_eq!(holds(&mut order, now, &write), waits, "{write:?}");
+    }
+    assert!(order.hold(now, &Concern::of(None)).is_some());
+    assert!(order.written(now, subscribed));
+    assert!(!holds(&mut order, now, &publish("/b", "/t")));
+    assert!(order.hold(now, &Concern::of(None)).is_none());
+
+    let watch = call("subscribeParam", &["/a", "http://a:1/", "/k/x"]);
+    begin(&mut order, now, &watch);
+    mirror.apply(&watch);
+    for (key, waits) in [("/k", true), ("/k/x/y", true), ("/", true), ("/k/y", false)] {
+        let write = call("setParam", &["/b", key, "1"]);
+        assert_eq!(holds(&mut order, now, &write), waits, "{key}");
+    }
+}
+
+#[test]
+fn a_read_of_a_subscribed_parameter_is_an_answer_too() {
+    let (mut order, mut mirror) = (Order::default(), Master::default());
+    let now = Instant::now();
+    let read = call("getParam", &["/a", "/k/x"]);
+    assert_eq!(heard_by_read(&read, &mirror), []);
+    mirror.apply(&call("subscribeParam", &["/a", "http://a:1/", "/k"]));
+    assert_eq!(heard_by_read(&call("getParam", &["/a", "/l"]), &mirror), []);
+    assert_eq!(heard_by_read(&call("hasParam", &["/a", "/k"]), &mirror), []);
+    let heard = heard_by_read(&Request::multicall([read]), &mirror);
+    let expected = Heard {
+        port: A.to_owned(),
+        subject: param("/k/x/"),
+    };
+    assert_eq!(heard, [expected]);
+    assert!(!holds(
+        &mut order,
+        now,
+        &call("setParam", &["/b", "/k/x", "1"])
+    ));
+    order.sent(&[param("/k/")], Vec::new());
+    assert!(order.holds_read(&heard));
+    assert!(order.settled());
+    assert!(!order.holds_read(&heard));
+}
+
+#[test]
+fn a_notification_waits_for_the_answer_and_for_its_lead_and_is_repeated_once() {
+    let (mut order, start, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    let number = begin(&mut order, start, &subscribe("/a", "/t"));
+    mirror.apply(&subscribe("/a", "/t"));
+    mirror.apply(&publish("/b", "/t"));
+    let update = Arc::new(mirror.publisher_update("/t"));
+    order.notify(A, topic("/t"), update.clone());
+    assert_eq!(order.take_idle_ports(), [A]);
+    assert_eq!(order.next(start, A, &mirror), Next::Wait { until: None });
+    assert!(order.written(start, number));
+    let until = Some(start + LEAD);
+    assert_eq!(order.next(start, A, &mirror), Next::Wait { until });
+    let now = start + LEAD;
+    let (list, number) = sent(order.next(now, A, &mirror));
+    assert_eq!(list, update.params[2]);
+    // While it is on its way, what makes a master notify of something newer waits, but not for ever.
+    assert!(holds(&mut order, now, &publish("/c", "/t")));
+    assert!(!holds(
+        &mut order,
+        now + NOTIFICATION_LIMIT,
+        &publish("/c", "/t")
+    ));
+    order.taken(now, number);
+    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+
+    let again = order.next_repeat().unwrap();
+    assert_eq!(again, now + REPEAT_AFTER);
+    order.repeat(again);
+    assert_eq!(order.take_idle_ports(), [A]);
+    let (_, number) = sent(order.next(again, A, &mirror));
+    order.taken(now, number);
+    assert_eq!(
+        (order.next(again, A, &mirror), order.next_repeat()),
+        (Next::Idle, None)
+    );
+}
+
+#[test]
+fn what_is_out_of_date_is_left_out_and_never_sent_after_something_newer() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    let mut lists = Vec::new();
+    for node in ["/b", "/c", "/d"] {
+        mirror.apply(&publish(node, "/t"));
+        let update = Arc::new(mirror.publisher_update("/t"));
+        lists.push(update.params[2].clone());
+        order.notify(A, topic("/t"), update);
+    }
+    // One by one, as a master sends them.
+    let (first, number) = sent(order.next(now, A, &mirror));
+    assert_eq!(first, lists[0]);
+    order.taken(now, number);
+    // The present state, of which somebody else has asked: the older ones are left out.
+    order.tell_state(A, topic("/t"));
+    order.begin(
+        now,
+        vec![Heard {
+            port: A.to_owned(),
+            subject: topic("/t"),
+        }],
+    );
+    assert_eq!(order.next(now, A, &mirror), Next::Wait { until: None });
+    order.written(now, 2);
+    let (last, number) = sent(order.next(now + LEAD, A, &mirror));
+    assert_eq!(last, lists[2]);
+    order.taken(now, number);
+    assert_eq!(order.next(now + LEAD, A, &mirror), Next::Idle);
+}
+
+#[test]
+fn so_many_that_they_pile_up_are_told_once_each() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&call("subscribeParam", &["/a", "http://a:1/", "/k"]));
+    for value in 0..1000 {
+        let set = Request::new(
+            Method::SetParam,
+            [Value::from("/b"), "/k".into(), value.into()],
+        );
+        mirror.apply(&set);
+        let update = Arc::new(mirror.param_update("/k/").unwrap());
+        order.notify(A, param("/k/"), update);
+    }
+    let mut values = Vec::new();
+    while let Next::Send { call, number } = order.next(now, A, &mirror) {
+        values.push(call.params[2].as_int().unwrap());
+        order.taken(now, number);
+    }
+    assert!(values.is_sorted() && values.len() < 300, "{values:?}");
+    assert_eq!(values.last(), Some(&999));
+}
+
+#[test]
+fn where_the_master_may_be_notifying_ours_is_put_off_and_told_with_the_state() {
+    let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
+    mirror.apply(&subscribe("/a", "/t"));
+    let old = Arc::new(mirror.publisher_update("/t"));
+    order.notify(A, topic("/t"), old);
+    order.sent(&[topic("/t")], Vec::new());
+    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+    mirror.apply(&publish("/b", "/t"));
+    order.told_by_master(now, &topic("/t"), 1);
+    assert!(!order.settled());
+    order.tell_state(A, topic("/t"));
+    assert_eq!(order.next(now, A, &mirror), Next::Idle);
+    let later = order.next_repeat().unwrap();
+    assert_eq!(later, now + MASTER_TAKES + REPEAT_AFTER);
+    order.repeat(later);
+    let (list, number) = sent(order.next(later, A, &mirror));
+    assert_eq!(list, mirror.publisher_update("/t").params[2]);
+    order.taken(now, number);
+    assert_eq!(order.next(later, A, &mirror), Next::Idle);
+    // After its death ours comes at once; what it had sent may be read later all the same.
+    order.told_by_master(later, &topic("/t"), 1);
+    order.notify(A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
+    let (_, number) = sent(order.next(later, A, &mirror));
+    order.taken(now, number);
+    assert_eq!(order.next_repeat(), Some(later + REPEAT_AFTER));
+}
+
+#[test]
+fn a_master_that_notifies_shortly_after_an_answer_is_repeated() {
+    let (mut order, now) = (Order::default(), Instant::now());
+    let number = begin(&mut order, now, &subscribe("/a", "/t"));
+    order.sent([], vec![number]);
+    // In one batch with it only what came before it in the queue: its answer is newer.
+    order.told_by_master(now, &topic("/t"), 1);
+    order.settled();
+    assert_eq!(order.next_repeat(), None);
+    order.written(now, number);
+    order.told_by_master(now, &topic("/t"), 1);
+    assert!(order.has_new_repeat());
+    let late = now + RECENT;
+    order.told_by_master(late, &topic("/t"), 1);
+    let until = now + 2 * MASTER_TAKES + REPEAT_AFTER;
+    assert_eq!(order.next_repeat(), Some(until));
+    assert_eq!(port_of("http://a:1/"), A);
+}
+
+#[test]
+fn a_parameter_that_is_set_all_the_time_takes_no_more_room_than_one_that_is_set_once() {
+    let (mut order, now) = (Order::default(), Instant::now());
+    for step in 0..10_000 {
+        let now = now + Duration::from_micros(100) * step;
+        order.told_by_master(now, &param("/k/"), 4);
+    }
+    assert_eq!(order.told.until.about(&param("/k/")).count(), 1);
+    assert_eq!(order.told.ends.queue.len(), 1);
+    let until = order.told.until(now, &param("/")).unwrap();
+    assert!(until < now + Duration::from_secs(1) + BACKLOG_MOST + 2 * REPEAT_AFTER);
+    assert_eq!(order.told.until(until, &param("/")), None);
+}
+
+/// Loggers subscribe the same parameter again and again, also while the master has a call of the same node.
+#[test]
+fn a_node_does_not_wait_for_its_own_registrations() {
+    let mut order = Order::default();
+    let watch = Concern::of(Some(&call("subscribeParam", &["/a", "http://a:1/", "/k"])));
+    order.sent(watch.tells(), Vec::new());
+    assert!(!order.holds_read(&watch.heard()));
+}

@@ -1,0 +1,157 @@
+//! Answers and notifications on their way to nodes.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    time::Instant,
+};
+
+use super::{BySubject, Heard, RECENT, Subject};
+
+/// What is on its way, by number, and what has arrived lately.
+#[derive(Debug, Default)]
+pub(super) struct UnderWay {
+    last: u64,
+    entries: HashMap<u64, Entry>,
+    by_subject: BySubject<u64>,
+    /// What has arrived, the oldest first.
+    written: VecDeque<(Instant, u64)>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Answer,
+    Notification,
+}
+
+#[derive(Debug)]
+struct Entry {
+    kind: Kind,
+    heard: Vec<Heard>,
+    /// Until when it holds up others.
+    limit: Option<Instant>,
+    written: Option<Instant>,
+}
+
+impl Entry {
+    fn holds_up(&self, now: Instant) -> bool {
+        self.written.is_none() && self.limit.is_none_or(|limit| now < limit)
+    }
+}
+
+/// The last answer to a node about a subject.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Answer {
+    /// It holds up others until `limit`, if there is one.
+    UnderWay { limit: Option<Instant> },
+    /// It was written at this time, not long ago.
+    Written { at: Instant },
+}
+
+impl UnderWay {
+    /// Something about `heard` is under way, and holds up others until `limit`.
+    pub(super) fn add(&mut self, kind: Kind, heard: Vec<Heard>, limit: Option<Instant>) -> u64 {
+        self.last += 1;
+        for heard in &heard {
+            self.by_subject.add(&heard.subject, self.last);
+        }
+        let entry = Entry {
+            kind,
+            heard,
+            limit,
+            written: None,
+        };
+        self.entries.insert(self.last, entry);
+        self.last
+    }
+
+    pub(super) fn limit(&mut self, number: u64, limit: Instant) {
+        if let Some(entry) = self.entries.get_mut(&number) {
+            entry.limit = Some(limit);
+        }
+    }
+
+    /// It has been written to its caller, or taken by its node.
+    pub(super) fn written(&mut self, now: Instant, number: u64) {
+        if let Some(entry) = self.entries.get_mut(&number) {
+            entry.written = Some(now);
+            self.written.push_back((now, number));
+        }
+    }
+
+    fn remove(&mut self, number: u64) {
+        for heard in self
+            .entries
+            .remove(&number)
+            .into_iter()
+            .flat_map(|entry| entry.heard)
+        {
+            self.by_subject.remove(&heard.subject, number);
+        }
+    }
+
+    /// Forgets what is not recent any more.
+    pub(super) fn forget(&mut self, now: Instant) {
+        while let Some((at, number)) = self.written.front()
+            && now.duration_since(*at) >= RECENT
+        {
+            let number = *number;
+            self.written.pop_front();
+            self.remove(number);
+        }
+    }
+
+    /// Whether anything is under way, and until when it holds up others.
+    pub(super) fn any(&self, now: Instant) -> Option<Option<Instant>> {
+        let mut entries = self.entries.values();
+        entries.find(|entry| entry.holds_up(now)).map(|it| it.limit)
+    }
+
+    /// Whether something about `subject` is under way, other than to `port`, and until when it holds up others.
+    pub(super) fn before(
+        &self,
+        now: Instant,
+        subject: &Subject,
+        port: Option<&str>,
+    ) -> Option<Option<Instant>> {
+        let mut entries = self.concerned(subject);
+        entries.find_map(|(_, entry, heard)| {
+            (entry.holds_up(now) && port != Some(&heard.port)).then_some(entry.limit)
+        })
+    }
+
+    /// The numbers and ports of what is under way about `subject`, or was not long ago.
+    pub(super) fn about(&mut self, now: Instant, subject: &Subject) -> Vec<(u64, String)> {
+        self.forget(now);
+        self.concerned(subject)
+            .map(|(number, _, heard)| (number, heard.port.clone()))
+            .collect()
+    }
+
+    /// The last answer to the node at `port` about `subject`, if it is under way or not long ago.
+    pub(super) fn answer_to(&self, now: Instant, port: &str, subject: &Subject) -> Option<Answer> {
+        let to_port = self
+            .concerned(subject)
+            .filter(|(_, entry, heard)| entry.kind == Kind::Answer && heard.port == port);
+        let mut last = None;
+        for (_, entry, _) in to_port {
+            if entry.holds_up(now) {
+                let limit = entry.limit;
+                return Some(Answer::UnderWay { limit });
+            }
+            last = last.max(entry.written);
+        }
+        last.map(|at| Answer::Written { at })
+    }
+
+    fn concerned<'a>(
+        &'a self,
+        subject: &'a Subject,
+    ) -> impl Iterator<Item = (u64, &'a Entry, &'a Heard)> {
+        self.by_subject.about(subject).filter_map(move |number| {
+            let entry = self.entries.get(&number)?;
+            let mut heard = entry.heard.iter();
+            let heard = heard.find(|heard| heard.subject.concerns(subject))?;
+            Some((number, entry, heard))
+        })
+    }
+}

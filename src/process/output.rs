@@ -1,0 +1,122 @@
+//! Where a child process prints to: a file beside the checkpoint. No call waits for the disk that it is on.
+
+use std::{
+    fs::File,
+    io,
+    os::unix::fs::FileExt,
+    path::{Path, PathBuf},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
+use super::beside;
+use crate::{limit::rarely, regular_file, wait};
+
+/// A disk that takes longer does not delay a master any more: it starts without the file.
+pub(super) const LIMIT: Duration = Duration::from_millis(250);
+/// The part of the output that messages show, in bytes.
+const TAIL: u64 = 400;
+
+/// The file that takes what a child process prints.
+#[derive(Clone, Debug)]
+pub(super) struct Output {
+    path: PathBuf,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    /// The present file, readable and open for appending.
+    file: Mutex<Option<File>>,
+    /// The disk has not answered yet. It is not asked again before.
+    asked: AtomicBool,
+}
+
+impl Output {
+    /// The file at `checkpoint` with `suffix` behind its name. Nothing is opened yet.
+    pub(super) fn beside(checkpoint: &Path, suffix: &str) -> Self {
+        Self {
+            path: beside(checkpoint, suffix),
+            shared: Arc::default(),
+        }
+    }
+
+    /// Creates an empty file for the next process. Logs why there is none.
+    pub(super) async fn renew(&self) {
+        self.set(None);
+        let path = self.path.clone();
+        let file = match self.ask(move || regular_file::create(&path)).await {
+            Some(Ok(file)) => Some(file),
+            Some(Err(error)) => {
+                self.report(&error.to_string());
+                None
+            }
+            None => {
+                self.report("the disk does not answer");
+                None
+            }
+        };
+        self.set(file);
+    }
+
+    fn report(&self, error: &str) {
+        rarely!(
+            warn,
+            file = %self.path.display(),
+            error,
+            "cannot create the file for a process's output; the process starts without it"
+        );
+    }
+
+    fn set(&self, file: Option<File>) {
+        *self
+            .shared
+            .file
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = file;
+    }
+
+    /// The present file, for a process to write to; none without one.
+    pub(super) fn file(&self) -> Option<File> {
+        let file = self
+            .shared
+            .file
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        file.as_ref()?.try_clone().ok()
+    }
+
+    /// The end of what was printed, for messages; empty if it cannot be read.
+    pub(super) async fn tail(&self) -> String {
+        let Some(file) = self.file() else {
+            return String::new();
+        };
+        let tail = self.ask(move || tail_of(&file)).await;
+        let tail = tail.and_then(Result::ok).unwrap_or_default();
+        String::from_utf8_lossy(&tail).trim().to_owned()
+    }
+
+    /// Runs `work` on the disk, in another thread; none if that takes too long or earlier work has not come back.
+    async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+        if self.shared.asked.swap(true, Ordering::AcqRel) {
+            return None;
+        }
+        let shared = Arc::clone(&self.shared);
+        let work = move || {
+            let done = work();
+            shared.asked.store(false, Ordering::Release);
+            done
+        };
+        wait::within(LIMIT, work).await
+    }
+}
+
+fn tail_of(file: &File) -> io::Result<Vec<u8>> {
+    let length = file.metadata()?.len();
+    let mut tail = vec![0; usize::try_from(length.min(TAIL)).unwrap_or_default()];
+    file.read_exact_at(&mut tail, length.saturating_sub(TAIL))?;
+    Ok(tail)
+}

@@ -1,0 +1,129 @@
+//! PID files beside the checkpoint: the rosmaster and the rosout that were started last.
+//!
+//! By them a new worker finds what the last one left running, and looks at no other process.
+
+use std::{
+    fs,
+    io::{self, Write},
+    path::{Path, PathBuf},
+};
+
+use tokio::task::spawn_blocking;
+
+use super::{Stat, beside, output};
+use crate::{regular_file, wait};
+
+/// A file that identifies one process.
+#[derive(Clone, Debug)]
+pub(super) struct PidFile(PathBuf);
+
+/// What a PID file tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Last {
+    /// The process that was started last runs. It was told this port.
+    Running { pid: u32, port: u16 },
+    /// It has ended.
+    Ended,
+    /// There is no whole file. An earlier version wrote none, the disk was full, or rosrescue was killed
+    /// while it started the process.
+    Unknown,
+}
+
+impl PidFile {
+    /// The file of the process `name` beside `checkpoint`.
+    pub(super) fn beside(checkpoint: &Path, name: &str) -> Self {
+        Self(beside(checkpoint, &format!(".{name}-pid")))
+    }
+
+    /// Must be called before a process is started: if we are killed before [`Self::write`], that process must
+    /// be searched for. A disk that answers late delays it for [`output::LIMIT`] at most.
+    pub(super) async fn clear(&self) {
+        let file = self.clone();
+        wait::within(output::LIMIT, move || file.remove()).await;
+    }
+
+    /// Records the process `pid`, which was told `port`. Without the file it must be searched for.
+    /// Does not wait for the disk.
+    pub(super) fn write(&self, pid: u32, port: u16) {
+        let file = self.clone();
+        spawn_blocking(move || file.record(pid, port));
+    }
+
+    /// As [`Self::clear`], but waits for the disk.
+    pub(super) fn remove(&self) {
+        let _ = fs::remove_file(&self.0);
+    }
+
+    /// As [`Self::write`], but waits for the disk.
+    pub(super) fn record(&self, pid: u32, port: u16) {
+        if let Some(stat) = Stat::of(pid) {
+            let line = format!("{pid} {} {port} {}\n", stat.started, boot_id());
+            let created = regular_file::create(&self.0);
+            if let Err(error) = created.and_then(|mut file| file.write_all(line.as_bytes())) {
+                tracing::debug!(%error, path = %self.0.display(), "no PID file");
+                self.remove();
+            }
+        }
+    }
+
+    /// Whether the process that was started last still runs.
+    pub(super) fn last(&self) -> Last {
+        let line = regular_file::open(&self.0).and_then(io::read_to_string);
+        let line = line.unwrap_or_default();
+        let fields: Vec<_> = line.split(' ').collect();
+        let (&[pid, started, port, boot], true) = (&*fields, line.ends_with('\n')) else {
+            return Last::Unknown;
+        };
+        let (Ok(pid), Ok(started), Ok(port)) = (pid.parse(), started.parse::<u64>(), port.parse())
+        else {
+            return Last::Unknown;
+        };
+        let runs = |stat: Stat| stat.started == started && stat.is_alive();
+        match Stat::of(pid).is_some_and(runs) && boot.trim_end() == boot_id() {
+            true => Last::Running { pid, port },
+            false => Last::Ended,
+        }
+    }
+}
+
+/// Process ids and times begin anew with each boot.
+fn boot_id() -> String {
+    let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    id.trim_end().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_is_found_as_long_as_it_runs() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = PidFile::beside(&folder.path().join("checkpoint"), "sleep");
+        assert_eq!(file.last(), Last::Unknown, "there is no file");
+        let mut child = std::process::Command::new("sleep")
+            .arg("60")
+            .spawn()
+            .unwrap();
+        let pid = child.id();
+        file.record(pid, 7);
+        assert_eq!(file.last(), Last::Running { pid, port: 7 });
+        let whole = fs::read_to_string(&file.0).unwrap();
+        let after = |text: String| {
+            fs::write(&file.0, text).unwrap();
+            file.last()
+        };
+        for half in ["", &whole[..whole.len() - 1], &whole[..3]] {
+            assert_eq!(after(half.to_owned()), Last::Unknown, "{half}");
+        }
+        let started = Stat::of(pid).unwrap().started.to_string();
+        assert_eq!(after(whole.replacen(&started, "1", 1)), Last::Ended);
+        assert_eq!(after(whole.replace(&boot_id(), "another")), Last::Ended);
+        assert_eq!(after(whole), Last::Running { pid, port: 7 });
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert_eq!(file.last(), Last::Ended);
+        file.remove();
+        assert_eq!(file.last(), Last::Unknown);
+    }
+}

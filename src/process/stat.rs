@@ -1,0 +1,85 @@
+//! What the kernel tells about a process without the lock of that process's memory (`proc_pid_stat(5)`).
+//!
+//! Its environment and its command line do need that lock, and on a busy computer a read waits for 100 ms and
+//! more.
+
+use std::fs;
+
+/// The state of a process.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Stat {
+    state: char,
+    pub(super) parent: u32,
+    /// When it was started, in clock ticks since the boot. With the process id it identifies the process.
+    pub(crate) started: u64,
+    has_memory: bool,
+}
+
+impl Stat {
+    /// That of the process `pid`; none if there is no such process.
+    pub(crate) fn of(pid: u32) -> Option<Self> {
+        Self::parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
+    }
+
+    fn parse(line: &str) -> Option<Self> {
+        // The command's name in parentheses comes first and may contain anything.
+        let mut fields = line.rsplit(')').next()?.split_whitespace();
+        let state = fields.next()?.chars().next()?;
+        let parent = fields.next()?.parse().ok()?;
+        let started = fields.nth(17)?.parse().ok()?;
+        let has_memory = fields.next()? != "0";
+        Some(Self {
+            state,
+            parent,
+            started,
+            has_memory,
+        })
+    }
+
+    /// Whether it runs. A process that ends gives up its memory first, and its sockets after that.
+    pub(crate) fn is_alive(self) -> bool {
+        self.has_memory && !matches!(self.state, 'Z' | 'X')
+    }
+
+    /// Whether it was stopped, by Ctrl-Z, SIGSTOP or a debugger.
+    pub(crate) fn is_stopped(self) -> bool {
+        matches!(self.state, 'T' | 't')
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LINE: &str = "7 (a) (b) S 3 7 7 0 -1 4194560 1 2 3 4 5 6 7 8 20 0 9 0 4711 8192 5 1";
+
+    #[test]
+    fn a_line_of_the_kernel_is_understood() {
+        let stat = Stat::parse(LINE).unwrap();
+        assert_eq!((stat.parent, stat.started), (3, 4711));
+        assert!(stat.is_alive() && !stat.is_stopped());
+        let with = |from: &str, to: &str| Stat::parse(&LINE.replace(from, to)).unwrap();
+        assert!(!with(" S ", " Z ").is_alive());
+        assert!(!with(" 8192 ", " 0 ").is_alive(), "it is ending");
+        for state in [" T ", " t "] {
+            assert!(with(" S ", state).is_stopped());
+            assert!(with(" S ", state).is_alive());
+        }
+        assert_eq!(Stat::parse("7 (a) S"), None);
+    }
+
+    #[test]
+    fn a_process_is_alive_until_it_has_ended() {
+        let own = Stat::of(std::process::id()).unwrap();
+        assert!(own.is_alive());
+        assert_eq!(own.parent, std::os::unix::process::parent_id());
+        let mut child = std::process::Command::new("sleep")
+            .arg("60")
+            .spawn()
+            .unwrap();
+        assert!(Stat::of(child.id()).unwrap().started >= own.started);
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert_eq!(Stat::of(child.id()), None);
+    }
+}

@@ -1,0 +1,144 @@
+//! The sentinel: a connection to the master on which nothing is ever sent. It ends with the master.
+
+use std::{io, mem::MaybeUninit, net::SocketAddr, sync::Arc, time::Duration};
+
+use socket2::SockRef;
+use tokio::{net::TcpStream, sync::watch};
+
+use super::{ConnectError, Upstream, is_local};
+
+/// How often it is renewed where nothing else does so: before a master with the shortest sensible `-t` closes it.
+const RENEWAL: Duration = Duration::from_secs(1);
+
+/// A connection on which nothing is ever sent. Also a master that closes each connection after one answer leaves
+/// it open. It is renewed from time to time, because a master may close idle connections.
+#[derive(Debug)]
+pub(crate) struct Sentinel {
+    stream: watch::Sender<Arc<TcpStream>>,
+    local: bool,
+    peer: SocketAddr,
+}
+
+impl Sentinel {
+    pub(super) fn new(stream: TcpStream) -> io::Result<Self> {
+        Ok(Self {
+            local: is_local(&stream)?,
+            peer: stream.peer_addr()?,
+            stream: watch::Sender::new(Arc::new(stream)),
+        })
+    }
+
+    /// Whether the other end is on this computer, or seems to be: a tunnel's end is here too.
+    pub(crate) fn is_local(&self) -> bool {
+        self.local
+    }
+
+    /// The other end's address.
+    pub(crate) fn peer(&self) -> SocketAddr {
+        self.peer
+    }
+
+    /// Whether the connection is open. Asks the kernel: the runtime may not have heard of its end yet.
+    pub(crate) fn is_open(&self) -> bool {
+        let mut byte = [MaybeUninit::uninit()];
+        let peeked = SockRef::from(&**self.stream.borrow()).peek(&mut byte);
+        peeked.is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
+    }
+
+    /// Replaces the connection by a new one to the same process. The kernel closes the descriptors of a dying
+    /// process one by one, mostly the newest first.
+    pub(crate) async fn renew(&self, upstream: &Upstream) -> Result<(), ConnectError> {
+        let (_, stream) = upstream.bounded_stream().await?;
+        // Open after the connect: no other process can have taken the new one.
+        if self.is_open() {
+            self.stream.send_replace(Arc::new(stream));
+        }
+        Ok(())
+    }
+
+    /// Runs `work` and renews the connection meanwhile.
+    pub(crate) async fn during<T>(&self, upstream: &Upstream, work: impl Future<Output = T>) -> T {
+        let renewing = async {
+            loop {
+                tokio::time::sleep(RENEWAL).await;
+                // If it fails, the end of the connection shows why.
+                let _ = self.renew(upstream).await;
+            }
+        };
+        tokio::select! {
+            done = work => done,
+            () = renewing => std::future::pending().await,
+        }
+    }
+
+    /// Returns when the connection has ended, or when the other end says something unasked, as no master does.
+    pub(crate) async fn ended(&self) {
+        let mut renewed = self.stream.subscribe();
+        loop {
+            let stream = renewed.borrow_and_update().clone();
+            let mut byte = [0];
+            tokio::select! {
+                biased;
+                _ = renewed.changed() => {}
+                _ = stream.peek(&mut byte) => return,
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use tokio::net::TcpListener;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn the_end_of_the_other_side_is_seen_at_once() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let connect =
+            || async { Sentinel::new(TcpStream::connect(address).await.unwrap()).unwrap() };
+        let sentinel = connect().await;
+        let waiting = connect().await;
+        assert!(sentinel.is_local() && sentinel.peer() == address);
+        assert!(sentinel.is_open() && waiting.is_open(), "not accepted yet");
+        let (accepted, _) = listener.accept().await.unwrap();
+        let early = tokio::time::timeout(Duration::from_millis(20), sentinel.ended()).await;
+        assert!(early.is_err() && sentinel.is_open());
+        drop(accepted);
+        assert!(!sentinel.is_open(), "without a turn of the runtime");
+        sentinel.ended().await;
+        assert!(waiting.is_open());
+        let silent = tokio::time::timeout(Duration::from_millis(20), waiting.ended());
+        assert!(silent.await.is_err());
+        drop(listener);
+        assert!(!waiting.is_open(), "nobody can accept it any more");
+    }
+
+    #[tokio::test]
+    async fn a_renewed_one_leads_to_the_same_process() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let uri = crate::ros_env::MasterUri::parse(&format!("http://{address}")).unwrap();
+        let name = hyper::header::HeaderValue::from_static("test");
+        let upstream = Upstream::new(uri, name, Duration::from_secs(1), 3);
+        let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
+        let ended = tokio::spawn({
+            let sentinel = sentinel.clone();
+            async move { sentinel.ended().await }
+        });
+        let (first, _) = listener.accept().await.unwrap();
+        sentinel.renew(&upstream).await.unwrap();
+        let (second, _) = listener.accept().await.unwrap();
+        assert_eq!(first.peek(&mut [0]).await.unwrap(), 0, "it is closed");
+        drop(first);
+        assert!(sentinel.is_open() && !ended.is_finished());
+        drop(second);
+        ended.await.unwrap();
+        // Its process is gone: one that another process takes is not believed.
+        sentinel.renew(&upstream).await.unwrap();
+        assert!(!sentinel.is_open());
+    }
+}

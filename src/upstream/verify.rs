@@ -1,0 +1,132 @@
+//! That a call is answered by the served incarnation and by no other.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use thiserror::Error;
+
+use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream, sentinel::Sentinel};
+use crate::replay::Token;
+
+/// Why a connection, or a reply, is not known to be that of the served incarnation.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum VerifyError {
+    #[error(transparent)]
+    Connect(#[from] ConnectError),
+    #[error(transparent)]
+    Call(#[from] CallError),
+    /// It is another incarnation, which does not hold the state yet.
+    #[error("the master behind a new connection does not bear the present incarnation's token")]
+    OtherIncarnation,
+    /// The master that was served is gone.
+    #[error("the master's sentinel has ended")]
+    Ended,
+}
+
+/// How calls are known to reach the served incarnation.
+#[derive(Clone, Debug)]
+pub(crate) enum Verification {
+    /// The master keeps connections open (HTTP/1.1): the token is looked up on each before its first call.
+    TokenFirst,
+    /// The master closes each connection after one answer (HTTP/1.0), and the sentinel leads to the process that
+    /// listens. While that is open, no other process can have taken a connection.
+    Sentinel(Arc<Sentinel>),
+    /// As above, but the master runs elsewhere or cannot be seen: the token is looked up after each answer.
+    TokenAfterwards,
+}
+
+impl Verification {
+    /// How calls to a master are verified. `keeps_alive`: whether it answers more than one call on a connection.
+    /// `sees_master`: whether the sentinel leads to the master's own process and not to a tunnel.
+    pub(crate) fn of(keeps_alive: bool, sees_master: bool, sentinel: &Arc<Sentinel>) -> Self {
+        match (keeps_alive, sees_master) {
+            (true, _) => Self::TokenFirst,
+            (false, true) => Self::Sentinel(sentinel.clone()),
+            (false, false) => Self::TokenAfterwards,
+        }
+    }
+}
+
+/// A connection that leads to the served incarnation, as far as that is known before a call.
+#[derive(Debug)]
+pub(crate) struct Verified {
+    pub(crate) connection: Connection,
+    by: Verification,
+}
+
+impl Verified {
+    /// A connection on which the token was found before.
+    pub(crate) fn before(connection: Connection) -> Self {
+        let by = Verification::TokenFirst;
+        Self { connection, by }
+    }
+
+    /// Sends `body` unchanged. Returns the reply unchanged, if it is that of the incarnation that bears `token`.
+    pub(crate) async fn forward(
+        &mut self,
+        upstream: &Upstream,
+        token: &Token,
+        head: &Head,
+        body: Bytes,
+    ) -> Result<RawReply, CallError> {
+        let reply = self.connection.forward(head, body).await?;
+        self.confirm(upstream, token).await?;
+        Ok(reply)
+    }
+
+    /// Whether what was answered since the verification counts.
+    pub(crate) async fn confirm(
+        &self,
+        upstream: &Upstream,
+        token: &Token,
+    ) -> Result<(), CallError> {
+        let confirmed = match &self.by {
+            Verification::TokenFirst => Ok(()),
+            Verification::Sentinel(sentinel) => is_open(sentinel),
+            // The process that bears the token now has had the port since it was given the token.
+            Verification::TokenAfterwards => match upstream.connect().await {
+                Ok(mut connection) => look_up(&mut connection, token).await,
+                Err(error) => Err(error.into()),
+            },
+        };
+        confirmed.map_err(|error| CallError::Unverified(error.into()))
+    }
+}
+
+/// Verifies a new `connection`. The master may have been replaced unnoticed.
+pub(crate) async fn connection(
+    mut connection: Connection,
+    upstream: &Upstream,
+    token: &Token,
+) -> Result<Verified, VerifyError> {
+    let by = upstream.verification().ok_or(VerifyError::Ended)?;
+    match &by {
+        Verification::TokenFirst => look_up(&mut connection, token).await?,
+        // Open after the connect: the connection leads to the same process.
+        Verification::Sentinel(sentinel) => is_open(sentinel)?,
+        Verification::TokenAfterwards => {}
+    }
+    Ok(Verified { connection, by })
+}
+
+/// Probes the master to which `sentinel` leads, and renews the sentinel if it bears `token`.
+pub(crate) async fn probe(
+    upstream: &Upstream,
+    token: &Token,
+    sentinel: &Sentinel,
+) -> Result<(), VerifyError> {
+    look_up(&mut upstream.connect().await?, token).await?;
+    Ok(sentinel.renew(upstream).await?)
+}
+
+async fn look_up(connection: &mut Connection, token: &Token) -> Result<(), VerifyError> {
+    match Token::is_found(&connection.call(&token.lookup().into()).await?) {
+        true => Ok(()),
+        false => Err(VerifyError::OtherIncarnation),
+    }
+}
+
+fn is_open(sentinel: &Sentinel) -> Result<(), VerifyError> {
+    sentinel.is_open().then_some(()).ok_or(VerifyError::Ended)
+}

@@ -1,0 +1,216 @@
+//! Nodes: what they call, and what they believe by what they have heard.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use super::{PARAMS, TOPICS, text};
+use crate::{
+    dice::Dice,
+    health::port_of,
+    master::{Master, Method, Request},
+    xmlrpc::{Call, Reply, Struct, Value},
+};
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Library {
+    Rospy,
+    Roscpp,
+}
+
+/// Which thread of a node has read what.
+#[derive(Debug)]
+pub(super) enum Thread {
+    /// The one that has made a call reads the answer.
+    Main(Request, Reply),
+    /// The one that serves XML-RPC reads a notification.
+    Server(Call),
+}
+
+/// A node, and what it believes.
+#[derive(Debug)]
+pub(super) struct Node {
+    name: String,
+    api: String,
+    library: Library,
+    /// The publishers of subscribed topics, by what was heard last.
+    topics: BTreeMap<String, Vec<String>>,
+    /// Cached parameters.
+    params: BTreeMap<String, Value>,
+    published: BTreeSet<String>,
+    /// Parameters that it subscribes, and those that it has set.
+    subscribed: BTreeSet<String>,
+    set: BTreeSet<String>,
+    /// A call of roscpp that holds the mutex which a publisherUpdate needs.
+    subscribing: Option<String>,
+    /// What waits for the mutex.
+    blocked: Vec<Call>,
+    /// When the value of each parameter that has arrived last was set, whoever sent it.
+    arrived: BTreeMap<String, u64>,
+    gone_back: Vec<String>,
+}
+
+impl Node {
+    pub(super) fn new(number: u64, library: Library) -> Self {
+        Self {
+            name: format!("/n{number}"),
+            api: format!("http://n{number}:1/"),
+            library,
+            topics: BTreeMap::new(),
+            params: BTreeMap::new(),
+            published: BTreeSet::new(),
+            subscribed: BTreeSet::new(),
+            set: BTreeSet::new(),
+            subscribing: None,
+            blocked: Vec::new(),
+            arrived: BTreeMap::new(),
+            gone_back: Vec::new(),
+        }
+    }
+
+    pub(super) fn port(&self) -> &str {
+        port_of(&self.api)
+    }
+
+    /// Its next call.
+    pub(super) fn call(&mut self, dice: &mut Dice, value: i32) -> Request {
+        let topic = format!("/t{}", dice.below(TOPICS));
+        let key = format!("/p{}", dice.below(PARAMS));
+        let (name, api) = (self.name.as_str(), self.api.as_str());
+        match dice.below(10) {
+            0..4 if !self.topics.contains_key(&topic) => {
+                self.topics.insert(topic.clone(), Vec::new());
+                if self.library == Library::Roscpp {
+                    self.subscribing = Some(topic.clone());
+                }
+                Request::new(Method::RegisterSubscriber, [name, &topic, "x/Y", api])
+            }
+            0..6 if self.published.remove(&topic) => {
+                Request::new(Method::UnregisterPublisher, [name, &topic, api])
+            }
+            0..6 => {
+                self.published.insert(topic.clone());
+                Request::new(Method::RegisterPublisher, [name, &topic, "x/Y", api])
+            }
+            6..8 if !self.set.contains(&key) && self.subscribed.insert(key.clone()) => {
+                Request::new(Method::SubscribeParam, [name, api, &key])
+            }
+            // Who sets a parameter is not notified of it, whoever the master is.
+            _ if self.subscribed.contains(&key) => {
+                Request::new(Method::UnregisterService, [name, "/none", "rosrpc://n:1"])
+            }
+            _ => {
+                self.set.insert(key.clone());
+                let params = [Value::from(name), key.as_str().into(), value.into()];
+                Request::new(Method::SetParam, params)
+            }
+        }
+    }
+
+    /// A notification arrives, in this order. `values`: when each parameter had each value.
+    pub(super) fn arrives(&mut self, call: &Call, values: &HashMap<(String, Option<i32>), u64>) {
+        let [_, subject, value] = call.params.as_slice() else {
+            return;
+        };
+        let key = text(subject);
+        if let Some(time) = values.get(&(key.clone(), value.as_int())) {
+            let before = self.arrived.insert(key, *time);
+            if before.is_some_and(|before| before > *time) {
+                let mistake = format!("{}: {subject:?} goes back to {value:?}", self.name);
+                self.gone_back.push(mistake);
+            }
+        }
+    }
+
+    /// One of its threads reads something. Returns the call that follows at once, if one does.
+    pub(super) fn hears(&mut self, thread: Thread) -> Option<Request> {
+        match thread {
+            Thread::Server(call) => {
+                let is_blocked = self.subscribing.is_some() && call.method == "publisherUpdate";
+                match is_blocked {
+                    true => self.blocked.push(call),
+                    false => self.notified(&call),
+                }
+                None
+            }
+            Thread::Main(call, reply) => self.answered(&call, &reply),
+        }
+    }
+
+    fn notified(&mut self, call: &Call) {
+        let [_, subject, value] = call.params.as_slice() else {
+            return;
+        };
+        let subject = text(subject);
+        if call.method == "publisherUpdate" {
+            if let Some(list) = self.topics.get_mut(&subject) {
+                *list = value.as_array().unwrap().iter().map(text).collect();
+            }
+            return;
+        }
+        let key = subject.trim_end_matches('/').to_owned();
+        // rospy ignores what is not in its cache yet.
+        if self.library == Library::Roscpp || self.params.contains_key(&key) {
+            self.params.insert(key, value.clone());
+        }
+    }
+
+    fn answered(&mut self, call: &Request, reply: &Reply) -> Option<Request> {
+        let Reply::Value(Value::Array(answer)) = reply else {
+            panic!("{reply:?}")
+        };
+        let [code, _, value] = answer.as_slice() else {
+            panic!("{reply:?}")
+        };
+        match call.method() {
+            Method::RegisterSubscriber => {
+                let topic = call.text(1).unwrap().to_owned();
+                let list = value.as_array().unwrap().iter().map(text).collect();
+                self.topics.insert(topic, list);
+                self.subscribing = None;
+                for call in std::mem::take(&mut self.blocked) {
+                    self.notified(&call);
+                }
+            }
+            Method::SubscribeParam => {
+                let key = call.text(2).unwrap();
+                match self.library {
+                    Library::Rospy => {
+                        self.params.insert(key.to_owned(), value.clone());
+                    }
+                    // roscpp ignores this value and reads it anew.
+                    Library::Roscpp => {
+                        return Some(Request::new(Method::GetParam, [&*self.name, key]));
+                    }
+                }
+            }
+            Method::GetParam if *code == Value::Int(1) => {
+                let key = call.text(1).unwrap();
+                self.params.insert(key.to_owned(), value.clone());
+            }
+            _ => {}
+        }
+        None
+    }
+
+    /// What it believes and `state` does not say.
+    pub(super) fn mistakes(&self, state: &Master) -> Vec<String> {
+        let mut mistakes = self.gone_back.clone();
+        for (topic, list) in &self.topics {
+            let truth = state.publishers_of(topic);
+            if *list != truth {
+                let name = &self.name;
+                mistakes.push(format!("{name} {topic}: {list:?} instead of {truth:?}"));
+            }
+        }
+        for (key, value) in &self.params {
+            let truth = state.param_update(&format!("{key}/")).unwrap();
+            let truth = truth.params.get(2).unwrap();
+            // A parameter that was not set is an empty struct in both.
+            let unset = Value::Struct(Struct::new());
+            if value != truth && !(*value == unset && *truth == unset) {
+                let name = &self.name;
+                mistakes.push(format!("{name} {key}: {value:?} instead of {truth:?}"));
+            }
+        }
+        mistakes
+    }
+}

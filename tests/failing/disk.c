@@ -1,0 +1,169 @@
+/* A disk that misbehaves: whatever rosrescue itself does with a file whose path contains DISK_PATH. How it does is the
+ * first letter in the file DISK_STATE; without that file all is well.
+ *   h  hangs until the file says otherwise
+ *   s  slow: each operation takes 0.2 s
+ *   f  full: what is written is taken in part, or not at all
+ *   r  read-only */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+enum kind { LOOKS, SYNCS, GROWS, CHANGES };
+
+static int is_rosrescue;
+
+__attribute__((constructor)) static void look_at_the_process(void)
+{
+    char program[4096];
+    ssize_t length = readlink("/proc/self/exe", program, sizeof program - 1);
+    program[length < 0 ? 0 : length] = 0;
+    is_rosrescue = strstr(program, "/rosrescue") != NULL;
+}
+
+static char state(void)
+{
+    char letter = 0;
+    const char *path = is_rosrescue ? getenv("DISK_STATE") : NULL;
+    int file = path == NULL ? -1 : (int)syscall(SYS_openat, AT_FDCWD, path, O_RDONLY | O_CLOEXEC, 0);
+    if (file < 0)
+        return 0;
+    if (syscall(SYS_read, file, &letter, 1) != 1)
+        letter = 0;
+    syscall(SYS_close, file);
+    return letter;
+}
+
+/* Zero, or why an operation of this kind fails. */
+static int meets(const char *path, enum kind kind)
+{
+    const char *part = getenv("DISK_PATH");
+    if (part == NULL || path == NULL || strstr(path, part) == NULL)
+        return 0;
+    char now = state();
+    for (; now == 'h'; now = state())
+        usleep(1000);
+    if (now == 's')
+        usleep(200000);
+    if (now == 'f' && kind == GROWS)
+        return ENOSPC;
+    if (now == 'r' && (kind == GROWS || kind == CHANGES))
+        return EROFS;
+    return 0;
+}
+
+static int meets_file(int file, enum kind kind)
+{
+    if (state() == 0)
+        return 0;
+    char link[40], path[4096];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", file);
+    ssize_t length = readlink(link, path, sizeof path - 1);
+    path[length < 0 ? 0 : length] = 0;
+    return meets(path, kind);
+}
+
+#define FAIL_IF(why)                                                                                                   \
+    do {                                                                                                               \
+        int found = (why);                                                                                             \
+        if (found != 0) {                                                                                              \
+            errno = found;                                                                                             \
+            return -1;                                                                                                 \
+        }                                                                                                              \
+    } while (0)
+
+ssize_t write(int file, const void *bytes, size_t count)
+{
+    int why = meets_file(file, GROWS);
+    if (why == ENOSPC && count > 40)
+        return syscall(SYS_write, file, bytes, 20);
+    FAIL_IF(why);
+    return syscall(SYS_write, file, bytes, count);
+}
+
+int fsync(int file)
+{
+    FAIL_IF(meets_file(file, SYNCS));
+    return syscall(SYS_fsync, file);
+}
+
+int fdatasync(int file)
+{
+    FAIL_IF(meets_file(file, SYNCS));
+    return syscall(SYS_fdatasync, file);
+}
+
+int statx(int folder, const char *restrict path, int flags, unsigned mask, struct statx *restrict found)
+{
+    FAIL_IF(*path == 0 ? meets_file(folder, LOOKS) : meets(path, LOOKS));
+    return syscall(SYS_statx, folder, path, flags, mask, found);
+}
+
+int rename(const char *from, const char *to)
+{
+    FAIL_IF(meets(from, CHANGES));
+    return syscall(SYS_renameat2, AT_FDCWD, from, AT_FDCWD, to, 0);
+}
+
+int unlink(const char *path)
+{
+    FAIL_IF(meets(path, CHANGES));
+    return syscall(SYS_unlinkat, AT_FDCWD, path, 0);
+}
+
+int link(const char *from, const char *to)
+{
+    FAIL_IF(meets(to, CHANGES));
+    return syscall(SYS_linkat, AT_FDCWD, from, AT_FDCWD, to, 0);
+}
+
+int linkat(int from_folder, const char *from, int to_folder, const char *to, int flags)
+{
+    FAIL_IF(meets(to, CHANGES));
+    return syscall(SYS_linkat, from_folder, from, to_folder, to, flags);
+}
+
+static int open_file(int folder, const char *path, int flags, mode_t mode)
+{
+    FAIL_IF(meets(path, (flags & O_ACCMODE) == O_RDONLY ? LOOKS : CHANGES));
+    return syscall(SYS_openat, folder, path, flags, mode);
+}
+
+#define MODE(flags)                                                                                                    \
+    mode_t mode = 0;                                                                                                   \
+    if ((flags) & (O_CREAT | O_TMPFILE)) {                                                                             \
+        va_list rest;                                                                                                  \
+        va_start(rest, flags);                                                                                         \
+        mode = va_arg(rest, mode_t);                                                                                   \
+        va_end(rest);                                                                                                  \
+    }
+
+int open(const char *path, int flags, ...)
+{
+    MODE(flags)
+    return open_file(AT_FDCWD, path, flags, mode);
+}
+
+int open64(const char *path, int flags, ...)
+{
+    MODE(flags)
+    return open_file(AT_FDCWD, path, flags | O_LARGEFILE, mode);
+}
+
+int openat(int folder, const char *path, int flags, ...)
+{
+    MODE(flags)
+    return open_file(folder, path, flags, mode);
+}
+
+int openat64(int folder, const char *path, int flags, ...)
+{
+    MODE(flags)
+    return open_file(folder, path, flags | O_LARGEFILE, mode);
+}

@@ -1,0 +1,5 @@
+"""Shows Python an old kernel, so that rosgraph makes servers of HTTP/1.0, as on a kernel before 4.16."""
+
+import platform
+
+platform.release = lambda: "4.9.0"

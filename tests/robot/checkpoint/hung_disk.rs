@@ -1,0 +1,203 @@
+//! A disk that does not answer, such as a dying SD card or an NFS server that is away. Reads go on as usual, writes
+//! wait for a limited time, and the recording begins again when the disk answers.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    Client, FailingDisk, FakeNode, Rescue, Rosmaster, Scratch, Setup, State, Trouble, eventually,
+    free_port, holds, signal, status,
+};
+use rustix::process::Signal;
+
+/// Longest time for a call that waits for no disk. Beyond that it hung: the disk does so for many seconds.
+const SOON: Duration = Duration::from_secs(2);
+/// Longest time for a write on a disk that hangs: rosrescue gives up after 5 s.
+const LATE: Duration = Duration::from_secs(30);
+
+fn unprotected(client: &Client) -> Option<String> {
+    let reason = status(client)["unprotected"].clone();
+    reason.as_str().map(str::to_owned)
+}
+
+#[track_caller]
+fn within<T>(limit: Duration, what: &str, work: impl FnOnce() -> T) -> T {
+    let start = Instant::now();
+    let result = work();
+    let taken = start.elapsed();
+    assert!(taken < limit, "{what} took {taken:?}");
+    result
+}
+
+/// All kinds of reads, while `write` is under way on a disk that hangs.
+#[track_caller]
+fn assert_reads_go_on<T: Send + 'static>(
+    client: &Client,
+    write: impl FnOnce() -> T + Send + 'static,
+) -> T {
+    let begun = Instant::now();
+    let write = thread::spawn(write);
+    let mut rounds = 0;
+    loop {
+        let over = write.is_finished();
+        within(SOON, "a parameter", || client.param("/before").unwrap());
+        within(SOON, "the state", || State::read(client));
+        within(SOON, "the status", || status(client));
+        rounds += 1;
+        if over {
+            break;
+        }
+    }
+    let taken = begun.elapsed();
+    assert!(taken < LATE && rounds > 3, "{rounds} rounds in {taken:?}");
+    write.join().unwrap()
+}
+
+/// Rosrescue and the master die, and the state is `wanted` afterwards.
+#[track_caller]
+fn assert_survives(rescue: &mut Rescue, wanted: &State) {
+    let client = rescue.client();
+    let master = client.master_pid().unwrap();
+    rescue.kill();
+    signal(master, Signal::KILL);
+    rescue.start_again();
+    rescue.wait_serving();
+    let found = State::read(&client);
+    assert_eq!(found.params, wanted.params);
+    assert_eq!(found.publishers_of("/topic"), ["/node"]);
+}
+
+#[test]
+fn reads_go_on_and_writes_wait_for_a_limited_time() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
+    let mut rescue = disk.under(setup).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    let node = FakeNode::start("/node");
+
+    disk.begin(Trouble::Hangs);
+    assert_reads_go_on(&client, {
+        let client = client.clone();
+        move || client.set_param("/during", 1)
+    });
+    let reason = unprotected(&client).expect("a write that is not on the disk");
+    assert!(reason.contains("has not answered"), "{reason}");
+    rescue.wait_line("that", |line| {
+        line.contains("unprotected") && line.contains("has not answered")
+    });
+    // Nodes go on without the disk.
+    within(SOON, "the next write", || client.set_param("/during", 2));
+    node.publish(&client, "/topic", "std_msgs/String");
+    let dead = client.master_pid().unwrap();
+    signal(dead, Signal::KILL);
+    eventually("another master is there", || {
+        client.master_pid().is_some_and(|pid| pid != dead) && status(&client)["open"] == true
+    });
+    assert_eq!(client.param("/during"), Some(2.into()));
+
+    disk.heal();
+    eventually("it is protected again", || unprotected(&client).is_none());
+    rescue.wait_line("that", |line| line.contains("protected again"));
+    client.set_param("/after", 1);
+    let wanted = State::read(&client);
+    assert_survives(&mut rescue, &wanted);
+}
+
+/// It hangs once more before the whole checkpoint that follows the first time is written.
+#[test]
+fn what_is_written_between_two_silences_is_not_taken_for_recorded() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
+    let mut rescue = disk.under(setup).start();
+    let client = rescue.client();
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    for round in 0..3 {
+        disk.begin(Trouble::Hangs);
+        within(LATE, "a write", || client.set_param("/round", round));
+        assert!(unprotected(&client).is_some());
+        client.set_param("/withheld", round);
+        disk.begin(Trouble::Slow);
+        client.set_param("/slow", round);
+    }
+    disk.heal();
+    eventually("it is protected again", || unprotected(&client).is_none());
+    let wanted = State::read(&client);
+    assert_survives(&mut rescue, &wanted);
+}
+
+#[test]
+fn a_stop_on_a_disk_that_hangs_ends_and_says_so() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port());
+    let mut rescue = disk.under(setup).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    disk.begin(Trouble::Hangs);
+    let status = within(LATE, "the stop", || rescue.terminate());
+    assert_eq!(status.code(), Some(0));
+    rescue.wait_line("why there is no closing checkpoint", |line| {
+        line.contains("stopped without a closing checkpoint")
+    });
+    assert_eq!(scratch.survivors(), vec![]);
+    // The next start takes it for a crash, and restores the state.
+    disk.heal();
+    rescue.start_again();
+    rescue.wait_serving();
+    assert_eq!(rescue.client().param("/before"), Some(1.into()));
+}
+
+/// The first generation of the checkpoint cannot be written.
+#[test]
+fn a_start_on_a_disk_that_hangs_serves() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let disk = FailingDisk::new(&scratch);
+    let mut rescue = disk.under(Setup::proxy(&scratch, master.port)).start();
+    rescue.client().set_param("/before", 1);
+    rescue.kill();
+    disk.begin(Trouble::Slow);
+    rescue.start_again();
+    let client = rescue.client();
+    eventually("it answers", || client.param("/before").is_some());
+    disk.begin(Trouble::Hangs);
+    within(LATE, "a write", || client.set_param("/during", 1));
+    disk.heal();
+    eventually("it is protected", || unprotected(&client).is_none());
+}
+
+/// What is promised with `--sync always` holds again as soon as the disk answers.
+#[test]
+fn answers_wait_for_a_disk_that_syncs_again() {
+    let scratch = Scratch::new();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port()).args(["--no-rosout", "--sync", "always"]);
+    let mut rescue = disk.under(setup).start();
+    let client = rescue.client();
+    client.set_param("/before", 1);
+    let node = FakeNode::start("/node");
+    node.publish(&client, "/topic", "std_msgs/String");
+    disk.begin(Trouble::Hangs);
+    assert_reads_go_on(&client, {
+        let client = client.clone();
+        move || client.set_param("/during", 1)
+    });
+    assert!(unprotected(&client).is_some());
+    disk.heal();
+    eventually("it is protected again", || unprotected(&client).is_none());
+    disk.begin(Trouble::Hangs);
+    let write = thread::spawn({
+        let client = client.clone();
+        move || client.set_param("/waits", 1)
+    });
+    let waits = holds(Duration::from_millis(700), || !write.is_finished());
+    disk.heal();
+    assert!(waits, "it did not wait for the disk");
+    write.join().unwrap();
+    let wanted = State::read(&client);
+    assert_survives(&mut rescue, &wanted);
+}

@@ -1,0 +1,131 @@
+//! What others have put beside the checkpoint, and a disk that hangs: no call waits for it, and no file elsewhere is
+//! changed.
+
+use std::fs;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::support::{Rescue, Scratch, Setup, eventually, free_port, signal, status};
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+use rustix::process::Signal;
+
+/// What rosrescue opens beside a checkpoint.
+const FILES: [&str; 4] = [
+    ".rosmaster-output.log",
+    ".rosmaster-logging.conf",
+    ".rosout-output.log",
+    ".lock",
+];
+
+/// A folder that every user may write to, and the checkpoint in it.
+fn open_folder(scratch: &Scratch) -> PathBuf {
+    let folder = scratch.path("open");
+    fs::create_dir(&folder).unwrap();
+    fs::set_permissions(&folder, fs::Permissions::from_mode(0o777)).unwrap();
+    folder.join("chkpt.yaml")
+}
+
+fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
+    format!("{}{suffix}", checkpoint.display()).into()
+}
+
+/// Kills the master, and sees that calls are answered and another master comes.
+#[track_caller]
+fn assert_rescued(rescue: &mut Rescue) {
+    let client = rescue.client();
+    client.set_param("/kept", 1);
+    let dead = client.master_pid().unwrap();
+    signal(dead, Signal::KILL);
+    eventually("another master", || {
+        assert_eq!(client.param("/kept"), Some(1.into()));
+        client.master_pid().is_some_and(|pid| pid != dead) && status(&client)["open"] == true
+    });
+    rescue.assert_no_panic();
+}
+
+#[test]
+fn links_that_were_planted_are_not_followed() {
+    let scratch = Scratch::new();
+    let checkpoint = open_folder(&scratch);
+    let victim = scratch.path("victim");
+    fs::write(&victim, "kept").unwrap();
+    for suffix in FILES {
+        symlink(&victim, beside(&checkpoint, suffix)).unwrap();
+    }
+    let mut rescue = Setup::core(&scratch, free_port())
+        .at_checkpoint(checkpoint)
+        .start();
+    rescue.wait_line("that others may write there", |line| {
+        line.contains("WARN") && line.contains("every user may write to it")
+    });
+    assert_rescued(&mut rescue);
+    assert_eq!(fs::read_to_string(&victim).unwrap(), "kept");
+}
+
+#[test]
+fn pipes_that_were_planted_stop_no_call() {
+    let scratch = Scratch::new();
+    let checkpoint = open_folder(&scratch);
+    for suffix in FILES {
+        let pipe = beside(&checkpoint, suffix);
+        mknodat(CWD, &pipe, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
+    }
+    let mut rescue = Setup::core(&scratch, free_port())
+        .at_checkpoint(checkpoint)
+        .start();
+    assert_rescued(&mut rescue);
+}
+
+/// Python evaluates a part of it.
+#[test]
+fn the_log_configuration_of_rosmaster_is_in_no_folder() {
+    let scratch = Scratch::new();
+    let checkpoint = open_folder(&scratch);
+    let rescue = Setup::core(&scratch, free_port())
+        .at_checkpoint(checkpoint.clone())
+        .start();
+    let master = rescue.client().master_pid().unwrap();
+    let environment = fs::read(format!("/proc/{master}/environ")).unwrap();
+    let mut variables = environment.split(|byte| *byte == 0);
+    let prefix = b"ROS_PYTHON_LOG_CONFIG_FILE=";
+    let given = variables
+        .find_map(|variable| variable.strip_prefix(prefix))
+        .unwrap();
+    assert!(given.starts_with(b"/proc/self/fd/"));
+    assert!(!beside(&checkpoint, ".rosmaster-logging.conf").exists());
+    let log = || fs::read_to_string(scratch.log_dir().join("master.log")).unwrap_or_default();
+    eventually("rosmaster logs as usual", || {
+        log().contains("initialization complete")
+    });
+}
+
+/// Files in the checkpoint's folder cannot be opened while the disk hangs.
+#[test]
+fn a_disk_that_hangs_delays_neither_calls_nor_the_next_master() {
+    let scratch = Scratch::new();
+    let library = scratch.path("held_open.so");
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/held_open.c");
+    let mut compiler = Command::new("gcc");
+    compiler
+        .args(["-shared", "-fPIC", "-o"])
+        .arg(&library)
+        .arg(source);
+    assert!(compiler.status().expect("gcc runs").success());
+    let (checkpoint, held) = (open_folder(&scratch), scratch.path("held"));
+    let setup = Setup::core(&scratch, free_port()).at_checkpoint(checkpoint.clone());
+    let setup = setup.env("LD_PRELOAD", &library).env("HELD_OPEN", &held);
+    let mut rescue = setup.env("HELD_PATH", &checkpoint).start();
+    fs::write(&held, "").unwrap();
+    for _ in 0..2 {
+        assert_rescued(&mut rescue);
+    }
+    rescue.wait_line("what is missing", |line| {
+        line.contains("cannot create the file for a process's output")
+    });
+    fs::remove_file(&held).unwrap();
+    assert_rescued(&mut rescue);
+    eventually("it is protected", || {
+        status(&rescue.client())["unprotected"].is_null()
+    });
+}

@@ -1,0 +1,86 @@
+//! Nodes that talk to the master of `proxy` past rosrescue.
+
+use crate::support::{
+    Library, Node, Rosmaster, Scratch, Setup, Tool, eventually, names, page, signal, status,
+};
+
+#[test]
+fn what_goes_past_rosrescue_is_named_until_it_ends() {
+    let scratch = Scratch::new();
+    let master = Rosmaster::start(&scratch);
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    let client = rescue.client();
+    let _talker = Node::start(&scratch, Library::Rospy, rescue.port(), "talker", &[]);
+    let _listener = Node::start(&scratch, Library::Roscpp, rescue.port(), "listener", &[]);
+    let bypassing = || names(&status(&client)["bypassing"]);
+    let check = || {
+        let tool = Tool::rosrescue(&scratch, rescue.port(), &["check", "--json"]);
+        let report: serde_json::Value = serde_json::from_str(&tool.stdout).expect("JSON");
+        let findings = report["findings"].as_array().unwrap().clone();
+        let said = findings.iter().filter(|it| it["subject"] == "unprotected");
+        said.map(|it| it["what"].as_str().unwrap().to_owned())
+            .collect::<Vec<_>>()
+    };
+    // rosmaster listens at loopback only, by its ROS_IP.
+    assert_eq!(check(), Vec::<String>::new());
+    assert_eq!(status(&client)["master_is_open"], false);
+
+    let node = Node::start(
+        &scratch,
+        Library::Roscpp,
+        master.port,
+        "talker",
+        &["__name:=direct"],
+    );
+    let who = format!("talker (process {})", node.pid());
+    // roscpp keeps its connection for 30 s.
+    eventually("it is named", || bypassing() == [who.clone()]);
+    let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(1);
+    let said = format!("1 client talks to the master directly, unprotected: {who}.");
+    assert!(
+        shown.contains(&said) && shown.contains("\nto do "),
+        "{shown}"
+    );
+    assert!(page(&client, "/metrics").contains("\nrosrescue_bypassing 1\n"));
+    let found = check();
+    let uri = format!("http://127.0.0.1:{}", master.port);
+    assert!(
+        found.contains(&format!("{who} talks to the master at {uri}/ directly")),
+        "{found:?}"
+    );
+    let by_environment = |it: &String| {
+        it.starts_with(&format!("talker (process {}, port ", node.pid()))
+            && it.ends_with(&format!(
+                " was started with ROS_MASTER_URI={uri}, the master behind rosrescue"
+            ))
+    };
+    assert!(found.iter().any(by_environment), "{found:?}");
+    assert!(rescue.log().contains("goes past rosrescue"));
+
+    signal(node.pid(), rustix::process::Signal::KILL);
+    eventually("it has ended", || bypassing().is_empty());
+    assert_eq!(check(), Vec::<String>::new());
+}
+
+#[test]
+fn a_master_that_others_can_reach_is_told() {
+    let scratch = Scratch::new();
+    let port = crate::support::free_port();
+    let master = Rosmaster::start_with(&scratch, port, |command| {
+        // It binds all addresses then.
+        command.env_remove("ROS_IP");
+    });
+    let rescue = Setup::proxy(&scratch, master.port).start();
+    eventually("the status says so", || {
+        status(&rescue.client())["master_is_open"] == true
+    });
+    let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(0);
+    assert!(shown.contains(", open to other computers"), "{shown}");
+    let checked = Tool::rosrescue(&scratch, rescue.port(), &["check"]);
+    assert!(
+        checked
+            .stdout
+            .contains("takes connections from other computers"),
+        "{checked:?}"
+    );
+}

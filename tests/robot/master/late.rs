@@ -1,0 +1,197 @@
+//! A master that does not answer for a while: writers do not wait for the verdict on it, it is given what it
+//! missed, and it is ended only if its process shows that it hangs.
+
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::support::{
+    FakeNode, Finish, Mode, Robot, Scratch, State, alive, eventually, signal, status, stop,
+};
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+/// With these a master is never found to hang within a test.
+const NO_VERDICT: [&str; 4] = ["--stand-in-after", "100", "--probe-count", "1000"];
+
+/// The values that a node was told of a parameter, as they came, and whether rosrescue told it.
+fn told(node: &FakeNode) -> Vec<(i32, bool)> {
+    let calls = node.calls().into_iter();
+    let updates = calls.filter(|call| call.method == "paramUpdate");
+    updates
+        .map(|call| (call.params[2].as_int().unwrap(), call.from_rosrescue))
+        .collect()
+}
+
+/// Who sets parameters, registers and unregisters waits for the patience once. The master that goes on is the same
+/// and has everything.
+#[test]
+fn writers_do_not_wait_for_the_verdict_on_a_stopped_master() {
+    for mode in [Mode::Proxy, Mode::Core] {
+        let robot = Robot::start_with(mode, &NO_VERDICT);
+        let client = robot.client();
+        let [first, second] = ["/first", "/second"].map(FakeNode::start);
+        first.subscribe(&client, "/both", "std_msgs/String");
+        let pid = robot.master_pid();
+        let restored = robot.counter("masters_restored");
+        stop(pid);
+        for pass in 1..=20 {
+            client.set_param("/pass", pass);
+            second.publish(&client, "/both", "std_msgs/String");
+            second.offer(&client, "/service");
+            second.unpublish(&client, "/both");
+            second.withdraw(&client, "/service");
+        }
+        first.publish(&client, "/only", "std_msgs/String");
+        assert!(!robot.is_open(), "the master is stopped");
+        let after = State::read(&client);
+        assert_eq!(client.param("/pass"), Some(Value::Int(20)));
+        signal(pid, Signal::CONT);
+        robot.await_gate();
+        assert_eq!(robot.master_pid(), pid, "the same master goes on");
+        assert_eq!(robot.bare().param("/pass"), Some(Value::Int(20)));
+        robot.await_state(&after, "in the master that goes on");
+        // It would be told twice of the topic that came and went, and so it was injected.
+        assert_eq!(robot.counter("masters_restored"), restored + 1);
+        assert_eq!(status(&client)["deaths"], 0);
+        robot.rescue.assert_no_panic();
+    }
+}
+
+/// It runs what it missed, and nothing else is done to it.
+#[test]
+fn a_master_that_was_merely_late_is_not_injected() {
+    for mode in [Mode::Proxy, Mode::Core] {
+        let robot = Robot::start_with(mode, &NO_VERDICT);
+        let client = robot.client();
+        let [node, watcher] = ["/node", "/watcher"].map(FakeNode::start);
+        watcher.subscribe(&client, "/topic", "std_msgs/String");
+        watcher.watch_param(&client, "/watched");
+        let pid = robot.master_pid();
+        let mut caught_up = 0;
+        for number in 1..=12 {
+            let restored = robot.counter("masters_restored");
+            stop(pid);
+            // Under way in the master.
+            client.set_param("/late", number);
+            // It misses these.
+            client.set_param("/missed", number);
+            client.set_param("/watched", number);
+            match number % 2 {
+                0 => node.unpublish(&client, "/topic"),
+                _ => node.publish(&client, "/topic", "std_msgs/String"),
+            }
+            assert!(!robot.is_open());
+            let after = State::read(&client);
+            signal(pid, Signal::CONT);
+            robot.await_gate();
+            for key in ["/late", "/missed", "/watched"] {
+                assert_eq!(robot.bare().param(key), Some(Value::Int(number)), "{key}");
+            }
+            after.assert_same(&robot.state(), "in the master");
+            // On a very busy computer it takes too long to catch up, and is injected.
+            if robot.counter("masters_restored") == restored {
+                caught_up += 1;
+                // A master that is stopped before it notifies does so when it goes on.
+                eventually("the master tells", || {
+                    told(&watcher).contains(&(number, false))
+                });
+            }
+            if caught_up == 3 {
+                break;
+            }
+        }
+        assert_eq!(caught_up, 3, "it is injected each time");
+        assert_eq!(robot.master_pid(), pid);
+        eventually("the watcher knows the publishers", || {
+            let publishers = robot.state().publishers_of("/topic").len();
+            let last = watcher.updates("/topic").last().map(Vec::len);
+            last == Some(publishers)
+        });
+        let values = told(&watcher);
+        assert!(values.is_sorted_by_key(|(value, _)| *value), "{values:?}");
+        assert_eq!(status(&client)["counters"]["divergences"], 0);
+        // It notifies nodes itself, as before.
+        client.set_param("/watched", 99);
+        eventually("the master tells", || told(&watcher).contains(&(99, false)));
+    }
+}
+
+/// It gets five parts in a hundred of its time.
+#[test]
+fn a_starved_master_is_not_killed() {
+    let probes = [
+        "--probe-interval",
+        "50",
+        "--probe-timeout",
+        "100",
+        "--probe-count",
+        "1",
+    ];
+    let robot = Robot::start_with(Mode::Core, &probes);
+    let client = robot.client();
+    let pid = robot.master_pid();
+    let done = AtomicBool::new(false);
+    let last = thread::scope(|scope| {
+        let finish = Finish(&done);
+        let writer = scope.spawn(|| {
+            let mut number = 0;
+            while !done.load(Ordering::Relaxed) {
+                number += 1;
+                client.set_param("/number", number);
+                thread::sleep(Duration::from_millis(5));
+            }
+            number
+        });
+        let start = Instant::now();
+        while start.elapsed() < Duration::from_secs(6) {
+            signal(pid, Signal::STOP);
+            thread::sleep(Duration::from_millis(285));
+            signal(pid, Signal::CONT);
+            thread::sleep(Duration::from_millis(15));
+        }
+        drop(finish);
+        writer.join().unwrap()
+    });
+    robot.await_gate();
+    assert_eq!(robot.master_pid(), pid);
+    assert_eq!(status(&client)["deaths"], 0);
+    assert_eq!(robot.bare().param("/number"), Some(Value::Int(last)));
+    assert!(
+        robot.rescue.log().contains("and is not killed"),
+        "no probe was missed: {}",
+        robot.rescue.log()
+    );
+    // One that hangs is.
+    stop(pid);
+    robot.await_recovery(pid);
+    assert!(!alive(pid));
+}
+
+/// It works for longer than it may take to listen.
+#[test]
+fn a_master_that_starts_slowly_is_started_once() {
+    let scratch = Scratch::new();
+    let [program, starts] = ["slow_to_start", "starts"].map(|name| scratch.path(name));
+    let script = format!(
+        "#!/bin/bash\necho >>'{}'\nend=$((SECONDS + 6))\nwhile [ $SECONDS -lt $end ]; do :; done\n\
+         exec rosmaster \"$@\"\n",
+        starts.display()
+    );
+    fs::write(&program, script).unwrap();
+    fs::set_permissions(&program, Permissions::from_mode(0o755)).unwrap();
+    let options = [
+        "--rosmaster",
+        program.to_str().unwrap(),
+        "--no-rosout",
+        "--start-limit",
+        "1",
+    ];
+    let robot = Robot::start_with(Mode::Core, &options);
+    robot.client().set_param("/kept", 1);
+    assert_eq!(robot.bare().param("/kept"), Some(Value::Int(1)));
+    assert_eq!(status(&robot.client())["deaths"], 0);
+    assert_eq!(fs::read_to_string(&starts).unwrap().lines().count(), 1);
+}

@@ -1,0 +1,41 @@
+//! A master as rosmaster 1.14.3 and before: it also tells a node of the parameter that this node has set itself. While
+//! it is away rosrescue does the same.
+
+use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
+use rosrescue::xmlrpc::Value;
+use std::time::Duration;
+
+in_both_modes!(who_sets_a_parameter_is_told_as_by_the_master);
+
+fn who_sets_a_parameter_is_told_as_by_the_master(mode: Mode) {
+    for (program, is_old) in [("old_rosmaster.py", true), ("waiting_rosmaster.py", false)] {
+        let mut robot = Robot::start_under(mode, program, &[]);
+        robot.stay_away();
+        let client = robot.client();
+        let node = FakeNode::start("/node");
+        node.watch_param(&client, "/gain");
+        let set = |value: i32| client.ok("setParam", params!["/node", "/gain", value]);
+        let told = |value| {
+            let calls = node.calls().into_iter();
+            let mut values = calls.filter(|call| call.method == "paramUpdate");
+            values.any(|call| call.params[2] == Value::Int(value))
+        };
+        let is_told = |value| match is_old {
+            true => eventually("the node is told", || told(value)),
+            false => assert!(holds(Duration::from_millis(300), || !told(value))),
+        };
+        set(1);
+        is_told(1);
+        let dead = robot.master_pid();
+        robot.take_master_away();
+        set(2);
+        is_told(2);
+        let (code, _, value) = client.status("lookupService", params!["/n", ""]).unwrap();
+        let empty = if is_old { 0.into() } else { "".into() };
+        assert_eq!((code, value), (-1, empty));
+        robot.revive_master();
+        robot.await_recovery(dead);
+        set(3);
+        is_told(3);
+    }
+}

@@ -1,0 +1,69 @@
+//! A master whose dictionaries have no order of their own, as those of Python 2. The order is no difference, and
+//! answers that show it are the master's.
+
+use std::time::Duration;
+
+use crate::support::{
+    Client, FakeNode, Mode, Robot, encode_call, eventually, holds, http_request, in_both_modes,
+    params, tree,
+};
+use rosrescue::xmlrpc::Value;
+
+in_both_modes!(the_order_of_dictionaries_is_no_difference);
+
+fn the_order_of_dictionaries_is_no_difference(mode: Mode) {
+    // A probe that is late on a busy computer is no difference either.
+    let patient = ["--probe-timeout", "30000"];
+    let options = ["--resync-interval", "0.2", "--no-rosout"];
+    let options = match mode {
+        Mode::Core => [&patient, &options[..]].concat(),
+        Mode::Proxy => [&patient, &options[..2]].concat(),
+    };
+    let mut robot = Robot::start_under_with(mode, "unordered_rosmaster.py", &[], &options);
+    let client = robot.client();
+    let nodes = ["/zoe", "/ada", "/mel"].map(FakeNode::start);
+    for (number, node) in nodes.iter().enumerate() {
+        let topic = format!("{}/topic", node.name);
+        node.publish(&client, &topic, "a/B");
+        nodes[0].subscribe(&client, &topic, "a/B");
+        node.offer(&client, &format!("{}/service", node.name));
+        let inner = tree! { "z" => 1, "a" => 2, "m" => tree! { "y" => 1, "b" => 2, "k" => 3 } };
+        client.set_param(&format!("/tree{number}"), inner);
+    }
+    nodes[1].watch_param(&client, "/tree1");
+    assert_exact(&robot);
+    for _ in 0..2 {
+        robot.crash_master();
+    }
+    assert_eq!(robot.bare().param("/tree2/m/k"), Some(Value::Int(3)));
+    assert_exact(&robot);
+    // Some looks, each of which might tell a difference.
+    assert!(holds(Duration::from_secs(2), || robot.is_open()));
+    assert_exact(&robot);
+    assert_eq!(robot.counter("divergences"), 0);
+    for line in robot.rescue.output() {
+        let is_difference = line.contains("differs") || line.contains("something else");
+        assert!(!is_difference, "{line}");
+    }
+}
+
+/// Reads are answered with the master's own bytes.
+fn assert_exact(robot: &Robot) {
+    for (method, params) in [
+        ("getSystemState", params!["/n"]),
+        ("getTopicTypes", params!["/n"]),
+        ("getPublishedTopics", params!["/n", ""]),
+        ("getParamNames", params!["/n"]),
+        ("getParam", params!["/n", "/"]),
+        ("getParam", params!["/n", "/tree1/m"]),
+        ("getParam", params!["/n", "/tree1/m/k"]),
+        ("lookupNode", params!["/n", "/ada"]),
+    ] {
+        let request = http_request(&encode_call(method, params));
+        let answer = |client: Client| client.exchange(&request).unwrap().text();
+        // On a busy computer the mirror may answer once for a master that is late.
+        eventually(&format!("{method} has the master's bytes"), || {
+            answer(robot.client()) == answer(robot.bare())
+        });
+    }
+}

@@ -1,0 +1,353 @@
+//! The answer to a node's own call is at the node before it is notified of something later. Raw requests: what
+//! one call changes and another call asks for are sent within 2 ms.
+
+use std::collections::BTreeMap;
+use std::io::{self, BufReader, Write};
+use std::mem::MaybeUninit;
+use std::net::{Ipv4Addr, TcpListener, TcpStream};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rosrescue::xmlrpc::{self, Call, Reply, Value};
+use socket2::SockRef;
+
+use crate::support::links::Dice;
+use crate::support::{
+    Client, FakeMaster, Mode, Robot, Wire, encode_call, eventually, http_request, params,
+    read_request,
+};
+
+/// How far apart the two calls are at most, in microseconds: one of these.
+const APART: [u64; 4] = [50, 200, 500, 2_000];
+/// How long each kind of pairs is tried; each takes some 5 to 20 ms.
+const TIME: Duration = Duration::from_millis(1_200);
+/// At the same time, after each kind alone.
+const PAIRS: usize = 6;
+/// `MSG_PEEK | MSG_DONTWAIT` of Linux: look at what has arrived, and do not wait for it.
+const LOOK: i32 = 0x02 | 0x40;
+
+/// What one node asks and another one changes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Subject {
+    /// `registerSubscriber`, and a publisher that comes.
+    Comes,
+    /// `registerSubscriber`, and a publisher that goes.
+    Goes,
+    /// `subscribeParam` and `setParam`.
+    Param,
+    /// `registerSubscriber`, and a namesake of the subscriber.
+    Namesake,
+}
+
+const SUBJECTS: [Subject; 4] = [
+    Subject::Comes,
+    Subject::Goes,
+    Subject::Param,
+    Subject::Namesake,
+];
+
+#[test]
+fn no_notification_overtakes_an_older_answer_in_core() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    no_notification_overtakes_an_answer(&robot.client(), &SUBJECTS);
+}
+
+#[test]
+fn no_notification_overtakes_an_older_answer_in_proxy() {
+    let robot = Robot::start(Mode::Proxy);
+    no_notification_overtakes_an_answer(&robot.client(), &SUBJECTS);
+}
+
+#[test]
+fn no_notification_overtakes_an_older_answer_while_standing_in() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.take_master_away();
+    // A displaced node is asked first who it is.
+    let subjects = SUBJECTS
+        .into_iter()
+        .filter(|subject| *subject != Subject::Namesake);
+    let subjects: Vec<_> = subjects.collect();
+    no_notification_overtakes_an_answer(&robot.client(), &subjects);
+}
+
+#[track_caller]
+fn no_notification_overtakes_an_answer(master: &Client, subjects: &[Subject]) {
+    let seed = u64::from(std::process::id()) << 20;
+    println!("seed {seed}");
+    let mut overtaken = Vec::new();
+    for &subject in subjects {
+        for pairs in [1, PAIRS] {
+            let run = |pair: usize| {
+                let mut dice = Dice(seed + pair as u64);
+                let mut pair = Pair::connect(master, &format!("{subject:?}_{pairs}_{pair}"));
+                let (begin, mut asked, mut rounds) = (Instant::now(), Vec::new(), 0);
+                while begin.elapsed() < TIME {
+                    rounds += 1;
+                    asked.extend(pair.round(subject, rounds, &mut dice));
+                }
+                // Who is displaced and who displaces is not in the answers.
+                (rounds, pair.judge(asked, subject != Subject::Namesake))
+            };
+            let (mut rounds, mut told) = (0, Vec::new());
+            thread::scope(|scope| {
+                let threads = (0..pairs).map(|pair| scope.spawn(move || run(pair)));
+                let threads: Vec<_> = threads.collect();
+                for thread in threads {
+                    let (more, found) = thread.join().unwrap();
+                    rounds += more;
+                    told.extend(found);
+                }
+            });
+            let count = told.len();
+            let (mut after, mut early) = (Vec::new(), Vec::new());
+            for told in told {
+                match told {
+                    Ok(time) => after.push(time),
+                    Err(text) => early.push(text),
+                }
+            }
+            after.sort();
+            println!(
+                "{subject:?}, {pairs} at once: {} of {count} notifications came before the answer ({rounds} rounds); the \
+                 others first {:.0?} after it",
+                early.len(),
+                after.iter().take(5).collect::<Vec<_>>()
+            );
+            overtaken.extend(early);
+        }
+    }
+    assert!(
+        overtaken.is_empty(),
+        "{} answers were overtaken:\n{}",
+        overtaken.len(),
+        overtaken.join("\n")
+    );
+}
+
+/// What has come to the node that asks.
+#[derive(Debug, Default)]
+struct Inbox {
+    /// What it is about to be told, and the connection of its answer, while that has not come.
+    waits: Option<(String, TcpStream)>,
+    /// When it was first notified of a subject, and whether that was before its answer.
+    heard: BTreeMap<String, (Instant, bool)>,
+}
+
+impl Inbox {
+    /// Whether the answer that is waited for has not arrived at the socket yet.
+    fn is_early(&self) -> bool {
+        let Some((_, stream)) = &self.waits else {
+            return false;
+        };
+        let mut byte = [MaybeUninit::uninit(); 1];
+        let seen = SockRef::from(stream).recv_with_flags(&mut byte, LOOK);
+        matches!(seen, Err(error) if error.kind() == io::ErrorKind::WouldBlock)
+    }
+}
+
+/// What a notification is about: a topic, a parameter, or the name of a node.
+fn subject_of(call: &Call) -> Option<String> {
+    let text = call.params.get(1)?.as_str()?;
+    let text = match call.method.as_str() {
+        "shutdown" => text.strip_prefix('[')?.split(']').next()?,
+        _ => text.trim_end_matches('/'),
+    };
+    Some(text.to_owned())
+}
+
+fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
+    inbox.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Threads that wait for a connection to the asking node: none is made when one comes.
+const THREADS: usize = 3;
+
+/// A thread that takes one connection.
+fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
+    let (listener, inbox) = (Arc::clone(listener), Arc::clone(inbox));
+    thread::spawn(move || {
+        let Ok((stream, _)) = listener.accept() else {
+            return;
+        };
+        let mut stream = BufReader::new(stream);
+        let mut first = true;
+        while let Some((_, body)) = read_request(&mut stream) {
+            let mut held = lock(&inbox);
+            // Before anything else: the answer may come at any moment.
+            let (early, at) = (held.is_early(), Instant::now());
+            if let Some(subject) = xmlrpc::decode_call(&body)
+                .ok()
+                .and_then(|call| subject_of(&call))
+            {
+                let early = early
+                    && held
+                        .waits
+                        .as_ref()
+                        .is_some_and(|(waits, _)| *waits == subject);
+                held.heard.entry(subject).or_insert((at, early));
+            }
+            drop(held);
+            let reply = FakeMaster::proper(&Reply::Value(params![1, "", 0].into()));
+            let sent = stream.get_mut().write_all(&reply);
+            if std::mem::take(&mut first) {
+                take_one(&listener, &inbox);
+            }
+            if sent.is_err() {
+                return;
+            }
+        }
+        if first {
+            take_one(&listener, &inbox);
+        }
+    });
+}
+
+/// A node asked, was answered, and the answer does not say what another node changed at about the same time.
+struct Asked {
+    subject: String,
+    /// When the answer arrived.
+    arrived: Instant,
+    text: String,
+}
+
+/// Two nodes: one that asks, and one that changes.
+struct Pair {
+    name: String,
+    inbox: Arc<Mutex<Inbox>>,
+    port: u16,
+    asks: Wire,
+    changes: Wire,
+}
+
+impl Pair {
+    fn connect(master: &Client, name: &str) -> Self {
+        let inbox = Arc::new(Mutex::new(Inbox::default()));
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let listener = Arc::new(listener);
+        (0..THREADS).for_each(|_| take_one(&listener, &inbox));
+        Self {
+            name: name.to_owned(),
+            inbox,
+            port,
+            asks: master.connect().unwrap(),
+            changes: master.connect().unwrap(),
+        }
+    }
+
+    /// One subject, asked for and changed at about the same time.
+    fn round(&mut self, subject: Subject, nth: usize, dice: &mut Dice) -> Option<Asked> {
+        let topic = format!("/order/{}/{nth}", self.name);
+        let names = ["asks", "changes"].map(|name| match subject {
+            Subject::Namesake => format!("/namesake/{}/{nth}", self.name),
+            _ => format!("/{name}/{}", self.name),
+        });
+        let [asker, changer] = names.each_ref().map(String::as_str);
+        let topic = topic.as_str();
+        let api = format!("http://127.0.0.1:{}/", self.port);
+        let other = format!("http://127.0.0.1:1/{}/{nth}", self.name);
+        let (api, other, kind) = (api.as_str(), other.as_str(), "std_msgs/String");
+        let publish = request("registerPublisher", params![changer, topic, kind, other]);
+        let subscribe = request("registerSubscriber", params![asker, topic, kind, api]);
+        let (ask, change, last) = match subject {
+            Subject::Comes => (subscribe, publish, params![other].into()),
+            Subject::Goes => {
+                exchange(&mut self.changes, &publish);
+                let leave = request("unregisterPublisher", params![changer, topic, other]);
+                (subscribe, leave, Value::Array(Vec::new()))
+            }
+            Subject::Param => (
+                request("subscribeParam", params![asker, api, topic]),
+                request("setParam", params![changer, topic, 7]),
+                Value::Int(7),
+            ),
+            // It publishes something else.
+            Subject::Namesake => {
+                let params = params![changer, format!("{topic}/else"), kind, other];
+                (
+                    subscribe,
+                    request("registerPublisher", params),
+                    Value::Int(0),
+                )
+            }
+        };
+        let subject = if subject == Subject::Namesake {
+            asker
+        } else {
+            topic
+        };
+        lock(&self.inbox).waits = Some((subject.to_owned(), self.asks.stream()));
+        let apart = dice.below(APART[nth % APART.len()]);
+        let asks_first = dice.below(2) == 0;
+        let begin = Instant::now();
+        let mut calls = [(&mut self.asks, &ask), (&mut self.changes, &change)];
+        if !asks_first {
+            calls.reverse();
+        }
+        for (nth, (wire, request)) in calls.into_iter().enumerate() {
+            if nth > 0 {
+                thread::sleep(Duration::from_micros(apart));
+            }
+            wire.send(request).unwrap();
+        }
+        // It has arrived, and is taken only when the inbox knows that.
+        self.asks.stream().peek(&mut [0]).unwrap();
+        let arrived = Instant::now();
+        lock(&self.inbox).waits = None;
+        let answer = value(&self.asks.response().unwrap().reply());
+        value(&self.changes.response().unwrap().reply());
+        let first = if asks_first { "asked" } else { "changed" };
+        // That the answer says so, too, is no news.
+        (answer != last).then(|| Asked {
+            subject: subject.to_owned(),
+            arrived,
+            text: format!(
+                "{subject}, before the answer {answer:?}, which came after {:.1?}; {first} first, {apart} us apart",
+                arrived - begin
+            ),
+        })
+    }
+
+    /// How long after each answer its node was notified of what it did not say; `Err` if that was before.
+    fn judge(&self, asked: Vec<Asked>, all: bool) -> Vec<Result<Duration, String>> {
+        let heard = |subject: &String| lock(&self.inbox).heard.get(subject).copied();
+        let mut told = Vec::new();
+        for Asked {
+            subject,
+            arrived,
+            text,
+        } in asked
+        {
+            if all {
+                eventually(&format!("a notification of {text}"), || {
+                    heard(&subject).is_some()
+                });
+            }
+            match heard(&subject) {
+                Some((_, true)) => told.push(Err(text)),
+                Some((at, false)) => told.push(Ok(at.saturating_duration_since(arrived))),
+                None => {}
+            }
+        }
+        told
+    }
+}
+
+fn request(method: &str, params: Vec<Value>) -> Vec<u8> {
+    http_request(&encode_call(method, params))
+}
+
+fn exchange(wire: &mut Wire, request: &[u8]) {
+    wire.send(request).unwrap();
+    value(&wire.response().unwrap().reply());
+}
+
+/// The value of an answer that is a success, or says that there was nothing to do.
+#[track_caller]
+fn value(reply: &Reply) -> Value {
+    match reply {
+        Reply::Value(Value::Array(fields)) if fields[0] == Value::Int(1) => fields[2].clone(),
+        other => panic!("{other:?}"),
+    }
+}

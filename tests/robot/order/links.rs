@@ -1,0 +1,47 @@
+//! Every start makes every link: real nodes that start at the same moment. `cargo bench --bench links` has the long
+//! run, and says what happens here.
+
+use crate::support::Library;
+use crate::support::links::{self, Place, Plan};
+
+/// One start.
+#[track_caller]
+fn every_link_is_made(place: Place, library: Library) {
+    let seed = u64::from(std::process::id());
+    println!("seed {seed}");
+    let plan = Plan {
+        library,
+        ..Plan::default()
+    };
+    links::start(place, &plan, seed).assert_whole(&plan);
+}
+
+#[test]
+fn every_link_is_made_through_core() {
+    every_link_is_made(Place::Core, Library::Rospy);
+}
+
+#[test]
+fn every_link_is_made_through_proxy() {
+    every_link_is_made(Place::Proxy, Library::Rospy);
+}
+
+#[test]
+fn every_link_is_made_while_the_mirror_stands_in() {
+    every_link_is_made(Place::StandingIn, Library::Rospy);
+}
+
+#[test]
+fn every_link_is_made_while_master_and_worker_are_killed() {
+    every_link_is_made(Place::Kills, Library::Rospy);
+}
+
+#[test]
+fn every_link_is_made_by_the_nodes_of_a_follower() {
+    every_link_is_made(Place::Follower, Library::Rospy);
+}
+
+#[test]
+fn every_link_is_made_by_roscpp() {
+    every_link_is_made(Place::Core, Library::Roscpp);
+}

@@ -1,0 +1,98 @@
+//! No value goes back: a node that is notified of one parameter again and again never hears an older value after a
+//! newer one, and hears the last one.
+
+use std::thread;
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+
+use crate::support::{
+    Client, Mode, Robot, State, eventually,
+    writers::{Subscriber, WRITERS, key, topic, write},
+};
+
+/// Between two calls of a writer at most: some 600 calls a second of all.
+const PAUSE: Duration = Duration::from_millis(18);
+const TIME: Duration = Duration::from_secs(6);
+
+#[test]
+fn no_value_goes_back_with_a_living_master() {
+    let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
+    no_value_goes_back(&robot.client(), || {});
+}
+
+#[test]
+fn no_value_goes_back_while_standing_in() {
+    let mut robot = Robot::start(Mode::Proxy);
+    robot.take_master_away();
+    no_value_goes_back(&robot.client(), || {});
+}
+
+#[test]
+fn no_value_goes_back_while_the_master_dies_again_and_again() {
+    let mut robot = Robot::start(Mode::Proxy);
+    no_value_goes_back(&robot.client(), || {
+        for _ in 0..3 {
+            robot.crash_master();
+        }
+    });
+}
+
+#[track_caller]
+fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
+    let seed = u64::from(std::process::id()) << 20;
+    println!("seed {seed}");
+    let subscribers = Subscriber::start_all(master);
+    let calls = thread::scope(|scope| {
+        let start = |writer| scope.spawn(move || write(master, writer, seed, PAUSE, TIME).len());
+        let writers: Vec<_> = (0..WRITERS).map(start).collect();
+        meanwhile();
+        let calls = writers.into_iter().map(|writer| writer.join().unwrap());
+        calls.sum::<usize>()
+    });
+    let (mut told, mut back) = (0, Vec::new());
+    for (number, subscriber) in subscribers.iter().enumerate() {
+        for writer in 0..WRITERS {
+            let (key, topic) = (key(writer), topic(writer));
+            let value = master.param(&key).and_then(|value| value.as_int());
+            eventually(
+                &format!("subscriber {number} hears the last value of {key}"),
+                || {
+                    let told = subscriber.told();
+                    told.values
+                        .get(&key)
+                        .and_then(|values| values.last().copied())
+                        == value
+                },
+            );
+            eventually(
+                &format!("subscriber {number} hears the last publishers of {topic}"),
+                || {
+                    // Nobody listens where the writers say they are: a rescue's health check unregisters them, also
+                    // while the state is read.
+                    let Ok(state) = State::try_read(master) else {
+                        return false;
+                    };
+                    let publishers = state.publishers_of(&topic).len();
+                    let told = subscriber.told();
+                    let last = told.publishers.get(&topic).and_then(|lists| lists.last());
+                    last.and_then(Value::as_array).map(<[Value]>::len) == Some(publishers)
+                },
+            );
+            let values = subscriber.told().values[&key].clone();
+            told += values.len();
+            let steps = values.windows(2).filter(|pair| pair[1] < pair[0]);
+            back.extend(steps.map(|pair| format!("subscriber {number}: {key} {pair:?}")));
+        }
+    }
+    println!(
+        "{calls} calls, {told} values told, {} went back",
+        back.len()
+    );
+    assert!(
+        back.is_empty(),
+        "{} values went back:\n{}",
+        back.len(),
+        back.join("\n")
+    );
+}

@@ -1,0 +1,108 @@
+//! Nodes that leave while there is no master: one that closes its port before it unregisters, as roslisp does, and
+//! one that dies.
+
+use std::time::Duration;
+
+use crate::support::{
+    Client, FakeNode, Mode, Robot, Rosmaster, eventually, holds, in_both_modes, names, params,
+    status,
+};
+use rosrescue::xmlrpc::Value;
+
+/// Between the calls of a node that leaves: longer than it takes until a port that refused is asked again.
+const PAUSE: Duration = Duration::from_millis(1500);
+
+/// Unregistrations, one after the other.
+type Calls = Vec<(&'static str, Vec<Value>)>;
+
+/// A node that is registered at both masters, and its unregistrations.
+fn registered(masters: [&Client; 2]) -> (FakeNode, Calls) {
+    let node = FakeNode::start("/leaving");
+    for master in masters {
+        node.publish(master, "/topic", "std_msgs/String");
+        node.subscribe(master, "/topic", "std_msgs/String");
+        node.offer(master, "/service_a");
+        node.offer(master, "/service_b");
+    }
+    let (name, api, service) = (node.name.as_str(), node.api.as_str(), node.service_api());
+    let service = service.as_str();
+    let calls = vec![
+        // It is notified of this one itself.
+        ("unregisterPublisher", params![name, "/topic", api]),
+        ("unregisterService", params![name, "/service_a", service]),
+        ("unregisterService", params![name, "/service_b", service]),
+        ("unregisterSubscriber", params![name, "/topic", api]),
+    ];
+    (node, calls)
+}
+
+/// Whether the leaving node is registered.
+fn knows(master: &Client) -> bool {
+    let params = params!["/test", "/leaving"];
+    master.ask("lookupNode", params).is_some()
+}
+
+/// Makes `calls` after each other, each of which must be answered as by `bare`.
+#[track_caller]
+fn leave(client: &Client, bare: &Client, calls: Calls, pause: Duration) {
+    let count = calls.len();
+    for (i, (method, params)) in calls.into_iter().enumerate() {
+        let expected = bare.status(method, params.clone()).unwrap();
+        assert_eq!(expected.2, Value::Int(1), "{expected:?}");
+        assert_eq!(client.status(method, params).unwrap(), expected, "{method}");
+        let is_last = i + 1 == count;
+        let stays = || is_last || knows(client);
+        assert!(holds(pause, stays), "it was removed after {method}");
+    }
+    assert!(!knows(client));
+}
+
+in_both_modes!(a_node_that_closes_its_port_before_it_unregisters_is_answered_as_by_rosmaster);
+
+fn a_node_that_closes_its_port_before_it_unregisters_is_answered_as_by_rosmaster(mode: Mode) {
+    let mut robot = Robot::start_for_outages(mode);
+    let bare = Rosmaster::start(&robot.scratch);
+    let client = robot.client();
+    let (node, calls) = registered([&client, &bare.client()]);
+    robot.kill_master();
+    drop(node);
+    leave(&client, &bare.client(), calls, PAUSE);
+    assert!(!robot.is_open(), "there was a master");
+    let log = robot.rescue.stderr().join("\n");
+    assert!(!log.contains("answers again"), "{log}");
+}
+
+/// The health check after the recovery asks it between its calls.
+#[test]
+fn a_node_that_unregisters_after_the_recovery_is_given_the_time() {
+    let mut robot = Robot::start(Mode::Proxy);
+    let bare = Rosmaster::start(&robot.scratch);
+    let client = robot.client();
+    let (node, calls) = registered([&client, &bare.client()]);
+    drop(node);
+    robot.crash_master();
+    leave(&client, &bare.client(), calls, Duration::from_secs(1));
+}
+
+#[test]
+fn a_node_that_dies_while_there_is_no_master_is_removed_after_the_recovery() {
+    let mut robot = Robot::start_for_outages(Mode::Proxy);
+    let client = robot.client();
+    let (dead, _) = registered([&client, &robot.bare()]);
+    let publisher = FakeNode::start("/publisher");
+    let before = robot.master_pid();
+    robot.kill_master();
+    drop(dead);
+    publisher.publish(&client, "/topic", "std_msgs/String");
+    eventually("it is unreachable", || {
+        names(&status(&client)["unreachable"]) == ["/leaving"]
+    });
+    let stays = || knows(&client);
+    assert!(holds(Duration::from_secs(4), stays), "it was removed");
+    robot.revive_master();
+    robot.await_recovery(before);
+    eventually("it is removed from the master", || !knows(&robot.bare()));
+    eventually("nobody is unreachable any more", || {
+        names(&status(&client)["unreachable"]).is_empty()
+    });
+}
