@@ -98,7 +98,7 @@ pub(super) struct Member {
     /// Processes that are being ended.
     endings: JoinSet<()>,
     cut_off: Option<CutOff>,
-    /// Writes of an earlier time alone are being sent. Gives how many did not hold.
+    /// The writes of the oldest time alone are being sent. Gives how many did not hold.
     merging: Option<Merging>,
     /// The ledger's state wins over the journal's if this computer leads next.
     ours: bool,
@@ -305,7 +305,7 @@ impl Member {
     /// Says who leads. Calls of nodes wait as long as what was answered before them, alone, is on its way.
     fn set_way(&self, way: Way) {
         let leads = matches!(way, Way::Leader { .. } | Way::Here { term: Some(_) });
-        let owes = self.cut_off.is_some() || self.merging.is_some();
+        let owes = self.cut_off.is_some();
         self.leads.send_replace(way.clone());
         let way = match leads && owes {
             true => Way::Nobody { known: true },

@@ -93,6 +93,37 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
     }
 }
 
+/// The second time begins as soon as the first one is over: its writes have reached the leader, or have not.
+#[test]
+fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let leader = fleet.await_whole();
+    let cut = (leader + 1) % 3;
+    let lonely = &fleet.computers[cut];
+    for value in 1..=3 {
+        fleet.network.cut_cable(cut);
+        eventually("it says that it is alone", || lonely.role_is("alone"));
+        if value > 1 {
+            assert_eq!(lonely.param("/count"), Some(Value::Int(value - 1)));
+        }
+        lonely.set_param("/count", value);
+        lonely.set_param(&format!("/written_{value}"), value);
+        fleet.network.mend_cable(cut);
+        eventually("it is not alone any more", || !lonely.role_is("alone"));
+    }
+    fleet.await_whole();
+    await_param(&fleet, "/count", 3);
+    for value in 1..=3 {
+        await_param(&fleet, &format!("/written_{value}"), value);
+    }
+    let lonely = &fleet.computers[cut];
+    assert!(lonely.logged("does not hold").is_empty());
+    assert!(lonely.logged("cannot be kept").is_empty());
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
+}
+
 #[test]
 fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
     let _alone = alone();

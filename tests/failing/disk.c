@@ -1,6 +1,8 @@
 /* A disk that misbehaves: whatever rosrescue itself does with a file whose path contains DISK_PATH. How it does is the
  * first letter in the file DISK_STATE; without that file all is well.
  *   h  hangs until the file says otherwise
+ *   o  hangs whoever opens a file
+ *   y  hangs whoever forces a file to it
  *   s  slow: each operation takes 0.2 s
  *   f  full: what is written is taken in part, or not at all
  *   r  read-only */
@@ -15,7 +17,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-enum kind { LOOKS, SYNCS, GROWS, CHANGES };
+enum kind { LOOKS, OPENS, CREATES, SYNCS, GROWS, CHANGES };
 
 static int is_rosrescue;
 
@@ -47,13 +49,15 @@ static int meets(const char *path, enum kind kind)
     if (part == NULL || path == NULL || strstr(path, part) == NULL)
         return 0;
     char now = state();
-    for (; now == 'h'; now = state())
+    while (now == 'h' || (now == 'o' && (kind == OPENS || kind == CREATES)) || (now == 'y' && kind == SYNCS)) {
         usleep(1000);
+        now = state();
+    }
     if (now == 's')
         usleep(200000);
     if (now == 'f' && kind == GROWS)
         return ENOSPC;
-    if (now == 'r' && (kind == GROWS || kind == CHANGES))
+    if (now == 'r' && (kind == GROWS || kind == CHANGES || kind == CREATES))
         return EROFS;
     return 0;
 }
@@ -131,7 +135,7 @@ int linkat(int from_folder, const char *from, int to_folder, const char *to, int
 
 static int open_file(int folder, const char *path, int flags, mode_t mode)
 {
-    FAIL_IF(meets(path, (flags & O_ACCMODE) == O_RDONLY ? LOOKS : CHANGES));
+    FAIL_IF(meets(path, (flags & O_ACCMODE) == O_RDONLY ? OPENS : CREATES));
     return syscall(SYS_openat, folder, path, flags, mode);
 }
 

@@ -86,6 +86,10 @@ pub(crate) struct FailingDisk {
 pub(crate) enum Trouble {
     /// Nothing is answered until that is over.
     Hangs,
+    /// No file can be opened until that is over.
+    HangsOnOpen,
+    /// Nothing is forced to it until that is over.
+    HangsOnSync,
     /// Each operation takes 0.2 s.
     Slow,
     Full,
@@ -115,6 +119,8 @@ impl FailingDisk {
     pub(crate) fn begin(&self, trouble: Trouble) {
         let letter = match trouble {
             Trouble::Hangs => "h",
+            Trouble::HangsOnOpen => "o",
+            Trouble::HangsOnSync => "y",
             Trouble::Slow => "s",
             Trouble::Full => "f",
             Trouble::ReadOnly => "r",

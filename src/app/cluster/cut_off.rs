@@ -1,7 +1,10 @@
 //! Writes that were answered while this computer was alone: kept beside the checkpoint until they have been
 //! sent to the leader.
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::VecDeque,
+    path::{Path, PathBuf},
+};
 
 use crate::{
     checkpoint::{
@@ -9,6 +12,7 @@ use crate::{
         session,
         store::{Store, StoreError},
     },
+    cluster::merge,
     ledger::{
         Change,
         journal::{DISK_PATIENCE, SILENT},
@@ -18,13 +22,18 @@ use crate::{
     wait,
 };
 
-pub(super) struct CutOff {
+/// One time alone.
+#[derive(Clone)]
+pub(super) struct Time {
     /// The state when this computer was cut off.
     pub(super) base: Master,
     /// What was answered since, in order.
     pub(super) calls: Vec<Request>,
-    /// Those of an earlier time.
-    earlier: usize,
+}
+
+pub(super) struct CutOff {
+    /// Those whose writes have not all reached the leader, the oldest first; never empty.
+    times: VecDeque<Time>,
     store: Option<Store>,
 }
 
@@ -71,46 +80,53 @@ impl CutOff {
                 Entry::Session(_) => None,
             })
             .collect();
-        let mut this = Self {
-            earlier: calls.len(),
-            base,
-            calls: Vec::new(),
-            store: None,
-        };
-        this.begin(store).await;
-        this.append(calls).await;
         tracing::info!(
-            calls = this.calls.len(),
+            calls = calls.len(),
             "an earlier process was alone; its writes are sent when a computer leads"
         );
+        let mut this = Self::of(Time { base, calls });
+        this.write(store).await;
         Some(this)
+    }
+
+    fn of(time: Time) -> Self {
+        Self {
+            times: VecDeque::from([time]),
+            store: None,
+        }
     }
 
     /// This computer is cut off in the state `base`.
     pub(super) async fn new(checkpoint: &Path, base: Master) -> Self {
         let path = path_of(checkpoint);
-        let mut this = Self {
-            base,
-            calls: Vec::new(),
-            earlier: 0,
-            store: None,
-        };
+        let calls = Vec::new();
+        let mut this = Self::of(Time { base, calls });
         match wait::within(DISK_PATIENCE, move || Store::open_over(&path)).await {
-            Some(Ok(store)) => this.begin(store).await,
+            Some(Ok(store)) => this.write(store).await,
             Some(Err(error)) => say_unkept(&error),
             None => say_unkept(&SILENT),
         }
         this
     }
 
-    async fn begin(&mut self, mut store: Store) {
+    /// Writes all times into the file. It tells no limits between them: after a crash they are one.
+    async fn write(&mut self, mut store: Store) {
+        let Some(first) = self.times.front() else {
+            return;
+        };
         let checkpoint = Checkpoint {
             seq: store.seq(),
-            snapshot: self.base.snapshot(),
+            snapshot: first.base.snapshot(),
             ..Checkpoint::default()
         };
-        let begin = move || (store.begin(&checkpoint), store);
-        self.keep(begin).await;
+        let calls = self.times.iter().flat_map(|time| &time.calls);
+        let entries = entries(calls);
+        let write = move || {
+            let written = store.begin(&checkpoint);
+            let written = written.and_then(|()| store.append(&entries).map(|_| ()));
+            (written, store)
+        };
+        self.keep(write).await;
     }
 
     /// Has `work` done, and takes the store back. No store is left of a disk that is silent.
@@ -127,9 +143,21 @@ impl CutOff {
         self.store = Some(store);
     }
 
-    /// Another time alone begins, before the writes of the last one were sent.
-    pub(super) fn again(&mut self) {
-        self.earlier = self.calls.len();
+    /// This computer is cut off once more, in the state `base`.
+    pub(super) fn again(&mut self, base: Master) {
+        let calls = Vec::new();
+        self.times.push_back(Time { base, calls });
+    }
+
+    /// `state`, that of the others, with what was answered alone and has not reached them.
+    pub(super) fn on(&self, state: &Master) -> Master {
+        let mut state = state.clone();
+        for Time { base, calls } in &self.times {
+            for call in merge::merge(base, &state, calls).send {
+                state.apply_telling(&call, &mut ());
+            }
+        }
+        state
     }
 
     /// Keeps what was answered.
@@ -149,23 +177,43 @@ impl CutOff {
         if calls.is_empty() {
             return;
         }
-        let entries: Vec<_> = calls
-            .iter()
-            .cloned()
-            .map(|call| Entry::call(call.into()))
-            .collect();
         if let Some(mut store) = self.store.take() {
+            let entries = entries(&calls);
             let append = move || (store.append(&entries).map(|_| ()), store);
             self.keep(append).await;
         }
-        self.calls.extend(calls);
+        if let Some(time) = self.times.back_mut() {
+            time.calls.extend(calls);
+        }
+    }
+
+    /// The oldest time.
+    pub(super) fn first(&self) -> Option<Time> {
+        self.times.front().cloned()
+    }
+
+    /// The writes of the oldest time have reached the leader. Returns what is left.
+    pub(super) async fn sent(mut self) -> Option<Self> {
+        self.times.pop_front();
+        if self.times.is_empty() {
+            return None;
+        }
+        if let Some(store) = self.store.take() {
+            self.write(store).await;
+        }
+        Some(self)
     }
 
     /// What was answered this time is in the journal after all. Returns what is left of earlier times.
     pub(super) fn resumed(mut self) -> Option<Self> {
-        self.calls.truncate(self.earlier);
-        Some(self).filter(|left| !left.calls.is_empty())
+        self.times.pop_back();
+        Some(self).filter(|left| !left.times.is_empty())
     }
+}
+
+fn entries<'a>(calls: impl IntoIterator<Item = &'a Request>) -> Vec<Entry> {
+    let calls = calls.into_iter().cloned();
+    calls.map(|call| Entry::call(call.into())).collect()
 }
 
 /// Removes what was kept beside `checkpoint`: all of it has been sent.
@@ -256,6 +304,7 @@ mod tests {
         drop(cut_off);
         for _ in 0..2 {
             let left = CutOff::left(&checkpoint, true).await.unwrap();
+            let left = left.first().unwrap();
             assert!(left.base == base());
             assert_eq!(left.calls, calls);
         }
@@ -288,13 +337,51 @@ mod tests {
         let checkpoint = folder.path().join("chkpt.yaml");
         let mut cut_off = CutOff::new(&checkpoint, base()).await;
         cut_off.add(&[change(5, set("/a", 1))]).await;
-        cut_off.again();
+        cut_off.again(base());
         cut_off.add(&[change(6, set("/b", 2))]).await;
         // etcd has the second after all.
         let left = cut_off.resumed().unwrap();
-        assert_eq!(left.calls, [set("/a", 1)]);
+        assert_eq!(left.first().unwrap().calls, [set("/a", 1)]);
         let only = CutOff::new(&folder.path().join("other.yaml"), base()).await;
         assert!(only.resumed().is_none());
+    }
+
+    /// The first one's writes are on their way when the second begins.
+    #[tokio::test]
+    async fn of_two_times_alone_the_second_goes_on_from_the_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("chkpt.yaml");
+        let others = base();
+        let mut cut_off = CutOff::new(&checkpoint, others.clone()).await;
+        cut_off.add(&[change(5, set("/count", 1))]).await;
+        let second = cut_off.on(&others);
+        assert_eq!(second.params().get("count"), Some(&1.into()));
+        cut_off.again(second);
+        cut_off.add(&[change(6, set("/count", 2))]).await;
+        // A crash loses neither.
+        let path = folder.path().join("copy.yaml");
+        std::fs::copy(path_of(&checkpoint), path_of(&path)).unwrap();
+        let left = CutOff::left(&path, true).await.unwrap();
+        assert_eq!(
+            left.first().unwrap().calls,
+            [set("/count", 1), set("/count", 2)]
+        );
+        // The others get the first.
+        let first = cut_off.first().unwrap();
+        let merged = merge::merge(&first.base, &others, &first.calls);
+        assert_eq!(merged.send, [set("/count", 1)]);
+        let mut others = others;
+        others.apply(&set("/count", 1));
+        let cut_off = cut_off.sent().await.unwrap();
+        let second = cut_off.first().unwrap();
+        let merged = merge::merge(&second.base, &others, &second.calls);
+        assert_eq!(merged.send, [set("/count", 2)]);
+        assert_eq!(merged.lost, []);
+        let left = CutOff::left(&checkpoint, true);
+        assert!(left.await.is_none(), "it is locked");
+        assert!(cut_off.sent().await.is_none());
+        let left = CutOff::left(&checkpoint, true).await.unwrap();
+        assert_eq!(left.first().unwrap().calls, [set("/count", 2)]);
     }
 
     #[tokio::test]
@@ -302,6 +389,6 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut cut_off = CutOff::new(&folder.path().join("no/folder.yaml"), base()).await;
         cut_off.add(&[change(5, set("/a", 1))]).await;
-        assert_eq!(cut_off.calls, [set("/a", 1)]);
+        assert_eq!(cut_off.first().unwrap().calls, [set("/a", 1)]);
     }
 }

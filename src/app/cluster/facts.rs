@@ -171,6 +171,10 @@ impl Known {
         Some((leader.name.clone(), self.sign?.1))
     }
 
+    pub(super) fn role(&self) -> Role {
+        self.role.0
+    }
+
     /// Returns the role before.
     pub(super) fn set_role(&mut self, role: Role) -> Role {
         std::mem::replace(&mut self.role, (role, Instant::now())).0

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use bytes::Bytes;
 use tokio::sync::watch;
 
-use super::CutOff;
+use super::cut_off::Time;
 use crate::{
     cluster::{
         merge::{self, Lost},
@@ -57,12 +57,11 @@ impl Route {
     }
 }
 
-/// Sends what of `cut_off` still holds, in order. `now`: the state that the others have. Returns how many did not
-/// hold.
-pub(super) async fn send(cut_off: CutOff, now: &Master, mut route: Route) -> u64 {
-    let merged = merge::merge(&cut_off.base, now, &cut_off.calls);
-    // Its file stays, and is not locked any more.
-    drop(cut_off);
+/// Sends what of a time alone still holds, in order. `now`: the state that the others have. Returns how many did
+/// not hold.
+pub(super) async fn send(time: Time, now: &Master, mut route: Route) -> u64 {
+    let merged = merge::merge(&time.base, now, &time.calls);
+    drop(time);
     let lost = merged.lost.len() as u64;
     say_lost(merged.lost);
     for calls in portions(&merged.send) {

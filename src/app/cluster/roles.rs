@@ -91,8 +91,7 @@ impl Member {
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
-            // What is being sent is in the file until it has arrived.
-            if self.cut_off.is_none() && self.merging.is_none() {
+            if self.cut_off.is_none() {
                 cut_off::remove(&self.given.post.checkpoint).await;
             }
         }
@@ -131,12 +130,12 @@ impl Member {
             true => self.held.clone(),
             false => self.given.post.ledger.with_mirror(Clone::clone),
         };
-        match &mut self.cut_off {
-            Some(cut_off) => cut_off.again(),
-            None => {
-                self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base.clone()).await)
-            }
-        }
+        // The nodes go on from what they wrote alone before.
+        let base = match &self.cut_off {
+            Some(cut_off) => cut_off.on(&base),
+            None => base,
+        };
+        self.cut_off_in(base.clone()).await;
         if self.has_master() {
             if let Some(cut_off) = &mut self.cut_off {
                 cut_off.add(self.outgoing.changes()).await;
@@ -144,12 +143,21 @@ impl Member {
         } else {
             let seq = self.machine.committed();
             self.outgoing.start(seq);
+            let _ = self.given.post.ledger.follow_state(base.clone());
             self.given.post.ledger.lead(seq, &base);
             self.begin_duty(None, CUT_OFF);
         }
         self.set_way(Way::Here { term: None });
         self.outgoing.all_ready();
         self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
+    }
+
+    /// What is answered from now on is kept for the leader. `base`: the present state.
+    async fn cut_off_in(&mut self, base: Master) {
+        match &mut self.cut_off {
+            Some(cut_off) => cut_off.again(base),
+            None => self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base).await),
+        }
     }
 
     /// `rosout`: see [`Post::begin`](crate::app::duty::Post::begin).
@@ -182,15 +190,22 @@ impl Member {
     /// `acknowledged`.
     pub(super) async fn give_back(&mut self, committed: u64, acknowledged: u64) {
         let lost: Vec<Change> = self.outgoing.take_all();
-        if self.cut_off.is_none() {
-            let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
-            let answered: Vec<_> = lost.iter().filter(answered).collect();
-            if !answered.is_empty() {
-                let mut cut_off = CutOff::new(&self.given.post.checkpoint, self.held.clone()).await;
+        if self.keeps() {
+            return;
+        }
+        let answered = |of: &&Change| of.seq() > committed && of.seq() <= acknowledged;
+        let answered: Vec<_> = lost.iter().filter(answered).collect();
+        if !answered.is_empty() {
+            self.cut_off_in(self.held.clone()).await;
+            if let Some(cut_off) = &mut self.cut_off {
                 cut_off.add(answered).await;
-                self.cut_off = Some(cut_off);
             }
         }
+    }
+
+    /// Whether what is answered now is kept for the leader.
+    fn keeps(&self) -> bool {
+        self.known.role() == Role::Alone && self.settings.alone == WhenAlone::Serve
     }
 
     /// A change is in the journal.
@@ -215,7 +230,9 @@ impl Member {
     pub(super) async fn take_changes(&mut self) {
         let changes = self.given.post.ledger.take_changes();
         let is_alone = self.machine.role() == Role::Alone;
-        if let Some(cut_off) = self.cut_off.as_mut().filter(|_| is_alone) {
+        if self.keeps()
+            && let Some(cut_off) = &mut self.cut_off
+        {
             cut_off.add(&changes).await;
         }
         self.outgoing.add(changes);
@@ -350,7 +367,7 @@ impl Member {
         };
         if settled
             && self.merging.is_none()
-            && let Some(cut_off) = self.cut_off.take()
+            && let Some(time) = self.cut_off.as_ref().and_then(CutOff::first)
         {
             let now = self.present();
             let route = Route {
@@ -359,7 +376,7 @@ impl Member {
                 write_queue: self.given.post.write_queue.clone(),
             };
             self.merging = Some(Box::pin(async move {
-                merging::send(cut_off, &now.await, route).await
+                merging::send(time, &now.await, route).await
             }));
         }
         self.work_beside(now);
@@ -400,11 +417,14 @@ impl Member {
     /// The writes of a time alone have been sent; so many did not hold.
     pub(super) async fn merged(&mut self, lost: u64) {
         self.merging = None;
-        let leads = self.leads.borrow().clone();
-        self.set_way(leads);
         self.known.lost_writes += lost;
+        if let Some(cut_off) = self.cut_off.take() {
+            self.cut_off = cut_off.sent().await;
+        }
         if self.cut_off.is_none() {
             cut_off::remove(&self.given.post.checkpoint).await;
         }
+        let leads = self.leads.borrow().clone();
+        self.set_way(leads);
     }
 }

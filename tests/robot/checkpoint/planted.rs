@@ -4,9 +4,10 @@
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
-use crate::support::{Rescue, Scratch, Setup, eventually, free_port, signal, status};
+use crate::support::{
+    FailingDisk, Rescue, Scratch, Setup, Trouble, eventually, free_port, signal, status,
+};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::Signal;
 
@@ -23,7 +24,7 @@ fn open_folder(scratch: &Scratch) -> PathBuf {
     let folder = scratch.path("open");
     fs::create_dir(&folder).unwrap();
     fs::set_permissions(&folder, fs::Permissions::from_mode(0o777)).unwrap();
-    folder.join("chkpt.yaml")
+    folder.join("latest-chkpt.yaml")
 }
 
 fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
@@ -104,26 +105,17 @@ fn the_log_configuration_of_rosmaster_is_in_no_folder() {
 #[test]
 fn a_disk_that_hangs_delays_neither_calls_nor_the_next_master() {
     let scratch = Scratch::new();
-    let library = scratch.path("held_open.so");
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/held_open.c");
-    let mut compiler = Command::new("gcc");
-    compiler
-        .args(["-shared", "-fPIC", "-o"])
-        .arg(&library)
-        .arg(source);
-    assert!(compiler.status().expect("gcc runs").success());
-    let (checkpoint, held) = (open_folder(&scratch), scratch.path("held"));
-    let setup = Setup::core(&scratch, free_port()).at_checkpoint(checkpoint.clone());
-    let setup = setup.env("LD_PRELOAD", &library).env("HELD_OPEN", &held);
-    let mut rescue = setup.env("HELD_PATH", &checkpoint).start();
-    fs::write(&held, "").unwrap();
+    let disk = FailingDisk::new(&scratch);
+    let setup = Setup::core(&scratch, free_port()).at_checkpoint(open_folder(&scratch));
+    let mut rescue = disk.under(setup).start();
+    disk.begin(Trouble::HangsOnOpen);
     for _ in 0..2 {
         assert_rescued(&mut rescue);
     }
     rescue.wait_line("what is missing", |line| {
         line.contains("cannot create the file for a process's output")
     });
-    fs::remove_file(&held).unwrap();
+    disk.heal();
     assert_rescued(&mut rescue);
     eventually("it is protected", || {
         status(&rescue.client())["unprotected"].is_null()

@@ -2,52 +2,25 @@
 //! rosrescue or the mirror had to find out first what was done.
 
 use std::fs;
-use std::path::PathBuf;
-use std::process::Command;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use crate::support::{
-    Client, FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, Setup, eventually, holds, params,
-    signal, status, stop, unreadable,
+    Client, FailingDisk, FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, Setup, Trouble,
+    eventually, holds, params, signal, status, stop, unreadable,
 };
 use rosrescue::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 
-/// A disk on which nothing is forced while it is held.
-struct Disk {
-    held: PathBuf,
-    library: PathBuf,
-}
-
-impl Disk {
-    fn new(scratch: &Scratch) -> Self {
-        let library = scratch.path("held_sync.so");
-        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/held_sync.c");
-        let mut compiler = Command::new("gcc");
-        compiler.args(["-shared", "-fPIC", "-o"]);
-        let compiled = compiler.arg(&library).arg(source).status();
-        assert!(compiled.expect("gcc runs").success());
-        let held = scratch.path("held");
-        Self { held, library }
-    }
-
-    fn under(&self, setup: Setup) -> Setup {
-        setup
-            .env("LD_PRELOAD", &self.library)
-            .env("HELD_SYNC", &self.held)
-    }
-
-    /// Runs `work` while the disk is held, and sees that it ends only after that.
-    #[track_caller]
-    fn holds_up<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
-        fs::write(&self.held, "").unwrap();
-        let work = thread::spawn(work);
-        let waits = holds(Duration::from_millis(700), || !work.is_finished());
-        fs::remove_file(&self.held).unwrap();
-        assert!(waits, "it did not wait for the disk");
-        work.join().unwrap()
-    }
+/// Runs `work` while nothing is forced to `disk`, and sees that it ends only after that.
+#[track_caller]
+fn held_up<T: Send + 'static>(disk: &FailingDisk, work: impl FnOnce() -> T + Send + 'static) -> T {
+    disk.begin(Trouble::HangsOnSync);
+    let work = thread::spawn(work);
+    let waits = holds(Duration::from_millis(700), || !work.is_finished());
+    disk.heal();
+    assert!(waits, "it did not wait for the disk");
+    work.join().unwrap()
 }
 
 #[track_caller]
@@ -60,11 +33,12 @@ fn assert_done(reply: &Reply) {
 fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
-    let disk = Disk::new(&scratch);
+    let disk = FailingDisk::new(&scratch);
     // Where its folder is to be.
     let obstacle = scratch.path("obstacle");
     fs::write(&obstacle, "").unwrap();
-    let setup = Setup::proxy(&scratch, master.port).at_checkpoint(obstacle.join("checkpoint"));
+    let setup =
+        Setup::proxy(&scratch, master.port).at_checkpoint(obstacle.join("latest-chkpt.yaml"));
     let mut rescue = disk.under(setup.args(["--sync", "always"])).start();
     let client = rescue.client();
     rescue.wait_line("that it has no checkpoint", |line| {
@@ -75,7 +49,7 @@ fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
     rescue.wait_line("that it has one", |line| line.contains("protected again"));
     for value in 0..2 {
         let client = client.clone();
-        disk.holds_up(move || client.set_param("/protected", value));
+        held_up(&disk, move || client.set_param("/protected", value));
     }
 }
 
@@ -83,7 +57,7 @@ fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
 fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
-    let disk = Disk::new(&scratch);
+    let disk = FailingDisk::new(&scratch);
     let setup = Setup::proxy(&scratch, master.port).args(["--sync", "always"]);
     let rescue = disk.under(setup).start();
     let client = rescue.client();
@@ -92,9 +66,9 @@ fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
     master.kill();
     eventually("the gate is shut", || status(&client)["open"] == false);
     let leaving = client.clone();
-    disk.holds_up(move || node.unpublish(&leaving, "/topic"));
+    held_up(&disk, move || node.unpublish(&leaving, "/topic"));
     // What changes nothing is no safer than what made it so.
-    disk.holds_up(move || {
+    held_up(&disk, move || {
         let first = thread::spawn({
             let client = client.clone();
             move || client.set_param("/same", 1)
@@ -112,11 +86,13 @@ fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
 fn what_a_call_did_that_cannot_be_read_is_in_the_file_before_its_answer() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
-    let disk = Disk::new(&scratch);
+    let disk = FailingDisk::new(&scratch);
     let mut rescue = disk.under(Setup::proxy(&scratch, master.port)).start();
     for key in ["/a", "/b"] {
         let client = rescue.client();
-        let reply = disk.holds_up(move || client.exchange(&unreadable(key, 1)).unwrap().reply());
+        let reply = held_up(&disk, move || {
+            client.exchange(&unreadable(key, 1)).unwrap().reply()
+        });
         assert_done(&reply);
         signal(rescue.pid(), Signal::KILL);
         master.kill();
