@@ -19,9 +19,9 @@ use rustix::process::Signal;
 
 /// The longest pass of a driver's loop, in milliseconds. Where drivers wait for the master they stall for 350 at
 /// least; measured on a computer with little else to do, no pass takes more than 15.
-const PASS: f64 = 200.0;
+const PASS: f64 = 300.0;
 /// The same behind a master that hangs: the mirror answers after 100. Where drivers wait, 6,500 at least.
-const PASS_HUNG: f64 = 300.0;
+const PASS_HUNG: f64 = 1_000.0;
 /// How much longer than an undisturbed driver's longest pass one may take.
 const NOISE: f64 = 3.0;
 /// Between two kills.

@@ -15,8 +15,6 @@ mod support;
 
 /// Loops of drivers do not stall.
 mod drivers;
-/// rosrescue answers before its rosmaster is up.
-mod first_start;
 /// Who cannot be told, or does not answer, delays nobody while there is no master.
 mod notifications;
 /// Nodes that cannot be reached delay nobody.

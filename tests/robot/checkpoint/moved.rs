@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use crate::support::{Rescue, Scratch, Setup, SmallDisk, eventually, free_port, signal, status};
 use rustix::process::Signal;
 
-/// How soon it must be said: a second, and another one because other tests want the processor too.
-const SAID: Duration = Duration::from_secs(2);
+/// How soon it must be said: within a second, or later on a busy computer, but long before the disk is forced.
+const SAID: Duration = Duration::from_secs(10);
 
 fn robot(scratch: &Scratch) -> Rescue {
     let folder = scratch.path("robot");

@@ -72,7 +72,7 @@ fn idle_connections_give_way_and_their_clients_are_served_again() {
     let start = Instant::now();
     client.set_param("/x", 1);
     let took = start.elapsed();
-    assert!(took < Duration::from_secs(2), "{took:?}");
+    assert!(took < Duration::from_secs(10), "{took:?}");
     // The oldest had to go, the youngest had not.
     assert!(wires[0].closes(PATIENCE));
     wires[199].send(&question()).unwrap();
@@ -137,7 +137,7 @@ fn with_few_files_calls_are_served_recorded_and_recovered_under_idle_connections
             client.set_param("/x", number);
         }
         let took = start.elapsed();
-        assert!(took < Duration::from_secs(5), "{limit} files: {took:?}");
+        assert!(took < Duration::from_secs(20), "{limit} files: {took:?}");
         assert_calm(&rescue, Duration::from_secs(1));
         // The master dies meanwhile.
         let dead = client.master_pid().unwrap();

@@ -11,7 +11,7 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 
 /// By then a call is answered, on a busy computer.
-const SOON: Duration = Duration::from_secs(2);
+const SOON: Duration = Duration::from_secs(5);
 
 /// rosrescue core with a rosmaster that can be made to fail, and a state.
 struct Robot {

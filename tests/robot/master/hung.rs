@@ -298,7 +298,7 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
     let slow = robot.scratch.path("slow");
 
     // The second one takes almost as long as a probe may, and the third longer than one may.
-    for (number, seconds) in (1..).zip(["0.3", "1.4", "2"]) {
+    for (number, seconds) in (1..).zip(["0.3", "1.2", "2"]) {
         fs::write(&slow, seconds).unwrap();
         let start = Instant::now();
         client.set_param("/kept", number);
@@ -308,7 +308,8 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
             "it was not slow: {:?}",
             start.elapsed()
         );
-        // Who reads need not wait so long.
+        // Who reads need not wait so long, unless the computer itself is slow.
+        let delay = delay.max(Duration::from_secs(1));
         let start = Instant::now();
         assert_eq!(client.param("/kept"), Some(Value::Int(number)));
         assert!(start.elapsed() < delay, "{:?}", start.elapsed());

@@ -10,7 +10,7 @@ use crate::support::{
 };
 
 /// By then a living subscriber knows a new publisher. One question to a name server that is waited for takes 5 s.
-const SOON: Duration = Duration::from_secs(3);
+const SOON: Duration = Duration::from_millis(4_500);
 
 /// `rosrescue core` that asks `server` and no other, and so does its master.
 fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
