@@ -295,8 +295,9 @@ pub(crate) fn run(
     tally: &mut Tally,
 ) -> Result<(), Failure> {
     let mut rig = Rig::start(servers, count);
-    let model = rig.state()?;
-    let result = steps(script, nodes, &mut rig, model, tally);
+    let result = rig
+        .state()
+        .and_then(|model| steps(script, nodes, &mut rig, model, tally));
     if result.is_err() && !crate::nodes::HURRIED.load(Ordering::Relaxed) {
         for computer in &rig.computers {
             eprintln!("{}", computer.rescue.log());

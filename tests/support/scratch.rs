@@ -2,10 +2,15 @@
 
 use std::ffi::OsString;
 use std::fs;
+use std::io::ErrorKind;
 use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
+use std::ops::Range;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
@@ -137,27 +142,38 @@ fn is_install(variable: &str) -> bool {
 }
 
 /// A port that nobody listens at, on IPv4 and IPv6, and below those that the kernel gives to
-/// outgoing connections: nobody gets it by chance before the test binds it.
+/// outgoing connections: nobody gets it by chance before the test binds it. No other test program gets it either,
+/// for as long as this one runs.
 pub(crate) fn free_port() -> u16 {
-    const FIRST: u32 = 12_000;
-    const COUNT: u32 = 20_000;
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    // Test processes that run at the same time begin far from each other.
-    let start = std::process::id().wrapping_mul(7919);
-    for _ in 0..COUNT {
-        let offset = start.wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed)) % COUNT;
-        let port = u16::try_from(FIRST + offset).unwrap();
+    const FIRST: u16 = 12_000;
+    const BLOCKS: u16 = 200;
+    const BLOCK: u16 = 100;
+    /// The sockets that say which blocks are ours, and the ports of the last one that are left.
+    static OURS: Mutex<(Vec<UnixListener>, Range<u16>)> = Mutex::new((Vec::new(), 0..0));
+    let mut ours = OURS.lock().unwrap_or_else(PoisonError::into_inner);
+    loop {
+        let Some(port) = ours.1.next() else {
+            let start = u16::try_from(std::process::id() % u32::from(BLOCKS)).unwrap();
+            let (block, socket) = (0..BLOCKS)
+                .map(|step| (start + step) % BLOCKS)
+                .find_map(|block| {
+                    let name = format!("rosrescue-tests-ports-{block}");
+                    let name = SocketAddr::from_abstract_name(name).unwrap();
+                    Some((block, UnixListener::bind_addr(&name).ok()?))
+                })
+                .expect("a block of ports that no test program has");
+            let first = FIRST + block * BLOCK;
+            ours.0.push(socket);
+            ours.1 = first..first + BLOCK;
+            continue;
+        };
         let v4 = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port));
-        drop(
-            v4.as_ref()
-                .ok()
-                .map(|_| TcpListener::bind((Ipv6Addr::LOCALHOST, port))),
-        );
-        if v4.is_ok() {
+        let v6 = TcpListener::bind((Ipv6Addr::LOCALHOST, port));
+        // Not every computer has IPv6.
+        if v4.is_ok() && !v6.is_err_and(|error| error.kind() == ErrorKind::AddrInUse) {
             return port;
         }
     }
-    panic!("no free port between {FIRST} and {}", FIRST + COUNT);
 }
 
 /// The text of an environment value for a message.
