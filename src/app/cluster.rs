@@ -24,7 +24,7 @@ use tokio::{
     sync::{mpsc, watch},
     task::JoinSet,
 };
-use tokio_util::sync::CancellationToken;
+use tokio_util::{sync::CancellationToken, task::AbortOnDropHandle};
 
 pub(super) use self::join::{Given, join};
 use self::{
@@ -213,14 +213,14 @@ impl Member {
             (Some(_), Some(term)) => Some((term, self.outgoing.missing_parts(&replica.keys))),
             _ => None,
         };
-        self.requests.spawn(async move {
+        let run = async move {
             let run = async {
                 if let Some((term, parts)) = parts.filter(|(_, parts)| !parts.is_empty()) {
                     replica.prepare(term, &parts).await?;
                 }
                 replica.run(&settings, &op, entry.as_ref()).await
             };
-            let answer = match run.await {
+            match run.await {
                 Ok(answer) => {
                     trouble.clear();
                     answer
@@ -229,9 +229,9 @@ impl Member {
                     trouble.set(&error);
                     Answer::Silence
                 }
-            };
-            Input::Answer { number, answer }
-        });
+            }
+        };
+        self.requests.spawn(answered(number, run));
     }
 
     /// The next event; an end if there is one.
@@ -250,10 +250,7 @@ impl Member {
             biased;
             () = stop.cancelled(), if !stopping => return self.begin_stop(),
             error = failed(&mut self.duty) => return Some(Some(error.into())),
-            Some(done) = self.requests.join_next() => match done {
-                Ok(input) => self.inbox.push_back(input),
-                Err(error) => tracing::error!(%error, "a request to etcd was not finished; please report this line"),
-            },
+            Some(done) = self.requests.join_next() => self.inbox.extend(done),
             () = self.given.post.ledger.shared.notified() => self.take_changes().await,
             done = wait::for_some(self.outgoing.preparing.as_mut()) => self.prepared(done),
             changes = next_changes(&mut self.watch) => self.changed(changes),
@@ -322,6 +319,16 @@ impl Member {
     }
 }
 
+/// The answer of a request to etcd. The machine waits for each: one that panics is given up, as if etcd were silent.
+async fn answered(number: u64, run: impl Future<Output = Answer> + Send + 'static) -> Input {
+    let run = AbortOnDropHandle::new(tokio::spawn(run));
+    let answer = run.await.unwrap_or_else(|error| {
+        tracing::error!(%error, "a request to etcd was not finished; please report this line");
+        Answer::Silence
+    });
+    Input::Answer { number, answer }
+}
+
 fn apply(state: &mut Master, records: &[Record]) {
     for record in records {
         if let Entry::Call { call, .. } = &record.entry {
@@ -341,5 +348,25 @@ async fn next_changes(watch: &mut Option<Watch>) -> Result<Vec<Change>, WatchEnd
     match watch {
         Some(watch) => watch.next().await,
         None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_request_that_panics_is_answered() {
+        let answered = answered(7, async { panic!("on purpose") }).await;
+        let expected = |input: &Input| {
+            matches!(
+                input,
+                Input::Answer {
+                    number: 7,
+                    answer: Answer::Silence
+                }
+            )
+        };
+        assert!(expected(&answered), "{answered:?}");
     }
 }
