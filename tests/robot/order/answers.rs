@@ -324,9 +324,14 @@ impl Pair {
                 arrived - begin
             ),
         });
-        // Whoever is at the address of a displaced node by then is not told while there is no master.
-        if let (Subject::Namesake, Some(asked)) = (subject, &asked) {
-            self.await_heard(asked);
+        // While there is no master, a displaced node is not told if another one is at its address by then.
+        match (subject, &asked) {
+            (Subject::Namesake, Some(asked)) => self.await_heard(asked),
+            (Subject::Namesake, None) => {
+                let leave = request("unregisterSubscriber", params![asker, topic, api]);
+                exchange(&mut self.asks, &leave);
+            }
+            _ => {}
         }
         asked
     }
