@@ -282,7 +282,6 @@ fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, 
 /// Sends the notifications that a master lost at `outage` may not have sent. Returns their topics.
 pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let (mut topics, params) = take_owed(nodes, outage);
-    nodes.ledger.with_order(|order, _| order.master_is_gone());
     topics.retain(|topic| notifications::notify_subscribers(nodes, topic));
     for (api, key) in params {
         notifications::tell(nodes, &api, Subject::Param(key.to_string()));

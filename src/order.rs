@@ -10,7 +10,8 @@
 //! * A notification of our own waits for such an answer, and for [`LEAD`] after it. Where the master may be
 //!   notifying the node of the same subject, ours is put off ([`Order::next`]).
 //! * Whoever is notified shortly after such an answer, or by two senders in a row, is told the state once more
-//!   ([`REPEAT_AFTER`]): the two may have been read in the wrong order.
+//!   ([`REPEAT_AFTER`]): the two may have been read in the wrong order. If the master notifies it of something newer
+//!   meanwhile, that is enough, and ours would be overtaken by the backlog of a master on a busy computer.
 //!
 //! Pure: time is an argument, and so is the mirror.
 
@@ -20,8 +21,7 @@ mod subject;
 mod under_way;
 
 use std::{
-    collections::{BTreeSet, HashMap},
-    hash::Hash,
+    collections::{BTreeMap, BTreeSet, HashSet},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -160,7 +160,10 @@ impl Order {
     pub(crate) fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
         let until = self.told.add(now, subject, nodes);
         self.outbox.renew_all(subject);
-        for (answer, port) in self.under_way.about(now, subject) {
+        let about = self.under_way.about(now, subject);
+        let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
+        self.repeats.drop_all_but(subject, &ports);
+        for (answer, port) in about {
             // Its own call was run later, or is what the node is notified of.
             if !self.in_flight.answers.contains(&answer) {
                 self.repeats.add(until, port, subject.clone());
@@ -248,10 +251,10 @@ impl Order {
         Next::Idle
     }
 
-    /// The node has taken the notification with this number, or has not. Returns whether something waits for
-    /// that.
-    pub(crate) fn taken(&mut self, now: Instant, number: u64) -> bool {
-        self.under_way.written(now, number);
+    /// The node has taken the notification with this number, so that it takes what comes next later, or has not.
+    /// Returns whether something waits for that.
+    pub(crate) fn taken(&mut self, number: u64) -> bool {
+        self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
     }
 
@@ -262,7 +265,7 @@ impl Order {
 
     /// Queues what is to be told once more by now.
     pub(crate) fn repeat(&mut self, now: Instant) {
-        while let Some((_, (port, subject))) = self.repeats.at.take_due(now) {
+        while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
             self.outbox.add(&port, subject, Content::StateAgain);
         }
     }
@@ -335,34 +338,47 @@ impl Told {
 /// What nodes are told once more, by port, after the last time that they might have read it in the wrong order.
 #[derive(Debug, Default)]
 struct Repeats {
-    at: Schedule<(String, Subject)>,
+    at: Schedule<(Subject, String)>,
     is_new: bool,
 }
 
 impl Repeats {
     fn add(&mut self, at: Instant, port: String, subject: Subject) {
         self.is_new |= self.at.next().is_none_or(|next| at < next);
-        self.at.set((port, subject), at);
+        self.at.set((subject, port), at);
+    }
+
+    /// The nodes at other ports than `kept` are not told of `subject` once more.
+    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
+        let from = (subject.clone(), String::new());
+        let about = self.at.at.range(from..);
+        let about = about.take_while(|((of, _), _)| of == subject);
+        let others = about.filter(|((_, port), _)| !kept.contains(port.as_str()));
+        let others: Vec<_> = others.map(|(thing, at)| (*at, thing.clone())).collect();
+        for (at, thing) in others {
+            self.at.at.remove(&thing);
+            self.at.queue.remove(&(at, thing));
+        }
     }
 }
 
 /// When each of several things is due.
 #[derive(Debug)]
 struct Schedule<T> {
-    at: HashMap<T, Instant>,
+    at: BTreeMap<T, Instant>,
     queue: BTreeSet<(Instant, T)>,
 }
 
 impl<T> Default for Schedule<T> {
     fn default() -> Self {
         Self {
-            at: HashMap::new(),
+            at: BTreeMap::new(),
             queue: BTreeSet::new(),
         }
     }
 }
 
-impl<T: Clone + Hash + Ord> Schedule<T> {
+impl<T: Clone + Ord> Schedule<T> {
     /// Returns when it was due before.
     fn set(&mut self, thing: T, at: Instant) -> Option<Instant> {
         let before = self.at.insert(thing.clone(), at);

@@ -126,7 +126,7 @@ impl Ledger {
 
     /// The notification with this number has been taken, or has not.
     pub(crate) fn notification_ended(&self, number: u64) {
-        let awaited = self.lock().order.taken(Instant::now(), number);
+        let awaited = self.lock().order.taken(number);
         self.report(awaited);
     }
 }

@@ -48,7 +48,6 @@ impl Ledger {
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.raise_incarnation();
-        inner.order.master_is_gone();
         // Either side is brought to the other's state, so there is no doubt.
         (inner.doubted, inner.abandoned) = (false, false);
         inner.token()

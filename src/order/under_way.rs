@@ -70,7 +70,7 @@ impl UnderWay {
         }
     }
 
-    /// It has been written to its caller, or taken by its node.
+    /// It has been written to its caller.
     pub(super) fn written(&mut self, now: Instant, number: u64) {
         if let Some(entry) = self.entries.get_mut(&number) {
             entry.written = Some(now);
@@ -78,7 +78,8 @@ impl UnderWay {
         }
     }
 
-    fn remove(&mut self, number: u64) {
+    /// It is not under way any more.
+    pub(super) fn remove(&mut self, number: u64) {
         for heard in self
             .entries
             .remove(&number)

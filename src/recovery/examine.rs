@@ -383,6 +383,10 @@ impl Examiner {
         if state != mirror {
             say_difference(&self.ledger.adopt(state.clone()));
         }
+        if bears == Bears::Nothing {
+            // One that is only late goes on to send what it had begun to send.
+            self.ledger.with_order(|order, _| order.master_is_gone());
+        }
         let token = self.ledger.succeed();
         let target = Target {
             state,

@@ -398,7 +398,7 @@ impl World {
                 self.caught_up += 1;
             }
             // It is examined and injected, and goes on to tell what it had begun to tell.
-            None => return self.revives(),
+            None => return self.is_injected(),
         }
         self.incarnation = self.ledger.serve();
     }
@@ -466,6 +466,11 @@ impl World {
     }
 
     fn revives(&mut self) {
+        self.ledger.with_order(|order, _| order.master_is_gone());
+        self.is_injected();
+    }
+
+    fn is_injected(&mut self) {
         let basis = self.ledger.begin_injection();
         self.ledger.succeed();
         self.ledger.delivered();
@@ -595,8 +600,7 @@ impl World {
                 }
             }
             Event::Taken(port, number) => {
-                let now = self.instant();
-                self.ledger.with_order(|order, _| order.taken(now, number));
+                self.ledger.with_order(|order, _| order.taken(number));
                 self.ports.insert(port, false);
             }
             Event::Dies => self.dies(),

@@ -81,8 +81,9 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
             );
             let values = subscriber.told().values[&key].clone();
             told += values.len();
-            let steps = values.windows(2).filter(|pair| pair[1] < pair[0]);
-            back.extend(steps.map(|pair| format!("subscriber {number}: {key} {pair:?}")));
+            let steps = (1..values.len()).filter(|&at| values[at] < values[at - 1]);
+            let around = steps.map(|at| &values[at.saturating_sub(4)..values.len().min(at + 4)]);
+            back.extend(around.map(|values| format!("subscriber {number}: {key} {values:?}")));
         }
     }
     println!(
