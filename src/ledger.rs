@@ -462,6 +462,11 @@ impl Inner {
 
     fn write_session(&mut self) {
         if std::mem::take(&mut self.session_unwritten) {
+            // What was not recorded is not in the file.
+            self.session.cluster_seq = match self.whole.is_due() {
+                true => 0,
+                false => self.cluster_seq(),
+            };
             let entry = Entry::Session(self.session.clone());
             self.append(vec![entry]);
         }

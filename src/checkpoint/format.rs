@@ -58,6 +58,9 @@ pub struct Session {
     pub port: u16,
     /// The last term in which this computer led several; 0 if it never did.
     pub term: u64,
+    /// In that term: the number of the last record in the computers' journal in etcd whose effect this file
+    /// holds. Each call that follows has the next number. Smaller, if it is not known.
+    pub cluster_seq: u64,
 }
 
 /// The content of a record.

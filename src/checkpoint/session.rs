@@ -117,6 +117,9 @@ pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt 
                 let taken = calls.filter_map(|call| rebuilt.mirror.displaced_by(call));
                 displaced.extend(taken.map(|it| (it.api.clone(), it)));
                 rebuilt.mirror.apply_telling(&request, &mut ());
+                if let Some(session) = &mut rebuilt.session {
+                    session.cluster_seq += 1;
+                }
                 if waits {
                     pending.push((seq, request));
                 }
@@ -186,6 +189,34 @@ mod tests {
         assert_eq!(waiting(&records), [""; 0]);
         records.push(write(14, true));
         assert_eq!(waiting(&records), ["/p14"]);
+    }
+
+    /// The number of the last call in the computers' journal, of a file with `records` after a snapshot of call 7.
+    fn cluster_seq(records: Vec<Record>) -> u64 {
+        let mut checkpoint = Checkpoint::default();
+        checkpoint.session.cluster_seq = 7;
+        rebuild(Some(checkpoint), records)
+            .session
+            .unwrap()
+            .cluster_seq
+    }
+
+    #[test]
+    fn each_call_after_the_session_was_written_is_one_more_in_the_computers_journal() {
+        let session = |seq, cluster_seq| {
+            let entry = Entry::Session(Session {
+                cluster_seq,
+                ..Session::default()
+            });
+            Record { seq, entry }
+        };
+        assert_eq!(cluster_seq(Vec::new()), 7);
+        assert_eq!(cluster_seq(vec![write(1, false), write(2, true)]), 9);
+        let records = vec![write(1, false), session(2, 8), write(3, false)];
+        assert_eq!(cluster_seq(records), 9);
+        // What was not recorded makes the number unknown.
+        let records = vec![write(1, false), session(2, 0), write(3, false)];
+        assert_eq!(cluster_seq(records), 1);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use super::{
     shared::Agreed,
 };
 use crate::checkpoint::{
-    format::Checkpoint,
+    format::{Checkpoint, Session},
     store::{Store, StoreError},
 };
 
@@ -54,7 +54,7 @@ pub(super) struct Whole {
 }
 
 impl Whole {
-    fn is_due(&self) -> bool {
+    pub(super) fn is_due(&self) -> bool {
         self.unrecorded > self.written
     }
 }
@@ -228,7 +228,10 @@ impl Inner {
     pub(super) fn checkpoint(&self) -> Checkpoint {
         Checkpoint {
             seq: self.seq(),
-            session: self.session.clone(),
+            session: Session {
+                cluster_seq: self.cluster_seq(),
+                ..self.session.clone()
+            },
             pending: self
                 .pending
                 .calls()

@@ -198,7 +198,15 @@ impl Inner {
             last.seq += 1;
             let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
             changes.push(Change::State { seq, state });
+            // The calls that follow have other numbers than the session tells.
+            self.session_unwritten = true;
         }
+    }
+
+    /// See [`Session::cluster_seq`](crate::checkpoint::format::Session::cluster_seq).
+    pub(super) fn cluster_seq(&self) -> u64 {
+        let last = self.shared.last();
+        last.map_or(self.session.cluster_seq, |last| last.seq)
     }
 }
 
@@ -315,6 +323,24 @@ mod tests {
         // Late news takes nothing back.
         ledger.agree(8);
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
+    }
+
+    #[test]
+    fn a_leaders_checkpoint_tells_how_much_of_the_computers_journal_it_holds() {
+        let ledger = ledger();
+        ledger.leave();
+        ledger.lead(7, &Master::default());
+        let cluster_seq = || ledger.checkpoint().session.cluster_seq;
+        assert_eq!(cluster_seq(), 7);
+        answer(&ledger, &set(1));
+        assert_eq!(cluster_seq(), 8);
+        ledger.update_session(|session| session.term = 3);
+        assert_eq!(ledger.session().cluster_seq, 8);
+        // A state that no record tells is in the next checkpoint, and not in the file before that.
+        ledger.adopt(state_of([set(2)]));
+        answer(&ledger, &set(3));
+        assert_eq!(ledger.session().cluster_seq, 0);
+        assert_eq!(cluster_seq(), 10);
     }
 
     #[tokio::test]

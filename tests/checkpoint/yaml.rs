@@ -52,6 +52,7 @@ fn with_params(params: Struct) -> Checkpoint {
             incarnation: 3,
             delivered: 4_999_999_999,
             term: 1_800_000,
+            cluster_seq: 1_700_000,
             port: 11_312,
         },
         snapshot: Snapshot {

@@ -23,6 +23,8 @@ mod traffic;
 mod cables;
 /// Computers die, and come back.
 mod deaths;
+/// A computer's disk is older than what was acknowledged.
+mod disks;
 /// etcd is away altogether.
 mod etcd;
 /// Another computer leads because somebody says so.

@@ -148,7 +148,10 @@ impl Member {
         let first = !std::mem::replace(&mut self.loaded, true);
         let leader = self.view.leader.as_ref();
         if first {
-            self.ours = leader.is_none_or(|leader| self.was_self(leader));
+            // etcd's journal is the truth. Our checkpoint may only hold more of it, written in the same term.
+            let ours = self.given.post.ledger.session().cluster_seq;
+            self.ours =
+                leader.is_none_or(|leader| self.was_self(leader) && ours >= self.view.seq());
         }
         if let Some(checkpoint) = loaded.checkpoint
             && loaded.progress.seq >= self.progress.seq

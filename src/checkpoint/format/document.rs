@@ -165,6 +165,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("incarnation", session.incarnation),
         ("delivered", session.delivered),
         ("term", session.term),
+        ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
     ];
     // A missing count is read as 0.
@@ -325,6 +326,7 @@ fn read_session(mut session: Struct) -> Result<Session, String> {
         incarnation: count(session, "incarnation")?.unwrap_or(0),
         delivered: count(session, "delivered")?.unwrap_or(0),
         term: count(session, "term")?.unwrap_or(0),
+        cluster_seq: count(session, "cluster_seq")?.unwrap_or(0),
         port: count(session, "port")?
             .and_then(|port| u16::try_from(port).ok())
             .unwrap_or(0),
