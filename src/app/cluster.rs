@@ -165,6 +165,7 @@ impl Member {
             tracing::trace!(?input, "cluster");
         }
         let actions = self.machine.on(now, input);
+        self.given.post.ledger.set_lease(self.machine.lease(now));
         for action in actions {
             if !matches!(action, Action::Send { .. } | Action::Acknowledge(_)) {
                 tracing::debug!(?action, "cluster");

@@ -40,6 +40,8 @@ pub struct Machine {
     role: Role,
     view: View,
     started: Option<Instant>,
+    /// When this process went on, after it had stood still.
+    resumed: Option<Instant>,
     /// When `view` was seen for the first time; another one that differs only in its own revision is no other.
     observed: Option<Instant>,
     /// When etcd was heard of last.
@@ -70,6 +72,7 @@ impl Machine {
             role: Role::Joining,
             view: View::default(),
             started: None,
+            resumed: None,
             observed: None,
             heard: None,
             reign: None,
@@ -126,6 +129,16 @@ impl Machine {
         self.sole_until().is_some_and(|until| now < until)
     }
 
+    /// Until when this computer may act as the leader without asking again; in the past if it may not. None
+    /// while it is alone and serves: it does not claim to lead then.
+    pub fn lease(&self, now: Instant) -> Option<Instant> {
+        match self.role {
+            Role::Alone if self.settings.alone == WhenAlone::Serve => None,
+            Role::Leading => Some(self.sole_until().unwrap_or(now)),
+            _ => Some(now),
+        }
+    }
+
     fn sole_until(&self) -> Option<Instant> {
         let ttl = self.settings.ttl;
         Some(self.reign?.sent? + ttl - ttl / MARGIN)
@@ -136,6 +149,12 @@ impl Machine {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
             return actions;
+        }
+        if self
+            .deadline()
+            .is_some_and(|due| due + self.settings.ttl / BEATS < now)
+        {
+            self.resumed = Some(now);
         }
         match input {
             Input::Start(seq) => {

@@ -138,7 +138,7 @@ impl Machine {
     fn alone_at(&self) -> Option<Instant> {
         let patience = self.settings.ttl + PATIENCE;
         let silent = self.heard.or(self.started)? + patience;
-        match self.role {
+        let at = match self.role {
             Role::Joining | Role::CatchingUp => Some(silent),
             Role::Following => match self.peer {
                 Some((true, _)) => None,
@@ -148,6 +148,8 @@ impl Machine {
             // Until then nothing is acknowledged that is not committed, unless nobody else can lead.
             Role::Leading => Some(self.reign?.sent? + patience),
             Role::Alone => None,
-        }
+        };
+        // What happened while this process stood still is not known: etcd is asked first.
+        Some(at?.max(self.resumed.map_or(at?, |resumed| resumed + PATIENCE)))
     }
 }

@@ -249,12 +249,51 @@ fn a_leader_that_etcd_answers_late_goes_on_as_if_nothing_had_been() {
     assert_eq!(machine.role(), Role::Leading);
 }
 
+/// It wakes whenever it wants to, until `end`.
+fn wake_until(machine: &mut Machine, end: Instant) {
+    while let Some(due) = machine.deadline().filter(|due| *due < end) {
+        machine.on(due, Input::Wake);
+    }
+    machine.on(end, Input::Wake);
+}
+
+/// Without a pause it is alone by then.
+#[test]
+fn a_leader_that_stood_still_asks_etcd_before_it_is_alone() {
+    let long = 5 * TTL;
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    wake_until(&mut machine, now + long);
+    assert_eq!(machine.role(), Role::Alone);
+    assert_eq!(machine.lease(now + long), None);
+
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    assert!(machine.lease(now).is_some_and(|until| until > now));
+    let (number, op) = sent(&machine.on(now + long, Input::Wake));
+    assert!(matches!(op, Op::Beat { .. }));
+    assert_eq!(machine.role(), Role::Leading);
+    let lease = machine.lease(now + long);
+    assert!(
+        lease.is_some_and(|until| until <= now + long),
+        "it may not act"
+    );
+    let answer = Answer::Is(led("b", 5, 6));
+    let actions = machine.on(now + long, Input::Answer { number, answer });
+    assert!(actions.contains(&Action::Become(Role::Following)));
+    assert_eq!(machine.lease(now + long), Some(now + long));
+
+    // If nobody answers it is alone after all.
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    machine.on(now + long, Input::Wake);
+    wake_until(&mut machine, now + long + PATIENCE);
+    assert_eq!(machine.role(), Role::Alone);
+}
+
 #[test]
 fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
     let (mut machine, now) = following(WhenAlone::Serve);
     machine.on(now, Input::Peer(true));
     let long = now + 10 * TTL;
-    machine.on(long, Input::Wake);
+    wake_until(&mut machine, long);
     assert_eq!(machine.role(), Role::Following);
     let actions = machine.on(long, Input::Peer(false));
     assert_eq!(actions[0], Action::Become(Role::Alone));
