@@ -42,7 +42,7 @@ use crate::{
         journal::Progress,
         machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
         replica::{Loaded, Replica, ReplicaError},
-        way::Way,
+        way::{Place, Way},
     },
     limit::rarely,
     master::{Master, Request},
@@ -71,8 +71,8 @@ pub(super) struct Member {
     /// Who leads, also while calls wait.
     leads: watch::Sender<Way>,
     peers: Arc<Peers>,
-    /// The last record of the journal that the mirror holds.
-    followed: watch::Sender<u64>,
+    /// How far the mirror holds the journal.
+    followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
     /// When the machine is started, even if etcd's state has not been read.
     start_by: Option<Instant>,

@@ -120,3 +120,37 @@ fn a_leader_that_stood_still_tells_no_node_anything_old() {
     }
     fleet.assert_nodes_live();
 }
+
+/// A follower that reaches no etcd knows of new writes by the leader's answers alone. Its mirror must not answer from before
+/// them, however long the leader stands still.
+#[test]
+fn no_read_goes_back_where_etcd_is_out_of_reach_and_the_leader_stands_still() {
+    let _alone = alone();
+    // The leader stands still for less than that.
+    let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);
+    let leader = fleet.await_whole();
+    let follower = fleet.others(leader)[0];
+    for other in fleet.others(follower) {
+        fleet.network.cut_port(follower, other, 2379);
+    }
+    fleet.computers[follower].kill_etcd();
+    let computer = &fleet.computers[follower];
+    for value in 1..=30 {
+        computer.set_param("/counted", value);
+    }
+    let worker = fleet.computers[leader].worker();
+    signal(worker, Signal::STOP);
+    scope(|scope| {
+        let read = scope.spawn(|| computer.param("/counted"));
+        holds(Duration::from_secs(5), || !read.is_finished());
+        signal(worker, Signal::CONT);
+        assert_eq!(read.join().unwrap(), Some(Value::Int(30)));
+    });
+    assert!(computer.role_is("following"));
+    for other in fleet.others(follower) {
+        fleet.network.mend_port(follower, other, 2379);
+    }
+    fleet.computers[follower].start_etcd();
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
+}

@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -22,7 +22,7 @@ use crate::{
         journal::{Keys, Progress},
         machine::{ANSWER_LIMIT, Commit, Machine, Settings, View, WhenAlone},
         replica::Replica,
-        way::Way,
+        way::{Place, Way},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     master::Master,
@@ -87,7 +87,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let known = given.restored;
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
-    let followed = watch::Sender::new(0);
+    let followed = watch::Sender::new(Place::default());
     let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
     let others = Others {
         way: way_rx,
@@ -96,7 +96,10 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         passing: Arc::default(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
-        told: Arc::new(u64::from(given.restored).into()),
+        told: Arc::new(Mutex::new(Place {
+            term: 0,
+            seq: given.restored.into(),
+        })),
         // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
         hold: given.hold.max(2 * config.ttl),
     };

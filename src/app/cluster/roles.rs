@@ -11,7 +11,7 @@ use crate::{
     checkpoint::session::{self, Decision, Evidence},
     cluster::{
         machine::{Leader, Session, WhenAlone},
-        way::Way,
+        way::{Place, Way},
     },
     gate::State,
     ledger::Change,
@@ -330,8 +330,14 @@ impl Member {
         let now = Instant::now();
         let role = self.machine.role();
         let seq = self.progress.seq;
-        self.followed
-            .send_if_modified(|now| std::mem::replace(now, seq) != seq);
+        let leader = self.view.leader.as_ref();
+        // The whole journal up to this leader's first record, at least.
+        let whole = leader.filter(|_| self.loaded && seq >= self.view.seq());
+        self.followed.send_if_modified(|now| {
+            let term = whole.map_or(now.term, |leader| leader.term);
+            let place = Place { term, seq };
+            std::mem::replace(now, place) != place
+        });
         self.look_for_namesake();
         let alive = self.view.alive.as_ref();
         let other = self
