@@ -139,7 +139,7 @@ impl Member {
                 self.take(input).await;
             }
             self.catch_up();
-            self.tend();
+            self.tend().await;
             if !self.inbox.is_empty() {
                 continue;
             }

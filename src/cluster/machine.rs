@@ -139,6 +139,19 @@ impl Machine {
         }
     }
 
+    /// Whether this computer may have a master of its own: only while nobody else can lead. A computer
+    /// that is alone has none. Its mirror answers, because a master would tell its nodes' state to nodes of the
+    /// others as soon as the network lets it.
+    pub fn may_have_master(&self) -> bool {
+        self.role == Role::Leading && self.lapses_at().is_some()
+    }
+
+    /// When another computer can lead at the earliest; none if one can.
+    fn lapses_at(&self) -> Option<Instant> {
+        let reign = self.reign.filter(|reign| !reign.lapsed)?;
+        Some(reign.sent? + self.settings.ttl)
+    }
+
     fn sole_until(&self) -> Option<Instant> {
         let ttl = self.settings.ttl;
         Some(self.reign?.sent? + ttl - ttl / MARGIN)
@@ -317,6 +330,7 @@ impl Machine {
             sent: Some(flight.first),
             beat: *beat,
             full: *seq > self.view.seq(),
+            lapsed: false,
             ..reign
         });
         let upto = self.committed;
@@ -340,6 +354,7 @@ impl Machine {
             beat: 0,
             caught_up: false,
             full: false,
+            lapsed: false,
         });
         self.catch_up(actions);
     }

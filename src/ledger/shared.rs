@@ -98,6 +98,11 @@ impl Ledger {
         self.shared.notify_one();
     }
 
+    /// Whether this computer's calls are recorded, and not another one's.
+    pub fn records_here(&self) -> bool {
+        !self.lock().is_elsewhere()
+    }
+
     /// What is to be given to the others, once.
     pub fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {

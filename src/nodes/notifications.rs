@@ -109,6 +109,9 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
         nodes.ledger.await_lease().await;
+        if !nodes.may_tell(&port).await {
+            return nodes.ledger.with_order(|order, _| order.drop_port(&port));
+        }
         changed.mark_unchanged();
         let (call, number) = match nodes.ledger.next_notification(&port) {
             Next::Send { call, number } => (call, number),
@@ -169,6 +172,9 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             let name = Subject::Name(displaced.node.clone());
             answers_are_written(&nodes, port_of(&displaced.api), &name).await;
             nodes.ledger.await_lease().await;
+            if !nodes.may_tell(port_of(&displaced.api)).await {
+                return;
+            }
             if is_taken(&nodes, &displaced.api) {
                 return;
             }

@@ -24,6 +24,7 @@ use crate::{
         way::{Place, Way},
     },
     master::{CALLER_ID, Kind, Method, Request, names},
+    nodes::served::Served,
     order::ANSWER_LIMIT,
     upstream::{
         Head, RawReply,
@@ -46,6 +47,8 @@ pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
+    /// Hosts whose nodes have this rosrescue for their master.
+    pub(crate) served: Served,
     /// Answers that followers have not passed on yet.
     pub(crate) passing: Arc<Passing>,
     /// How far the mirror holds the journal.
@@ -162,6 +165,12 @@ impl Others {
             && kind == Kind::Identity
         {
             return calls.identity(call);
+        }
+        if let Some(call) = call
+            .as_ref()
+            .filter(|_| asked_term.is_none() && kind.mutates())
+        {
+            self.served.add(call);
         }
         let on_its_way = Call {
             others: self,

@@ -18,7 +18,7 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// What no reader must get: the parameter is set to something else.
 const STEADY: &str = "/steady";
 
-const TYPE: &str = "std_msgs/String";
+pub(crate) const TYPE: &str = "std_msgs/String";
 
 #[derive(Clone, Debug)]
 struct Call {

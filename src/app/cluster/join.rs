@@ -26,6 +26,7 @@ use crate::{
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     master::Master,
+    nodes::served::Served,
     process::Rosmaster,
     server::others::Others,
     upstream::peer::Peers,
@@ -47,6 +48,8 @@ pub(in crate::app) struct Given {
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
+    /// Hosts whose nodes have this rosrescue for their master.
+    pub(in crate::app) served: Served,
     /// Cancelled when calls are no longer taken.
     pub(in crate::app) halt: CancellationToken,
 }
@@ -94,6 +97,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
+        served: given.served.clone(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
         told: Arc::new(Mutex::new(Place {

@@ -19,7 +19,7 @@ impl Member {
     pub(super) fn catch_up(&mut self) {
         let wanted = self.wanted.unwrap_or_default();
         let news = self.wanted.is_some() || self.reported != self.progress.seq;
-        if news && self.loaded && !self.has_master() && self.progress.seq >= wanted {
+        if news && self.loaded && !self.records() && self.progress.seq >= wanted {
             (self.wanted, self.reported) = (None, self.progress.seq);
             self.inbox.push_back(Input::Followed(self.progress.seq));
         }

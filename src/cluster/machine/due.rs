@@ -12,7 +12,10 @@ impl Machine {
     pub fn deadline(&self) -> Option<Instant> {
         let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
         let send = self.send_at().filter(|_| !under_way);
-        [send, self.alone_at()].into_iter().flatten().min()
+        [send, self.alone_at(), self.lapses_at()]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// What is due at `now`.
@@ -26,6 +29,11 @@ impl Machine {
             reign.caught_up = true;
             self.follow_to(self.view.seq());
             self.become_role(Role::Leading, actions);
+        }
+        if self.lapses_at().is_some_and(|at| at <= now)
+            && let Some(reign) = &mut self.reign
+        {
+            reign.lapsed = true;
         }
         if self.alone_at().is_some_and(|at| at <= now) {
             self.become_role(Role::Alone, actions);

@@ -197,6 +197,11 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
     for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
         let (mut machine, now) = leading(alone);
         sent(&machine.on(now, Input::Recorded(1)));
+        // Nobody else can lead before that.
+        assert!(machine.may_have_master());
+        assert_eq!(machine.deadline(), Some(now + TTL));
+        machine.on(now + TTL, Input::Wake);
+        assert!(!machine.may_have_master());
         // etcd may be choosing a leader of its own.
         let lapses = now + TTL + PATIENCE;
         assert_eq!(machine.deadline(), Some(lapses));
@@ -221,7 +226,7 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
     let late = now + TTL + PATIENCE;
-    machine.on(late, Input::Wake);
+    wake_until(&mut machine, late);
     assert_eq!(machine.role(), Role::Alone);
     let answer = Answer::Silence;
     machine.on(late, Input::Answer { number, answer });
@@ -236,6 +241,7 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let answer = Answer::Applied { revision, seq };
     let actions = machine.on(late + ms(200), Input::Answer { number, answer });
     assert_eq!(actions, [Action::Become(Role::Leading)]);
+    assert!(machine.may_have_master());
 }
 
 #[test]
