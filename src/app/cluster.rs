@@ -38,6 +38,7 @@ use super::{RunError, duty::Duty};
 use crate::{
     checkpoint::format::{Entry, Record},
     cluster::{
+        displaced::DisplacedLately,
         etcd::{Change, Watch, WatchEnd},
         journal::Progress,
         machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
@@ -92,6 +93,7 @@ pub(super) struct Member {
     reported: u64,
     /// The journal's state, and how far it has been read.
     held: Master,
+    displaced: DisplacedLately,
     progress: Progress,
     outgoing: Outgoing,
     duty: Option<Duty>,
@@ -300,6 +302,15 @@ impl Member {
         stopped.then_some(None)
     }
 
+    /// Brings the state that is held of the journal forward by `records`.
+    fn hold_records(&mut self, records: &[Record]) {
+        let now = Instant::now();
+        for request in calls(records) {
+            self.displaced.note(now, &self.held, &request);
+            self.held.apply_telling(&request, &mut ());
+        }
+    }
+
     /// Says who leads. Calls of nodes wait as long as what was answered before them, alone, is on its way.
     fn set_way(&self, way: Way) {
         let leads = matches!(way, Way::Leader { .. } | Way::Here { term: Some(_) });
@@ -331,11 +342,16 @@ async fn answered(number: u64, run: impl Future<Output = Answer> + Send + 'stati
 }
 
 fn apply(state: &mut Master, records: &[Record]) {
-    for record in records {
-        if let Entry::Call { call, .. } = &record.entry {
-            state.apply_telling(&Request::from(call.clone()), &mut ());
-        }
+    for request in calls(records) {
+        state.apply_telling(&request, &mut ());
     }
+}
+
+fn calls(records: &[Record]) -> impl Iterator<Item = Request> {
+    records.iter().filter_map(|record| match &record.entry {
+        Entry::Call { call, .. } => Some(Request::from(call.clone())),
+        Entry::Session(_) => None,
+    })
 }
 
 async fn failed(duty: &mut Option<Duty>) -> ProcessError {

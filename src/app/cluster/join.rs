@@ -136,6 +136,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         wanted: None,
         reported: 0,
         held: Master::default(),
+        displaced: Default::default(),
         progress: Progress::default(),
         outgoing: Outgoing::default(),
         duty: None,

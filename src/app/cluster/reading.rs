@@ -117,7 +117,7 @@ impl Member {
 
     /// New records of the journal.
     pub(super) fn follow(&mut self, records: &[Record]) {
-        apply(&mut self.held, records);
+        self.hold_records(records);
         if self.follows() {
             // Only if this computer has the master by now.
             let _ = self.given.post.ledger.follow(records);
@@ -163,14 +163,15 @@ impl Member {
                     return;
                 }
             }
-            apply(&mut self.held, &loaded.records);
+            self.displaced.add(Instant::now(), checkpoint.displaced);
+            self.hold_records(&loaded.records);
             self.progress = loaded.progress;
             self.adopt_held();
         } else if let Ok(new) = self.progress.take(loaded.records, 0) {
             match first {
                 // The ledger may hold something else.
                 true => {
-                    apply(&mut self.held, &new);
+                    self.hold_records(&new);
                     self.adopt_held();
                 }
                 false => self.follow(&new),

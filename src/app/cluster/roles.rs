@@ -86,7 +86,10 @@ impl Member {
             self.ours = false;
             let seq = self.machine.committed();
             self.outgoing.start(seq);
-            self.given.post.ledger.lead(seq, &self.held);
+            let ledger = &self.given.post.ledger;
+            ledger.lead(seq, &self.held);
+            let displaced = self.displaced.at(Instant::now());
+            ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
             self.begin_duty(Some(self.given.rosout), cause);
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
@@ -240,7 +243,7 @@ impl Member {
         match change {
             Change::Call(record) => {
                 if let Ok(new) = self.progress.take(vec![record], 0) {
-                    super::apply(&mut self.held, &new);
+                    self.hold_records(&new);
                 }
             }
             Change::State { seq, state } => {
