@@ -79,10 +79,20 @@ pub enum RunError {
     Loop { master: MasterUri },
     /// Two computers would depose each other for ever.
     #[error(
-        "another rosrescue has the same name in the cluster, `{name}`, and leads at {uri}: give each computer a \
-         name of its own with --cluster-name"
+        "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give \
+         this one a name of its own with --cluster-name"
     )]
-    Namesake { name: String, uri: String },
+    Namesake {
+        name: String,
+        uri: String,
+        own: String,
+    },
+    /// The same, and their addresses are the same, too.
+    #[error(
+        "another computer of this robot has the same name, `{name}`, and the same address, {uri}. Set ROS_IP on \
+         each computer to its own address; a name that is given with --cluster-name must be its own, too"
+    )]
+    Double { name: String, uri: String },
     /// Several computers: etcd's options cannot be used.
     #[error(transparent)]
     Cluster(#[from] EtcdError),

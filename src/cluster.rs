@@ -11,7 +11,9 @@
 //! * [`machine`]: who leads, and what may be acknowledged; pure.
 //! * [`journal`]: records and snapshots to and from keys and values; pure.
 //! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
+//! * [`namesake`]: another computer with this one's name; pure.
 //! * [`etcd`]: etcd's JSON gateway.
+//! * [`survey`]: what is wrong with `--cluster`.
 //! * [`replica`]: the robot's state in etcd.
 //! * [`way`]: where calls go.
 
@@ -20,7 +22,9 @@ pub mod etcd;
 pub mod journal;
 pub mod machine;
 pub mod merge;
+pub mod namesake;
 pub mod replica;
+pub mod survey;
 #[cfg(test)]
 mod tests;
 pub mod way;

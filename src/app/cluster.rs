@@ -12,6 +12,7 @@ mod merging;
 mod outgoing;
 mod reading;
 mod roles;
+mod survey;
 
 use std::{
     collections::VecDeque,
@@ -42,6 +43,7 @@ use crate::{
         etcd::{Change, Watch, WatchEnd},
         journal::Progress,
         machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
+        namesake,
         replica::{Loaded, Replica, ReplicaError},
         way::{Place, Way},
     },
@@ -112,6 +114,8 @@ pub(super) struct Member {
     led: bool,
     /// Where another computer of this name is.
     namesake: Option<String>,
+    /// Looks for one since etcd's state has been read.
+    namesakes: Option<namesake::Watch>,
     /// Whether the session in etcd goes on, while that is found out.
     deciding: Option<Deciding>,
     probe: Option<Flag>,
@@ -136,6 +140,7 @@ impl Member {
         mut self: Box<Self>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, RunError> {
+        self.try_endpoints();
         loop {
             while let Some(input) = self.inbox.pop_front() {
                 self.take(input).await;
@@ -146,10 +151,7 @@ impl Member {
                 continue;
             }
             let end = match self.namesake.take() {
-                Some(uri) => Some(Some(RunError::Namesake {
-                    name: self.settings.name.clone(),
-                    uri,
-                })),
+                Some(uri) => Some(Some(self.namesake_at(uri))),
                 None => self.next(&stop).await,
             };
             if let Some(result) = end {

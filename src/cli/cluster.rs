@@ -6,7 +6,7 @@ use clap::{Args, ValueEnum};
 use hyper::http::uri::Authority;
 
 /// The robot's name if none is given.
-const ROBOT: &str = "robot";
+pub(crate) const ROBOT: &str = "robot";
 /// Longest name of a robot or a computer. It is part of each key in etcd.
 const NAME_MOST: usize = 128;
 
@@ -24,7 +24,8 @@ pub struct ClusterArgs {
     #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST")]
     #[arg(requires = "cluster")]
     pub advertise: Option<String>,
-    /// The name of this computer, which no other one has [default: the host name]
+    /// Unique name of this computer [default: made from the host name and the address where the others reach
+    /// it, as in arm-10.0.0.2]
     #[arg(long, env = "ROSRESCUE_CLUSTER_NAME", value_name = "NAME")]
     #[arg(value_parser = name, requires = "cluster")]
     pub cluster_name: Option<String>,

@@ -28,7 +28,8 @@ pub struct HandoverArgs {
     /// Which one; any of the robot's computers will do.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// The computer that should lead [default: any that follows]
+    /// The computer that should lead: its name, the beginning of its name if no other name has it, or its address
+    /// [default: any that follows]
     #[arg(long, env = "ROSRESCUE_HANDOVER_TO", value_name = "NAME", value_parser = name)]
     pub to: Option<String>,
     /// How long to wait until another computer leads, in seconds

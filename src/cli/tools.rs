@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
 
 use super::{
-    DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, ReportArgs, RestoreArgs, TopArgs,
-    VerifyArgs, WaitArgs,
+    ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, ReportArgs,
+    RestoreArgs, TopArgs, VerifyArgs, WaitArgs,
     service::{CompletionsArgs, InstallArgs, ManArgs, UninstallArgs},
 };
 use crate::hide::{self, Hide};
@@ -109,6 +109,9 @@ pub struct CheckArgs {
     /// topics? Exit status 1 if a link is missing
     #[arg(long)]
     pub live: bool,
+    /// Several computers, as `core` is told of them.
+    #[command(flatten)]
+    pub cluster: ClusterArgs,
     /// In which form.
     #[command(flatten)]
     pub output: OutputArgs,

@@ -41,6 +41,10 @@ const NEXT_AFTER: Duration = Duration::from_millis(250);
 const ROUND_PAUSE: Duration = Duration::from_millis(100);
 /// Most keys of one page of a range. The values of so many are 16 MiB at most.
 const PAGE: usize = 32;
+/// Most robots that are looked for.
+const ROBOTS_MOST: usize = 16;
+/// The keys of all robots are before it.
+const ROBOTS_END: &str = "0";
 
 /// All that is to be known about a cluster of etcd.
 #[derive(Clone, Debug)]
@@ -63,6 +67,14 @@ pub struct Etcd {
 pub struct Found {
     pub revision: u64,
     pub kvs: Vec<Kv>,
+}
+
+/// An endpoint that was tried on its own.
+#[derive(Debug)]
+pub struct Tried {
+    pub endpoint: String,
+    /// The id of its cluster, or why it does not serve clients.
+    pub cluster: Result<u64, EtcdError>,
 }
 
 /// What a member of etcd says of itself.
@@ -268,6 +280,69 @@ impl Etcd {
             .call("maintenance/status", "{}".into(), limit)
             .await?;
         wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
+    }
+
+    /// Tries each endpoint on its own, with a look at a key of `keys`. Needs no majority.
+    pub async fn try_each(&self, keys: &Keys, limit: Duration) -> Vec<Tried> {
+        let mut asked = JoinSet::new();
+        for index in 0..self.endpoints.len() {
+            let (client, key) = (self.clone(), keys.leader());
+            asked.spawn(async move { (index, client.try_one(index, &key, limit).await) });
+        }
+        let mut tried = asked.join_all().await;
+        tried.sort_by_key(|(index, _)| *index);
+        tried.into_iter().filter_map(|(_, tried)| tried).collect()
+    }
+
+    async fn try_one(&self, index: usize, key: &str, limit: Duration) -> Option<Tried> {
+        let endpoint = self.endpoints.get(index)?;
+        let request = wire::local_count(key);
+        let answer = endpoint
+            .call("kv/range", request.to_string().into(), limit)
+            .await;
+        let cluster = answer.and_then(|bytes| {
+            let cluster =
+                wire::parse(&bytes).and_then(|answer: wire::RangeAnswer| answer.cluster());
+            cluster.map_err(|error| match error {
+                EtcdError::NotEtcd { why, .. } => EtcdError::NotEtcd {
+                    endpoint: endpoint.url().to_owned(),
+                    why,
+                },
+                other => other,
+            })
+        });
+        Some(Tried {
+            endpoint: endpoint.url().to_owned(),
+            cluster,
+        })
+    }
+
+    /// The names of the robots that have a leader in this etcd, or had one; some of them, if there are many.
+    ///
+    /// # Errors
+    ///
+    /// Why they are not known, such as a user who may read one robot's keys alone.
+    pub async fn robots(&self, limit: Duration) -> Result<Vec<String>, EtcdError> {
+        let mut robots = Vec::new();
+        let mut from = "/".to_owned();
+        // Not key by key: a robot may have a thousand.
+        for _ in 0..ROBOTS_MOST {
+            let request = wire::first_key(&(from..ROBOTS_END.to_owned()));
+            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
+            let (_, _, kvs) = page.read()?;
+            let key = kvs.first().and_then(|kv| kv.key.strip_prefix('/'));
+            let Some(name) = key.and_then(|key| key.split('/').next()) else {
+                break;
+            };
+            let view = self.view(&Keys::new(name), limit).await;
+            if view.is_ok_and(|view| view.leader.is_some()) {
+                robots.push(name.to_owned());
+            }
+            // `0` follows `/`.
+            from = format!("/{name}0");
+        }
+        robots.sort();
+        Ok(robots)
     }
 
     /// What changes in `range`, after revision `after`. Nothing for `quiet` means that the endpoint is cut off,

@@ -224,6 +224,7 @@ impl Machine {
                     name,
                     id,
                     uri,
+                    boot,
                     version,
                     ..
                 } = self.settings.clone();
@@ -233,6 +234,7 @@ impl Machine {
                     id,
                     claim: *claim,
                     uri,
+                    boot,
                     version,
                 };
                 (Some(leader), 0, None, *settled)

@@ -2,6 +2,7 @@
 //!
 //! [`facts`] gathers and judges nothing, [`judge`] judges and looks at nothing.
 
+mod computers;
 mod facts;
 mod judge;
 mod launch;

@@ -84,9 +84,12 @@ impl fmt::Display for Outcome {
 
 pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, Failure> {
     let running = Running::find(&args.target)?;
-    let wanted = args.to.as_deref();
     let before = computers(&running).await?;
-    let from = leader(&before, wanted)?;
+    let wanted = match args.to.as_deref() {
+        Some(given) => Some(meant(&before, given)?),
+        None => None,
+    };
+    let from = leader(&before)?;
     let mut to = Some(from.clone());
     let start = Instant::now();
     if wanted != Some(&from.name) {
@@ -114,18 +117,19 @@ async fn computers(running: &Running) -> Result<Computers, Failure> {
     })
 }
 
-/// Who leads, and would give it up.
-fn leader<'a>(now: &'a Computers, wanted: Option<&str>) -> Result<&'a Leader, Failure> {
-    let mut names = now.computers.iter().map(|computer| &*computer.name);
-    if let Some(wanted) = wanted
-        && !names.any(|name| name == wanted)
-    {
+/// The name of the computer that `--to` means.
+fn meant<'a>(now: &'a Computers, given: &str) -> Result<&'a str, Failure> {
+    now.find(given).ok_or_else(|| {
         let names: Vec<_> = now.computers.iter().map(|of| &*of.name).collect();
-        return Err(Failure::Usage(format!(
-            "--to: no computer of this robot is called `{wanted}`; there are {}",
+        Failure::Usage(format!(
+            "--to: no computer of this robot is called `{given}`, or more than one is; there are {}",
             names.join(", ")
-        )));
-    }
+        ))
+    })
+}
+
+/// Who leads, and would give it up.
+fn leader(now: &Computers) -> Result<&Leader, Failure> {
     if now.role == Role::Alone {
         return Err(Failure::Failed(format!(
             "{} is cut off from the others: ask another computer, with --uri",
@@ -221,17 +225,16 @@ mod tests {
     #[test]
     fn a_leader_is_asked_only_if_there_is_one_and_the_name_is_known() {
         let mut facts = ClusterFacts::of_three();
-        let with = |facts: &ClusterFacts, wanted| {
-            let now = Computers::from(facts);
-            leader(&now, wanted).cloned()
-        };
-        assert_eq!(with(&facts, Some("pc-3")).unwrap().name, "pc-1");
-        let unknown = with(&facts, Some("pc-4")).expect_err("unknown");
+        let with = |facts: &ClusterFacts| leader(&Computers::from(facts)).cloned();
+        assert_eq!(with(&facts).unwrap().name, "pc-1");
+        let now = Computers::from(&facts);
+        assert_eq!(meant(&now, "pc-3").unwrap(), "pc-3");
+        let unknown = meant(&now, "pc-4").expect_err("unknown");
         assert!(matches!(&unknown, Failure::Usage(why) if why.contains("pc-1, pc-2, pc-3")));
         facts.role = Role::Alone;
-        assert!(matches!(with(&facts, None), Err(Failure::Failed(_))));
+        assert!(matches!(with(&facts), Err(Failure::Failed(_))));
         facts.role = Role::Following;
         facts.leaderless = Some(std::time::Instant::now());
-        assert!(matches!(with(&facts, None), Err(Failure::Failed(_))));
+        assert!(matches!(with(&facts), Err(Failure::Failed(_))));
     }
 }

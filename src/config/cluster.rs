@@ -2,17 +2,18 @@
 
 use std::{
     fmt, fs, io,
-    net::Ipv6Addr,
+    net::{IpAddr, Ipv6Addr},
     path::{Path, PathBuf},
     time::Duration,
 };
 
+use hyper::Uri;
 use thiserror::Error;
 
 pub use crate::cli::{ClusterSync, WhenCutOff};
 use crate::{
     cli::{ClusterArgs, cluster::name},
-    ros_env::MasterUri,
+    ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 
 /// How this computer takes part in a cluster of several.
@@ -24,6 +25,8 @@ pub struct ClusterConfig {
     pub robot: String,
     /// This computer's name. No other one of the robot has it.
     pub name: String,
+    /// The host name, if the name is made from it and the address; none if the name is given.
+    pub(super) hostname: Option<String>,
     /// Where the other computers reach this rosrescue.
     pub advertised: MasterUri,
     /// How long the leader may be silent.
@@ -47,12 +50,18 @@ pub enum ClusterError {
     /// `--advertise` is not an address.
     #[error("--advertise: `{given}` is no HOST or HOST:PORT, as in 10.0.0.7 or robot-7:11311")]
     Advertise { given: String },
-    /// The host name is no name that tells this computer from the others.
+    /// Neither host name nor address make a name.
     #[error(
-        "the host name `{hostname}` does not tell this computer from the others; give it a name with \
-         --cluster-name"
+        "no name for this computer can be made from its host name, `{hostname}`, and its address, {address}; \
+         give it a name of its own with --cluster-name"
     )]
-    Name { hostname: String },
+    Name { hostname: String, address: String },
+    /// The advertised address leads each computer to itself.
+    #[error(
+        "with --cluster {endpoint} other computers must reach this rosrescue, and {address} is each computer \
+         itself: set ROS_IP to this computer's address in the network, or give it with --advertise"
+    )]
+    Loopback { address: String, endpoint: String },
     /// etcd's certificate cannot be checked.
     #[error(
         "--cluster {endpoint}: https needs the certificate of the authority that has signed etcd's; \
@@ -83,7 +92,7 @@ impl fmt::Debug for ClusterConfig {
 impl ClusterConfig {
     /// What `args` say on the computer `hostname`, whose rosrescue others reach at `usual`; none without
     /// `--cluster`. Reads the file of the password.
-    pub(super) fn new(
+    pub(crate) fn new(
         args: &ClusterArgs,
         usual: &MasterUri,
         hostname: &str,
@@ -105,18 +114,24 @@ impl ClusterConfig {
             }
             _ => {}
         }
-        let own_name = match &args.cluster_name {
-            Some(given) => given.clone(),
-            None => name(hostname)
-                .ok()
-                .filter(|name| name != "localhost")
-                .ok_or_else(|| ClusterError::Name {
-                    hostname: hostname.to_owned(),
-                })?,
-        };
         let advertised = match &args.advertise {
             Some(given) => advertised(given, usual.port)?,
             None => usual.clone(),
+        };
+        let mut far = members.endpoints.iter();
+        let far = far.find(|endpoint| !is_on_loopback(endpoint));
+        if let Some(endpoint) = far.filter(|_| is_loopback(&advertised.host)) {
+            return Err(ClusterError::Loopback {
+                address: advertised.host,
+                endpoint: endpoint.clone(),
+            });
+        }
+        let own_name = match &args.cluster_name {
+            Some(given) => given.clone(),
+            None => default_name(hostname, &advertised).ok_or_else(|| ClusterError::Name {
+                hostname: hostname.to_owned(),
+                address: advertised.host.clone(),
+            })?,
         };
         let user = match (&args.cluster_user, &args.cluster_password_file) {
             (Some(user), Some(file)) => Some((user.clone(), password(file)?)),
@@ -126,6 +141,10 @@ impl ClusterConfig {
             endpoints: members.endpoints.clone(),
             robot: members.robot.clone(),
             name: own_name,
+            hostname: match args.cluster_name {
+                Some(_) => None,
+                None => Some(hostname.to_owned()),
+            },
             advertised,
             ttl: args.cluster_ttl,
             sync: args.cluster_sync,
@@ -145,7 +164,44 @@ impl ClusterConfig {
         if self.advertised.port == before.port {
             self.advertised.port = now.port;
         }
+        let hostname = self.hostname.as_deref();
+        let made = hostname.and_then(|hostname| default_name(hostname, &self.advertised));
+        if let Some(made) = made {
+            self.name = made;
+        }
     }
+}
+
+/// The name of the computer `hostname` that others reach at `advertised`. Copies of a disk have the same host name,
+/// and the same `/etc/machine-id`; only the address tells them apart. It is there as `arm-10.0.0.2`, or by itself if
+/// it is a name. A port other than 11311 follows.
+fn default_name(hostname: &str, advertised: &MasterUri) -> Option<String> {
+    let host = &advertised.host;
+    let is_address = host.parse::<IpAddr>().is_ok() || host == "localhost";
+    let tells = name(hostname)
+        .ok()
+        .filter(|hostname| is_address && hostname != "localhost");
+    let port = match advertised.port {
+        DEFAULT_MASTER_PORT => None,
+        port => Some(port.to_string()),
+    };
+    let parts = [tells, Some(host.replace(':', "-")), port];
+    let parts: Vec<_> = parts.into_iter().flatten().collect();
+    name(&parts.join("-")).ok()
+}
+
+/// Whether `host` is the computer itself, on each computer.
+fn is_loopback(host: &str) -> bool {
+    let address = host.trim_start_matches('[').trim_end_matches(']');
+    match address.parse::<IpAddr>() {
+        Ok(address) => address.is_loopback(),
+        Err(_) => host == "localhost",
+    }
+}
+
+fn is_on_loopback(endpoint: &str) -> bool {
+    let uri = endpoint.parse::<Uri>();
+    uri.is_ok_and(|uri| uri.host().is_some_and(is_loopback))
 }
 
 /// `HOST`, which has `port`, or `HOST:PORT`.
@@ -199,19 +255,60 @@ mod tests {
     }
 
     #[test]
-    fn a_computer_is_known_by_its_host_name_and_its_usual_address() {
+    fn a_computer_is_known_by_its_host_name_and_the_address_where_others_reach_it() {
         assert_eq!(config(&[], "pc-1").unwrap().cluster, None);
         let one = cluster(&[]).unwrap();
         assert_eq!(one.endpoints, ["http://a:2379", "http://b:2379"]);
-        assert_eq!((one.robot.as_str(), one.name.as_str()), ("r", "pc-1"));
+        assert_eq!(one.robot, "r");
+        assert_eq!(one.name, "pc-1-10.0.0.7-12000");
         assert_eq!(one.advertised.to_string(), "http://10.0.0.7:12000/");
         let named = cluster(&["--cluster-name", "left"]).unwrap();
         assert_eq!(named.name, "left");
-        for hostname in ["", "localhost", "a b"] {
-            let error = config(&["--cluster", "http://a"], hostname).map(|_| ());
-            let error = error.expect_err("refused").to_string();
-            assert!(error.contains(&format!("`{hostname}`")) && error.contains("--cluster-name"));
+    }
+
+    #[test]
+    fn copies_of_a_computer_have_names_of_their_own() {
+        let made = |hostname, host: &str, port| {
+            let host = host.to_owned();
+            default_name(hostname, &MasterUri { host, port })
+        };
+        for (hostname, host, port, expected) in [
+            ("robot", "10.0.0.1", 11311, "robot-10.0.0.1"),
+            ("robot", "10.0.0.2", 11311, "robot-10.0.0.2"),
+            ("robot", "10.0.0.2", 11312, "robot-10.0.0.2-11312"),
+            ("robot", "fd00::2", 11311, "robot-fd00--2"),
+            // Others find it by that name.
+            ("robot", "robot", 11311, "robot"),
+            ("robot-0", "robot-0.fleet", 11311, "robot-0.fleet"),
+            ("localhost", "10.0.0.1", 11311, "10.0.0.1"),
+            ("a b", "10.0.0.1", 11311, "10.0.0.1"),
+            ("robot", "localhost", 11312, "robot-localhost-11312"),
+        ] {
+            let name = made(hostname, host, port);
+            assert_eq!(name.as_deref(), Some(expected), "{hostname} {host}");
         }
+        let error = config(&["--cluster", "http://a", "--advertise", "ä"], "ö").map(|_| ());
+        let error = error.expect_err("refused").to_string();
+        assert!(
+            error.contains("`ö`") && error.contains("--cluster-name"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn an_address_that_only_this_computer_reaches_is_for_etcd_on_this_computer_alone() {
+        let at = |cluster, host| {
+            config(&["--cluster", cluster, "--advertise", host], "pc-1").map_err(|e| e.to_string())
+        };
+        for host in ["127.0.0.1", "127.0.1.1", "localhost", "::1"] {
+            let error = at("http://127.0.0.1:2379,http://10.0.0.2:2379", host);
+            let error = error.map(|_| ()).expect_err("refused");
+            assert!(error.contains("http://10.0.0.2:2379"), "{error}");
+            assert!(error.contains("ROS_IP"), "{error}");
+            let near = at("http://127.0.0.1:1,http://localhost:2,http://[::1]:3", host);
+            assert!(near.is_ok(), "{near:?}");
+        }
+        assert!(at("http://10.0.0.2:2379", "pc-1").is_ok());
     }
 
     #[test]
@@ -243,7 +340,10 @@ mod tests {
             config.serve_at(vec!["[::]:4000".parse().unwrap()], &|name| {
                 (name == "ROS_IP").then(|| "10.0.0.7".to_owned())
             });
-            assert_eq!(config.cluster.unwrap().advertised.to_string(), uri);
+            let cluster = config.cluster.unwrap();
+            assert_eq!(cluster.advertised.to_string(), uri);
+            let port = if uri.contains(":4000") { "-4000" } else { "-5" };
+            assert!(cluster.name.ends_with(port), "{}", cluster.name);
         }
     }
 

@@ -5,7 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
-use crate::{clock, cluster::machine::Role};
+use crate::{clock, cluster::machine::Role, ros_env::MasterUri};
 
 /// What is known of the computers of the robot, this one included. All times of day are seconds since 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -165,6 +165,26 @@ impl Computers {
         self.leader
             .as_ref()
             .filter(|_| self.leaderless_since.is_none())
+    }
+
+    /// The name of the computer that a person means by `given`: its name, the beginning of one name, or its
+    /// address.
+    pub(crate) fn find(&self, given: &str) -> Option<&str> {
+        let names = || self.computers.iter().map(|of| of.name.as_str());
+        if let Some(name) = names().find(|name| *name == given) {
+            return Some(name);
+        }
+        let is_meant = |of: &&Computer| {
+            let host = MasterUri::parse(&of.uri).map(|uri| uri.host);
+            host.is_ok_and(|host| host == given)
+                || of
+                    .name
+                    .strip_prefix(given)
+                    .is_some_and(|rest| !given.is_empty() && rest.starts_with(['-', '.']))
+        };
+        let mut meant = self.computers.iter().filter(is_meant);
+        let first = meant.next()?;
+        meant.next().is_none().then_some(&first.name)
     }
 
     /// The lines of `rosrescue status`, at `now` in seconds since 1970.
@@ -334,6 +354,27 @@ mod tests {
                 "lost        1 of the changes made alone: others had changed the same; the log names each",
             ]
         );
+    }
+
+    #[test]
+    fn a_computer_is_meant_by_its_name_its_beginning_or_its_address() {
+        let mut facts = ClusterFacts::of_three();
+        for (index, member) in facts.members.iter_mut().enumerate() {
+            member.name = ["base-10.0.0.1", "arm-10.0.0.2", "arm-10.0.0.3"][index].to_owned();
+            member.uri = format!("http://10.0.0.{}:11311/", index + 1);
+        }
+        let computers = Computers::from(&facts);
+        for (given, meant) in [
+            ("base-10.0.0.1", Some("base-10.0.0.1")),
+            ("base", Some("base-10.0.0.1")),
+            ("10.0.0.3", Some("arm-10.0.0.3")),
+            ("arm-10.0.0.3", Some("arm-10.0.0.3")),
+            ("arm", None),
+            ("bas", None),
+            ("", None),
+        ] {
+            assert_eq!(computers.find(given), meant, "{given}");
+        }
     }
 
     #[test]

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use rosrescue::cluster::{
-    etcd::EtcdError,
-    journal::Put,
+    etcd::{Access, Etcd, EtcdError, Options},
+    journal::{Keys, Put},
     machine::{Answer, Guard, Op},
 };
 use serde_json::json;
@@ -277,4 +277,64 @@ async fn a_request_that_is_too_large_is_told_from_others() {
         .await
         .unwrap_err();
     assert!(matches!(error, EtcdError::TooLarge), "{error}");
+}
+
+#[tokio::test]
+async fn each_endpoint_is_tried_on_its_own_and_a_wrong_one_is_told_from_the_others() {
+    let servers = Servers::new(1).await;
+    let endpoints = |port| vec![servers.endpoints(0)[0].clone(), port];
+    let unknown = "http://nobody.invalid:2379".to_owned();
+    let client = |second| {
+        let access = Access::default();
+        let endpoints = endpoints(second);
+        Etcd::new(&Options { endpoints, access }).unwrap()
+    };
+    let keys = keys();
+    for (wrong, is_expected) in [
+        (
+            servers.peer(0),
+            (|error| matches!(error, EtcdError::PeerPort { .. })) as fn(&EtcdError) -> bool,
+        ),
+        (unknown, |error| matches!(error, EtcdError::Connect { .. })),
+    ] {
+        let client = client(wrong.clone());
+        let [good, bad] = <[_; 2]>::try_from(client.try_each(&keys, LIMIT).await).unwrap();
+        assert_ne!(good.cluster.unwrap(), 0);
+        assert_eq!(bad.endpoint, wrong);
+        let error = bad.cluster.unwrap_err();
+        assert!(
+            is_expected(&error) && error.to_string().contains(&wrong),
+            "{error}"
+        );
+        client.view(&keys, LIMIT).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn the_robots_in_etcd_are_found_without_the_keys_of_others() {
+    let servers = Servers::new(1).await;
+    let client = servers.client();
+    assert_eq!(client.robots(LIMIT).await.unwrap(), [""; 0]);
+    let claim = Op::Claim {
+        guard: Guard::default(),
+        claim: 1,
+        seq: 0,
+        settled: true,
+    };
+    for robot in ["arm", "arm-2", "leg"] {
+        let keys = Keys::new(robot);
+        client
+            .run(&keys, &settings("a"), &claim, None, LIMIT)
+            .await
+            .unwrap();
+    }
+    for key in ["/armor", "/registry/pods", "plain", "/zoo/leader"] {
+        let put = Put {
+            key: key.to_owned(),
+            value: b"of another program".to_vec(),
+        };
+        let lease = client.grant(Duration::from_secs(60), LIMIT).await.unwrap();
+        client.put_with_lease(&put, lease, LIMIT).await.unwrap();
+    }
+    assert_eq!(client.robots(LIMIT).await.unwrap(), ["arm", "arm-2", "leg"]);
 }

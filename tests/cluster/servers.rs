@@ -19,6 +19,7 @@ pub(crate) fn settings(name: &str) -> Settings {
         name: name.to_owned(),
         id: format!("{name}-1"),
         uri: format!("http://{name}:11311"),
+        boot: String::new(),
         version: "0.1.0".to_owned(),
         ttl: Duration::from_secs(2),
         commit: Commit::Always,

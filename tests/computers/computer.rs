@@ -91,6 +91,10 @@ pub(crate) struct Computer {
     scratch: Arc<Scratch>,
     /// More options of rosrescue.
     pub(crate) options: Vec<String>,
+    /// Its `--cluster-name`.
+    pub(crate) called: String,
+    /// Its `--cluster`, if it is not as it must be.
+    pub(crate) cluster: Option<String>,
 }
 
 impl Computer {
@@ -112,6 +116,8 @@ impl Computer {
             boots: 0,
             scratch: Arc::clone(scratch),
             options: Vec::new(),
+            called: name.to_owned(),
+            cluster: None,
         }
     }
 
@@ -253,12 +259,17 @@ impl Computer {
     /// Starts rosrescue, as a person does, and waits for nothing.
     #[track_caller]
     pub(crate) fn start_rescue(&mut self) {
-        let endpoints: Vec<_> = (0..COUNT)
-            .map(|index| format!("http://{}:2379", address(index)))
-            .collect();
-        let cluster = format!("{}/robot", endpoints.join(","));
+        let cluster = match &self.cluster {
+            Some(cluster) => cluster.clone(),
+            None => format!("{}/robot", endpoints().join(",")),
+        };
         let mut command = command(&self.scratch, PORT, &["core", "--cluster", &cluster]);
-        command.args(["--advertise", &self.address(), "--cluster-name", self.name]);
+        command.args([
+            "--advertise",
+            &self.address(),
+            "--cluster-name",
+            &self.called,
+        ]);
         command.args(["-p", &PORT.to_string()]);
         command.args(["--master-port", &MASTER_PORT.to_string()]);
         command.arg("--checkpoint").arg(self.path("chkpt.yaml"));
@@ -283,6 +294,14 @@ impl Computer {
             })
         });
         self.downtimes.end();
+    }
+
+    /// The exit status of rosrescue, which ends by itself.
+    #[track_caller]
+    pub(crate) fn await_end(&mut self) -> Option<i32> {
+        let rescue = self.rescue.as_mut().expect("a rosrescue");
+        let what = format!("rosrescue of {} ends", self.name);
+        eventually_some(&what, || rescue.exited()).code()
     }
 
     /// SIGTERM to rosrescue alone, and its end.
@@ -395,6 +414,12 @@ impl Drop for Computer {
             self.power_off();
         }
     }
+}
+
+/// The clients' ports of all members of etcd.
+pub(crate) fn endpoints() -> Vec<String> {
+    let all = (0..COUNT).map(|index| format!("http://{}:2379", address(index)));
+    all.collect()
 }
 
 /// What was started by `ip netns exec … unshare` or `nsenter`, which stay as its parents.

@@ -1,7 +1,7 @@
 use rosrescue::xmlrpc::Value;
 
 use crate::alone;
-use crate::computer::NAMES;
+use crate::computer::{Computer, NAMES, endpoints};
 use crate::fleet::Fleet;
 use crate::network::COUNT;
 use crate::support::eventually;
@@ -97,6 +97,127 @@ fn a_new_session_goes_on_when_its_first_leader_leads_again() {
         let kept = computer.param("/of_the_new_session");
         assert_eq!(kept, Some(Value::Int(1)), "{index}");
     }
+}
+
+#[test]
+fn a_computer_with_the_name_of_a_living_one_does_not_start_and_the_others_notice_nothing() {
+    let _alone = alone();
+    let mut fleet = Fleet::empty(&[]);
+    for index in [0, 1] {
+        fleet.computers[index].start_rescue();
+    }
+    for index in [0, 1] {
+        fleet.computers[index].await_answers();
+    }
+    let leader = fleet.await_leader_of(&[0, 1]);
+    let follower = 1 - leader;
+    await_entry(&fleet, leader, follower);
+    let before = [leader, follower].map(|index| lasting(&fleet.computers[index]));
+    assert!(before.iter().all(|of| of[0] == 0), "{before:?}");
+    for namesake in [leader, follower] {
+        let third = &mut fleet.computers[2];
+        third.called = NAMES[namesake].to_owned();
+        third.start_rescue();
+        assert_eq!(third.await_end(), Some(1));
+        let said = third.logged("--cluster-name");
+        let [said] = said.as_slice() else {
+            panic!("{said:?}");
+        };
+        for address in [2, namesake].map(crate::network::address) {
+            assert!(said.contains(&format!("http://{address}:11311/")), "{said}");
+        }
+        assert!(said.contains(&format!("`{}`", NAMES[namesake])), "{said}");
+    }
+    assert_eq!(
+        [leader, follower].map(|index| lasting(&fleet.computers[index])),
+        before
+    );
+    for computer in &fleet.computers[..2] {
+        assert_eq!(computer.logged("same name"), <[String; 0]>::default());
+    }
+}
+
+#[test]
+fn a_computer_that_has_another_address_than_before_starts() {
+    let _alone = alone();
+    let mut fleet = Fleet::empty(&[]);
+    for index in [0, 1] {
+        fleet.computers[index].start_rescue();
+    }
+    for index in [0, 1] {
+        fleet.computers[index].await_answers();
+    }
+    let leader = fleet.await_leader_of(&[0, 1]);
+    let follower = 1 - leader;
+    await_entry(&fleet, leader, follower);
+    // It dies without a word, and the third computer is the same one with another address.
+    fleet.computers[follower].power_off();
+    let third = &mut fleet.computers[2];
+    third.called = NAMES[follower].to_owned();
+    third.start_rescue();
+    third.await_answers();
+    eventually("it follows", || fleet.computers[2].role_is("following"));
+    assert_eq!(fleet.leader_of(&[leader]), Some(leader));
+    let waits = fleet.computers[2].logged("knows this computer's name at another address");
+    assert_eq!(waits.len(), 1, "{waits:?}");
+}
+
+#[test]
+fn what_is_wrong_with_the_options_of_one_computer_is_said_with_what_to_do() {
+    let _alone = alone();
+    let mut fleet = Fleet::empty(&[]);
+    fleet.computers[0].start_rescue();
+    fleet.computers[0].await_answers();
+    fleet.await_leader_of(&[0]);
+    let [first, second, third] = <[String; 3]>::try_from(endpoints()).unwrap();
+    let peer = third.replace(":2379", ":2380");
+    let nobody = second.replace(":2379", ":2378");
+    let unknown = "http://nobody.invalid:2379";
+    let cluster = format!("{first},{peer},{nobody},{unknown}/robt");
+    let (status, said) = fleet.computers[1].rosrescue(&["check", "--cluster", &cluster]);
+    assert_eq!(status, Some(1), "{said}");
+    fleet.computers[1].cluster = Some(cluster);
+    fleet.computers[1].start_rescue();
+    for wrong in [
+        format!("{peer} is etcd's port for its peers; clients use another one, usually 2379"),
+        format!("cannot connect to etcd at {nobody}"),
+        format!("cannot connect to etcd at {unknown}"),
+        "etcd has no robot `robt` yet, but it has `robot`".to_owned(),
+    ] {
+        assert!(said.contains(&wrong), "{wrong} is not in {said}");
+        eventually(&format!("the log has {wrong}"), || {
+            let lines = fleet.computers[1].logged(&wrong);
+            lines.iter().any(|line| line.contains("check --cluster"))
+        });
+    }
+    fleet.computers[1].await_answers();
+}
+
+/// Waits until the follower's entry in etcd says that it follows.
+fn await_entry(fleet: &Fleet, leader: usize, follower: usize) {
+    eventually("the other one says that it follows", || {
+        let page = fleet.computers[leader].status();
+        let all = page.and_then(|page| page["cluster"]["computers"].as_array().cloned());
+        all.is_some_and(|all| {
+            let mut all = all.iter();
+            all.any(|of| of["name"] == NAMES[follower] && of["role"] == "following")
+        })
+    });
+}
+
+/// What a takeover or the death of a worker would change: worker restarts, role, takeovers, leader and term.
+fn lasting(computer: &Computer) -> [serde_json::Value; 5] {
+    let page = computer.status().unwrap();
+    let cluster = &page["cluster"];
+    let leader = &cluster["leader"];
+    [
+        &page["worker_restarts"],
+        &cluster["role"],
+        &cluster["takeovers"],
+        &leader["name"],
+        &leader["term"],
+    ]
+    .map(Clone::clone)
 }
 
 /// The power of all computers fails, and comes back.

@@ -172,14 +172,14 @@ fn certificates_and_users_are_made_as_the_document_says() {
     ]
     .concat());
     assert_eq!(said.matches("is healthy").count(), 3, "{said}");
-    assert!(said.contains("base led, "), "{said}");
+    assert!(said.contains("base-10.0.0.1 led, "), "{said}");
     assert!(said.contains("Authentication Enabled"), "{said}");
 }
 
 #[test]
 fn rosrescue_runs_as_the_document_says_and_hands_over() {
     let document = Document::new();
-    let [core, _, _] = document.section("rosrescue");
+    let [core, _, _, check] = document.section("rosrescue");
     let [look] = document.section("Seeing it, and trying it");
     let said = run(&[
         three_etcd(&document),
@@ -187,13 +187,17 @@ fn rosrescue_runs_as_the_document_says_and_hands_over() {
         on(&["head"], &look),
         // Its exit status says whether the next master is there yet.
         on(&["base"], "rosrescue status || true"),
+        // There is more to say of such a computer.
+        on(&["head"], &format!("{} || true", check.trim_end())),
     ]
     .concat());
     assert!(
-        said.contains("base led, ") && said.contains("leads now, after"),
+        said.contains("base-10.0.0.1 led, ") && said.contains("leads now, after"),
         "{said}"
     );
-    assert!(said.contains("base (this one) follows"), "{said}");
+    assert!(said.contains("base-10.0.0.1 (this one) follows"), "{said}");
+    assert!(said.contains("all 3 members of etcd answer"), "{said}");
+    assert!(said.contains("etcd has the robot robot, "), "{said}");
 }
 
 #[test]

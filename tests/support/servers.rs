@@ -137,6 +137,11 @@ impl Servers {
             .collect()
     }
 
+    /// The port for the other members, which serves no client.
+    pub(crate) fn peer(&self, index: usize) -> String {
+        format!("http://127.0.0.1:{}", self.members[index].peer)
+    }
+
     pub(crate) fn client(&self) -> Etcd {
         self.client_of(0, Access::default())
     }

@@ -125,9 +125,13 @@ impl Background {
 impl Member {
     /// Begins what is due.
     pub(super) fn work_beside(&mut self, now: Instant) {
+        // It would hide the entry of another computer with this name.
+        let may_say = self.namesakes.as_ref().is_some_and(|of| of.is_over(now));
         if self.background.say_at.is_none_or(|at| at <= now) {
             self.background.say_at = Some(now + MemberFacts::SAYS_EVERY);
-            self.say();
+            if may_say {
+                self.say();
+            }
         }
         let term = self.machine.term();
         let leading = term.filter(|_| self.machine.role() == Role::Leading);

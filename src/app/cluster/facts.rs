@@ -9,7 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{Member, Role, Settings, View};
 use crate::{
-    cluster::{etcd::Kv, journal::Keys},
+    cluster::{
+        etcd::Kv,
+        journal::Keys,
+        namesake::{Key, Sign},
+    },
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover},
 };
 
@@ -20,12 +24,17 @@ struct Said {
     version: String,
     role: String,
     seq: u64,
+    /// See [`Settings::boot`].
+    #[serde(default)]
+    boot: String,
 }
 
 /// What is known of the other computers.
 pub(super) struct Known {
     settings: Settings,
     members: BTreeMap<String, MemberFacts>,
+    /// The entry under this computer's name, if another computer wrote it.
+    namesake: Option<Sign>,
     leader: Option<LeaderFacts>,
     /// The revision of the last sign of a leader, and when it was seen.
     sign: Option<(u64, Instant)>,
@@ -40,6 +49,7 @@ impl Known {
         Self {
             settings: settings.clone(),
             members: BTreeMap::new(),
+            namesake: None,
             leader: None,
             sign: None,
             role: (Role::Joining, Instant::now()),
@@ -77,12 +87,26 @@ impl Known {
         }
     }
 
+    pub(super) fn namesake(&self) -> Option<&Sign> {
+        self.namesake.as_ref()
+    }
+
     /// A key has changed; `kv` is none if it was deleted.
     pub(super) fn member(&mut self, keys: &Keys, key: &str, kv: Option<&Kv>) {
         let Some(name) = key.strip_prefix(&keys.member("")) else {
             return;
         };
         let said = kv.and_then(|kv| serde_json::from_slice::<Said>(&kv.value).ok());
+        if name == self.settings.name {
+            let own = &self.settings;
+            let other = said.as_ref();
+            let other = other.filter(|of| !own.is_of_this_computer(name, &of.uri, &of.boot));
+            self.namesake = other.zip(kv).map(|(of, kv)| Sign {
+                key: Key::Member,
+                uri: of.uri.clone(),
+                revision: kv.revision,
+            });
+        }
         if let Some(said) = said {
             let role = Role::ALL
                 .into_iter()
@@ -106,6 +130,7 @@ impl Known {
             version: self.settings.version.clone(),
             role: role.as_str().to_owned(),
             seq,
+            boot: self.settings.boot.clone(),
         };
         serde_json::to_vec(&said).unwrap_or_default()
     }

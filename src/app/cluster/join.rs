@@ -2,6 +2,7 @@
 
 use std::{
     collections::VecDeque,
+    net::IpAddr,
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
@@ -33,7 +34,7 @@ use crate::{
 };
 
 /// It is best to know what was before one claims; but not for longer.
-const START_BY: Duration = Duration::from_secs(1);
+const START_BY: Duration = Duration::from_secs(2);
 
 /// What a computer among several is given.
 pub(in crate::app) struct Given {
@@ -72,6 +73,10 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         name: config.name.clone(),
         id: startup::kernel_id("/proc/sys/kernel/random/uuid"),
         uri: config.advertised.to_string(),
+        boot: match config.advertised.host.parse::<IpAddr>() {
+            Ok(_) => String::new(),
+            Err(_) => startup::kernel_id("/proc/sys/kernel/random/boot_id"),
+        },
         version: env!("CARGO_PKG_VERSION").to_owned(),
         ttl: config.ttl,
         commit: match config.sync {
@@ -148,6 +153,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         was_released: false,
         led: false,
         namesake: None,
+        namesakes: None,
         deciding: None,
         probe: None,
         probe_at: None,

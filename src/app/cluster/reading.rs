@@ -9,6 +9,7 @@ use crate::{
         etcd::{Change, WatchEnd},
         journal::{self, Manifest},
         machine::{Input, Leader},
+        namesake,
         replica::{Loaded, ReplicaError},
     },
     master::Master,
@@ -146,8 +147,10 @@ impl Member {
             self.view = loaded.view;
         }
         let first = !std::mem::replace(&mut self.loaded, true);
-        let leader = self.view.leader.as_ref();
         if first {
+            self.begin_watch_for_namesake();
+            self.look_for_typo();
+            let leader = self.view.leader.as_ref();
             // etcd's journal is the truth. Our checkpoint may only hold more of it, written in the same term.
             let ours = self.given.post.ledger.session().cluster_seq;
             self.ours =
@@ -177,8 +180,32 @@ impl Member {
                 false => self.follow(&new),
             }
         }
-        self.start();
+        if self
+            .namesakes
+            .as_ref()
+            .is_none_or(|of| of.is_over(Instant::now()))
+        {
+            self.start();
+        }
         self.look_at_view();
+    }
+
+    /// Holds the start back if another computer may have this one's name.
+    fn begin_watch_for_namesake(&mut self) {
+        let (now, ttl) = (Instant::now(), self.settings.ttl);
+        let watch = namesake::Watch::new(now, ttl, self.signs_of_namesake());
+        if let (Some(until), Some(uri)) = (watch.hold(), watch.suspect()) {
+            let name = &self.settings.name;
+            tracing::info!(
+                name,
+                uri,
+                "the cluster knows this computer's name at another address; the start waits up to {:.0?} to see \
+                 whether another computer has it",
+                until - now
+            );
+            self.start_by = self.start_by.map(|_| until);
+        }
+        self.namesakes = Some(watch);
     }
 
     pub(super) fn start(&mut self) {

@@ -7,10 +7,11 @@ use super::{
     merging::{self, Route},
 };
 use crate::{
-    app::life,
+    app::{RunError, life},
     checkpoint::session::{self, Decision, Evidence},
     cluster::{
-        machine::{Leader, Session, WhenAlone},
+        machine::{Leader, Session, Settings, WhenAlone},
+        namesake,
         way::{Place, Way},
     },
     gate::State,
@@ -417,16 +418,45 @@ impl Member {
         self.show();
     }
 
-    /// Notices another process of this computer's name: there is one at a time on a computer, so it is another
-    /// computer's, and the two would depose each other for ever.
+    /// Notices another living computer of this name, best before this one takes part.
     fn look_for_namesake(&mut self) {
+        let now = Instant::now();
+        let signs = self.signs_of_namesake();
+        let living = self.namesakes.as_ref();
+        let living = living.and_then(|watch| watch.living(now, &signs));
+        if let Some(sign) = living {
+            self.namesake = Some(sign.uri.clone());
+            return;
+        }
         let Some(leader) = &self.view.leader else {
             return;
         };
+        // There is one process at a time on a computer, so that one is another computer's.
         if leader.id == self.settings.id {
             self.led = true;
         } else if self.led && leader.name == self.settings.name {
             self.namesake = Some(leader.uri.clone());
+        }
+    }
+
+    /// What etcd shows of another computer with this one's name.
+    pub(super) fn signs_of_namesake(&self) -> Vec<namesake::Sign> {
+        let leader = namesake::sign_of_leader(&self.settings, &self.view);
+        let member = self.known.namesake().cloned();
+        leader.into_iter().chain(member).collect()
+    }
+
+    /// Why this computer does not take part.
+    pub(super) fn namesake_at(&self, uri: String) -> RunError {
+        let Settings { name, uri: own, .. } = &self.settings;
+        let name = name.clone();
+        match uri == *own {
+            true => RunError::Double { name, uri },
+            false => RunError::Namesake {
+                name,
+                uri,
+                own: own.clone(),
+            },
         }
     }
 

@@ -126,8 +126,31 @@ impl Endpoint {
                 *lock(&self.token) = None;
                 self.send(path, body).await
             }
+            Err(EtcdError::NotEtcd { .. }) if self.is_for_peers().await => {
+                Err(EtcdError::PeerPort {
+                    endpoint: self.url.clone(),
+                })
+            }
             done => done,
         }
+    }
+
+    /// Whether this is the port for etcd's other members: only that one lists them at `/members`.
+    async fn is_for_peers(&self) -> bool {
+        let ask = async {
+            let mut connection = self.connect().await.ok()?;
+            let request = Request::get("/members").header(HOST, self.authority());
+            let request = request.body(Full::default()).ok()?;
+            let response = connection.send_request(request).await.ok()?;
+            let body = Limited::new(response.into_body(), ANSWER_BYTES_MAX);
+            Some(body.collect().await.ok()?.to_bytes())
+        };
+        let page = ask.await.unwrap_or_default();
+        serde_json::from_slice::<Vec<wire::Peer>>(&page).is_ok_and(|peers| !peers.is_empty())
+    }
+
+    fn authority(&self) -> String {
+        format!("{}:{}", self.host, self.port)
     }
 
     async fn send(&self, path: &str, body: Bytes) -> Result<Bytes, EtcdError> {
@@ -241,7 +264,7 @@ impl Endpoint {
         token: Option<&str>,
     ) -> Result<Response<Incoming>, EtcdError> {
         let mut request = Request::post(format!("/v3/{path}"))
-            .header(HOST, format!("{}:{}", self.host, self.port))
+            .header(HOST, self.authority())
             .header(CONTENT_TYPE, "application/json");
         if let Some(token) = token {
             request = request.header(AUTHORIZATION, token);

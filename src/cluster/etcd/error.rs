@@ -53,6 +53,8 @@ pub enum EtcdError {
          etcd's certificate must be good for clients, too (extendedKeyUsage clientAuth)"
     )]
     Gateway { endpoint: String, why: String },
+    #[error("{endpoint} is etcd's port for its peers; clients use another one, usually 2379")]
+    PeerPort { endpoint: String },
     #[error("{endpoint} does not answer as etcd 3.4 or later does: {why}")]
     NotEtcd { endpoint: String, why: String },
     #[error("etcd at {endpoint} says: {why}")]

@@ -28,6 +28,8 @@ struct LeaderValue {
     id: String,
     claim: u64,
     uri: String,
+    #[serde(default)]
+    boot: String,
     version: String,
 }
 
@@ -70,6 +72,18 @@ pub(super) fn range(range: &Range<String>, revision: u64, limit: usize) -> Value
         "key": base64(&range.start), "range_end": base64(&range.end),
         "revision": revision.to_string(), "limit": limit.to_string(),
     })
+}
+
+/// The first key in `range`, without its value.
+pub(super) fn first_key(range: &Range<String>) -> Value {
+    json!({
+        "key": base64(&range.start), "range_end": base64(&range.end), "limit": "1", "keys_only": true,
+    })
+}
+
+/// Whether `key` exists, as the asked member alone knows: it needs no majority.
+pub(super) fn local_count(key: &str) -> Value {
+    json!({ "key": base64(key), "serializable": true, "count_only": true })
 }
 
 fn get(key: &str) -> Value {
@@ -136,6 +150,7 @@ pub(super) fn request(
                 name,
                 id,
                 uri,
+                boot,
                 version,
                 ..
             } = settings.clone();
@@ -145,6 +160,7 @@ pub(super) fn request(
                 id,
                 claim,
                 uri,
+                boot,
                 version,
             };
             let alive = alive(0, *seq, &None, *settled);
@@ -200,6 +216,8 @@ pub(super) struct Header {
     revision: u64,
     #[serde(default, deserialize_with = "number")]
     member_id: u64,
+    #[serde(default, deserialize_with = "number")]
+    cluster_id: u64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -238,6 +256,14 @@ pub(super) struct RangeAnswer {
 }
 
 impl RangeAnswer {
+    /// The id of the cluster that the asked member belongs to.
+    pub(super) fn cluster(&self) -> Result<u64, EtcdError> {
+        match self.header.cluster_id {
+            0 => Err(not_etcd("its answer names no cluster")),
+            id => Ok(id),
+        }
+    }
+
     pub(super) fn read(&self) -> Result<(u64, bool, Vec<Kv>), EtcdError> {
         let kvs = self.kvs.iter().map(RawKv::read).collect::<Result<_, _>>()?;
         Ok((self.header.revision, self.more, kvs))
@@ -308,6 +334,7 @@ pub(super) fn absorb(
                     id: value.id,
                     claim: value.claim,
                     uri: value.uri,
+                    boot: value.boot,
                     version: value.version,
                 })
             }
@@ -346,6 +373,13 @@ impl Found {
         }
         Ok(view)
     }
+}
+
+/// A member of etcd, as the port for its peers lists them.
+#[derive(Debug, Deserialize)]
+pub(super) struct Peer {
+    #[serde(rename = "peerURLs")]
+    _urls: Vec<String>,
 }
 
 #[derive(Debug, Deserialize)]

@@ -122,7 +122,8 @@ impl Machine {
 
     /// How long after it was seen in its present state leading is open to this computer.
     fn vacant_after(&self) -> Duration {
-        let Settings { name, id, ttl, .. } = &self.settings;
+        let own = &self.settings;
+        let Settings { name, id, ttl, .. } = own;
         let Some(leader) = &self.view.leader else {
             return Duration::ZERO;
         };
@@ -137,7 +138,9 @@ impl Machine {
             Some(to) if to.is_empty() || to == name => Duration::ZERO,
             Some(_) => *ttl / BEATS,
             // An earlier process on this computer. It cannot live: there is one at a time.
-            None if leader.name == *name => Duration::ZERO,
+            None if own.is_of_this_computer(&leader.name, &leader.uri, &leader.boot) => {
+                Duration::ZERO
+            }
             None => *ttl,
         }
     }

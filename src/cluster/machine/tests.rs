@@ -9,6 +9,7 @@ fn machine(alone: WhenAlone) -> (Machine, Instant) {
         name: "a".to_owned(),
         id: "a-1".to_owned(),
         uri: String::new(),
+        boot: String::new(),
         version: String::new(),
         ttl: TTL,
         commit: Commit::Always,
@@ -31,6 +32,7 @@ fn led(name: &str, term: u64, revision: u64) -> View {
             id: format!("{name}-1"),
             claim: 1,
             uri: String::new(),
+            boot: String::new(),
             version: String::new(),
         }),
         alive: Some(Alive {
@@ -125,6 +127,30 @@ fn an_earlier_process_of_this_computer_is_succeeded_at_once() {
     before.leader.as_mut().unwrap().id = "a-0".to_owned();
     let answer = Answer::Is(before);
     let (_, op) = sent(&machine.on(now, Input::Answer { number, answer }));
+    assert!(matches!(op, Op::Claim { .. }), "{op:?}");
+}
+
+#[test]
+fn a_computer_of_the_same_name_at_another_address_is_not_deposed_while_it_lives() {
+    let (mut machine, now) = machine(WhenAlone::Serve);
+    let (number, _) = sent(&machine.on(now, Input::Start(0)));
+    let namesake = |revision| {
+        let mut view = led("a", 5, revision);
+        let leader = view.leader.as_mut().unwrap();
+        leader.id = "a-elsewhere".to_owned();
+        leader.uri = "http://10.0.0.9:11311/".to_owned();
+        view
+    };
+    let answer = Answer::Is(namesake(6));
+    let actions = machine.on(now, Input::Answer { number, answer });
+    assert_eq!(machine.role(), Role::Following, "{actions:?}");
+    for beat in 1..9 {
+        let now = now + beat * TTL / BEATS;
+        let actions = machine.on(now, Input::View(namesake(6 + u64::from(beat))));
+        assert_eq!(actions, []);
+    }
+    // It is silent: as any other leader.
+    let (_, op) = sent(&machine.on(now + 3 * TTL, Input::Wake));
     assert!(matches!(op, Op::Claim { .. }), "{op:?}");
 }
 

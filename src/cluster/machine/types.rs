@@ -30,12 +30,23 @@ pub struct Settings {
     pub id: String,
     /// Where nodes and other computers find it.
     pub uri: String,
+    /// The kernel's id of this boot, by which copies of one disk differ; empty if the address is an IP address,
+    /// since no two computers can have the same one.
+    pub boot: String,
     /// Of rosrescue.
     pub version: String,
     /// How long the leader may be silent.
     pub ttl: Duration,
     pub commit: Commit,
     pub alone: WhenAlone,
+}
+
+impl Settings {
+    /// Whether a process of this computer, the present or an earlier one, has this name, address and boot.
+    pub fn is_of_this_computer(&self, name: &str, uri: &str, boot: &str) -> bool {
+        let same_boot = boot.is_empty() || self.boot.is_empty() || self.boot == boot;
+        self.name == name && self.uri == uri && same_boot
+    }
 }
 
 /// What the key `leader` holds.
@@ -48,6 +59,7 @@ pub struct Leader {
     pub id: String,
     pub claim: u64,
     pub uri: String,
+    pub boot: String,
     pub version: String,
 }
 

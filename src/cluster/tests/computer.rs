@@ -141,6 +141,7 @@ fn machine(index: usize, life: u64, settings: &(Commit, WhenAlone, Duration)) ->
         name: name(index),
         id: format!("{index} {life}"),
         uri: String::new(),
+        boot: String::new(),
         version: String::new(),
         ttl: settings.2,
         commit: settings.0,

@@ -64,6 +64,7 @@ impl Etcd {
                     id: format!("{} {}", request.from, request.life),
                     claim: *claim,
                     uri: String::new(),
+                    boot: String::new(),
                     version: String::new(),
                 });
                 self.set_alive(0, None, *settled);

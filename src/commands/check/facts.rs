@@ -5,6 +5,7 @@ use std::{
     fs, io,
     net::IpAddr,
     path::{Path, PathBuf},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -15,6 +16,7 @@ use rustix::{
 use tokio::{task::JoinSet, time::timeout};
 
 use super::{
+    computers::{Cluster, Unusable},
     launch::{self, Launches},
     ros::{self, Program},
     units::{self, Unit},
@@ -92,6 +94,8 @@ pub(super) struct Facts {
     pub(super) behind: Option<Behind>,
     /// Masters that run beside rosrescue.
     pub(super) masters: Vec<Process>,
+    /// What `--cluster` leads to; none without it.
+    pub(super) cluster: Option<Arc<Result<Cluster, Unusable>>>,
 }
 
 /// ROS's variables.
@@ -224,6 +228,11 @@ impl Facts {
         let served = port
             .as_ref()
             .map_or(ros_env::DEFAULT_MASTER_PORT, |port| *port);
+        let usual = MasterUri {
+            host: own.clone(),
+            port: served,
+        };
+        let cluster = Cluster::look(&args.cluster, &usual, &hostname).await;
         let checkpoint = config::checkpoint_path(args.checkpoint.as_deref(), served, &env);
         let port = match port {
             Ok(number) => Ok(Port::look(number).await),
@@ -335,6 +344,7 @@ impl Facts {
             units: units::find(),
             memory: free_memory(),
             masters: masters(),
+            cluster: cluster.map(Arc::new),
         }
     }
 }

@@ -1,5 +1,6 @@
 //! What the facts mean for a robot, and what to do. Looks at nothing.
 
+mod computers;
 mod network;
 mod system;
 #[cfg(test)]
@@ -27,6 +28,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
         found.nodes(facts);
         found.files(facts.files);
         found.clock(&facts.clock);
+        found.cluster(facts);
         found.memory(facts.memory);
         return found.0;
     }
@@ -45,6 +47,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Finding> {
     found.ros(facts);
     found.masters(facts);
     found.systemd(facts);
+    found.cluster(facts);
     found.memory(facts.memory);
     found.0
 }

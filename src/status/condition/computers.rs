@@ -107,9 +107,18 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
         since: of.since,
         text: format!("{notice}. This computer is cut off from the others{why}."),
         action: Some(
-            "bring back the network between the computers, and a majority of etcd; the rest goes by \
-             itself."
-                .to_owned(),
+            match (&of.etcd, &of.leader) {
+                // Nothing has come from etcd since the start.
+                (Some(_), None) => {
+                    "see that a majority of etcd runs, and that --cluster has its addresses and its port for \
+                     clients; `rosrescue check --cluster URLS` tries each."
+                }
+                _ => {
+                    "bring back the network between the computers, and a majority of etcd; the rest goes by \
+                     itself."
+                }
+            }
+            .to_owned(),
         ),
     }
 }
@@ -243,6 +252,12 @@ mod tests {
             refusing.text.contains("(etcd has no majority)"),
             "{refusing:?}"
         );
+        let action = |of: Condition| of.action.unwrap();
+        assert!(action(refusing).contains("bring back the network"));
+        // The options may be wrong, not the network.
+        cluster.leader = None;
+        let never = action(of(OPEN, &cluster));
+        assert!(never.contains("rosrescue check --cluster"), "{never}");
     }
 
     #[test]

@@ -1,3 +1,4 @@
+mod computers;
 mod network;
 mod system;
 
@@ -81,6 +82,7 @@ fn robot() -> Facts {
         lease: None,
         behind: None,
         masters: Vec::new(),
+        cluster: None,
     }
 }
 

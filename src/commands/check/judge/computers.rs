@@ -1,0 +1,69 @@
+//! Several computers: `--cluster`.
+
+use super::{
+    super::{
+        computers::{Cluster, Unusable},
+        facts::Facts,
+    },
+    Findings,
+};
+use crate::cluster::survey;
+
+const SUBJECT: &str = "--cluster";
+
+impl Findings {
+    pub(super) fn cluster(&mut self, facts: &Facts) {
+        let cluster = match facts.cluster.as_deref() {
+            None => return,
+            Some(Ok(cluster)) => cluster,
+            Some(Err(Unusable::Options(error))) => {
+                let todo = "correct the options: `core` does not start with them";
+                return self.bad(SUBJECT, error.to_string(), todo);
+            }
+            Some(Err(Unusable::Etcd(error))) => {
+                let todo = "correct the options of etcd: `core` does not start with them";
+                return self.bad(SUBJECT, error.to_string(), todo);
+            }
+        };
+        let all = cluster.tried.len();
+        let good = cluster.tried.iter().filter(|one| one.cluster.is_ok());
+        let good = good.count();
+        for complaint in survey::complaints(&cluster.tried) {
+            match good * 2 > all {
+                true => self.warn(SUBJECT, complaint.what, complaint.todo),
+                false => self.bad(SUBJECT, complaint.what, complaint.todo),
+            }
+        }
+        if good == all {
+            self.ok(SUBJECT, format!("all {all} members of etcd answer"));
+        }
+        self.robot(cluster);
+        if let Some(uri) = &cluster.namesake {
+            let Cluster { name, uri: own, .. } = cluster;
+            self.bad(
+                "--cluster-name",
+                format!(
+                    "another computer is called {name}, too: it is at {uri}, this one is at {own}"
+                ),
+                "give this computer a name of its own with --cluster-name",
+            );
+        } else {
+            self.ok(
+                "--cluster-name",
+                format!("this computer is {}, at {}", cluster.name, cluster.uri),
+            );
+        }
+    }
+
+    fn robot(&mut self, cluster: &Cluster) {
+        let robot = &cluster.robot;
+        match (&cluster.leader, survey::typo(robot, &cluster.others)) {
+            (Some(leader), _) => self.ok(
+                SUBJECT,
+                format!("etcd has the robot {robot}, last led by {leader}"),
+            ),
+            (None, Some(typo)) => self.warn(SUBJECT, typo.what, typo.todo),
+            (None, None) => {}
+        }
+    }
+}
