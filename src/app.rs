@@ -244,6 +244,7 @@ pub async fn run(
                 restore: config.restore,
                 hold: config.hold,
                 restored,
+                hide: config.hide.clone(),
                 halt: halt.clone(),
             };
             let (others, member) = cluster::join(given).await?;

@@ -48,7 +48,7 @@ use crate::{
     master::{Master, Request},
     process::ProcessError,
     recovery::master_process::MasterProcess,
-    server::others::Handover,
+    server::others::{Forwarded, Handover},
     upstream::peer::Peers,
     wait,
 };
@@ -71,6 +71,8 @@ pub(super) struct Member {
     /// Who leads, also while calls wait.
     leads: watch::Sender<Way>,
     peers: Arc<Peers>,
+    /// Writes of this computer that a leader has not answered yet.
+    forwarded: Arc<Forwarded>,
     /// The last record of the journal that the mirror holds.
     followed: watch::Sender<u64>,
     handovers: mpsc::Receiver<Handover>,

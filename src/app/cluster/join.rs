@@ -25,9 +25,10 @@ use crate::{
         way::Way,
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
+    hide::Hide,
     master::Master,
     process::Rosmaster,
-    server::others::Others,
+    server::others::{Forwarded, Others},
     upstream::peer::Peers,
 };
 
@@ -47,6 +48,8 @@ pub(in crate::app) struct Given {
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
+    /// Which values of parameters the log does not show.
+    pub(in crate::app) hide: Hide,
     /// Cancelled when calls are no longer taken.
     pub(in crate::app) halt: CancellationToken,
 }
@@ -88,12 +91,14 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
     let followed = watch::Sender::new(0);
+    let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
     let others = Others {
         way: way_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
+        forwarded: forwarded.clone(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
         told: Arc::new(u64::from(given.restored).into()),
@@ -116,6 +121,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         leads: watch::Sender::new(Way::Nobody { known }),
         way,
         peers,
+        forwarded,
         followed,
         handovers,
         inbox: VecDeque::new(),
