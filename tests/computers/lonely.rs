@@ -4,10 +4,10 @@ use std::thread::scope;
 use rosrescue::xmlrpc::Value;
 
 use crate::alone;
-use crate::computer::Computer;
+use crate::computer::{Computer, PORT};
 use crate::fleet::Fleet;
 use crate::network::enter;
-use crate::support::{Finish, eventually, params};
+use crate::support::{Client, Finish, eventually, params};
 
 /// Keys of the writes in bulk.
 const KEYS: usize = 1500;
@@ -179,11 +179,11 @@ fn a_leader_without_etcd_keeps_no_call_that_others_make_elsewhere() {
     scope(|scope| {
         let finish = Finish(&finish);
         for &index in &rest {
-            let (computer, count, finish) = (&fleet.computers[index], &counts[index], finish.0);
-            let namespace = computer.namespace.clone();
+            let (count, finish) = (&counts[index], finish.0);
+            let namespace = fleet.computers[index].namespace.clone();
             scope.spawn(move || {
                 enter(&namespace);
-                let client = computer.client();
+                let client = Client::new(PORT);
                 for value in 1.. {
                     client.ok("setParam", params!["/writer", key(index), value]);
                     count.store(value, Ordering::Relaxed);

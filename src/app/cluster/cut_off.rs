@@ -184,15 +184,23 @@ impl CutOff {
             .iter()
             .flat_map(|time| time.pending.calls().cloned())
             .collect();
-        let last_is_empty = self
+        let is_empty = self
             .times
             .back()
-            .is_some_and(|time| time.pending.is_empty());
-        if last_is_empty && self.times.len() > 1 {
+            .is_some_and(|last| last.pending.is_empty());
+        if is_empty && self.times.len() > 1 {
             self.times.pop_back();
-        } else if self.times.len() >= TIMES_MOST {
-            // Goes on with the last one: what others have changed since that counts.
-            return;
+        }
+        // The oldest one may be on its way.
+        if self.times.len() >= TIMES_MOST
+            && let Some(second) = self.times.remove(2)
+            && let Some(first) = self.times.get_mut(1)
+        {
+            // What others have changed since the first one counts for both.
+            second
+                .pending
+                .calls()
+                .for_each(|call| first.pending.add(call));
         }
         let mut time = Time::new(base);
         time.changes.expect(earlier);
@@ -279,6 +287,11 @@ impl CutOff {
         {
             self.write(store).await;
         }
+    }
+
+    /// How many writes are kept.
+    pub(super) fn len(&self) -> usize {
+        self.times.iter().map(|time| time.pending.len()).sum()
     }
 
     /// The oldest time.
@@ -536,5 +549,9 @@ mod tests {
         assert!(cut_off.times.len() <= TIMES_MOST);
         let last = cut_off.times.back().unwrap();
         assert_eq!(calls_of(last), [set("/a", 49)]);
+        // What was written this time only is in the journal.
+        let left = cut_off.resumed().unwrap();
+        assert_eq!(calls_of(&left.times[0]), []);
+        assert_eq!(calls_of(left.times.back().unwrap()), [set("/a", 48)]);
     }
 }

@@ -216,6 +216,14 @@ impl Member {
         }
     }
 
+    /// How many writes etcd does not have yet.
+    pub(super) fn uncommitted(&self) -> usize {
+        match &self.cut_off {
+            Some(cut_off) if self.keeps() => cut_off.len(),
+            _ => self.outgoing.len(),
+        }
+    }
+
     /// Whether what is answered now is kept for the leader.
     fn keeps(&self) -> bool {
         self.known.role() == Role::Alone && self.settings.alone == WhenAlone::Serve

@@ -166,7 +166,7 @@ fn of_each_subject_only_what_makes_its_last_state_is_kept() {
     let [first, second] = ["http://n:1/", "http://n:2/"].map(|api| publish("/n", "/t", api));
     assert_eq!(
         kept(&[first.clone(), unpublish("http://n:1/"), second.clone()]),
-        [second.clone()]
+        std::slice::from_ref(&second)
     );
     // The first process of the node ends late.
     assert_eq!(
