@@ -20,7 +20,7 @@ use crate::{
     guardian::handover::{self, Sockets},
     ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
     lifecycle::{Action, Patience, Supervision},
-    nodes::{self, Nodes},
+    nodes::{self, Nodes, served::Served},
     process::{ProcessError, Rosmaster, bypass},
     recovery::{Driver, report_file},
     ros_env::MasterUri,
@@ -197,12 +197,14 @@ pub async fn run(
         config.reap_interval.is_some(),
         Patience::new(config.probing.patience),
     );
+    let served = Served::default();
     let nodes = Arc::new(Nodes::new(
         ledger.clone(),
         gate.clone(),
         write_queue.clone(),
         stats,
         config.node_timeout,
+        served.clone(),
     ));
     for (node, at) in removed {
         nodes.removed.add(&node, at);
@@ -245,6 +247,7 @@ pub async fn run(
                 hold: config.hold,
                 restored,
                 hide: config.hide.clone(),
+                served,
                 halt: halt.clone(),
             };
             let (others, member) = cluster::join(given).await?;

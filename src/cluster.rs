@@ -7,6 +7,7 @@
 //! was cut off can commit nothing, and one that is sent twice has its effect once. The records of calls are
 //! in `journal/`, and travel in the same transaction. See decision 29.
 //!
+//! * [`displaced`]: who is to be told to shut down by the next leader; pure.
 //! * [`machine`]: who leads, and what may be acknowledged; pure.
 //! * [`journal`]: records and snapshots to and from keys and values; pure.
 //! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
@@ -14,6 +15,7 @@
 //! * [`replica`]: the robot's state in etcd.
 //! * [`way`]: where calls go.
 
+pub mod displaced;
 pub mod etcd;
 pub mod journal;
 pub mod machine;

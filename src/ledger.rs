@@ -87,6 +87,8 @@ pub struct Ledger {
     disk_silent: Notify,
     /// What other computers have of our writes.
     agreed: watch::Sender<Agreed>,
+    /// See [`Ledger::set_lease`].
+    lease: watch::Sender<Option<Instant>>,
     /// The mirror's version in the last whole checkpoint that was attempted.
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
@@ -170,6 +172,7 @@ impl Ledger {
             sync_is_late: AtomicBool::new(false),
             disk_silent: Notify::new(),
             agreed: watch::channel(Agreed::default()).0,
+            lease: watch::channel(None).0,
             attempted: watch::channel(0).0,
             work: Notify::new(),
             shared: Notify::new(),

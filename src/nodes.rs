@@ -6,13 +6,14 @@ mod identify;
 pub(crate) mod liveness;
 pub(crate) mod notifications;
 mod removed;
+pub(crate) mod served;
 mod visits;
 
 use std::{
     collections::HashSet,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
@@ -27,6 +28,7 @@ use self::{
     liveness::Liveness,
     notifications::Notifications,
     removed::Removed,
+    served::Served,
     visits::Visits,
 };
 use crate::{
@@ -35,6 +37,7 @@ use crate::{
     ledger::{Ledger, activity::Change},
     limit::rarely,
     order::Subject,
+    resolver,
     status::{report::HealthCheck, stats::Stats},
     wait,
     write_queue::WriteQueue,
@@ -67,6 +70,9 @@ pub struct Nodes {
     /// Ports of nodes that do not answer `paramUpdate`, but answer otherwise.
     mute: Mutex<HashSet<String>>,
     pub(crate) removed: Removed,
+    /// This computer is cut off from the others.
+    alone: AtomicBool,
+    served: Served,
     /// Recoveries whose health check is not over.
     checks: AtomicUsize,
     /// Nodes that have not been asked yet, or have not answered yet.
@@ -75,13 +81,15 @@ pub struct Nodes {
 }
 
 impl Nodes {
-    /// `ledger` knows the nodes. `timeout`: how long one may take to answer.
+    /// `ledger` knows the nodes. `timeout`: how long one may take to answer. `served`: hosts whose nodes have this
+    /// rosrescue for their master.
     pub fn new(
         ledger: Arc<Ledger>,
         gate: gate::Rx,
         write_queue: WriteQueue,
         stats: &'static Stats,
         timeout: Duration,
+        served: Served,
     ) -> Self {
         Self {
             ledger,
@@ -96,10 +104,25 @@ impl Nodes {
             unreachable: Mutex::default(),
             mute: Mutex::default(),
             removed: Removed::default(),
+            alone: AtomicBool::new(false),
+            served,
             checks: AtomicUsize::new(0),
             unanswered: AtomicUsize::new(0),
             changed: Notify::new(),
         }
+    }
+
+    /// Whether this computer is cut off from the others.
+    pub(crate) fn set_alone(&self, alone: bool) {
+        self.alone.store(alone, Ordering::Relaxed);
+    }
+
+    /// Whether the node at `port` may be told something. A computer that is alone tells the others' nodes nothing:
+    /// they hear the state of the computer that leads.
+    pub(super) async fn may_tell(&self, port: &str) -> bool {
+        !self.alone.load(Ordering::Relaxed)
+            || self.served.has(port)
+            || !resolver::is_elsewhere(port, self.timeout).await
     }
 
     fn lock(&self) -> MutexGuard<'_, Unreachable> {

@@ -263,6 +263,12 @@ impl Order {
         self.outbox.remove(port);
     }
 
+    /// Drops all that waits: another computer notifies nodes from now on.
+    pub(crate) fn forget_notifications(&mut self) {
+        self.outbox.clear();
+        (self.told, self.repeats) = Default::default();
+    }
+
     /// Queues what is to be told once more by now.
     pub(crate) fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {

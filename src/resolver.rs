@@ -6,9 +6,12 @@ use std::{
     io,
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs, UdpSocket},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
 };
 
 use tokio::sync::{Semaphore, watch};
+
+use crate::ros_env::MasterUri;
 
 /// Most lookups at a time. A name server that does not answer costs a thread for some ten seconds.
 const LOOKUPS: usize = 64;
@@ -69,6 +72,18 @@ pub(crate) fn is_own(address: IpAddr) -> bool {
     address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
 }
 
+/// Whether a node's `api` is on another computer. Not if its host has no address, or if that is not known within
+/// `patience`.
+pub(crate) async fn is_elsewhere(api: &str, patience: Duration) -> bool {
+    let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
+        return false;
+    };
+    match tokio::time::timeout(patience, addresses(&host, port)).await {
+        Ok(Ok(addresses)) => !addresses.iter().any(|address| is_own(address.ip())),
+        _ => false,
+    }
+}
+
 /// Keeps the scope of an IPv6 address.
 fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
     address.set_port(port);
@@ -112,5 +127,22 @@ mod tests {
         assert!(under_way().get("::1").is_none());
         let nobody = addresses("nobody.invalid", 4711).await;
         assert!(nobody.is_err(), "{nobody:?}");
+    }
+
+    const LONG: Duration = Duration::from_secs(1);
+
+    #[tokio::test]
+    async fn own_addresses_are_told_from_others() {
+        for own in ["127.0.0.1", "127.9.9.9", "[::1]", "0.0.0.0", "localhost"] {
+            assert!(
+                !is_elsewhere(&format!("http://{own}:4711/"), LONG).await,
+                "{own}"
+            );
+        }
+        // Set apart for documentation.
+        assert!(is_elsewhere("http://198.51.100.7:4711/", LONG).await);
+        for nobody in ["http://nobody.invalid:4711/", "nonsense"] {
+            assert!(!is_elsewhere(nobody, LONG).await, "{nobody}");
+        }
     }
 }

@@ -38,11 +38,12 @@ use super::{RunError, duty::Duty};
 use crate::{
     checkpoint::format::{Entry, Record},
     cluster::{
+        displaced::DisplacedLately,
         etcd::{Change, Watch, WatchEnd},
         journal::Progress,
         machine::{Action, Answer, Input, Machine, Op, Role, Settings, View},
         replica::{Loaded, Replica, ReplicaError},
-        way::Way,
+        way::{Place, Way},
     },
     limit::rarely,
     master::{Master, Request},
@@ -73,8 +74,8 @@ pub(super) struct Member {
     peers: Arc<Peers>,
     /// Writes of this computer that a leader has not answered yet.
     forwarded: Arc<Forwarded>,
-    /// The last record of the journal that the mirror holds.
-    followed: watch::Sender<u64>,
+    /// How far the mirror holds the journal.
+    followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
     /// When the machine is started, even if etcd's state has not been read.
     start_by: Option<Instant>,
@@ -94,6 +95,7 @@ pub(super) struct Member {
     reported: u64,
     /// The journal's state, and how far it has been read.
     held: Master,
+    displaced: DisplacedLately,
     progress: Progress,
     outgoing: Outgoing,
     duty: Option<Duty>,
@@ -141,7 +143,7 @@ impl Member {
                 self.take(input).await;
             }
             self.catch_up();
-            self.tend();
+            self.tend().await;
             if !self.inbox.is_empty() {
                 continue;
             }
@@ -167,6 +169,7 @@ impl Member {
             tracing::trace!(?input, "cluster");
         }
         let actions = self.machine.on(now, input);
+        self.given.post.ledger.set_lease(self.machine.lease(now));
         for action in actions {
             if !matches!(action, Action::Send { .. } | Action::Acknowledge(_)) {
                 tracing::debug!(?action, "cluster");
@@ -301,6 +304,15 @@ impl Member {
         stopped.then_some(None)
     }
 
+    /// Brings the state that is held of the journal forward by `records`.
+    fn hold_records(&mut self, records: &[Record]) {
+        let now = Instant::now();
+        for request in calls(records) {
+            self.displaced.note(now, &self.held, &request);
+            self.held.apply_telling(&request, &mut ());
+        }
+    }
+
     /// Says who leads. Calls of nodes wait as long as what was answered before them, alone, is on its way.
     fn set_way(&self, way: Way) {
         let leads = matches!(way, Way::Leader { .. } | Way::Here { term: Some(_) });
@@ -332,11 +344,16 @@ async fn answered(number: u64, run: impl Future<Output = Answer> + Send + 'stati
 }
 
 fn apply(state: &mut Master, records: &[Record]) {
-    for record in records {
-        if let Entry::Call { call, .. } = &record.entry {
-            state.apply_telling(&Request::from(call.clone()), &mut ());
-        }
+    for request in calls(records) {
+        state.apply_telling(&request, &mut ());
     }
+}
+
+fn calls(records: &[Record]) -> impl Iterator<Item = Request> {
+    records.iter().filter_map(|record| match &record.entry {
+        Entry::Call { call, .. } => Some(Request::from(call.clone())),
+        Entry::Session(_) => None,
+    })
 }
 
 async fn failed(duty: &mut Option<Duty>) -> ProcessError {

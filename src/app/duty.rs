@@ -179,20 +179,22 @@ impl Duty {
         }
     }
 
-    /// Ends it: no call passes to the master any more. What is returned ends the processes.
+    /// Ends it, and the master at once: another computer may lead, and no node is to hear this one's master any
+    /// more. What is returned waits for the processes.
     pub(super) async fn end(self) -> impl Future<Output = ()> + Send + 'static {
         self.stop.cancel();
         let process = match self.driver.await {
             Ok(ended) => ended.ok().flatten(),
             Err(panic) => resume(panic),
         };
+        let ended = process.map(MasterProcess::end);
         async move {
             if let Some(roscore) = self.roscore {
                 // A panic there must not prevent the rest.
                 let _ = roscore.await;
             }
-            if let Some(process) = process {
-                process.stop().await;
+            if let Some(ended) = ended {
+                ended.await;
             }
         }
     }

@@ -2,14 +2,13 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use tokio::{task::JoinSet, time::timeout};
+use tokio::task::JoinSet;
 
 use crate::{
     health::port_of,
     master::{self, Master},
     nodes::client::{self, Sign},
     resolver,
-    ros_env::MasterUri,
 };
 
 /// How long nodes have to answer, and name servers to resolve their hosts.
@@ -25,7 +24,7 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     for port in ports {
         let (api, call) = (port.to_owned(), call.clone());
         questions.spawn(async move {
-            (same_boot || is_elsewhere(&api).await)
+            (same_boot || resolver::is_elsewhere(&api, LIFE_SIGN).await)
                 && client::ask(&api, &call, LIFE_SIGN).await == Sign::Alive
         });
     }
@@ -35,34 +34,4 @@ pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
         }
     }
     false
-}
-
-/// Whether `api` is on another computer. Not if its host has no address.
-async fn is_elsewhere(api: &str) -> bool {
-    let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
-        return false;
-    };
-    match timeout(LIFE_SIGN, resolver::addresses(&host, port)).await {
-        Ok(Ok(addresses)) => !addresses
-            .iter()
-            .any(|address| resolver::is_own(address.ip())),
-        _ => false,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test]
-    async fn own_addresses_are_told_from_others() {
-        for own in ["127.0.0.1", "127.9.9.9", "[::1]", "0.0.0.0", "localhost"] {
-            assert!(!is_elsewhere(&format!("http://{own}:4711/")).await, "{own}");
-        }
-        // Set apart for documentation.
-        assert!(is_elsewhere("http://198.51.100.7:4711/").await);
-        for nobody in ["http://nobody.invalid:4711/", "nonsense"] {
-            assert!(!is_elsewhere(nobody).await, "{nobody}");
-        }
-    }
 }

@@ -40,6 +40,8 @@ pub struct Machine {
     role: Role,
     view: View,
     started: Option<Instant>,
+    /// When this process went on, after it had stood still.
+    resumed: Option<Instant>,
     /// When `view` was seen for the first time; another one that differs only in its own revision is no other.
     observed: Option<Instant>,
     /// When etcd was heard of last.
@@ -70,6 +72,7 @@ impl Machine {
             role: Role::Joining,
             view: View::default(),
             started: None,
+            resumed: None,
             observed: None,
             heard: None,
             reign: None,
@@ -126,6 +129,29 @@ impl Machine {
         self.sole_until().is_some_and(|until| now < until)
     }
 
+    /// Until when this computer may act as the leader without asking again; in the past if it may not. None
+    /// while it is alone and serves: it does not claim to lead then.
+    pub fn lease(&self, now: Instant) -> Option<Instant> {
+        match self.role {
+            Role::Alone if self.settings.alone == WhenAlone::Serve => None,
+            Role::Leading => Some(self.sole_until().unwrap_or(now)),
+            _ => Some(now),
+        }
+    }
+
+    /// Whether this computer may have a master of its own: only while nobody else can lead. A computer
+    /// that is alone has none. Its mirror answers, because a master would tell its nodes' state to nodes of the
+    /// others as soon as the network lets it.
+    pub fn may_have_master(&self) -> bool {
+        self.role == Role::Leading && self.lapses_at().is_some()
+    }
+
+    /// When another computer can lead at the earliest; none if one can.
+    fn lapses_at(&self) -> Option<Instant> {
+        let reign = self.reign.filter(|reign| !reign.lapsed)?;
+        Some(reign.sent? + self.settings.ttl)
+    }
+
     fn sole_until(&self) -> Option<Instant> {
         let ttl = self.settings.ttl;
         Some(self.reign?.sent? + ttl - ttl / MARGIN)
@@ -136,6 +162,12 @@ impl Machine {
         let mut actions = Vec::new();
         if self.started.is_none() && !matches!(input, Input::Start(_)) {
             return actions;
+        }
+        if self
+            .deadline()
+            .is_some_and(|due| due + self.settings.ttl / BEATS < now)
+        {
+            self.resumed = Some(now);
         }
         match input {
             Input::Start(seq) => {
@@ -298,6 +330,7 @@ impl Machine {
             sent: Some(flight.first),
             beat: *beat,
             full: *seq > self.view.seq(),
+            lapsed: false,
             ..reign
         });
         let upto = self.committed;
@@ -321,6 +354,7 @@ impl Machine {
             beat: 0,
             caught_up: false,
             full: false,
+            lapsed: false,
         });
         self.catch_up(actions);
     }

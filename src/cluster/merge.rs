@@ -2,7 +2,7 @@
 //! something that others have changed since it was cut off, whatever it is now.
 //!
 //! It is judged twice by the same rules: by the computer that was alone, by what it reads in the journal; and by
-//! the leader before each portion, by what came after that. See decision 41.
+//! the leader before each portion, by what came after that. See decision 42.
 
 mod changes;
 mod pending;

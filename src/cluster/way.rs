@@ -18,3 +18,13 @@ pub enum Way {
         known: bool,
     },
 }
+
+/// A place in the journal of all computers. One of a later term is further: whoever leads in it holds all that was
+/// committed before, and nothing else of the earlier terms will ever be in the journal.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Place {
+    /// The term of the computer that leads.
+    pub term: u64,
+    /// The number of a record.
+    pub seq: u64,
+}

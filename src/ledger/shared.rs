@@ -1,6 +1,8 @@
 //! What other computers are given of our writes, and what we follow of theirs.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{collections::VecDeque, sync::Arc, time::Instant};
+
+use tokio::sync::watch;
 
 use super::{Inner, Ledger, Superseded};
 use crate::{
@@ -132,9 +134,13 @@ impl Shared {
 
 impl Ledger {
     /// Another computer has the master, or may have it: from now on nothing is recorded but what
-    /// [`Self::follow`] is given. Calls whose records the others lack are not acknowledged.
+    /// [`Self::follow`] is given. Calls whose records the others lack are not acknowledged, and no node is
+    /// notified: the other computer does that.
     pub fn leave(&self) {
-        self.lock().shared = Shared::Elsewhere;
+        let mut inner = self.lock();
+        inner.shared = Shared::Elsewhere;
+        inner.order.forget_notifications();
+        drop(inner);
         self.agreed.send_modify(|agreed| {
             *agreed = Agreed {
                 reign: agreed.reign + 1,
@@ -160,6 +166,11 @@ impl Ledger {
         // They have these. A write that changes nothing waits for the last of them only.
         self.agree(seq);
         self.shared.notify_one();
+    }
+
+    /// Whether this computer's calls are recorded, and not another one's.
+    pub fn records_here(&self) -> bool {
+        !self.lock().is_elsewhere()
     }
 
     /// What is to be given to the others, once.
@@ -208,6 +219,40 @@ impl Ledger {
             agreed.seq = agreed.seq.max(seq);
             more
         });
+    }
+
+    /// Until when no other computer can lead; none if that does not matter. After that no call is given to this
+    /// computer's master and no node is notified: another leader may have acknowledged newer writes while this
+    /// process stood still.
+    pub fn set_lease(&self, until: Option<Instant>) {
+        self.lease.send_if_modified(|lease| {
+            // A longer lease is seen by whoever looks. Those that wait want to hear only of a new one.
+            let now = Instant::now();
+            let held = lease.is_none_or(|until| now < until);
+            *lease = until;
+            !held
+        });
+    }
+
+    /// Whether the lease holds at this moment.
+    pub fn has_lease(&self) -> bool {
+        self.lease
+            .borrow()
+            .is_none_or(|until| Instant::now() < until)
+    }
+
+    /// Notifies of each new lease.
+    pub(crate) fn lease_changed(&self) -> watch::Receiver<Option<Instant>> {
+        self.lease.subscribe()
+    }
+
+    /// Returns when the lease holds.
+    pub(crate) async fn await_lease(&self) {
+        let mut changed = self.lease_changed();
+        while !self.has_lease() {
+            // We own the sender.
+            let _ = changed.changed().await;
+        }
     }
 
     /// Returns when the others have the record at `place`. False if this computer no longer has the master.
@@ -325,7 +370,7 @@ impl Inner {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Instant;
+    use std::time::Duration;
 
     use super::*;
     use crate::{
@@ -563,6 +608,27 @@ mod tests {
         };
         assert!(*state == state_of([set(2)]));
         assert!(seqs(&ledger).is_empty());
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_the_lease_goes_on_when_there_is_a_new_one() {
+        let ledger = ledger();
+        assert!(
+            ledger.has_lease(),
+            "without other computers it always holds"
+        );
+        let now = Instant::now();
+        ledger.set_lease(Some(now));
+        assert!(!ledger.has_lease());
+        let waits = async { ledger.await_lease().await };
+        let renews = async {
+            tokio::task::yield_now().await;
+            ledger.set_lease(Some(now + Duration::from_secs(60)));
+        };
+        tokio::join!(waits, renews);
+        assert!(ledger.has_lease());
+        ledger.set_lease(None);
+        assert!(ledger.has_lease());
     }
 
     #[tokio::test]

@@ -108,6 +108,10 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
     loop {
         // Never closed.
         let permit = notifications.permits.acquire().await.ok();
+        nodes.ledger.await_lease().await;
+        if !nodes.may_tell(&port).await {
+            return nodes.ledger.with_order(|order, _| order.drop_port(&port));
+        }
         changed.mark_unchanged();
         let (call, number) = match nodes.ledger.next_notification(&port) {
             Next::Send { call, number } => (call, number),
@@ -167,6 +171,10 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             tokio::time::sleep(Duration::from_secs(seconds)).await;
             let name = Subject::Name(displaced.node.clone());
             answers_are_written(&nodes, port_of(&displaced.api), &name).await;
+            nodes.ledger.await_lease().await;
+            if !nodes.may_tell(port_of(&displaced.api)).await {
+                return;
+            }
             if is_taken(&nodes, &displaced.api) {
                 return;
             }

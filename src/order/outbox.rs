@@ -88,6 +88,11 @@ impl Outbox {
         self.ports.remove(port);
     }
 
+    /// Drops all. Whoever sends to a port finds nothing more.
+    pub(super) fn clear(&mut self) {
+        self.ports.values_mut().for_each(VecDeque::clear);
+    }
+
     /// The subject of the next notification to `port`.
     pub(super) fn first(&self, port: &str) -> Option<&Subject> {
         self.ports.get(port)?.front().map(|first| &first.subject)

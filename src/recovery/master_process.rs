@@ -234,6 +234,21 @@ impl MasterProcess {
         }
     }
 
+    /// Ends the master at once, so that it notifies no node any more. Returns when it is gone.
+    pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
+        self.spare = None;
+        self.coming_spare = None;
+        self.current = self.current.or(self.starting);
+        if let Some(pid) = self.current {
+            process::signal_process(pid, rustix::process::Signal::KILL);
+        }
+        async move {
+            if self.current.is_some() {
+                gone(&mut self.ends.1, self.current).await;
+            }
+        }
+    }
+
     /// The last output of the last master.
     pub(crate) async fn last_words(&self) -> String {
         self.rosmaster.last_words().await

@@ -2,10 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
 
@@ -25,9 +22,14 @@ use super::{
     replies::{HttpReply, UntilWritten, forwarded, text, xml},
 };
 use crate::{
-    cluster::{journal::RECORD_BYTES_MAX, merge::wire::Ask, way::Way},
+    cluster::{
+        journal::RECORD_BYTES_MAX,
+        merge::wire::Ask,
+        way::{Place, Way},
+    },
     ledger::Source,
     master::{CALLER_ID, Kind, Method, Request, names},
+    nodes::served::Served,
     order::ANSWER_LIMIT,
     upstream::{
         Head, RawReply,
@@ -36,9 +38,6 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// How long a read waits for a mirror that is behind. With `--cluster-sync interval` the leader may take with it
-/// what the mirror waits for.
-const CATCH_UP_LIMIT: Duration = Duration::from_secs(3);
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// The method by which `rosrescue handover` has the leader give up leading.
@@ -53,14 +52,16 @@ pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
+    /// Hosts whose nodes have this rosrescue for their master.
+    pub(crate) served: Served,
     /// Answers that followers have not passed on yet.
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
-    /// The last record of the journal that the mirror holds.
-    pub(crate) followed: watch::Receiver<u64>,
-    /// The last one that a leader's answer told of.
-    pub(crate) told: Arc<AtomicU64>,
+    /// How far the mirror holds the journal.
+    pub(crate) followed: watch::Receiver<Place>,
+    /// The furthest place that a leader's answer told of.
+    pub(crate) told: Arc<Mutex<Place>>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
 }
@@ -172,6 +173,12 @@ impl Others {
         {
             return calls.identity(call);
         }
+        if let Some(call) = call
+            .as_ref()
+            .filter(|_| asked_term.is_none() && kind.mutates())
+        {
+            self.served.add(call);
+        }
         let on_its_way = Call {
             others: self,
             calls,
@@ -209,6 +216,7 @@ impl Others {
                 let merged = self.merge(call.calls, ask).await;
                 return Ok(merged.unwrap_or_else(|| not_leading(term)));
             }
+            let mut by_mirror = false;
             let retry = match now {
                 Way::Here { .. } => {
                     if let Some(to) = call.hands_over() {
@@ -273,9 +281,7 @@ impl Others {
                     }
                 }
                 Way::Nobody { known } => {
-                    if known && let Some(reply) = call.by_mirror().await {
-                        return Ok(reply);
-                    }
+                    by_mirror = known;
                     None
                 }
             };
@@ -286,6 +292,8 @@ impl Others {
                 }
             };
             tokio::select! {
+                biased;
+                Some(reply) = call.by_mirror_when_fresh(), if by_mirror => return Ok(reply),
                 changed = way.changed() => changed.map_err(|_| Closed("rosrescue stops"))?,
                 () = retry => {}
                 () = &mut hold => {
@@ -304,6 +312,10 @@ impl Others {
             _ = leads.wait_for(|way| *way == Way::Here { term: None }) => None,
             answer = calls.write_queue.merge(ask) => Some(xml(&answer?.to_reply())),
         }
+    }
+
+    fn told(&self) -> MutexGuard<'_, Place> {
+        self.told.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     async fn hand_over(&self, to: &str) -> HttpReply {
@@ -351,8 +363,10 @@ impl Call<'_> {
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
-        let told = &self.others.told;
-        told.fetch_max(seq.unwrap_or(0), Ordering::Relaxed);
+        let seq = seq.unwrap_or(0);
+        let mut told = self.others.told();
+        *told = told.max(Place { term, seq });
+        drop(told);
         let number = raw.headers.get(peer::ANSWER_HEADER);
         let number = number.and_then(|number| number.to_str().ok().map(str::to_owned));
         let mut reply = forwarded(&self.calls.uri, self.call.as_ref(), raw);
@@ -395,10 +409,11 @@ impl Call<'_> {
                 Ok(reply) => reply.ok()?,
                 Err(_) => {
                     leader.set_late(true);
-                    if let Some(reply) = self.by_mirror().await {
-                        return Some(reply);
+                    tokio::select! {
+                        biased;
+                        Some(reply) = self.by_mirror_when_fresh() => return Some(reply),
+                        reply = &mut asked => reply.ok()?,
                     }
-                    asked.await.ok()?
                 }
             };
         match reply {
@@ -425,21 +440,26 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// The mirror's answer to a read; none to any other call. It shows what the leader's answers have shown
-    /// before, unless that is lost.
+    /// The mirror's answer to a read; none to any other call, and none if the mirror does not show yet what the
+    /// leader's answers have shown before: on one computer no read goes back.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let read = self.call.as_ref().filter(|_| self.kind == Kind::Read)?;
-        let told = self.others.told.load(Ordering::Relaxed);
-        let mut followed = self.others.followed.clone();
-        let caught_up = async { followed.wait_for(|seq| *seq >= told).await.is_ok() };
-        let caught_up = tokio::time::timeout(CATCH_UP_LIMIT, caught_up).await;
-        if caught_up.is_err() {
-            // Lost: the next read need not wait for it.
-            let now = *self.others.followed.borrow();
-            let (set, seen) = (Ordering::Relaxed, Ordering::Relaxed);
-            let _ = self.others.told.compare_exchange(told, now, set, seen);
+        let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
+        match followed >= told {
+            true => self.calls.stand_in(Some(read)).await,
+            false => None,
         }
-        self.calls.stand_in(Some(read)).await
+    }
+
+    /// As [`Self::by_mirror`], when the mirror has caught up.
+    async fn by_mirror_when_fresh(&self) -> Option<HttpReply> {
+        if self.kind != Kind::Read {
+            return None;
+        }
+        let mut followed = self.others.followed.clone();
+        let fresh = followed.wait_for(|followed| *followed >= *self.others.told());
+        fresh.await.ok()?;
+        self.by_mirror().await
     }
 }
 

@@ -76,6 +76,7 @@ pub(crate) struct Drain {
     /// When calls that wait for answers to others are tried again at the latest.
     pub(super) held_until: Option<tokio::time::Instant>,
     order_changed: watch::Receiver<()>,
+    lease: watch::Receiver<Option<Instant>>,
     /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
     /// read from the master again and holds their effects.
     opaque: Opaque,
@@ -103,6 +104,7 @@ impl Drain {
         Self {
             held_until: None,
             order_changed: link.ledger.order_changed(),
+            lease: link.ledger.lease_changed(),
             link,
             gate,
             stats,
@@ -148,6 +150,7 @@ impl Drain {
                 () = wait::until(self.held_until) => {}
                 // The ledger lives as long.
                 _ = self.order_changed.changed() => {}
+                _ = self.lease.changed() => {}
                 () = wait::until(self.grace) => {}
                 () = wait::until(self.late_at) => {
                     if let Some(batch) = &mut self.in_flight {
@@ -174,11 +177,12 @@ impl Drain {
             }
             self.late_over &= state == State::Late;
             match state {
+                State::Elsewhere => self.send_elsewhere(),
+                _ if !self.link.ledger.has_lease() => {}
                 State::Open { incarnation } => self.send(incarnation),
                 State::StandingIn => self.stand_in(),
                 State::Late => self.stand_in_for_late(),
                 State::Injecting | State::Unknown => self.grace = None,
-                State::Elsewhere => self.send_elsewhere(),
             }
             self.late_at = self.late_at(state);
             self.tell_sent

@@ -7,7 +7,7 @@ use rustix::process::Signal;
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
 use crate::support::{Library, PATIENCE, eventually, holds, params};
-use crate::traffic::Traffic;
+use crate::traffic::{Named, TYPE, Traffic};
 use crate::{alone, rounds, some_time};
 
 /// Waits until `value` is there, on each computer.
@@ -161,4 +161,79 @@ fn writes_to_a_computer_that_is_cut_off_and_must_not_serve_wait() {
         fleet.await_same_state();
         fleet.assert_nodes_live();
     }
+}
+
+/// Those who were alone with it know another state. What they were told there must not reach a node of the others, which
+/// would drop a stream.
+#[test]
+fn a_computer_that_was_alone_tells_nodes_of_others_nothing() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    for round in 0..rounds() {
+        let leader = fleet.await_whole();
+        let cut = victim(round, leader);
+        let rest = fleet.others(cut);
+        let (lonely, healthy) = (&fleet.computers[cut], &fleet.computers[rest[0]]);
+        let topic = format!("/of_both_{round}");
+        let subscribers = ["one", "two", "three"]
+            .map(|name| Named::new(healthy, &format!("/subscriber_{name}_{round}")));
+        for subscriber in &subscribers {
+            healthy.within(|| subscriber.it().subscribe(&healthy.client(), &topic, TYPE));
+        }
+        fleet.await_same_state();
+        fleet.network.cut_cable(cut);
+        eventually("it says that it is alone", || lonely.role_is("alone"));
+        fleet.await_leader_of(&rest);
+        let publishers = [lonely, healthy].map(|computer| {
+            let publisher = Named::new(computer, &format!("/publisher_{}_{round}", computer.name));
+            computer.within(|| publisher.it().publish(&computer.client(), &topic, TYPE));
+            publisher
+        });
+        let [of_lonely, of_healthy] = [0, 1].map(|nth| publishers[nth].it().api.clone());
+        // One after the other: its master would try again and again to reach the subscribers.
+        for _ in 0..20 {
+            lonely.within(|| {
+                publishers[0].it().unpublish(&lonely.client(), &topic);
+                publishers[0].it().publish(&lonely.client(), &topic, TYPE);
+            });
+        }
+        let heard = |of: &Named| of.it().updates(&topic);
+        eventually("the subscribers hear of their publisher", || {
+            subscribers
+                .iter()
+                .all(|it| heard(it).last() == Some(&vec![of_healthy.clone()]))
+        });
+        let before = subscribers.each_ref().map(|it| heard(it).len());
+        fleet.network.mend_cable(cut);
+        fleet.await_whole();
+        let all = |it: &Named| {
+            let last = heard(it).pop().unwrap_or_default();
+            last.contains(&of_lonely) && last.contains(&of_healthy)
+        };
+        eventually("the subscribers hear of both", || {
+            subscribers.iter().all(all)
+        });
+        // TCP tries again after 1, 2, 4 and 8 seconds.
+        holds(Duration::from_secs(8), || subscribers.iter().all(all));
+        for (subscriber, before) in subscribers.iter().zip(before) {
+            let since = heard(subscriber).split_off(before);
+            let dropped = since
+                .iter()
+                .find(|publishers| !publishers.contains(&of_healthy));
+            assert_eq!(
+                dropped,
+                None,
+                "round {round}, {}: {since:?}",
+                subscriber.it().name
+            );
+        }
+        for (computer, publisher) in [lonely, healthy].into_iter().zip(&publishers) {
+            computer.within(|| publisher.it().unpublish(&computer.client(), &topic));
+        }
+        for subscriber in &subscribers {
+            healthy.within(|| subscriber.it().unsubscribe(&healthy.client(), &topic));
+        }
+    }
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
 }

@@ -218,6 +218,18 @@ impl Computer {
         self.etcd = Some(etcd);
     }
 
+    /// The process id, seen from outside, of the process that answers calls.
+    #[track_caller]
+    pub(crate) fn worker(&self) -> u32 {
+        let rescue = self.rescue.as_ref().expect("a rosrescue");
+        eventually_some("the guardian has a worker", || {
+            children(child_of(rescue)?).into_iter().find(|pid| {
+                let name = fs::read_to_string(format!("/proc/{pid}/comm"));
+                name.is_ok_and(|name| name.trim_end() == "rosrescue")
+            })
+        })
+    }
+
     /// SIGKILL.
     #[track_caller]
     pub(crate) fn kill_etcd(&mut self) {
@@ -387,10 +399,14 @@ impl Drop for Computer {
 
 /// What was started by `ip netns exec … unshare` or `nsenter`, which stay as its parents.
 fn child_of(parent: &Process) -> Option<u32> {
-    let pid = parent.pid();
+    children(parent.pid()).first().copied()
+}
+
+fn children(pid: u32) -> Vec<u32> {
     let children = format!("/proc/{pid}/task/{pid}/children");
     let children = fs::read_to_string(children).unwrap_or_default();
-    children.split_whitespace().next()?.parse().ok()
+    let pids = children.split_whitespace().map(str::parse);
+    pids.collect::<Result<_, _>>().unwrap_or_default()
 }
 
 /// Sends a signal to what runs on the computer.

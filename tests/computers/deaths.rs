@@ -3,8 +3,8 @@ use std::time::{Duration, Instant};
 
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
-use crate::support::Library;
-use crate::traffic::Traffic;
+use crate::support::{Library, eventually};
+use crate::traffic::{Named, TYPE, Traffic};
 use crate::{alone, rounds, some_time};
 use rustix::process::Signal;
 
@@ -65,4 +65,33 @@ fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
         traffic.assert_nothing_lost(&fleet);
         fleet.assert_nodes_live();
     }
+}
+
+/// The leader cannot reach it, and dies before it has told it.
+#[test]
+fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    let computers = [&fleet.computers[rest[0]], &fleet.computers[rest[1]]];
+    let [old, new] = computers.map(|computer| Named::new(computer, "/twin"));
+    let publish = |nth: usize, node: &Named| {
+        let computer = computers[nth];
+        computer.within(|| node.it().publish(&computer.client(), "/of_twin", TYPE));
+    };
+    publish(0, &old);
+    fleet.await_same_state();
+    fleet.network.cut_port(leader, rest[0], old.it().port());
+    publish(1, &new);
+    let told = |node: &Named| !node.it().heard("shutdown").is_empty();
+    assert!(!told(&old), "the leader has reached it");
+    fleet.computers[leader].power_off();
+    fleet.await_leader_of(&rest);
+    eventually("the next leader tells it", || told(&old));
+    assert!(!told(&new));
+    fleet.network.mend_port(leader, rest[0], old.it().port());
+    fleet.bring_back(leader);
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
 }

@@ -33,6 +33,8 @@ mod handover;
 mod lonely;
 /// Two computers do not see each other, or not all of each other.
 mod pairs;
+/// A leader stands still, and goes on when another one leads.
+mod pauses;
 /// The first start, one that joins, and a start after all have stopped.
 mod starts;
 /// The harness itself.

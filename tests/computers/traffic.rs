@@ -18,7 +18,7 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// What no reader must get: the parameter is set to something else.
 const STEADY: &str = "/steady";
 
-const TYPE: &str = "std_msgs/String";
+pub(crate) const TYPE: &str = "std_msgs/String";
 
 #[derive(Clone, Debug)]
 struct Call {
@@ -61,7 +61,9 @@ impl Traffic {
     pub(crate) fn start(fleet: &Fleet) -> Self {
         fleet.computers[0].set_param(STEADY, 7);
         let common = Arc::new(Common::default());
-        let nodes = fleet.computers.iter().map(Named::new);
+        let nodes = fleet.computers.iter();
+        let nodes =
+            nodes.map(|computer| Named::new(computer, &format!("/writer_{}", computer.name)));
         let nodes: Vec<_> = nodes.collect();
         let writers = fleet.computers.iter().zip(&nodes).map(|(computer, node)| {
             let (node, name) = (node.clone(), computer.name);
@@ -236,25 +238,24 @@ impl Caller {
     }
 }
 
-/// In whose name a writer registers. Nothing kills it: it is only out of reach for a while.
+/// A node on a computer. Nothing kills it: it is only out of reach for a while.
 #[derive(Clone, Debug)]
-struct Named {
+pub(crate) struct Named {
     namespace: String,
     node: Option<Arc<FakeNode>>,
 }
 
 impl Named {
-    fn new(computer: &Computer) -> Self {
-        let name = format!("/writer_{}", computer.name);
+    pub(crate) fn new(computer: &Computer, name: &str) -> Self {
         let address = computer.address().parse().unwrap();
-        let node = computer.within(|| FakeNode::start_on(&name, address, 0));
+        let node = computer.within(|| FakeNode::start_on(name, address, 0));
         Self {
             namespace: computer.namespace.clone(),
             node: Some(Arc::new(node)),
         }
     }
 
-    fn it(&self) -> &FakeNode {
+    pub(crate) fn it(&self) -> &FakeNode {
         self.node.as_ref().unwrap()
     }
 }

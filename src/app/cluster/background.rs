@@ -142,6 +142,7 @@ impl Member {
             let checkpoint = Checkpoint {
                 seq: progress.seq,
                 snapshot: self.held.snapshot(),
+                displaced: self.displaced.at(now),
                 ..Checkpoint::default()
             };
             self.background.tasks.spawn(async move {

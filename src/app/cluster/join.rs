@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -22,11 +22,12 @@ use crate::{
         journal::{Keys, Progress},
         machine::{ANSWER_LIMIT, Commit, Machine, Settings, View, WhenAlone},
         replica::Replica,
-        way::Way,
+        way::{Place, Way},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
     hide::Hide,
     master::Master,
+    nodes::served::Served,
     process::Rosmaster,
     server::others::{Forwarded, Others},
     upstream::peer::Peers,
@@ -50,6 +51,8 @@ pub(in crate::app) struct Given {
     pub(in crate::app) restored: bool,
     /// Which values of parameters the log does not show.
     pub(in crate::app) hide: Hide,
+    /// Hosts whose nodes have this rosrescue for their master.
+    pub(in crate::app) served: Served,
     /// Cancelled when calls are no longer taken.
     pub(in crate::app) halt: CancellationToken,
 }
@@ -90,7 +93,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let known = given.restored;
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
-    let followed = watch::Sender::new(0);
+    let followed = watch::Sender::new(Place::default());
     let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
     let others = Others {
@@ -99,9 +102,13 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         handovers: handovers_tx,
         passing: Arc::default(),
         forwarded: forwarded.clone(),
+        served: given.served.clone(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
-        told: Arc::new(u64::from(given.restored).into()),
+        told: Arc::new(Mutex::new(Place {
+            term: 0,
+            seq: given.restored.into(),
+        })),
         // The next leader needs the time to live, and etcd may have to choose a leader of its own before.
         hold: given.hold.max(2 * config.ttl),
     };
@@ -135,6 +142,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         wanted: None,
         reported: 0,
         held: Master::default(),
+        displaced: Default::default(),
         progress: Progress::default(),
         outgoing: Outgoing::default(),
         duty: None,

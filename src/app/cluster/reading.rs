@@ -62,7 +62,7 @@ impl Member {
     pub(super) fn catch_up(&mut self) {
         let wanted = self.wanted.unwrap_or_default();
         let news = self.wanted.is_some() || self.reported != self.progress.seq;
-        if news && self.loaded && !self.has_master() && self.progress.seq >= wanted {
+        if news && self.loaded && !self.records() && self.progress.seq >= wanted {
             (self.wanted, self.reported) = (None, self.progress.seq);
             self.inbox.push_back(Input::Followed(self.progress.seq));
         }
@@ -150,7 +150,7 @@ impl Member {
 
     /// New records of the journal.
     pub(super) fn follow(&mut self, records: &[Record]) {
-        apply(&mut self.held, records);
+        self.hold_records(records);
         if let Some(cut_off) = &mut self.cut_off {
             cut_off.note(records);
         }
@@ -204,14 +204,15 @@ impl Member {
                 cut_off.note_difference(Some(&before), &self.held);
                 cut_off.note(&loaded.records);
             }
-            apply(&mut self.held, &loaded.records);
+            self.displaced.add(Instant::now(), checkpoint.displaced);
+            self.hold_records(&loaded.records);
             self.progress = loaded.progress;
             self.adopt_held();
         } else if let Ok(new) = self.progress.take(loaded.records, 0) {
             match first {
                 // The ledger may hold something else.
                 true => {
-                    apply(&mut self.held, &new);
+                    self.hold_records(&new);
                     self.adopt_held();
                 }
                 false => self.follow(&new),

@@ -11,7 +11,7 @@ use crate::{
     checkpoint::session::{self, Decision, Evidence},
     cluster::{
         machine::{Leader, Session, WhenAlone},
-        way::Way,
+        way::{Place, Way},
     },
     gate::State,
     ledger::{Change, Source},
@@ -34,14 +34,14 @@ const PROBES: u32 = 4;
 static ALONE: Pair = Pair::new();
 
 impl Member {
-    /// Whether calls pass to a master of this computer, or are answered for it.
-    pub(super) fn has_master(&self) -> bool {
-        self.duty.is_some()
+    /// Whether this computer records its own calls: it leads, or it is alone and serves.
+    pub(super) fn records(&self) -> bool {
+        self.given.post.ledger.records_here()
     }
 
     /// Whether the ledger holds what the journal does.
     pub(super) fn follows(&self) -> bool {
-        self.loaded && !self.ours && !self.has_master()
+        self.loaded && !self.ours && !self.records()
     }
 
     /// Whether the mirror's answers hold: its state is not that of a session which may be over.
@@ -67,7 +67,7 @@ impl Member {
             Role::Leading => self.lead().await,
             Role::Alone => self.be_alone().await,
             Role::Joining | Role::Following | Role::CatchingUp => {
-                if self.has_master() {
+                if self.records() {
                     tracing::warn!(
                         "this computer does not lead any more; another one does, or may"
                     );
@@ -80,7 +80,7 @@ impl Member {
 
     async fn lead(&mut self) {
         let term = self.machine.term().unwrap_or_default();
-        if !self.has_master() {
+        if !self.records() {
             if matches!(self.machine.session(), Session::Over(_)) {
                 let _ = self.given.post.ledger.follow_state(Master::default());
             }
@@ -91,10 +91,15 @@ impl Member {
             self.ours = false;
             let seq = self.machine.committed();
             self.outgoing.start(seq);
-            self.given.post.ledger.lead(seq, &self.held);
+            let ledger = &self.given.post.ledger;
+            ledger.lead(seq, &self.held);
+            let displaced = self.displaced.at(Instant::now());
+            ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
             self.begin_duty(Some(self.given.rosout), cause);
         } else {
             tracing::warn!("this computer leads again: etcd has answered");
+            self.given.post.nodes.set_alone(false);
+            self.begin_duty(Some(self.given.rosout), CUT_OFF);
             self.cut_off = self.cut_off.take().and_then(CutOff::resumed);
             if self.cut_off.is_none() {
                 cut_off::remove(&self.given.post.checkpoint).await;
@@ -131,7 +136,9 @@ impl Member {
             self.give_up_duty().await;
             return self.set_way(Way::Nobody { known: true });
         }
-        let base = match self.has_master() {
+        let led = self.records();
+        self.end_duty().await;
+        let base = match led {
             true => self.held.clone(),
             false => self.given.post.ledger.with_mirror(Clone::clone),
         };
@@ -141,8 +148,9 @@ impl Member {
             None => base,
         };
         self.cut_off_in(base.clone()).await;
+        self.given.post.nodes.set_alone(true);
         if let Some(cut_off) = &mut self.cut_off {
-            if self.duty.is_some() {
+            if led {
                 let answered = self.given.post.ledger.last_agreed();
                 let changes = self.outgoing.changes();
                 let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
@@ -151,13 +159,13 @@ impl Member {
                 cut_off.expect(self.forwarded.writes());
             }
         }
-        if !self.has_master() {
+        if !led {
             let seq = self.machine.committed();
             self.outgoing.start(seq);
             let _ = self.given.post.ledger.follow_state(base.clone());
             self.given.post.ledger.lead(seq, &base);
-            self.begin_duty(None, CUT_OFF);
         }
+        self.given.post.gate_tx.set(State::StandingIn);
         self.set_way(Way::Here { term: None });
         self.outgoing.all_ready();
         self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
@@ -179,6 +187,28 @@ impl Member {
         self.duty = Some(self.given.post.begin(process, rosout, cause));
     }
 
+    /// Has a master as long as the machine allows it.
+    async fn tend_duty(&mut self) {
+        let may = self.machine.may_have_master();
+        if self.duty.is_some() && !may {
+            tracing::warn!(
+                "etcd is silent, and another computer may lead by now: this one's master is ended, and its mirror answers"
+            );
+            self.end_duty().await;
+            self.given.post.gate_tx.set(State::StandingIn);
+        } else if self.duty.is_none() && may && self.records() {
+            self.begin_duty(Some(self.given.rosout), CUT_OFF);
+        }
+    }
+
+    async fn end_duty(&mut self) {
+        if let Some(duty) = self.duty.take() {
+            let ending = duty.end().await;
+            self.endings.spawn(ending);
+        }
+        self.given.post.ledger.end_injection();
+    }
+
     /// Whatever is recorded or answered here from now on is not for the others.
     pub(super) async fn give_up_duty(&mut self) {
         let post = &self.given.post;
@@ -186,12 +216,9 @@ impl Member {
         self.set_way(Way::Nobody {
             known: self.knows(),
         });
-        if let Some(duty) = self.duty.take() {
-            let ending = duty.end().await;
-            self.endings.spawn(ending);
-        }
+        self.end_duty().await;
         let post = &self.given.post;
-        post.ledger.end_injection();
+        post.nodes.set_alone(false);
         post.gate_tx.set(match self.machine.role() {
             Role::Joining => State::Unknown,
             _ => State::Elsewhere,
@@ -237,7 +264,7 @@ impl Member {
         match change {
             Change::Call(record, _) => {
                 if let Ok(new) = self.progress.take(vec![record], 0) {
-                    super::apply(&mut self.held, &new);
+                    self.hold_records(&new);
                     if let Some(cut_off) = &mut self.cut_off {
                         cut_off.note(&new);
                     }
@@ -286,7 +313,7 @@ impl Member {
     }
 
     fn prepare(&mut self) {
-        let Some(term) = self.machine.term().filter(|_| self.has_master()) else {
+        let Some(term) = self.machine.term().filter(|_| self.records()) else {
             return;
         };
         match self.outgoing.prepare(&self.replica.keys) {
@@ -367,12 +394,19 @@ impl Member {
     }
 
     /// What follows from all that has happened.
-    pub(super) fn tend(&mut self) {
+    pub(super) async fn tend(&mut self) {
         let now = Instant::now();
+        self.tend_duty().await;
         let role = self.machine.role();
         let seq = self.progress.seq;
-        self.followed
-            .send_if_modified(|now| std::mem::replace(now, seq) != seq);
+        let leader = self.view.leader.as_ref();
+        // The whole journal up to this leader's first record, at least.
+        let whole = leader.filter(|_| self.loaded && seq >= self.view.seq());
+        self.followed.send_if_modified(|now| {
+            let term = whole.map_or(now.term, |leader| leader.term);
+            let place = Place { term, seq };
+            std::mem::replace(now, place) != place
+        });
         self.look_for_namesake();
         let alive = self.view.alive.as_ref();
         let other = self
@@ -403,7 +437,7 @@ impl Member {
         );
         let settled = match role {
             Role::Following => self.wanted.is_none() && self.loaded,
-            Role::Leading => self.has_master(),
+            Role::Leading => self.records(),
             _ => false,
         };
         if settled

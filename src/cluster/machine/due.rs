@@ -12,7 +12,10 @@ impl Machine {
     pub fn deadline(&self) -> Option<Instant> {
         let under_way = self.flight.as_ref().is_some_and(|flight| !flight.silent);
         let send = self.send_at().filter(|_| !under_way);
-        [send, self.alone_at()].into_iter().flatten().min()
+        [send, self.alone_at(), self.lapses_at()]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// What is due at `now`.
@@ -26,6 +29,11 @@ impl Machine {
             reign.caught_up = true;
             self.follow_to(self.view.seq());
             self.become_role(Role::Leading, actions);
+        }
+        if self.lapses_at().is_some_and(|at| at <= now)
+            && let Some(reign) = &mut self.reign
+        {
+            reign.lapsed = true;
         }
         if self.alone_at().is_some_and(|at| at <= now) {
             self.become_role(Role::Alone, actions);
@@ -138,7 +146,7 @@ impl Machine {
     fn alone_at(&self) -> Option<Instant> {
         let patience = self.settings.ttl + PATIENCE;
         let silent = self.heard.or(self.started)? + patience;
-        match self.role {
+        let at = match self.role {
             Role::Joining | Role::CatchingUp => Some(silent),
             Role::Following => match self.peer {
                 Some((true, _)) => None,
@@ -148,6 +156,8 @@ impl Machine {
             // Until then nothing is acknowledged that is not committed, unless nobody else can lead.
             Role::Leading => Some(self.reign?.sent? + patience),
             Role::Alone => None,
-        }
+        };
+        // What happened while this process stood still is not known: etcd is asked first.
+        Some(at?.max(self.resumed.map_or(at?, |resumed| resumed + PATIENCE)))
     }
 }

@@ -15,6 +15,8 @@ pub(super) struct Reign {
     pub(super) caught_up: bool,
     /// The last beat did not take all records that there were.
     pub(super) full: bool,
+    /// Another computer can lead since the last beat.
+    pub(super) lapsed: bool,
 }
 
 /// A request whose effect is not known yet.

@@ -197,6 +197,11 @@ fn a_leader_that_hears_nothing_acknowledges_nothing_and_is_alone_after_a_while()
     for (alone, answers) in [(WhenAlone::Serve, true), (WhenAlone::Refuse, false)] {
         let (mut machine, now) = leading(alone);
         sent(&machine.on(now, Input::Recorded(1)));
+        // Nobody else can lead before that.
+        assert!(machine.may_have_master());
+        assert_eq!(machine.deadline(), Some(now + TTL));
+        machine.on(now + TTL, Input::Wake);
+        assert!(!machine.may_have_master());
         // etcd may be choosing a leader of its own.
         let lapses = now + TTL + PATIENCE;
         assert_eq!(machine.deadline(), Some(lapses));
@@ -221,7 +226,7 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let (mut machine, now) = leading(WhenAlone::Serve);
     let (number, _) = sent(&machine.on(now, Input::Recorded(1)));
     let late = now + TTL + PATIENCE;
-    machine.on(late, Input::Wake);
+    wake_until(&mut machine, late);
     assert_eq!(machine.role(), Role::Alone);
     let answer = Answer::Silence;
     machine.on(late, Input::Answer { number, answer });
@@ -236,6 +241,7 @@ fn a_leader_whose_etcd_comes_back_unchanged_goes_on() {
     let answer = Answer::Applied { revision, seq };
     let actions = machine.on(late + ms(200), Input::Answer { number, answer });
     assert_eq!(actions, [Action::Become(Role::Leading)]);
+    assert!(machine.may_have_master());
 }
 
 #[test]
@@ -249,12 +255,51 @@ fn a_leader_that_etcd_answers_late_goes_on_as_if_nothing_had_been() {
     assert_eq!(machine.role(), Role::Leading);
 }
 
+/// It wakes whenever it wants to, until `end`.
+fn wake_until(machine: &mut Machine, end: Instant) {
+    while let Some(due) = machine.deadline().filter(|due| *due < end) {
+        machine.on(due, Input::Wake);
+    }
+    machine.on(end, Input::Wake);
+}
+
+/// Without a pause it is alone by then.
+#[test]
+fn a_leader_that_stood_still_asks_etcd_before_it_is_alone() {
+    let long = 5 * TTL;
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    wake_until(&mut machine, now + long);
+    assert_eq!(machine.role(), Role::Alone);
+    assert_eq!(machine.lease(now + long), None);
+
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    assert!(machine.lease(now).is_some_and(|until| until > now));
+    let (number, op) = sent(&machine.on(now + long, Input::Wake));
+    assert!(matches!(op, Op::Beat { .. }));
+    assert_eq!(machine.role(), Role::Leading);
+    let lease = machine.lease(now + long);
+    assert!(
+        lease.is_some_and(|until| until <= now + long),
+        "it may not act"
+    );
+    let answer = Answer::Is(led("b", 5, 6));
+    let actions = machine.on(now + long, Input::Answer { number, answer });
+    assert!(actions.contains(&Action::Become(Role::Following)));
+    assert_eq!(machine.lease(now + long), Some(now + long));
+
+    // If nobody answers it is alone after all.
+    let (mut machine, now) = leading(WhenAlone::Serve);
+    machine.on(now + long, Input::Wake);
+    wake_until(&mut machine, now + long + PATIENCE);
+    assert_eq!(machine.role(), Role::Alone);
+}
+
 #[test]
 fn a_follower_without_etcd_goes_on_while_the_leader_says_that_it_leads() {
     let (mut machine, now) = following(WhenAlone::Serve);
     machine.on(now, Input::Peer(true));
     let long = now + 10 * TTL;
-    machine.on(long, Input::Wake);
+    wake_until(&mut machine, long);
     assert_eq!(machine.role(), Role::Following);
     let actions = machine.on(long, Input::Peer(false));
     assert_eq!(actions[0], Action::Become(Role::Alone));

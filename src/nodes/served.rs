@@ -1,0 +1,62 @@
+//! Hosts whose nodes have this rosrescue for their master, where there are several computers.
+
+use std::{
+    collections::HashSet,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use crate::{health::port_of, master::Request, ros_env::MasterUri};
+
+/// Most hosts that are remembered. A robot has few.
+const MOST: usize = 1024;
+
+/// The hosts of nodes that have registered here, and not at another computer's rosrescue.
+#[derive(Clone, Debug, Default)]
+pub struct Served(Arc<Mutex<HashSet<String>>>);
+
+impl Served {
+    fn lock(&self) -> MutexGuard<'_, HashSet<String>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A client of this rosrescue makes `call`. If it registers a node, the node's host is one of ours.
+    pub(crate) fn add(&self, call: &Request) {
+        for call in call.calls() {
+            let Some(host) = call.registrant().and_then(|(_, api)| host_of(api)) else {
+                continue;
+            };
+            let mut hosts = self.lock();
+            if hosts.len() < MOST {
+                hosts.insert(host);
+            }
+        }
+    }
+
+    /// Whether nodes at the host of `api` are ours.
+    pub(crate) fn has(&self, api: &str) -> bool {
+        host_of(api).is_some_and(|host| self.lock().contains(&host))
+    }
+}
+
+fn host_of(api: &str) -> Option<String> {
+    MasterUri::parse(port_of(api)).ok().map(|uri| uri.host)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::master::Method;
+
+    #[test]
+    fn a_host_is_ours_once_a_node_there_has_registered_here() {
+        let served = Served::default();
+        let api = "http://arm:40001/";
+        assert!(!served.has(api));
+        served.add(&Request::new(Method::SetParam, ["/n", "/p", api]));
+        assert!(!served.has(api));
+        let publish = Request::new(Method::RegisterPublisher, ["/n", "/t", "x/Y", api]);
+        served.add(&Request::multicall([publish]));
+        assert!(served.has(api) && served.has("http://arm:40002"));
+        assert!(!served.has("http://base:40001/"));
+    }
+}

@@ -1,0 +1,156 @@
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::scope;
+use std::time::Duration;
+
+use rosrescue::xmlrpc::Value;
+use rustix::process::Signal;
+
+use crate::computer::{Computer, NAMES, PORT};
+use crate::fleet::Fleet;
+use crate::network::enter;
+use crate::support::{Client, FakeNode, eventually, holds, params, signal};
+use crate::traffic::Named;
+use crate::{alone, rounds};
+
+/// Each has a writer of its own.
+const KEYS: usize = 8;
+
+fn key(index: usize) -> String {
+    format!("/of_writer_{index}")
+}
+
+/// Counts `key` up from `number` on until `stop`. Returns the last number, which was answered.
+fn count(key: &str, mut number: i32, stop: &AtomicBool) -> i32 {
+    let client = Client::new(PORT);
+    loop {
+        client.ok("setParam", params!["/writer", key, number]);
+        if stop.load(Ordering::Relaxed) {
+            return number;
+        }
+        number += 1;
+    }
+}
+
+/// The values of each key that the node was told, in order.
+fn told(node: &FakeNode) -> BTreeMap<String, Vec<i32>> {
+    let mut told: BTreeMap<String, Vec<i32>> = BTreeMap::new();
+    for update in node.heard("paramUpdate") {
+        let key = update[1].as_str().unwrap().trim_end_matches('/').to_owned();
+        told.entry(key).or_default().extend(update[2].as_int());
+    }
+    told
+}
+
+/// A node that is told all values of all keys.
+fn watch(computer: &Computer) -> Named {
+    let watcher = Named::new(computer, "/watcher");
+    for index in 0..KEYS {
+        computer.within(|| watcher.it().watch_param(&computer.client(), &key(index)));
+    }
+    watcher
+}
+
+/// Its worker stands still for longer than the time to live, with calls of a follower under way. They are answered by the
+/// next leader, and newer ones as well.
+#[test]
+fn a_leader_that_stood_still_tells_no_node_anything_old() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&[]);
+    let (mut first, mut watcher) = (0, None);
+    for round in 0..rounds() {
+        let leader = fleet.await_whole();
+        let rest = fleet.others(leader);
+        let [healthy, late] = [0, 1].map(|nth| &fleet.computers[rest[nth]]);
+        let watcher = watcher.get_or_insert_with(|| watch(healthy)).it();
+        let told_all = |least: i32| {
+            let told = told(watcher);
+            (0..KEYS).all(|index| told.get(&key(index)).and_then(|of| of.last()) >= Some(&least))
+        };
+        let worker = fleet.computers[leader].worker();
+        let stop = AtomicBool::new(false);
+        let last: Vec<i32> = scope(|scope| {
+            let writers: Vec<_> = (0..KEYS)
+                .map(|index| {
+                    let (stop, namespace) = (&stop, [healthy, late][index % 2].namespace.clone());
+                    scope.spawn(move || {
+                        enter(&namespace);
+                        count(&key(index), first, stop)
+                    })
+                })
+                .collect();
+            eventually("all writers count", || told_all(first + 5));
+            signal(worker, Signal::STOP);
+            let next = fleet.await_leader_of(&rest);
+            println!(
+                "round {round}: {} stands still, {} leads",
+                NAMES[leader], NAMES[next]
+            );
+            stop.store(true, Ordering::Relaxed);
+            writers
+                .into_iter()
+                .map(|writer| writer.join().unwrap())
+                .collect()
+        });
+        let told_last = || {
+            let told = told(watcher);
+            (0..)
+                .zip(&last)
+                .all(|(index, last)| told[&key(index)].last() == Some(last))
+        };
+        eventually("the last values are told", told_last);
+        signal(worker, Signal::CONT);
+        fleet.await_same_state();
+        for (index, last) in (0..).zip(&last) {
+            assert_eq!(
+                healthy.param(&key(index)),
+                Some(Value::Int(*last)),
+                "{}",
+                key(index)
+            );
+        }
+        // Whatever is told once more is told by then.
+        if !holds(Duration::from_secs(1), told_last) {
+            panic!(
+                "round {round}: {last:?} are the last values; told: {:?}",
+                told(watcher)
+            );
+        }
+        first = last.iter().max().unwrap() + 1;
+    }
+    fleet.assert_nodes_live();
+}
+
+/// A follower that reaches no etcd knows of new writes by the leader's answers alone. Its mirror must not answer from before
+/// them, however long the leader stands still.
+#[test]
+fn no_read_goes_back_where_etcd_is_out_of_reach_and_the_leader_stands_still() {
+    let _alone = alone();
+    // The leader stands still for less than that.
+    let mut fleet = Fleet::start(&["--cluster-ttl", "20"]);
+    let leader = fleet.await_whole();
+    let follower = fleet.others(leader)[0];
+    for other in fleet.others(follower) {
+        fleet.network.cut_port(follower, other, 2379);
+    }
+    fleet.computers[follower].kill_etcd();
+    let computer = &fleet.computers[follower];
+    for value in 1..=30 {
+        computer.set_param("/counted", value);
+    }
+    let worker = fleet.computers[leader].worker();
+    signal(worker, Signal::STOP);
+    scope(|scope| {
+        let read = scope.spawn(|| computer.param("/counted"));
+        holds(Duration::from_secs(5), || !read.is_finished());
+        signal(worker, Signal::CONT);
+        assert_eq!(read.join().unwrap(), Some(Value::Int(30)));
+    });
+    assert!(computer.role_is("following"));
+    for other in fleet.others(follower) {
+        fleet.network.mend_port(follower, other, 2379);
+    }
+    fleet.computers[follower].start_etcd();
+    fleet.await_same_state();
+    fleet.assert_nodes_live();
+}
