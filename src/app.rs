@@ -256,6 +256,7 @@ pub async fn run(
                 restore: config.restore,
                 hold: config.hold,
                 restored,
+                hide: config.hide.clone(),
                 served,
                 halt: halt.clone(),
             };

@@ -26,7 +26,10 @@ use std::{
 use tokio::sync::{Notify, watch};
 
 use self::activity::{Activity, Noticed};
-pub(crate) use self::{durability::Mark, shared::Change};
+pub(crate) use self::{
+    durability::Mark,
+    shared::{Change, Source},
+};
 use self::{
     durability::Whole,
     journal::Journal,
@@ -55,7 +58,7 @@ pub struct Superseded;
 
 /// The result of recording answered calls.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Recorded {
+pub(crate) struct Recorded {
     /// Where their last record is.
     pub mark: Mark,
     /// Whether the mirror is no longer known to equal the master.
@@ -233,13 +236,28 @@ impl Ledger {
         self.lock().token()
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in the order in which it ran
-    /// them.
-    pub fn record(
+    /// As [`Self::record_from`], of calls that were made here.
+    #[cfg(test)]
+    pub(crate) fn record(
         &self,
         now: Instant,
         incarnation: u64,
         batch: &[(&Request, &Reply)],
+    ) -> Result<Recorded, Superseded> {
+        let batch: Vec<_> = batch
+            .iter()
+            .map(|(call, reply)| (*call, *reply, &Source::Here))
+            .collect();
+        self.record_from(now, incarnation, &batch)
+    }
+
+    /// Records and applies calls that the master of `incarnation` has answered, in the order in which it ran
+    /// them.
+    pub(crate) fn record_from(
+        &self,
+        now: Instant,
+        incarnation: u64,
+        batch: &[(&Request, &Reply, &Source)],
     ) -> Result<Recorded, Superseded> {
         let mut inner = self.lock();
         if inner.session.incarnation != incarnation || inner.injecting || inner.is_elsewhere() {
@@ -247,17 +265,19 @@ impl Ledger {
         }
         let mut recorded = Recorded::default();
         let mut answered = Vec::with_capacity(batch.len());
-        for (call, reply) in batch {
+        for (call, reply, source) in batch {
             let accepted = replay::accepted(&inner.mirror, call, reply);
             recorded.doubtful |= !accepted.certain;
-            answered.extend(accepted.calls);
+            answered.extend(accepted.calls.into_iter().map(|of| (of, *source)));
         }
-        let writes =
-            |of: &Answered<'_>| matches!(of.call.method(), Method::SetParam | Method::DeleteParam);
+        let writes = |(of, _): &(Answered<'_>, _)| {
+            matches!(of.call.method(), Method::SetParam | Method::DeleteParam)
+        };
         let last_write = answered.iter().rposition(writes).unwrap_or_default();
         let mut entries = Vec::with_capacity(answered.len());
+        let mut sources = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
-        for (index, answered) in answered.into_iter().enumerate() {
+        for (index, (answered, source)) in answered.into_iter().enumerate() {
             // If so, the mirror is known to differ: the master holds what cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
@@ -274,13 +294,14 @@ impl Ledger {
             }
             if answered.executed {
                 entries.push(Entry::call(answered.call.clone().into()));
+                sources.push(source);
             }
         }
         inner.doubted |= recorded.doubtful;
         let has_entries = !entries.is_empty();
         if has_entries {
             self.stats.writes_recorded.add(entries.len() as u64);
-            inner.append(entries);
+            inner.append_from(entries, &sources);
         }
         if unrecorded {
             inner.changed_unrecorded();
@@ -505,9 +526,14 @@ impl Inner {
 
     /// Gives `entries` to the journal. A failure is kept by the store and does not fail the call.
     fn append(&mut self, entries: Vec<Entry>) {
+        self.append_from(entries, &[]);
+    }
+
+    /// As [`Self::append`], with where each call comes from; from here if it is not said.
+    fn append_from(&mut self, entries: Vec<Entry>, sources: &[&Source]) {
         // First: what follows is to reach the incarnation that it names.
         self.write_session();
-        self.share(&entries);
+        self.share(&entries, sources);
         if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {
             journal.append(entries);
         }

@@ -5,6 +5,7 @@
 pub(crate) mod batch;
 mod drain;
 mod evict;
+mod merge;
 mod outdated;
 pub(crate) mod parts;
 mod resync;
@@ -12,7 +13,6 @@ mod round_trip;
 
 use std::{sync::Arc, time::Duration};
 
-use bytes::Bytes;
 use tokio::{
     sync::{Notify, mpsc, watch},
     time::Instant,
@@ -21,13 +21,14 @@ use tokio::{
 use self::batch::{Answer, Condition, Item};
 pub(crate) use self::drain::Drain;
 use crate::{
+    cluster::merge::wire::{self, Ask},
     gate,
     ledger::Ledger,
     lifecycle::Patience,
     master::Request,
     status::stats::Stats,
-    upstream::{Head, Upstream},
-    xmlrpc::{self, Reply},
+    upstream::Upstream,
+    xmlrpc::{self, Reply, Value},
 };
 
 /// Calls between the clients and the queue. The worker always empties it at once.
@@ -62,24 +63,22 @@ impl WriteQueue {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes a call of a client that has its answer already. None if there is no answer.
-    pub(crate) async fn call_of_client(&self, call: Request) -> Option<Reply> {
-        let body = xmlrpc::encode_call(&call.clone().into());
-        self.answer_to(Some((Head::default(), body.into())), call, None)
-            .await
+    /// Makes the calls of `ask`, but for those about something that others have changed since. None if there is
+    /// no answer.
+    pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::Answer> {
+        let (item, answered, judged) = merge::item(ask);
+        self.items.send(item).await.ok()?;
+        let reply = match answered.await.ok()?.0 {
+            Answer::Made(reply) => reply,
+            // One that cannot be read is that of a master that could not write it.
+            Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).unwrap_or(Reply::Value(Value::Nil)),
+            Answer::Close | Answer::Elsewhere => return None,
+        };
+        Some(judged.answer(&reply))
     }
 
     async fn call_own(&self, call: Request, condition: Option<Condition>) -> Option<Reply> {
-        self.answer_to(None, call, condition).await
-    }
-
-    async fn answer_to(
-        &self,
-        raw: Option<(Head, Bytes)>,
-        call: Request,
-        condition: Option<Condition>,
-    ) -> Option<Reply> {
-        let (mut item, answered) = Item::new(raw, Some(Arc::new(call)));
+        let (mut item, answered) = Item::new(None, Some(Arc::new(call)));
         item.condition = condition;
         self.items.send(item).await.ok()?;
         match answered.await.ok()?.0 {

@@ -51,7 +51,7 @@ use crate::{
     master::{Master, Request},
     process::ProcessError,
     recovery::master_process::MasterProcess,
-    server::others::Handover,
+    server::others::{Forwarded, Handover},
     upstream::peer::Peers,
     wait,
 };
@@ -74,6 +74,8 @@ pub(super) struct Member {
     /// Who leads, also while calls wait.
     leads: watch::Sender<Way>,
     peers: Arc<Peers>,
+    /// Writes of this computer that a leader has not answered yet.
+    forwarded: Arc<Forwarded>,
     /// How far the mirror holds the journal.
     followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,

@@ -19,7 +19,7 @@ use crate::checkpoint::format::{self, EncodeError, Record};
 /// 1 MB, and nothing else is committed meanwhile.
 pub const BATCH_BYTES: usize = 256 << 10;
 /// Most records of one transaction: more are no quicker.
-const BATCH_RECORDS: usize = 2_000;
+pub const BATCH_RECORDS: usize = 2_000;
 /// Bytes of a part of something larger.
 const PART_BYTES: usize = 512 << 10;
 /// The largest record. etcd keeps 2 GiB at most unless it is told otherwise, and a record is in the journal

@@ -1,13 +1,23 @@
 //! What of the writes that a computer has answered while it was alone still holds: all but those about
-//! something that was changed meanwhile, where the others are. What was changed is seen by comparing the
-//! state at which the computer was cut off with the present one. A parameter that has a value which was written
-//! alone, too, was not changed by others: that write had reached them before.
+//! something that others have changed since it was cut off, whatever it is now.
+//!
+//! It is judged twice by the same rules: by the computer that was alone, by what it reads in the journal; and by
+//! the leader before each portion, by what came after that. See decision 42.
 
-use std::{collections::HashMap, fmt};
+mod changes;
+mod pending;
+pub mod wire;
 
+use std::fmt;
+
+use self::changes::{param_of, value_at};
+pub use self::{
+    changes::{Changes, Subject},
+    pending::{Pending, weight},
+};
 use crate::{
     master::{Master, Method, Request, names},
-    xmlrpc::{Struct, Value},
+    xmlrpc::Value,
 };
 
 /// What becomes of the writes.
@@ -19,10 +29,22 @@ pub struct Merged {
 }
 
 /// A write that does not hold.
-#[derive(Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Lost {
     pub call: Request,
     pub why: Conflict,
+    /// What others have set the parameter to, or one that holds it.
+    pub present: Option<Value>,
+}
+
+/// What becomes of a write.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Verdict {
+    /// Nobody has changed the same.
+    Runs,
+    /// Others have changed the same, to what it would set.
+    Holds,
+    Lost(Lost),
 }
 
 /// What was changed meanwhile by others.
@@ -69,114 +91,107 @@ impl fmt::Display for Conflict {
     }
 }
 
-/// Separates `pending`, writes that were answered from the state `base` on, in order. `now` is the state
-/// where the others are.
-pub fn merge(base: &Master, now: &Master, pending: &[Request]) -> Merged {
+/// Separates `pending`, in order, by what others have changed. `now` is the state where they are.
+pub fn merge<'a>(
+    changes: &Changes,
+    now: &Master,
+    pending: impl IntoIterator<Item = &'a Request>,
+) -> Merged {
     let mut merged = Merged::default();
-    // The first write of each parameter: it may have been on its way when this computer was cut off.
-    let mut written: HashMap<String, Value> = HashMap::new();
-    for call in pending.iter().flat_map(Request::calls) {
-        if let (Method::SetParam, Some(caller), [_, key, value, ..]) =
-            (call.method(), call.caller(), call.params())
-            && let Some(key) = key.as_str()
-        {
-            let key = names::resolve(key, caller);
-            written.entry(key).or_insert_with(|| value.clone());
+    let mut deleted = Changes::default();
+    let pending: Vec<_> = pending.into_iter().collect();
+    for call in pending.into_iter().rev() {
+        let path = param_of(call);
+        match judge(changes, now, call) {
+            Verdict::Runs => merged.send.push(call.clone()),
+            Verdict::Holds => {}
+            // What was deleted again is not lost.
+            Verdict::Lost(_) if path.as_ref().is_some_and(|path| deleted.has_above(path)) => {}
+            Verdict::Lost(lost) => merged.lost.push(lost),
+        }
+        if let Some(path) = path.filter(|_| *call.method() == Method::DeleteParam) {
+            deleted.add(Subject::Param(path));
         }
     }
-    let has_arrived = |why: &Conflict| {
-        let Conflict::Parameter(key) = why else {
-            return false;
-        };
-        let path: Vec<&str> = names::parts(key).collect();
-        let present = value_at(now.params(), &path);
-        written.get(key).is_some_and(|value| Some(value) == present)
-    };
-    for call in pending.iter().flat_map(Request::calls) {
-        let call = call.clone();
-        match conflict(base, now, &call).filter(|why| !has_arrived(why)) {
-            Some(why) => merged.lost.push(Lost { call, why }),
-            None => merged.send.push(call),
-        }
-    }
+    merged.send.reverse();
+    merged.lost.reverse();
     merged
 }
 
-fn conflict(base: &Master, now: &Master, call: &Request) -> Option<Conflict> {
+/// What becomes of `call`, other than a multicall.
+pub fn judge(changes: &Changes, now: &Master, call: &Request) -> Verdict {
+    let Some(why) = conflict(changes, now, call) else {
+        return Verdict::Runs;
+    };
+    let path = param_of(call).unwrap_or_default();
+    let parts: Vec<&str> = names::parts(&path).collect();
+    let present = value_at(now.params(), &parts).cloned();
+    if matches!(why, Conflict::Parameter(_)) && !parts.is_empty() {
+        let wanted = match call.method() {
+            Method::SetParam => call.params().get(2),
+            _ => None,
+        };
+        if wanted == present.as_ref() {
+            return Verdict::Holds;
+        }
+    }
+    let call = call.clone();
+    Verdict::Lost(Lost { call, why, present })
+}
+
+fn conflict(changes: &Changes, now: &Master, call: &Request) -> Option<Conflict> {
     let caller = call.caller()?;
-    let name = |at: usize| Some(names::resolve(call.text(at)?, caller));
-    let node = |at: usize| node(base, now, caller, call.text(at)?);
-    let anew = |topic: String, of: fn(&Master, &str, &str) -> bool| {
-        let registered = of(now, &topic, caller) && !of(base, &topic, caller);
-        registered.then(|| Conflict::Registration {
-            name: topic,
+    let name = || Some(names::resolve(call.text(1)?, caller));
+    let node = |at: usize| node(changes, now, caller, call.text(at)?);
+    let anew = |publishes| {
+        let subject = Subject::Topic {
+            publishes,
+            topic: name()?,
+            node: caller.to_owned(),
+        };
+        let registered = changes.has(&subject) && now.has_topic(caller, publishes, &name()?);
+        registered.then_some(())?;
+        Some(Conflict::Registration {
+            name: name()?,
             node: caller.to_owned(),
         })
     };
     match call.method() {
         Method::SetParam | Method::DeleteParam => {
-            let key = name(1)?;
-            let path: Vec<&str> = names::parts(&key).collect();
-            is_changed(base.params(), now.params(), &path).then_some(Conflict::Parameter(key))
+            let changed = changes.has_param(&param_of(call)?);
+            changed.then_some(())?;
+            Some(Conflict::Parameter(name()?))
         }
         Method::RegisterPublisher | Method::RegisterSubscriber => node(3),
-        Method::UnregisterPublisher => node(2).or_else(|| {
-            anew(name(1)?, |master, topic, node| {
-                master.publications(node).any(|of| of == topic)
-            })
-        }),
-        Method::UnregisterSubscriber => node(2).or_else(|| {
-            anew(name(1)?, |master, topic, node| {
-                master.subscriptions(node).any(|of| of == topic)
-            })
-        }),
-        Method::RegisterService => node(3).or_else(|| service(base, now, &name(1)?, call.text(2)?)),
-        Method::UnregisterService => service(base, now, &name(1)?, call.text(2)?),
+        Method::UnregisterPublisher => node(2).or_else(|| anew(true)),
+        Method::UnregisterSubscriber => node(2).or_else(|| anew(false)),
+        Method::RegisterService => {
+            node(3).or_else(|| service(changes, now, &name()?, call.text(2)?))
+        }
+        Method::UnregisterService => service(changes, now, &name()?, call.text(2)?),
         Method::SubscribeParam | Method::UnsubscribeParam => node(1),
         _ => None,
     }
 }
 
-/// Whether another node has taken the name `caller`, which is at `api` here. A registration would end it.
-fn node(base: &Master, now: &Master, caller: &str, api: &str) -> Option<Conflict> {
+/// Whether others have a node `caller`, which is at `api` here. A registration would end it.
+fn node(changes: &Changes, now: &Master, caller: &str, api: &str) -> Option<Conflict> {
     let holder = now.api_of(caller).filter(|holder| *holder != api)?;
-    (base.api_of(caller) != Some(holder)).then(|| Conflict::Node {
+    let theirs = changes.has(&Subject::Node(caller.to_owned()));
+    theirs.then(|| Conflict::Node {
         name: caller.to_owned(),
         api: holder.to_owned(),
     })
 }
 
 /// Whether another node provides the service that is at `api` here.
-fn service(base: &Master, now: &Master, name: &str, api: &str) -> Option<Conflict> {
+fn service(changes: &Changes, now: &Master, name: &str, api: &str) -> Option<Conflict> {
     let provider = now.registry.services.get(name)?;
-    let before = base.registry.services.get(name);
-    (provider.api != api && before != Some(provider)).then(|| Conflict::Service {
+    let theirs = changes.has(&Subject::Service(name.to_owned()));
+    (provider.api != api && theirs).then(|| Conflict::Service {
         name: name.to_owned(),
         node: provider.node.clone(),
     })
-}
-
-fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
-    let (first, rest) = path.split_first()?;
-    match (tree.get(*first)?, rest) {
-        (value, []) => Some(value),
-        (Value::Struct(below), rest) => value_at(below, rest),
-        _ => None,
-    }
-}
-
-/// Whether anything at or below `path` differs, or a namespace above it has become a value.
-fn is_changed(base: &Struct, now: &Struct, path: &[&str]) -> bool {
-    let Some((first, rest)) = path.split_first() else {
-        return base != now;
-    };
-    match (base.get(*first), now.get(*first)) {
-        (was, is) if rest.is_empty() => was != is,
-        (Some(Value::Struct(was)), Some(Value::Struct(is))) => is_changed(was, is, rest),
-        (None, Some(Value::Struct(is))) => is_changed(&Struct::new(), is, rest),
-        (Some(Value::Struct(was)), None) => is_changed(was, &Struct::new(), rest),
-        (was, is) => was != is,
-    }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Instant};
 
-use super::{Ledger, Mark, delivery::Delivery};
+use super::{Ledger, Mark, Source, delivery::Delivery};
 use crate::{
     checkpoint::format::Entry,
     master::{Kind, Method, Request},
@@ -95,7 +95,8 @@ impl Ledger {
     ///
     /// None during an injection, if another computer has the master, or if the call also reads too much: it has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
-        let (reply, mark, _) = self.answer_standing_in(now, call, &Concern::default())?;
+        let concern = Concern::default();
+        let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
         Some((reply, mark))
     }
 
@@ -105,8 +106,9 @@ impl Ledger {
         now: Instant,
         call: &Request,
         concern: &Concern,
+        source: &Source,
     ) -> Option<(Reply, Mark, Option<Delivery>)> {
-        let (reply, mark, number) = self.answer_standing_in(now, call, concern)?;
+        let (reply, mark, number) = self.answer_standing_in(now, call, concern, source)?;
         let delivery = number.map(|number| Delivery::new(self, number));
         Some((reply, mark, delivery))
     }
@@ -116,6 +118,7 @@ impl Ledger {
         now: Instant,
         call: &Request,
         concern: &Concern,
+        source: &Source,
     ) -> Option<(Reply, Mark, Option<u64>)> {
         let mut inner = self.lock();
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
@@ -159,7 +162,9 @@ impl Ledger {
             call: call.clone().into(),
             pending: true,
         });
-        inner.append(entries.collect());
+        let entries: Vec<_> = entries.collect();
+        let sources = vec![source; entries.len()];
+        inner.append_from(entries, &sources);
         let mark = inner.mark();
         inner.add_pending(writes.into_iter().cloned());
         drop(inner);

@@ -1,14 +1,20 @@
 //! What other computers are given of our writes, and what we follow of theirs.
 
-use std::time::Instant;
+use std::{collections::VecDeque, sync::Arc, time::Instant};
 
 use tokio::sync::watch;
 
 use super::{Inner, Ledger, Superseded};
 use crate::{
     checkpoint::format::{self, Entry, Record},
+    cluster::merge::{self, Changes, Subject, Verdict},
     master::{Master, Request},
 };
+
+/// Most changes that are remembered for computers that were alone.
+const RECENT_MOST: usize = 4096;
+/// And their most bytes, about.
+const RECENT_BYTES_MOST: usize = 4 << 20;
 
 /// Which computer's writes the ledger holds.
 #[derive(Debug)]
@@ -22,7 +28,70 @@ pub(super) enum Shared {
         /// The number of the last one.
         last: Agreed,
         changes: Vec<Change>,
+        recent: Recent,
     },
+}
+
+/// Where a call that is recorded comes from.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Source {
+    /// A node of this computer, or rosrescue itself.
+    #[default]
+    Here,
+    /// Another computer, which makes it again elsewhere if it gets no answer.
+    Forwarded,
+    /// A computer that was alone sends what was answered there, all under this name.
+    Merge(Arc<str>),
+}
+
+/// What was changed lately, the oldest first.
+#[derive(Debug, Default)]
+pub(super) struct Recent {
+    /// All changes after this record are here.
+    after: u64,
+    changes: VecDeque<(u64, Source, Vec<Subject>)>,
+    bytes: usize,
+}
+
+impl Recent {
+    /// All changes after record `seq` will be here.
+    fn from(seq: u64) -> Self {
+        Self {
+            after: seq,
+            ..Self::default()
+        }
+    }
+
+    fn add(&mut self, seq: u64, source: &Source, call: &Request) {
+        let subjects: Vec<_> = call.calls().into_iter().flat_map(Subject::of).collect();
+        self.bytes += bytes_of(&subjects);
+        self.changes.push_back((seq, source.clone(), subjects));
+        while (self.changes.len() > RECENT_MOST || self.bytes > RECENT_BYTES_MOST)
+            && let Some((seq, _, subjects)) = self.changes.pop_front()
+        {
+            self.after = seq;
+            self.bytes -= bytes_of(&subjects);
+        }
+    }
+
+    /// What was changed after record `seq`, and not by `merge`. None if that is not known any more.
+    fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
+        if seq < self.after {
+            return None;
+        }
+        let later = self.changes.iter().filter(|(of, ..)| *of > seq);
+        let theirs = later
+            .filter(|(_, source, _)| !matches!(source, Source::Merge(name) if **name == *merge));
+        let mut changes = Changes::default();
+        for subject in theirs.flat_map(|(.., subjects)| subjects) {
+            changes.add(subject.clone());
+        }
+        Some(changes)
+    }
+}
+
+fn bytes_of(subjects: &[Subject]) -> usize {
+    subjects.iter().map(Subject::size).sum()
 }
 
 /// A place in the journal of all computers: which time that this one has the master, and the number of a
@@ -35,8 +104,8 @@ pub(crate) struct Agreed {
 
 /// A change to be given to the other computers.
 #[derive(Clone, Debug)]
-pub enum Change {
-    Call(Record),
+pub(crate) enum Change {
+    Call(Record, Source),
     /// The state was replaced as a whole by record `seq`.
     State {
         seq: u64,
@@ -46,9 +115,9 @@ pub enum Change {
 
 impl Change {
     /// Its number in the journal of all computers.
-    pub fn seq(&self) -> u64 {
+    pub(crate) fn seq(&self) -> u64 {
         match self {
-            Self::Call(record) => record.seq,
+            Self::Call(record, _) => record.seq,
             Self::State { seq, .. } => *seq,
         }
     }
@@ -88,6 +157,7 @@ impl Ledger {
         inner.shared = Shared::Here {
             last: Agreed { reign, seq },
             changes: Vec::new(),
+            recent: Recent::from(seq),
         };
         if inner.mirror != *held {
             inner.share_state();
@@ -104,11 +174,37 @@ impl Ledger {
     }
 
     /// What is to be given to the others, once.
-    pub fn take_changes(&self) -> Vec<Change> {
+    pub(crate) fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {
             Shared::Here { changes, .. } => std::mem::take(changes),
             _ => Vec::new(),
         }
+    }
+
+    /// The same as one change: the state that they have led to. None if this computer does not have the master.
+    pub(crate) fn take_as_state(&self) -> Option<Change> {
+        let mut inner = self.lock();
+        let state = Box::new(inner.mirror.clone());
+        let Shared::Here { last, changes, .. } = &mut inner.shared else {
+            return None;
+        };
+        changes.clear();
+        let seq = last.seq;
+        Some(Change::State { seq, state })
+    }
+
+    /// What becomes of `calls`, which a computer has answered while it was alone, if they are made now. It sends
+    /// them under the name `merge`, and knows what others have changed up to record `seq`. None if the changes
+    /// after that are not known any more.
+    pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
+        let inner = self.lock();
+        let Shared::Here { recent, .. } = &inner.shared else {
+            return None;
+        };
+        let changes = recent.since(seq, merge)?;
+        let calls = calls.iter();
+        let verdicts = calls.map(|call| merge::judge(&changes, &inner.mirror, call));
+        Some(verdicts.collect())
     }
 
     /// The last record that the others have, or need not have, in this time that this computer has the master.
@@ -219,14 +315,21 @@ impl Inner {
         matches!(self.shared, Shared::Elsewhere)
     }
 
-    pub(super) fn share(&mut self, entries: &[Entry]) {
-        let Shared::Here { last, changes } = &mut self.shared else {
+    /// `sources`: where each comes from; from here if it is not said.
+    pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
+        let Shared::Here {
+            last,
+            changes,
+            recent,
+        } = &mut self.shared
+        else {
             return;
         };
-        for entry in entries {
+        for (index, entry) in entries.iter().enumerate() {
             let Entry::Call { call, .. } = entry else {
                 continue;
             };
+            let source = sources.get(index).copied().unwrap_or(&Source::Here);
             let record = Record {
                 seq: last.seq + 1,
                 entry: Entry::call(call.clone()),
@@ -234,16 +337,24 @@ impl Inner {
             // What cannot be written is in no journal, as in that of one computer.
             if format::push_record(&mut Vec::new(), &record).is_ok() {
                 last.seq += 1;
-                changes.push(Change::Call(record));
+                recent.add(last.seq, source, &Request::from(call.clone()));
+                changes.push(Change::Call(record, source.clone()));
             }
         }
     }
 
     /// The state has changed otherwise than by calls.
     pub(super) fn share_state(&mut self) {
-        if let Shared::Here { last, changes } = &mut self.shared {
+        if let Shared::Here {
+            last,
+            changes,
+            recent,
+        } = &mut self.shared
+        {
             last.seq += 1;
             let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
+            // Anything may have changed.
+            *recent = Recent::from(seq);
             changes.push(Change::State { seq, state });
             // The calls that follow have other numbers than the session tells.
             self.session_unwritten = true;
@@ -420,6 +531,85 @@ mod tests {
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
     }
 
+    fn set_of(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    /// What becomes of setting these parameters to -1.
+    fn judged(ledger: &Ledger, seq: u64, keys: &[&str]) -> Option<Vec<bool>> {
+        let calls: Vec<_> = keys.iter().map(|key| set_of(key, -1)).collect();
+        let calls: Vec<_> = calls.iter().collect();
+        let verdicts = ledger.judge(seq, "mine", &calls)?;
+        Some(verdicts.iter().map(|of| *of == Verdict::Runs).collect())
+    }
+
+    #[test]
+    fn what_others_have_changed_after_a_record_is_known_by_its_number_and_by_who_it_was() {
+        let ledger = ledger();
+        assert_eq!(judged(&ledger, 0, &["/a"]), None);
+        ledger.leave();
+        assert_eq!(judged(&ledger, 0, &["/a"]), None);
+        ledger.lead(7, &Master::default());
+        let reply = Reply::Value(vec![Value::from(1), "".into(), 0.into()].into());
+        let sources = [
+            Source::Here,
+            Source::Forwarded,
+            Source::Merge("mine".into()),
+            Source::Merge("another's".into()),
+        ];
+        let keys = ["/a", "/b", "/c", "/d", "/e"];
+        let calls: Vec<_> = keys.iter().map(|key| set_of(key, 1)).collect();
+        let batch = calls.iter().zip(&sources);
+        let batch: Vec<_> = batch.map(|(call, source)| (call, &reply, source)).collect();
+        ledger
+            .record_from(Instant::now(), ledger.incarnation(), &batch)
+            .unwrap();
+        let of = |seq| judged(&ledger, seq, &keys);
+        assert_eq!(of(6), None);
+        assert_eq!(of(7), Some(vec![false, false, true, false, true]));
+        assert_eq!(of(8), Some(vec![true, false, true, false, true]));
+        assert_eq!(of(11), Some(vec![true; 5]));
+        let changes = ledger.take_changes();
+        let forwarded = |change: &Change| matches!(change, Change::Call(_, Source::Forwarded));
+        let forwarded = changes.iter().filter(|change| forwarded(change));
+        assert_eq!(forwarded.map(Change::seq).collect::<Vec<_>>(), [9]);
+        // A state may have changed anything.
+        ledger.adopt(state_of([set(1)]));
+        assert_eq!(judged(&ledger, 11, &["/x"]), None);
+        assert_eq!(judged(&ledger, 12, &["/x"]), Some(vec![true]));
+    }
+
+    #[test]
+    fn what_was_changed_long_ago_is_not_known_any_more() {
+        let mut recent = Recent::from(3);
+        for seq in 4..=u64::try_from(RECENT_MOST).unwrap() + 13 {
+            recent.add(seq, &Source::Here, &set_of("/a", 1));
+        }
+        assert!(recent.since(12, "mine").is_none());
+        assert!(recent.since(13, "mine").is_some());
+        let key = "k".repeat(RECENT_BYTES_MOST);
+        recent.add(9_000, &Source::Here, &set_of(&key, 1));
+        assert!(recent.since(8_999, "mine").is_none() && recent.changes.is_empty());
+        assert_eq!(recent.bytes, 0);
+    }
+
+    #[test]
+    fn changes_that_nobody_is_given_become_one_state() {
+        let ledger = ledger();
+        assert!(ledger.take_as_state().is_none());
+        ledger.leave();
+        ledger.lead(7, &Master::default());
+        for call in [set(1), set(2)] {
+            answer(&ledger, &call);
+        }
+        let Some(Change::State { seq: 9, state }) = ledger.take_as_state() else {
+            panic!("no state");
+        };
+        assert!(*state == state_of([set(2)]));
+        assert!(seqs(&ledger).is_empty());
+    }
+
     #[tokio::test]
     async fn who_waits_for_the_lease_goes_on_when_there_is_a_new_one() {
         let ledger = ledger();
@@ -455,7 +645,7 @@ mod tests {
                 seq: 8,
                 state: first,
             },
-            Change::Call(Record { seq: 9, .. }),
+            Change::Call(Record { seq: 9, .. }, _),
             Change::State {
                 seq: 10,
                 state: last,

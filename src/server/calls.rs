@@ -24,7 +24,7 @@ use super::{
 use crate::{
     cli::Reads,
     gate::{self, State},
-    ledger::{Ledger, delivery::Delivery},
+    ledger::{Ledger, Source, delivery::Delivery},
     limit::rarely,
     master::{Kind, Master, Method, Request},
     status::stats::Stats,
@@ -139,7 +139,7 @@ impl Calls {
             return Ok(refusal);
         }
         match &self.others {
-            None => Ok(self.answer_here(head, body, call).await?),
+            None => Ok(self.answer_here(head, body, call, Source::Here).await?),
             Some(others) => others.answer(self, head, body, call).await,
         }
     }
@@ -150,6 +150,7 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Request>,
+        source: Source,
     ) -> Result<HttpReply, Unanswered> {
         let undecoded = || self.decode_without_master(&head, &body);
         let call = match call.map(Ok).or_else(undecoded).transpose() {
@@ -170,7 +171,7 @@ impl Calls {
                 self.read(head, body, call.as_ref()).await
             }
             (_, Kind::Unregister | Kind::Mutate | Kind::Shutdown) => {
-                self.write(head, body, call).await
+                self.write(head, body, call, source).await
             }
         }
     }
@@ -373,18 +374,24 @@ impl Calls {
         head: Head,
         body: Bytes,
         mut call: Option<Request>,
+        source: Source,
     ) -> Result<HttpReply, Unanswered> {
         if let Some(parts) = Parts::of(&mut call, body.len()) {
             drop(body);
-            return self.write_parts(&head, parts).await;
+            return self.write_parts(&head, parts, source).await;
         }
         let call = call.map(Arc::new);
-        let (answer, delivery) = self.queue(head, body, call.clone()).await?;
+        let (answer, delivery) = self.queue(head, body, call.clone(), source).await?;
         self.http(call.as_deref(), answer, delivery)
     }
 
     /// Makes one part after the other. If one gets no result for each entry, its answer is that to the whole.
-    async fn write_parts(&self, head: &Head, parts: Parts) -> Result<HttpReply, Unanswered> {
+    async fn write_parts(
+        &self,
+        head: &Head,
+        parts: Parts,
+        source: Source,
+    ) -> Result<HttpReply, Unanswered> {
         let mut whole = ListWriter::answer();
         for part in parts {
             let part = Arc::new(part);
@@ -392,7 +399,12 @@ impl Calls {
             // No node both hears and tells of a subject in so many calls at once: each part's answer counts as
             // written when it is there.
             let (answer, delivery) = self
-                .queue(head.clone(), body.into(), Some(part.clone()))
+                .queue(
+                    head.clone(),
+                    body.into(),
+                    Some(part.clone()),
+                    source.clone(),
+                )
                 .await?;
             let reply = match &answer {
                 Answer::Made(reply) => Some(reply.clone()),
@@ -433,13 +445,15 @@ impl Calls {
         head: Head,
         body: Bytes,
         call: Option<Arc<Request>>,
+        source: Source,
     ) -> Result<Answered, Unanswered> {
         if self.gate.state() == State::Injecting
             && let Some((reply, delivery)) = self.answer_if_unchanged(call.as_deref()).await
         {
             return Ok((Answer::Made(reply), delivery));
         }
-        let (item, mut answered) = Item::new(Some((head, body)), call.clone());
+        let (mut item, mut answered) = Item::new(Some((head, body)), call.clone());
+        item.source = source;
         self.write_queue.submit(item).await;
         let call = call.as_deref();
         let mut gate = self.gate.clone();

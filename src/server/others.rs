@@ -14,6 +14,9 @@ use tokio::{
     time::Instant,
 };
 
+mod forwarded;
+
+pub(crate) use self::forwarded::Forwarded;
 use super::{
     calls::{Calls, Closed, NOT_IN_TIME, PATIENCE, Unanswered},
     replies::{HttpReply, UntilWritten, forwarded, text, xml},
@@ -21,8 +24,10 @@ use super::{
 use crate::{
     cluster::{
         journal::RECORD_BYTES_MAX,
+        merge::wire::Ask,
         way::{Place, Way},
     },
+    ledger::Source,
     master::{CALLER_ID, Kind, Method, Request, names},
     nodes::served::Served,
     order::ANSWER_LIMIT,
@@ -51,6 +56,8 @@ pub(crate) struct Others {
     pub(crate) served: Served,
     /// Answers that followers have not passed on yet.
     pub(crate) passing: Arc<Passing>,
+    /// Writes of this computer that a leader has not answered yet.
+    pub(crate) forwarded: Arc<Forwarded>,
     /// How far the mirror holds the journal.
     pub(crate) followed: watch::Receiver<Place>,
     /// The furthest place that a leader's answer told of.
@@ -193,6 +200,7 @@ impl Others {
         let mut hold = std::pin::pin!(tokio::time::sleep(self.hold));
         let deletes = call.deletes();
         let mut sent = false;
+        let mut unanswered = None;
         loop {
             // The leader that ran it died before it could answer; the next one would refuse it.
             if sent && deletes.is_some() && call.deletes().is_none() {
@@ -203,6 +211,10 @@ impl Others {
                 && now != (Way::Here { term: Some(term) })
             {
                 return Ok(not_leading(term));
+            }
+            if let (Some(term), Some(ask)) = (asked_term, call.merges()) {
+                let merged = self.merge(call.calls, ask).await;
+                return Ok(merged.unwrap_or_else(|| not_leading(term)));
             }
             let mut by_mirror = false;
             let retry = match now {
@@ -219,12 +231,16 @@ impl Others {
                     } = call;
                     let (head, body, request) = (head.clone(), body.clone(), call.call.clone());
                     let mut leads = self.way.clone();
+                    let source = match asked_term {
+                        Some(_) => Source::Forwarded,
+                        None => Source::Here,
+                    };
                     let answered = tokio::select! {
                         biased;
                         // What is answered alone holds only if nobody else changes it: the computer that has
                         // asked need not be cut off, and may be about to lead itself.
                         _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
-                        answered = calls.answer_here(head, body, request) => answered,
+                        answered = calls.answer_here(head, body, request, source) => answered,
                     };
                     match answered {
                         Err(Unanswered::Elsewhere) => None,
@@ -249,6 +265,12 @@ impl Others {
                         return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
                     }
                     sent = true;
+                    if unanswered.is_none() && call.kind.mutates() {
+                        unanswered = call
+                            .call
+                            .as_ref()
+                            .and_then(|call| self.forwarded.begin(call));
+                    }
                     tokio::select! {
                         answered = call.forward(&leader, term) => match answered {
                             Some(reply) => return Ok(reply),
@@ -279,6 +301,16 @@ impl Others {
                     return Err(Closed(NOT_IN_TIME));
                 }
             }
+        }
+    }
+
+    /// Makes writes of a computer that was alone. None if this one does not lead any more.
+    async fn merge(&self, calls: &Calls, ask: Ask) -> Option<HttpReply> {
+        let mut leads = self.way.clone();
+        tokio::select! {
+            biased;
+            _ = leads.wait_for(|way| *way == Way::Here { term: None }) => None,
+            answer = calls.write_queue.merge(ask) => Some(xml(&answer?.to_reply())),
         }
     }
 
@@ -313,6 +345,11 @@ impl Call<'_> {
         let call = self.call.as_ref()?;
         let is_it = matches!(call.method(), Method::Unknown(name) if **name == *HANDOVER);
         is_it.then(|| call.text(1).unwrap_or_default())
+    }
+
+    /// What a computer that was alone asks for, if it is that.
+    fn merges(&self) -> Option<Ask> {
+        Ask::read(self.call.as_ref()?)
     }
 
     /// The number of the answer that a follower has passed on, if that is what is told.

@@ -5,8 +5,9 @@ use std::{collections::VecDeque, sync::Arc, time::Instant};
 use bytes::Bytes;
 use tokio::sync::oneshot;
 
+use super::merge::Merge;
 use crate::{
-    ledger::{activity::LastCalls, delivery::Delivery},
+    ledger::{Source, activity::LastCalls, delivery::Delivery},
     master::{Entry, Kind, Method, Request, entry_reply},
     order::{BySubject, Concern, Order},
     upstream::{Head, RawReply},
@@ -46,6 +47,9 @@ pub(crate) struct Item {
     pub condition: Option<Condition>,
     /// Whether those whose ports it takes have been dealt with.
     pub way_made: bool,
+    pub source: Source,
+    /// For writes of a computer that was alone.
+    pub(super) merge: Option<Merge>,
 }
 
 /// An answer, and what is to be dropped when the caller has it.
@@ -84,6 +88,8 @@ impl Item {
             delivery: None,
             condition: None,
             way_made: false,
+            source: Source::Here,
+            merge: None,
         };
         (item, answered)
     }

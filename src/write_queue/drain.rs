@@ -12,7 +12,7 @@ use tracing::Instrument;
 
 use super::batch::{self, Answer, Item};
 use super::{
-    Link, Signals, evict,
+    Link, Signals, evict, merge,
     outdated::is_outdated,
     resync::ResyncSchedule,
     round_trip::{Done, Received, RoundTripError, round_trip},
@@ -400,12 +400,12 @@ impl Drain {
         let answered: Vec<_> = items
             .iter()
             .zip(&replies)
-            .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply)))
+            .filter_map(|(item, reply)| Some((item.call.as_deref()?, reply, &item.source)))
             .collect();
         let Ok(recorded) = self
             .link
             .ledger
-            .record(Instant::now(), incarnation, &answered)
+            .record_from(Instant::now(), incarnation, &answered)
         else {
             return self.take_back(items);
         };
@@ -525,6 +525,9 @@ impl Drain {
                 item.reply(Answer::Close);
                 continue;
             }
+            let Some(item) = merge::judged(&ledger, item) else {
+                continue;
+            };
             let call = item.call.as_deref().filter(|call| call.is_answerable());
             if let Some(call) = call.filter(|_| self.evicts && item.raw.is_some()) {
                 evict::while_standing_in(&ledger, call);
@@ -593,7 +596,7 @@ impl Answers {
     /// Answers `item`, or returns it if only a master can.
     fn add(&mut self, ledger: &Arc<Ledger>, mut item: Item) -> Option<Item> {
         let call = item.call.as_deref().filter(|call| call.is_answerable());
-        let answer = |call| ledger.stand_in_for(Instant::now(), call, item.concern());
+        let answer = |call| ledger.stand_in_for(Instant::now(), call, item.concern(), &item.source);
         let Some((reply, mark, delivery)) = call.and_then(answer) else {
             return Some(item);
         };

@@ -6,6 +6,7 @@ use std::{sync::Arc, time::Instant};
 use super::{
     batch::{self, Answer, Batch, Item},
     drain::Drain,
+    merge,
 };
 use crate::{
     health::{Eviction, first_taking},
@@ -17,11 +18,22 @@ impl Drain {
     /// The next batch. A call that takes a port is the first of its batch, and the eviction goes before it.
     pub(super) fn pack(&mut self) -> Vec<Item> {
         let ledger = self.link.ledger.clone();
-        let Batch { mut items, until } = ledger.with_order(|order, _| {
-            let delivery = |number| Delivery::new(&ledger, number);
-            batch::pack(&mut self.queue, order, Instant::now(), delivery)
-        });
-        self.held_until = until.map(Into::into);
+        let mut items = loop {
+            let Batch { items, until } = ledger.with_order(|order, _| {
+                let delivery = |number| Delivery::new(&ledger, number);
+                batch::pack(&mut self.queue, order, Instant::now(), delivery)
+            });
+            self.held_until = until.map(Into::into);
+            let any = !items.is_empty();
+            let items: Vec<_> = items
+                .into_iter()
+                .filter_map(|item| merge::judged(&ledger, item))
+                .collect();
+            // Those that are answered leave room for others.
+            if !any || !items.is_empty() {
+                break items;
+            }
+        };
         if !self.evicts {
             return items;
         }

@@ -29,6 +29,8 @@ mod disks;
 mod etcd;
 /// Another computer leads because somebody says so.
 mod handover;
+/// What a computer that was cut off has written meets what others have.
+mod lonely;
 /// Two computers do not see each other, or not all of each other.
 mod pairs;
 /// A leader stands still, and goes on when another one leads.

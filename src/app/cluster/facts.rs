@@ -243,7 +243,7 @@ impl Member {
             leaderless: self.leaderless(),
             seq,
             behind: seq - self.progress.seq,
-            uncommitted: self.outgoing.len() as u64,
+            uncommitted: self.uncommitted() as u64,
             etcd: self.trouble.get(),
             members,
             takeovers: known.takeovers,

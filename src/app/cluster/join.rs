@@ -26,10 +26,11 @@ use crate::{
         way::{Place, Way},
     },
     config::{ClusterConfig, ClusterSync, WhenCutOff},
+    hide::Hide,
     master::Master,
     nodes::served::Served,
     process::Rosmaster,
-    server::others::Others,
+    server::others::{Forwarded, Others},
     upstream::peer::Peers,
 };
 
@@ -49,6 +50,8 @@ pub(in crate::app) struct Given {
     pub(in crate::app) hold: Duration,
     /// Whether the mirror is from a checkpoint whose session continues.
     pub(in crate::app) restored: bool,
+    /// Which values of parameters the log does not show.
+    pub(in crate::app) hide: Hide,
     /// Hosts whose nodes have this rosrescue for their master.
     pub(in crate::app) served: Served,
     /// Cancelled when calls are no longer taken.
@@ -96,12 +99,14 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);
     let followed = watch::Sender::new(Place::default());
+    let forwarded = Arc::<Forwarded>::default();
     let peers = Arc::new(Peers::new(given.instance.clone(), post.probe_timeout));
     let others = Others {
         way: way_rx,
         peers: peers.clone(),
         handovers: handovers_tx,
         passing: Arc::default(),
+        forwarded: forwarded.clone(),
         served: given.served.clone(),
         followed: followed.subscribe(),
         // A restored mirror may be old: it shows nothing before etcd's journal has been read.
@@ -128,6 +133,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
         leads: watch::Sender::new(Way::Nobody { known }),
         way,
         peers,
+        forwarded,
         followed,
         handovers,
         inbox: VecDeque::new(),

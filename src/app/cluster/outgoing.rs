@@ -5,9 +5,15 @@ use std::{collections::VecDeque, pin::Pin};
 use crate::{
     checkpoint::format::{self, Checkpoint, Entry, Record},
     cluster::journal::{self, JournalError, Keys, Put},
-    ledger::Change,
+    ledger::{Change, Source},
     master,
+    xmlrpc::Value,
 };
+
+/// So many may be on their way at once.
+const FIRST: usize = journal::BATCH_RECORDS;
+/// Most bytes of those behind them while this computer is alone, about.
+const BYTES_MOST: usize = 16 << 20;
 
 /// Writes the parts of a change. Gives whether this process still leads, if that is known.
 pub(super) type Preparing = Pin<Box<dyn Future<Output = Option<bool>> + Send>>;
@@ -44,6 +50,25 @@ impl Outgoing {
 
     pub(super) fn changes(&self) -> impl Iterator<Item = &Change> {
         self.changes.iter()
+    }
+
+    /// Drops all: nobody is given them.
+    pub(super) fn forget(&mut self) {
+        self.changes.clear();
+    }
+
+    /// Whether so many have piled up that a state is to take the place of the later ones.
+    pub(super) fn has_outgrown(&self) -> bool {
+        let later = self.changes.iter().skip(FIRST);
+        self.changes.len() > 2 * FIRST || later.map(weight_of).sum::<usize>() > BYTES_MOST
+    }
+
+    /// Replaces all but the first ones, which may be on their way, by the state `rest`.
+    pub(super) fn replace_rest(&mut self, rest: Option<Change>) {
+        if let Some(rest) = rest {
+            self.changes.truncate(FIRST);
+            self.changes.push_back(rest);
+        }
     }
 
     /// The last one that is ready.
@@ -88,7 +113,7 @@ impl Outgoing {
         let ready = self.ready;
         if let Some(next) = self.changes.iter_mut().find(|of| of.seq() > ready) {
             let (seq, entry) = (next.seq(), Entry::call(master::get_pid()));
-            *next = Change::Call(Record { seq, entry });
+            *next = Change::Call(Record { seq, entry }, Source::Here);
         }
     }
 
@@ -107,7 +132,7 @@ impl Outgoing {
             return Ok(Some(state(keys, first)?.1));
         }
         let records = self.changes.iter().map_while(|change| match change {
-            Change::Call(record) if record.seq <= seq => Some(record.clone()),
+            Change::Call(record, _) if record.seq <= seq => Some(record.clone()),
             _ => None,
         });
         Ok(journal::pack(keys, &records.collect::<Vec<_>>())?.entry)
@@ -130,8 +155,20 @@ impl Outgoing {
 
 fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
     match change {
-        Change::Call(record) => journal::parts(keys, record),
+        Change::Call(record, _) => journal::parts(keys, record),
         Change::State { .. } => Ok(state(keys, change)?.0),
+    }
+}
+
+/// About how many bytes a change takes.
+fn weight_of(change: &Change) -> usize {
+    match change {
+        Change::Call(record, _) => match &record.entry {
+            Entry::Call { call, .. } => call.params.iter().map(Value::size).sum(),
+            Entry::Session(_) => 0,
+        },
+        // There is one.
+        Change::State { .. } => 0,
     }
 }
 
@@ -139,7 +176,7 @@ fn parts(keys: &Keys, change: &Change) -> Result<Vec<Put>, JournalError> {
 fn state(keys: &Keys, change: &Change) -> Result<(Vec<Put>, Put), JournalError> {
     let snapshot = match change {
         Change::State { state, .. } => state.snapshot(),
-        Change::Call(_) => Default::default(),
+        Change::Call(..) => Default::default(),
     };
     let checkpoint = Checkpoint {
         seq: change.seq(),
@@ -159,7 +196,7 @@ mod tests {
         let value = "x".repeat(bytes).as_str().into();
         let call = Call::new("setParam", vec!["/n".into(), "/p".into(), value]);
         let entry = Entry::call(call);
-        Change::Call(Record { seq, entry })
+        Change::Call(Record { seq, entry }, Source::Here)
     }
 
     fn state(seq: u64) -> Change {
@@ -257,6 +294,34 @@ mod tests {
     }
 
     #[test]
+    fn what_piles_up_becomes_a_state_behind_what_may_be_on_its_way() {
+        let count = 2 * FIRST as u64;
+        let (mut outgoing, keys) = outgoing((5..5 + count).map(|seq| call(seq, 1)));
+        outgoing.all_ready();
+        assert!(!outgoing.has_outgrown());
+        let before = added(&outgoing, &keys, 4 + count);
+        outgoing.add([call(5 + count, 1)]);
+        outgoing.all_ready();
+        assert!(outgoing.has_outgrown());
+        outgoing.replace_rest(Some(state(6 + count)));
+        outgoing.all_ready();
+        assert_eq!((outgoing.len(), outgoing.ready()), (FIRST + 1, 6 + count));
+        // A beat that is sent again has what it had.
+        assert_eq!(added(&outgoing, &keys, 4 + count), before);
+        outgoing.committed(4 + FIRST as u64);
+        let entry = outgoing.entry(&keys, 6 + count).unwrap().unwrap();
+        assert_eq!(entry.key, keys.journal(6 + count));
+        assert!(!outgoing.missing_parts(&keys).is_empty());
+        let large = (FIRST as u64 + 5..)
+            .take(4)
+            .map(|seq| call(seq, BYTES_MOST / 3));
+        let first = (5..FIRST as u64 + 5).map(|seq| call(seq, 1));
+        let mut outgoing = Outgoing::default();
+        outgoing.add(first.chain(large));
+        assert!(outgoing.has_outgrown());
+    }
+
+    #[test]
     fn what_cannot_be_written_leaves_its_number_to_a_call_that_changes_nothing() {
         let most = journal::RECORD_BYTES_MAX;
         let (mut outgoing, keys) = outgoing([call(5, 1), call(6, most), call(7, 1)]);
@@ -266,7 +331,7 @@ mod tests {
         assert!(outgoing.prepare(&keys).unwrap().is_none());
         assert_eq!(outgoing.ready(), 7);
         let instead: Vec<_> = outgoing.changes().skip(1).take(1).collect();
-        let [Change::Call(Record { seq: 6, entry })] = instead.as_slice() else {
+        let [Change::Call(Record { seq: 6, entry }, _)] = instead.as_slice() else {
             panic!("{instead:?}");
         };
         assert_eq!(*entry, Entry::call(master::get_pid()));

@@ -2,18 +2,61 @@
 
 use std::time::Instant;
 
-use super::{AGAIN, Member, apply};
+use super::{AGAIN, Member, apply, cut_off::note};
 use crate::{
     checkpoint::format::Record,
     cluster::{
         etcd::{Change, WatchEnd},
-        journal::{self, Manifest},
+        journal::{self, Manifest, Progress},
         machine::{Input, Leader},
+        merge::Changes,
         namesake,
-        replica::{Loaded, ReplicaError},
+        replica::{Loaded, Replica, ReplicaError},
     },
     master::Master,
 };
+
+/// The journal as far as a task has read it.
+pub(super) struct Present {
+    replica: Replica,
+    progress: Progress,
+    pub(super) state: Master,
+}
+
+impl Present {
+    /// The number of the last record.
+    pub(super) fn seq(&self) -> u64 {
+        self.progress.seq
+    }
+
+    /// Reads it to a moment after this. What the watch has told may be of long before. Notes what is new in
+    /// `changes`.
+    pub(super) async fn catch_up(&mut self, changes: &mut Changes) {
+        loop {
+            if let Ok(loaded) = self.replica.load(self.progress).await {
+                let state = loaded
+                    .checkpoint
+                    .map(|of| Master::from_snapshot(of.snapshot));
+                let is_read = match state.transpose() {
+                    Ok(Some(state)) => {
+                        changes.note_difference(&self.state, &state);
+                        self.state = state;
+                        true
+                    }
+                    Ok(None) => true,
+                    Err(_) => false,
+                };
+                if is_read {
+                    note(changes, &loaded.records);
+                    apply(&mut self.state, &loaded.records);
+                    self.progress = loaded.progress;
+                    return;
+                }
+            }
+            tokio::time::sleep(AGAIN).await;
+        }
+    }
+}
 
 impl Member {
     /// Has the journal read if it is not known as far as it must be.
@@ -38,22 +81,12 @@ impl Member {
         }
     }
 
-    /// The state in etcd at a moment after this. What the watch has told may be of long before.
-    pub(super) fn present(&self) -> impl Future<Output = Master> + Send + 'static {
-        let (replica, known, held) = (self.replica.clone(), self.progress, self.held.clone());
-        async move {
-            loop {
-                if let Ok(loaded) = replica.load(known).await {
-                    let state = loaded
-                        .checkpoint
-                        .map(|of| Master::from_snapshot(of.snapshot));
-                    if let Ok(mut state) = state.unwrap_or_else(|| Ok(held.clone())) {
-                        apply(&mut state, &loaded.records);
-                        return state;
-                    }
-                }
-                tokio::time::sleep(AGAIN).await;
-            }
+    /// The journal as far as it has been read.
+    pub(super) fn present(&self) -> Present {
+        Present {
+            replica: self.replica.clone(),
+            progress: self.progress,
+            state: self.held.clone(),
         }
     }
 
@@ -119,6 +152,9 @@ impl Member {
     /// New records of the journal.
     pub(super) fn follow(&mut self, records: &[Record]) {
         self.hold_records(records);
+        if let Some(cut_off) = &mut self.cut_off {
+            cut_off.note(records);
+        }
         if self.follows() {
             // Only if this computer has the master by now.
             let _ = self.given.post.ledger.follow(records);
@@ -159,12 +195,17 @@ impl Member {
         if let Some(checkpoint) = loaded.checkpoint
             && loaded.progress.seq >= self.progress.seq
         {
-            match Master::from_snapshot(checkpoint.snapshot) {
-                Ok(state) => self.held = state,
+            let state = match Master::from_snapshot(checkpoint.snapshot) {
+                Ok(state) => state,
                 Err(error) => {
                     tracing::error!(%error, "the state in etcd is no state of a master; please report this");
                     return;
                 }
+            };
+            let before = std::mem::replace(&mut self.held, state);
+            if let Some(cut_off) = self.cut_off.as_mut().filter(|_| !first) {
+                cut_off.note_difference(Some(&before), &self.held);
+                cut_off.note(&loaded.records);
             }
             self.displaced.add(Instant::now(), checkpoint.displaced);
             self.hold_records(&loaded.records);
@@ -179,6 +220,9 @@ impl Member {
                 }
                 false => self.follow(&new),
             }
+        }
+        if let Some(cut_off) = self.cut_off.as_mut().filter(|_| first) {
+            cut_off.note_difference(None, &self.held);
         }
         if self
             .namesakes

@@ -15,13 +15,18 @@ use crate::{
         way::{Place, Way},
     },
     gate::State,
-    ledger::Change,
+    ledger::{Change, Source},
     limit::{Pair, alarm, all_clear, rarely},
     master::Master,
     recovery::master_process::MasterProcess,
     ros_env::MasterUri,
     status::report::{CUT_OFF, STARTED, TAKEN_OVER},
 };
+
+/// Whether a change is not another computer's call, which is made elsewhere when it gets no answer here.
+fn is_ours(change: &Change) -> bool {
+    !matches!(change, Change::Call(_, Source::Forwarded))
+}
 
 /// How often the leader's rosrescue is asked within the time to live.
 const PROBES: u32 = 4;
@@ -145,11 +150,17 @@ impl Member {
         };
         self.cut_off_in(base.clone()).await;
         self.given.post.nodes.set_alone(true);
-        if led {
-            if let Some(cut_off) = &mut self.cut_off {
-                cut_off.add(self.outgoing.changes()).await;
+        if let Some(cut_off) = &mut self.cut_off {
+            if led {
+                let answered = self.given.post.ledger.last_agreed();
+                let changes = self.outgoing.changes();
+                let kept = changes.filter(|change| change.seq() <= answered || is_ours(change));
+                cut_off.add(kept, true).await;
+            } else {
+                cut_off.expect(self.forwarded.writes());
             }
-        } else {
+        }
+        if !led {
             let seq = self.machine.committed();
             self.outgoing.start(seq);
             let _ = self.given.post.ledger.follow_state(base.clone());
@@ -164,6 +175,8 @@ impl Member {
     /// What is answered from now on is kept for the leader. `base`: the present state.
     async fn cut_off_in(&mut self, base: Master) {
         match &mut self.cut_off {
+            // It is not known yet what the others have: that is compared with the first time.
+            Some(_) if !self.loaded => {}
             Some(cut_off) => cut_off.again(base),
             None => self.cut_off = Some(CutOff::new(&self.given.post.checkpoint, base).await),
         }
@@ -226,8 +239,16 @@ impl Member {
         if !answered.is_empty() {
             self.cut_off_in(self.held.clone()).await;
             if let Some(cut_off) = &mut self.cut_off {
-                cut_off.add(answered).await;
+                cut_off.add(answered, true).await;
             }
+        }
+    }
+
+    /// How many writes etcd does not have yet.
+    pub(super) fn uncommitted(&self) -> usize {
+        match &self.cut_off {
+            Some(cut_off) if self.keeps() => cut_off.len(),
+            _ => self.outgoing.len(),
         }
     }
 
@@ -242,12 +263,18 @@ impl Member {
             return;
         }
         match change {
-            Change::Call(record) => {
+            Change::Call(record, _) => {
                 if let Ok(new) = self.progress.take(vec![record], 0) {
                     self.hold_records(&new);
+                    if let Some(cut_off) = &mut self.cut_off {
+                        cut_off.note(&new);
+                    }
                 }
             }
             Change::State { seq, state } => {
+                if let Some(cut_off) = &mut self.cut_off {
+                    cut_off.note_difference(Some(&self.held), &state);
+                }
                 self.held = *state;
                 self.progress.take_state(seq, 0);
             }
@@ -261,11 +288,25 @@ impl Member {
         if self.keeps()
             && let Some(cut_off) = &mut self.cut_off
         {
-            cut_off.add(&changes).await;
+            let given = self.machine.term().is_some();
+            cut_off
+                .add(changes.iter().filter(|of| is_ours(of)), given)
+                .await;
         }
+        let leads_on = self.machine.term().is_some();
         self.outgoing.add(changes);
         if is_alone {
             self.outgoing.all_ready();
+            match leads_on {
+                // Nobody is given them: the leader gets what is kept.
+                false => self.outgoing.forget(),
+                true if self.outgoing.has_outgrown() => {
+                    let rest = self.given.post.ledger.take_as_state();
+                    self.outgoing.replace_rest(rest);
+                    self.outgoing.all_ready();
+                }
+                true => {}
+            }
             self.inbox.push_back(Input::Recorded(self.outgoing.ready()));
         } else {
             self.prepare();
@@ -404,14 +445,15 @@ impl Member {
             && self.merging.is_none()
             && let Some(time) = self.cut_off.as_ref().and_then(CutOff::first)
         {
-            let now = self.present();
+            let present = self.present();
+            let hide = self.given.hide.clone();
             let route = Route {
                 leads: self.leads.subscribe(),
                 peers: self.peers.clone(),
                 write_queue: self.given.post.write_queue.clone(),
             };
             self.merging = Some(Box::pin(async move {
-                merging::send(time, &now.await, route).await
+                merging::send(time, present, route, &hide).await
             }));
         }
         self.work_beside(now);

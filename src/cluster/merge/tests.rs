@@ -2,9 +2,11 @@
 
 use proptest::{collection::vec, prelude::*};
 
-use super::{Conflict, Merged, merge};
+mod model;
+
+use super::{Changes, Conflict, Merged, Pending, changes::param_path, merge};
 use crate::{
-    master::{Master, Method, Notice, Request},
+    master::{Master, Method, Notice, Request, is_success},
     xmlrpc::Value,
 };
 
@@ -28,10 +30,25 @@ fn state(of: &Master, calls: &[Request]) -> Master {
     master
 }
 
+/// The state after `there` was run, and what that has changed. What the master refuses is in no journal.
+fn changed(base: &Master, there: &[Request], changes: &mut Changes) -> Master {
+    let mut master = base.clone();
+    for (seq, call) in (1..).zip(there) {
+        if is_success(&master.apply_telling(call, &mut ())) {
+            changes.note(seq, call);
+        }
+    }
+    master
+}
+
 /// What becomes of `here`, when both sides began with `base` and the other one has run `there`.
 fn after(base: &[Request], there: &[Request], here: &[Request]) -> Merged {
     let base = state(&Master::default(), base);
-    merge(&base, &state(&base, there), here)
+    let mut changes = Changes::default();
+    let now = changed(&base, there, &mut changes);
+    let mut pending = Pending::default();
+    here.iter().for_each(|call| pending.add(call));
+    merge(&changes, &now, pending.calls())
 }
 
 fn lost(base: &[Request], there: &[Request], here: Request) -> Option<Conflict> {
@@ -40,12 +57,125 @@ fn lost(base: &[Request], there: &[Request], here: Request) -> Option<Conflict> 
 }
 
 #[test]
-fn a_write_that_had_reached_the_others_before_is_no_change_of_theirs() {
-    let here = [set("/a", "1"), set("/a", "2"), set("/b", "1")];
-    let there = [set("/a", "1"), set("/b", "9")];
-    let merged = after(&[], &there, &here);
-    assert_eq!(merged.send, here[..2]);
-    assert_eq!(merged.lost[0].why, Conflict::Parameter("/b".to_owned()));
+fn the_others_win_although_they_have_written_what_was_written_here_before() {
+    let here = [set("/estop", "true"), set("/estop", "false")];
+    let merged = after(&[], &[set("/estop", "true")], &here);
+    assert_eq!(merged.send, []);
+    assert_eq!(merged.lost.len(), 1);
+    assert_eq!(merged.lost[0].call, here[1]);
+    assert_eq!(merged.lost[0].present, Some("true".into()));
+}
+
+#[test]
+fn the_others_win_although_they_have_set_it_back() {
+    let there = [set("/a", "2"), set("/a", "1")];
+    let merged = after(&[set("/a", "1")], &there, &[set("/a", "7")]);
+    assert_eq!(merged.send, []);
+    assert_eq!(merged.lost[0].present, Some("1".into()));
+}
+
+#[test]
+fn a_write_to_what_others_have_written_too_is_neither_sent_nor_lost() {
+    let merged = after(&[], &[set("/a", "1")], &[set("/a", "2"), set("/a", "1")]);
+    assert_eq!(merged, Merged::default());
+    let delete = call(Method::DeleteParam, &["/n", "/a"]);
+    let there = [delete.clone()];
+    let merged = after(&[set("/a", "1")], &there, &[set("/a", "2"), delete]);
+    assert_eq!(merged, Merged::default());
+}
+
+#[test]
+fn what_was_set_and_deleted_again_is_lost_once() {
+    let delete = call(Method::DeleteParam, &["/n", "/a"]);
+    let here = [set("/a/b", "1"), delete.clone()];
+    let merged = after(&[], &[set("/a/b", "2")], &here);
+    let lost: Vec<_> = merged.lost.into_iter().map(|lost| lost.call).collect();
+    assert_eq!(lost, [delete]);
+}
+
+#[test]
+fn a_call_of_this_computer_that_had_reached_the_others_is_no_change_of_theirs() {
+    let base = Master::default();
+    let (own, here) = (set("/a", "1"), set("/a", "2"));
+    let judge = |there: &[Request], expect: &dyn Fn(&mut Changes)| {
+        let mut changes = Changes::default();
+        expect(&mut changes);
+        let now = changed(&base, there, &mut changes);
+        merge(&changes, &now, [&here]).send.len()
+    };
+    let sent = |changes: &mut Changes| changes.expect([own.clone()]);
+    let recorded = |changes: &mut Changes| changes.expect_record(1, own.clone());
+    let once = [own.clone()];
+    assert_eq!(judge(&once, &|_| {}), 0);
+    assert_eq!(judge(&once, &sent), 1);
+    assert_eq!(judge(&once, &recorded), 1);
+    // Twice is once by others.
+    let twice = [own.clone(), own.clone()];
+    assert_eq!(judge(&twice, &sent), 0);
+    assert_eq!(judge(&twice, &recorded), 0);
+    assert_eq!(judge(&[set("/b", "1"), own.clone()], &recorded), 0);
+}
+
+#[test]
+fn where_only_states_are_known_what_differs_was_changed() {
+    let base = state(
+        &Master::default(),
+        &[set("/a/b", "1"), publish("/n", "/t", "http://n:1/")],
+    );
+    let there = [
+        set("/a/c", "1"),
+        set("/own", "1"),
+        publish("/m", "/t", "http://m:1/"),
+    ];
+    let now = state(&base, &there);
+    let mut changes = Changes::default();
+    changes.expect([set("/own", "1")]);
+    changes.note_difference(&base, &now);
+    let sent = |call: Request| !merge(&changes, &now, [&call]).send.is_empty();
+    assert!(sent(set("/a/b", "2")) && sent(set("/own", "2")) && sent(set("/d", "2")));
+    assert!(!sent(set("/a/c", "2")) && !sent(set("/a", "2")));
+    assert!(!sent(publish("/m", "/u", "http://here:1/")));
+    assert!(sent(publish("/n", "/u", "http://here:1/")));
+    assert!(!sent(call(
+        Method::UnregisterPublisher,
+        &["/m", "/t", "http://m:1/"]
+    )));
+}
+
+#[test]
+fn of_each_subject_only_what_makes_its_last_state_is_kept() {
+    let kept = |calls: &[Request]| {
+        let mut pending = Pending::default();
+        calls.iter().for_each(|call| pending.add(call));
+        pending.calls().cloned().collect::<Vec<_>>()
+    };
+    let delete = |key: &str| call(Method::DeleteParam, &["/n", key]);
+    let unpublish = |api: &str| call(Method::UnregisterPublisher, &["/n", "/t", api]);
+    assert_eq!(
+        kept(&[set("/a/b", "1"), set("/c", "1"), set("/a/b", "2")]),
+        [set("/c", "1"), set("/a/b", "2")]
+    );
+    // It must be there to be deleted.
+    let deleted = [set("/a/b", "2"), delete("/a")];
+    let calls = [&[set("/a/c", "1"), set("/ab", "1")], &deleted[..]].concat();
+    assert_eq!(kept(&calls), [&[set("/ab", "1")], &deleted[..]].concat());
+    assert_eq!(kept(&[&deleted[..], &deleted[..]].concat()), deleted);
+    assert_eq!(kept(&[delete("/a"), set("/a", "1")]), [set("/a", "1")]);
+    let below = [set("/a", "1"), set("/a/b", "1")];
+    assert_eq!(kept(&below), below);
+    let [first, second] = ["http://n:1/", "http://n:2/"].map(|api| publish("/n", "/t", api));
+    assert_eq!(
+        kept(&[first.clone(), unpublish("http://n:1/"), second.clone()]),
+        std::slice::from_ref(&second)
+    );
+    // The first process of the node ends late.
+    assert_eq!(
+        kept(&[first.clone(), second.clone(), unpublish("http://n:1/")]),
+        [second]
+    );
+    let ended = [first, unpublish("http://n:1/")];
+    assert_eq!(kept(&ended), ended);
+    assert_eq!(kept(&[&ended[..], &ended[..]].concat()), ended);
 }
 
 #[test]
@@ -190,9 +320,10 @@ proptest! {
         here in vec(any_call("here"), 0..8),
     ) {
         let base = state(&Master::default(), &base);
-        let now = state(&base, &there);
-        let merged = merge(&base, &now, &here);
-        prop_assert_eq!(merged.send.len() + merged.lost.len(), here.len());
+        let mut changes = Changes::default();
+        let now = changed(&base, &there, &mut changes);
+        let merged = merge(&changes, &now, &here);
+        prop_assert!(merged.send.len() + merged.lost.len() <= here.len());
         let mut after = now.clone();
         for call in &merged.send {
             let mut notices: Vec<Notice> = Vec::new();
@@ -204,25 +335,9 @@ proptest! {
                 }
             }
         }
-        let changed = |key: &str| {
-            let path: Vec<_> = key.split('/').filter(|part| !part.is_empty()).collect();
-            super::is_changed(base.params(), now.params(), &path)
-        };
         for key in ["/a/b/c", "/d"] {
             let value = |of: &Master| of.params.get(key);
-            // What equals a write of this side is none of theirs.
-            let is_ours = here.iter().any(|call| {
-                let (Some(of), Some(value)) = (call.text(1), call.params().get(2)) else {
-                    return false;
-                };
-                let path: Vec<_> = of.split('/').filter(|part| !part.is_empty()).collect();
-                let related = format!("{key}/").starts_with(&format!("{}/", of.trim_end_matches('/')))
-                    || of.starts_with(key);
-                *call.method() == Method::SetParam
-                    && related
-                    && super::value_at(now.params(), &path) == Some(value)
-            });
-            if changed(key) && !is_ours {
+            if changes.has_param(&param_path(key)) {
                 prop_assert_eq!(value(&after), value(&now), "{}", key);
             }
         }

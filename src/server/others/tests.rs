@@ -91,6 +91,7 @@ impl Computer {
                 peers: Arc::new(Peers::new(instance(), second)),
                 handovers: handovers_tx,
                 passing: Arc::default(),
+                forwarded: Arc::default(),
                 served: Default::default(),
                 followed,
                 told: Arc::default(),

@@ -1,0 +1,300 @@
+//! What was changed, by subject: not by comparing states, which do not show that a parameter was set and set back.
+
+use std::{
+    collections::{BTreeSet, HashMap, HashSet},
+    ops::Bound,
+};
+
+use crate::{
+    master::{Master, Method, Request, names},
+    xmlrpc::{Struct, Value},
+};
+
+/// What a call changes, as far as another one may be about the same.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Subject {
+    /// A parameter, by its [path](param_path).
+    Param(String),
+    /// Somebody has registered something as this node.
+    Node(String),
+    Service(String),
+    Topic {
+        publishes: bool,
+        topic: String,
+        node: String,
+    },
+}
+
+impl Subject {
+    /// About how many bytes it takes.
+    pub fn size(&self) -> usize {
+        size_of::<Self>()
+            + match self {
+                Self::Param(name) | Self::Node(name) | Self::Service(name) => name.len(),
+                Self::Topic { topic, node, .. } => topic.len() + node.len(),
+            }
+    }
+
+    /// What `call`, other than a multicall, changes. An unregistration is in nobody's way.
+    pub fn of(call: &Request) -> Vec<Self> {
+        let Some(caller) = call.caller() else {
+            return Vec::new();
+        };
+        let node = Self::Node(caller.to_owned());
+        let name = || Some(names::resolve(call.text(1)?, caller));
+        let topic = |publishes| {
+            let (topic, node) = (name()?, caller.to_owned());
+            Some(Self::Topic {
+                publishes,
+                topic,
+                node,
+            })
+        };
+        match call.method() {
+            Method::SetParam | Method::DeleteParam => {
+                param_of(call).map(Self::Param).into_iter().collect()
+            }
+            Method::RegisterPublisher => topic(true).into_iter().chain([node]).collect(),
+            Method::RegisterSubscriber => topic(false).into_iter().chain([node]).collect(),
+            Method::RegisterService => {
+                let service = name().map(Self::Service);
+                service.into_iter().chain([node]).collect()
+            }
+            Method::SubscribeParam => vec![node],
+            _ => Vec::new(),
+        }
+    }
+}
+
+/// A parameter's name with a slash at its end, so that names above it are its beginnings.
+pub(super) fn param_path(key: &str) -> String {
+    let mut path = String::with_capacity(key.len() + 1);
+    path.push('/');
+    for part in names::parts(key) {
+        path.push_str(part);
+        path.push('/');
+    }
+    path
+}
+
+/// The path of the parameter that `call` sets or deletes.
+pub(super) fn param_of(call: &Request) -> Option<String> {
+    match call.method() {
+        Method::SetParam | Method::DeleteParam => {
+            Some(param_path(&names::resolve(call.text(1)?, call.caller()?)))
+        }
+        _ => None,
+    }
+}
+
+/// What others have changed since some moment.
+#[derive(Clone, Debug, Default)]
+pub struct Changes {
+    params: BTreeSet<String>,
+    rest: HashSet<Subject>,
+    own: Own,
+}
+
+impl Changes {
+    /// Calls of this computer that the others may have run before, or may still run: these are no changes of
+    /// theirs.
+    pub fn expect(&mut self, calls: impl IntoIterator<Item = Request>) {
+        for call in calls {
+            self.own.add(call);
+        }
+    }
+
+    /// This computer has given `call` to the journal as record `seq`, and the journal may have it.
+    pub fn expect_record(&mut self, seq: u64, call: Request) {
+        self.own.records.insert(seq, call);
+    }
+
+    /// The journal has `call` as record `seq`.
+    pub fn note(&mut self, seq: u64, call: &Request) {
+        if self
+            .own
+            .records
+            .remove(&seq)
+            .is_some_and(|own| own == *call)
+        {
+            return;
+        }
+        for call in call.calls() {
+            if !self.own.take(call) {
+                Subject::of(call).into_iter().for_each(|it| self.add(it));
+            }
+        }
+    }
+
+    pub fn add(&mut self, subject: Subject) {
+        match subject {
+            Subject::Param(path) => {
+                self.params.insert(path);
+            }
+            other => {
+                self.rest.insert(other);
+            }
+        }
+    }
+
+    /// The others' state was `was` and is `is`; what they did in between is not known. What they set and set
+    /// back does not show.
+    pub fn note_difference(&mut self, was: &Master, is: &Master) {
+        let mut paths = Vec::new();
+        differing("/", was.params(), is.params(), &mut paths);
+        for path in paths {
+            let parts: Vec<&str> = names::parts(&path).collect();
+            if !self.own.explains(&path, value_at(is.params(), &parts)) {
+                self.add(Subject::Param(path));
+            }
+        }
+        for (node, api) in is.nodes() {
+            if was.api_of(node) != Some(api) && !self.own.registers(node, api) {
+                self.add(Subject::Node(node.to_owned()));
+            }
+            for publishes in [true, false] {
+                let topics: Vec<_> = match publishes {
+                    true => is.publications(node).collect(),
+                    false => is.subscriptions(node).collect(),
+                };
+                let new = topics.into_iter();
+                let new = new.filter(|topic| !was.has_topic(node, publishes, topic));
+                for topic in new.filter(|_| !self.own.registers(node, api)) {
+                    let (topic, node) = (topic.to_owned(), node.to_owned());
+                    self.rest.insert(Subject::Topic {
+                        publishes,
+                        topic,
+                        node,
+                    });
+                }
+            }
+        }
+        for (name, service) in &is.registry.services {
+            let node = is.api_of(&service.node).unwrap_or_default();
+            if was.registry.services.get(name) != Some(service)
+                && !self.own.registers(&service.node, node)
+            {
+                self.add(Subject::Service(name.clone()));
+            }
+        }
+    }
+
+    /// Whether the parameter at this path or one above it was changed.
+    pub(super) fn has_above(&self, path: &str) -> bool {
+        let mut above = path.match_indices('/');
+        above.any(|(end, _)| {
+            path.get(..=end)
+                .is_some_and(|above| self.params.contains(above))
+        })
+    }
+
+    /// Whether the parameter at this path, one above it or one below it was changed.
+    pub(super) fn has_param(&self, path: &str) -> bool {
+        self.has_above(path)
+            || self
+                .params
+                .range::<str, _>((Bound::Included(path), Bound::Unbounded))
+                .next()
+                .is_some_and(|below| below.starts_with(path))
+    }
+
+    pub(super) fn has(&self, subject: &Subject) -> bool {
+        self.rest.contains(subject)
+    }
+}
+
+/// Calls of this computer. Each is met once.
+#[derive(Clone, Debug, Default)]
+struct Own {
+    /// By what they are about.
+    calls: HashMap<String, Vec<Request>>,
+    /// By their numbers in the journal.
+    records: HashMap<u64, Request>,
+}
+
+fn slot(call: &Request) -> String {
+    let name = call.text(1).unwrap_or_default();
+    let caller = call.caller().unwrap_or_default();
+    format!("{} {caller} {name}", call.method().name())
+}
+
+impl Own {
+    fn add(&mut self, call: Request) {
+        self.calls.entry(slot(&call)).or_default().push(call);
+    }
+
+    fn take(&mut self, call: &Request) -> bool {
+        let slot = slot(call);
+        let Some(calls) = self.calls.get_mut(&slot) else {
+            return false;
+        };
+        let Some(at) = calls.iter().position(|of| of == call) else {
+            return false;
+        };
+        calls.remove(at);
+        if calls.is_empty() {
+            self.calls.remove(&slot);
+        }
+        true
+    }
+
+    fn calls(&self) -> impl Iterator<Item = &Request> {
+        let records = self.records.values();
+        self.calls.values().flatten().chain(records)
+    }
+
+    /// Whether one of them made the parameter at `path` what it is.
+    fn explains(&self, path: &str, is: Option<&Value>) -> bool {
+        self.calls().any(|call| {
+            let below = param_of(call).and_then(|of| path.strip_prefix(of.as_str()));
+            let Some(below) = below else { return false };
+            let set = call.params().get(2);
+            let set = set.filter(|_| *call.method() == Method::SetParam);
+            let parts: Vec<&str> = names::parts(below).collect();
+            let value = match (set, parts.as_slice()) {
+                (set, []) => set,
+                (Some(Value::Struct(tree)), parts) => value_at(tree, parts),
+                _ => None,
+            };
+            value == is
+        })
+    }
+
+    fn registers(&self, node: &str, api: &str) -> bool {
+        let mut calls = self.calls();
+        calls.any(|call| call.registrant() == Some((node, api)))
+    }
+}
+
+/// The value at the path of these parts; none at the root.
+pub(super) fn value_at<'a>(tree: &'a Struct, path: &[&str]) -> Option<&'a Value> {
+    let (first, rest) = path.split_first()?;
+    match (tree.get(*first)?, rest) {
+        (value, []) => Some(value),
+        (Value::Struct(below), rest) => value_at(below, rest),
+        _ => None,
+    }
+}
+
+/// The paths of the values, as deep as can be, by which the trees differ.
+fn differing(path: &str, was: &Struct, is: &Struct, found: &mut Vec<String>) {
+    let added = is.iter().map(|(key, _)| key);
+    let added = added.filter(|key| was.get(key.as_str()).is_none());
+    for key in was.iter().map(|(key, _)| key).chain(added) {
+        let path = format!("{path}{key}/");
+        let empty = Struct::new();
+        match (was.get(key.as_str()), is.get(key.as_str())) {
+            (was, is) if was == is => {}
+            (Some(Value::Struct(was)), Some(Value::Struct(is))) => {
+                differing(&path, was, is, found);
+            }
+            (None, Some(Value::Struct(is))) if !is.is_empty() => {
+                differing(&path, &empty, is, found);
+            }
+            (Some(Value::Struct(was)), None) if !was.is_empty() => {
+                differing(&path, was, &empty, found);
+            }
+            _ => found.push(path),
+        }
+    }
+}

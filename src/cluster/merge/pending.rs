@@ -1,0 +1,138 @@
+//! The writes of a time alone: of each subject as many as make its last state.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::changes::param_of;
+use crate::{
+    master::{Method, Request, names},
+    xmlrpc::{self, Value},
+};
+
+/// What a registration or unregistration is about.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+struct Place {
+    what: &'static str,
+    name: String,
+    caller: String,
+}
+
+/// The last registration at a place, with its address, and the unregistrations after it.
+#[derive(Clone, Debug, Default)]
+struct Registered {
+    registration: Option<(u64, String)>,
+    unregistrations: Vec<(u64, String)>,
+}
+
+/// Writes to be sent, in order. Those that later ones have made superfluous are left out.
+#[derive(Clone, Debug, Default)]
+pub struct Pending {
+    calls: BTreeMap<u64, Request>,
+    last: u64,
+    /// Parameters by path, and whether they are set or deleted.
+    params: BTreeMap<(String, bool), u64>,
+    registered: HashMap<Place, Registered>,
+    /// Other calls, as they are encoded.
+    others: HashMap<String, u64>,
+}
+
+impl Pending {
+    /// Adds a write that was answered. The entries of a multicall are writes of their own.
+    pub fn add(&mut self, call: &Request) {
+        for call in call.calls() {
+            self.add_one(call);
+        }
+    }
+
+    fn add_one(&mut self, call: &Request) {
+        self.last += 1;
+        let number = self.last;
+        if let Some(path) = param_of(call) {
+            let sets = *call.method() == Method::SetParam;
+            let below = self.params.range((path.clone(), false)..);
+            let below = below.take_while(|((of, _), _)| of.starts_with(&path));
+            let mut below: Vec<_> = below.map(|(of, number)| (*number, of.clone())).collect();
+            below.sort();
+            if !sets {
+                // What is deleted must be there first, with the namespaces that setting it has made.
+                let last = below.iter().rposition(|(_, (_, sets))| *sets);
+                last.map(|last| below.remove(last));
+            }
+            for (number, of) in below {
+                self.params.remove(&of);
+                self.calls.remove(&number);
+            }
+            self.params.insert((path, sets), number);
+        } else if let Some((place, api, registers)) = place(call) {
+            let at = self.registered.entry(place).or_default();
+            if registers {
+                let before = std::mem::take(at);
+                at.registration = Some((number, api));
+                let before = before
+                    .registration
+                    .into_iter()
+                    .chain(before.unregistrations);
+                before.for_each(|(number, _)| {
+                    self.calls.remove(&number);
+                });
+            } else {
+                if at.registration.as_ref().is_some_and(|(_, of)| *of != api) {
+                    // Of an earlier process of the node: the master refuses it.
+                    return;
+                }
+                let before = at.unregistrations.iter().position(|(_, of)| *of == api);
+                if let Some(before) = before {
+                    let (number, _) = at.unregistrations.remove(before);
+                    self.calls.remove(&number);
+                }
+                at.unregistrations.push((number, api));
+            }
+        } else {
+            let encoded = xmlrpc::encode_call(&call.clone().into());
+            let encoded = String::from_utf8_lossy(&encoded).into_owned();
+            if let Some(before) = self.others.insert(encoded, number) {
+                self.calls.remove(&before);
+            }
+        }
+        self.calls.insert(number, call.clone());
+    }
+
+    /// In the order in which they were answered.
+    pub fn calls(&self) -> impl Iterator<Item = &Request> {
+        self.calls.values()
+    }
+
+    pub fn len(&self) -> usize {
+        self.calls.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.calls.is_empty()
+    }
+}
+
+/// What `call` is about, at which address, and whether it registers.
+fn place(call: &Request) -> Option<(Place, String, bool)> {
+    let (what, name, api, registers) = match call.method() {
+        Method::RegisterPublisher => ("publisher", 1, 3, true),
+        Method::UnregisterPublisher => ("publisher", 1, 2, false),
+        Method::RegisterSubscriber => ("subscriber", 1, 3, true),
+        Method::UnregisterSubscriber => ("subscriber", 1, 2, false),
+        Method::RegisterService => ("service", 1, 2, true),
+        Method::UnregisterService => ("service", 1, 2, false),
+        Method::SubscribeParam => ("parameter", 2, 1, true),
+        Method::UnsubscribeParam => ("parameter", 2, 1, false),
+        _ => return None,
+    };
+    let caller = call.caller()?.to_owned();
+    let place = Place {
+        what,
+        name: names::resolve(call.text(name)?, &caller),
+        caller,
+    };
+    Some((place, call.text(api)?.to_owned(), registers))
+}
+
+/// About how many bytes a call takes.
+pub fn weight(call: &Request) -> usize {
+    call.params().iter().map(Value::size).sum()
+}

@@ -1,0 +1,228 @@
+//! How a computer that was alone asks the leader to make its writes, and what it is answered.
+
+use std::sync::Arc;
+
+use super::{Conflict, Lost, Verdict};
+use crate::{
+    master::{CALLER_ID, Method, Request, entry_reply, is_success},
+    xmlrpc::{Call, Reply, Value},
+};
+
+/// The method.
+pub const METHOD: &str = "rosrescue/merge";
+/// The method of several calls in one.
+const MULTICALL: &str = "system.multicall";
+
+/// Writes that were answered alone.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ask {
+    /// The name under which all portions of a time alone are sent.
+    pub id: Arc<str>,
+    /// They conflict with nothing that was changed up to this record of the journal.
+    pub seq: u64,
+    pub calls: Vec<Request>,
+}
+
+impl Ask {
+    pub fn to_request(&self) -> Request {
+        let calls = Call::from(Request::multicall(self.calls.iter().cloned()));
+        let seq = self.seq.to_string();
+        let head = [CALLER_ID, &*self.id, seq.as_str()].map(Value::from);
+        Request::new(
+            Method::named(METHOD),
+            head.into_iter().chain(calls.params.into_iter().take(1)),
+        )
+    }
+
+    /// None if `request` is something else.
+    pub fn read(request: &Request) -> Option<Self> {
+        let is_it = matches!(request.method(), Method::Unknown(name) if **name == *METHOD);
+        let calls = request.params().get(3).filter(|_| is_it)?;
+        let calls = Request::from(Call::new(MULTICALL, vec![calls.clone()]));
+        Some(Self {
+            id: request.text(1)?.into(),
+            seq: request.text(2)?.parse().ok()?,
+            calls: calls.calls().into_iter().cloned().collect(),
+        })
+    }
+}
+
+/// What has become of one write.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// It was made, or what it sets is there.
+    Holds,
+    /// The master has refused it.
+    Refused(String),
+    /// Others have changed the same.
+    Lost { why: String, present: Option<Value> },
+}
+
+impl From<&Lost> for Outcome {
+    fn from(lost: &Lost) -> Self {
+        Self::Lost {
+            why: lost.why.to_string(),
+            present: match lost.why {
+                Conflict::Parameter(_) => lost.present.clone(),
+                _ => None,
+            },
+        }
+    }
+}
+
+/// The leader's answer.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Answer {
+    /// It does not know all that was changed after the record: judge anew.
+    Again,
+    /// For each write.
+    Done(Vec<Outcome>),
+}
+
+impl Answer {
+    /// What has become of writes with these verdicts, when the master has answered those that ran with `reply`.
+    pub fn of(verdicts: &[Verdict], reply: &Reply) -> Self {
+        let results = match reply {
+            Reply::Value(Value::Array(results)) => results.as_slice(),
+            _ => &[],
+        };
+        let mut results = results.iter();
+        let outcomes = verdicts.iter().map(|verdict| match verdict {
+            Verdict::Holds => Outcome::Holds,
+            Verdict::Lost(lost) => lost.into(),
+            // Without a result it was made: the master could not write the whole answer.
+            Verdict::Runs => match results.next().and_then(entry_reply) {
+                Some(reply) if !is_success(&reply) => Outcome::Refused(text(&reply)),
+                _ => Outcome::Holds,
+            },
+        });
+        Self::Done(outcomes.collect())
+    }
+
+    pub fn to_reply(&self) -> Reply {
+        let (code, outcomes) = match self {
+            Self::Again => (0, Vec::new()),
+            Self::Done(outcomes) => (1, outcomes.iter().map(value).collect()),
+        };
+        let text = match self {
+            Self::Again => "what was changed since is not known any more",
+            Self::Done(_) => "merged",
+        };
+        Reply::Value(vec![code.into(), text.into(), Value::Array(outcomes)].into())
+    }
+
+    /// The answer for `count` writes; none if it is no answer to this, as from one that does not know the method.
+    pub fn read(reply: &Reply, count: usize) -> Option<Self> {
+        let Reply::Value(Value::Array(answer)) = reply else {
+            return None;
+        };
+        match answer.as_slice() {
+            [Value::Int(0), _, Value::Array(none)] if none.is_empty() => Some(Self::Again),
+            [Value::Int(1), _, Value::Array(outcomes)] => {
+                let outcomes: Vec<_> = outcomes.iter().map(outcome).collect::<Option<_>>()?;
+                (outcomes.len() == count).then_some(Self::Done(outcomes))
+            }
+            _ => None,
+        }
+    }
+}
+
+fn value(outcome: &Outcome) -> Value {
+    let (code, text, present) = match outcome {
+        Outcome::Holds => (1, "", None),
+        Outcome::Refused(text) => (0, text.as_str(), None),
+        Outcome::Lost { why, present } => (-1, why.as_str(), present.clone()),
+    };
+    let parts = [Value::Int(code), text.into()].into_iter().chain(present);
+    Value::Array(parts.collect())
+}
+
+fn outcome(value: &Value) -> Option<Outcome> {
+    let parts = value.as_array()?;
+    let text = || Some(parts.get(1)?.as_str()?.to_owned());
+    Some(match parts.first()?.as_int()? {
+        1 => Outcome::Holds,
+        0 => Outcome::Refused(text()?),
+        -1 => Outcome::Lost {
+            why: text()?,
+            present: parts.get(2).cloned(),
+        },
+        _ => return None,
+    })
+}
+
+/// The words of a refusal.
+fn text(reply: &Reply) -> String {
+    match reply {
+        Reply::Fault { text, .. } => text.clone(),
+        Reply::Value(value) => {
+            let text = value.as_array().and_then(|answer| answer.get(1)?.as_str());
+            text.unwrap_or_default().to_owned()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(key: &str, value: i32) -> Request {
+        let params = [Value::from("/n"), key.into(), value.into()];
+        Request::new(Method::SetParam, params)
+    }
+
+    fn coded(request: Request) -> Request {
+        let body = crate::xmlrpc::encode_call(&request.into());
+        Request::decode(&body).unwrap()
+    }
+
+    #[test]
+    fn what_is_asked_is_read_as_it_was_written() {
+        let ask = Ask {
+            id: "one".into(),
+            seq: u64::MAX,
+            calls: vec![set("/a", 1), set("/b", 2)],
+        };
+        assert_eq!(Ask::read(&coded(ask.to_request())), Some(ask));
+        assert_eq!(Ask::read(&set("/a", 1)), None);
+        let short = Request::new(Method::named(METHOD), [CALLER_ID, "one", "1"]);
+        assert_eq!(Ask::read(&short), None);
+    }
+
+    #[test]
+    fn each_write_has_an_outcome_and_those_that_did_not_run_take_no_result() {
+        let call = set("/a", 1);
+        let why = Conflict::Parameter("/a".to_owned());
+        let present = Some(Value::Int(2));
+        let lost = Verdict::Lost(Lost { call, why, present });
+        let verdicts = [Verdict::Runs, lost, Verdict::Holds, Verdict::Runs];
+        let result = |code: i32, text: &str| {
+            let reply: Vec<Value> = vec![code.into(), text.into(), 0.into()];
+            Value::Array(vec![reply.into()])
+        };
+        let reply = Reply::Value(vec![result(1, "done"), result(-1, "no")].into());
+        let answer = Answer::of(&verdicts, &reply);
+        let expected = Answer::Done(vec![
+            Outcome::Holds,
+            Outcome::Lost {
+                why: "the parameter `/a` was changed meanwhile".to_owned(),
+                present: Some(Value::Int(2)),
+            },
+            Outcome::Holds,
+            Outcome::Refused("no".to_owned()),
+        ]);
+        assert_eq!(answer, expected);
+        assert_eq!(Answer::read(&answer.to_reply(), 4), Some(expected));
+        assert_eq!(Answer::read(&answer.to_reply(), 3), None);
+        let again = Answer::Again.to_reply();
+        assert_eq!(Answer::read(&again, 4), Some(Answer::Again));
+    }
+
+    #[test]
+    fn who_does_not_know_the_method_has_not_answered() {
+        let (code, text) = (1, "method is not supported".to_owned());
+        assert_eq!(Answer::read(&Reply::Fault { code, text }, 1), None);
+        let reply: Vec<Value> = vec![(-1).into(), "what?".into(), 0.into()];
+        assert_eq!(Answer::read(&Reply::Value(reply.into()), 1), None);
+    }
+}

@@ -1,0 +1,89 @@
+//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now, they may be in the
+//! journal, and are no changes by others.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use crate::{cluster::merge::weight, master::Request};
+
+/// Most that are remembered,
+const MOST: usize = 1000;
+/// and the most bytes of one, about. One that is not remembered is reported as lost although it is there.
+const BYTES_MOST: usize = 1 << 20;
+
+/// See the [module](self).
+#[derive(Debug, Default)]
+pub(crate) struct Forwarded(Mutex<Calls>);
+
+#[derive(Debug, Default)]
+struct Calls {
+    last: u64,
+    calls: BTreeMap<u64, Request>,
+}
+
+impl Forwarded {
+    fn lock(&self) -> MutexGuard<'_, Calls> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// `call` is sent from now on. It is answered, or nobody waits for it, when the result is dropped.
+    pub(super) fn begin(self: &Arc<Self>, call: &Request) -> Option<Sent> {
+        let bytes: usize = call.calls().into_iter().map(weight).sum();
+        let mut calls = self.lock();
+        if calls.calls.len() >= MOST || bytes > BYTES_MOST {
+            return None;
+        }
+        calls.last += 1;
+        let number = calls.last;
+        calls.calls.insert(number, call.clone());
+        let of = self.clone();
+        Some(Sent { of, number })
+    }
+
+    /// The calls in them that write.
+    pub(crate) fn writes(&self) -> Vec<Request> {
+        let calls = self.lock();
+        let calls = calls.calls.values().flat_map(Request::calls);
+        let writes = calls.filter(|call| call.kind().mutates());
+        writes.cloned().collect()
+    }
+}
+
+/// A call that was sent.
+pub(super) struct Sent {
+    of: Arc<Forwarded>,
+    number: u64,
+}
+
+impl Drop for Sent {
+    fn drop(&mut self) {
+        self.of.lock().calls.remove(&self.number);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::master::Method;
+
+    #[test]
+    fn a_write_is_remembered_until_it_is_answered() {
+        let set = |key: &str| Request::new(Method::SetParam, ["/n", key, "v"]);
+        let get = Request::new(Method::GetParam, ["/n", "/a"]);
+        let forwarded = Arc::new(Forwarded::default());
+        let first = forwarded.begin(&set("/a"));
+        let second = forwarded.begin(&Request::multicall([get, set("/b")]));
+        assert_eq!(forwarded.writes(), [set("/a"), set("/b")]);
+        drop(first);
+        assert_eq!(forwarded.writes(), [set("/b")]);
+        drop(second);
+        assert_eq!(forwarded.writes(), []);
+        let large = "x".repeat(BYTES_MOST + 1);
+        let large = Request::new(Method::SetParam, ["/n", "/a", large.as_str()]);
+        assert!(forwarded.begin(&large).is_none());
+        let sent: Vec<_> = (0..=MOST).map(|_| forwarded.begin(&set("/a"))).collect();
+        assert_eq!(sent.iter().flatten().count(), MOST);
+    }
+}

@@ -1,0 +1,233 @@
+use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
+use std::thread::scope;
+
+use rosrescue::xmlrpc::Value;
+
+use crate::alone;
+use crate::computer::{Computer, PORT};
+use crate::fleet::Fleet;
+use crate::network::enter;
+use crate::support::{Client, Finish, eventually, params};
+
+/// Keys of the writes in bulk.
+const KEYS: usize = 1500;
+/// One in so many is written by others after the network was mended.
+const SHARED: usize = 50;
+
+fn key(number: usize) -> String {
+    format!("/bulk/k{number}")
+}
+
+/// Waits until the writes of the time alone are where they belong.
+#[track_caller]
+fn await_merged(computer: &Computer) {
+    eventually("its writes have been sent", || {
+        !computer
+            .logged("writes of a time alone were sent")
+            .is_empty()
+    });
+}
+
+fn lost_writes(computer: &Computer) -> Option<u64> {
+    computer.status()?["cluster"]["lost_writes"].as_u64()
+}
+
+#[test]
+fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let leader = fleet.await_whole();
+    let cut = (leader + 1) % 3;
+    let before = [("/estop", 0), ("/back", 1), ("/wifi/password", 1)];
+    for (key, value) in before {
+        fleet.computers[leader].set_param(key, value);
+    }
+    fleet.await_same_state();
+    fleet.network.cut_cable(cut);
+    let next = fleet.await_leader_of(&fleet.others(cut));
+    let (others, lonely) = (&fleet.computers[next], &fleet.computers[cut]);
+    eventually("it says that it is alone", || lonely.role_is("alone"));
+    others.set_param("/estop", 1);
+    lonely.set_param("/estop", 1);
+    lonely.set_param("/estop", 0);
+    // As it was, and yet they have written it.
+    others.set_param("/back", 2);
+    others.set_param("/back", 1);
+    lonely.set_param("/back", 7);
+    others.set_param("/wifi/password", 2);
+    lonely.set_param("/wifi/password", 31337);
+    for value in 0..100 {
+        lonely.set_param("/only_here", value);
+    }
+    fleet.network.mend_cable(cut);
+    fleet.await_whole();
+    await_merged(lonely);
+    fleet.await_same_state();
+    let expected = [
+        ("/estop", 1),
+        ("/back", 1),
+        ("/wifi/password", 2),
+        ("/only_here", 99),
+    ];
+    for computer in &fleet.computers {
+        for (key, value) in expected {
+            let found = computer.param(key);
+            assert_eq!(found, Some(Value::Int(value)), "{key} on {}", computer.name);
+        }
+    }
+    eventually("the lost writes are counted", || {
+        lost_writes(lonely) == Some(3)
+    });
+    let lines = lonely.logged("does not hold");
+    assert_eq!(lines.len(), 3, "{lines:#?}");
+    for (key, alone, others) in [
+        ("`/estop`", "alone=0", "others=1"),
+        ("`/back`", "alone=7", "others=1"),
+        ("`/wifi/password`", "(hidden)", "(hidden)"),
+    ] {
+        let line = lines.iter().find(|line| line.contains(key));
+        let line = line.unwrap_or_else(|| panic!("{key} is not in {lines:#?}"));
+        assert!(line.contains("WARN") && line.contains(alone) && line.contains(others));
+        assert!(!line.contains("31337"), "{line}");
+    }
+    fleet.assert_nodes_live();
+}
+
+#[test]
+fn no_write_from_alone_replaces_what_others_write_while_it_is_being_sent() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let leader = fleet.await_whole();
+    let cut = (leader + 1) % 3;
+    fleet.network.cut_cable(cut);
+    let next = fleet.await_leader_of(&fleet.others(cut));
+    let (others, lonely) = (&fleet.computers[next], &fleet.computers[cut]);
+    eventually("it says that it is alone", || lonely.role_is("alone"));
+    lonely.within(|| {
+        let client = lonely.client();
+        for number in 0..KEYS {
+            client.set_param(&key(number), -1);
+        }
+    });
+    fleet.network.mend_cable(cut);
+    let finish = AtomicBool::new(false);
+    // The value of each shared key that was answered last.
+    let written = scope(|scope| {
+        let writer = scope.spawn(|| {
+            others.within(|| {
+                let client = others.client();
+                let mut written = vec![0; KEYS / SHARED];
+                // The first ones are there: the last ones are on their way.
+                while client.param(&key(1)).is_none() && !finish.load(Ordering::Relaxed) {}
+                for round in 1.. {
+                    for (nth, last) in written.iter_mut().enumerate().rev() {
+                        let params = params!["/writer", key(nth * SHARED), round];
+                        client.ok("setParam", params);
+                        *last = round;
+                    }
+                    if finish.load(Ordering::Relaxed) {
+                        break;
+                    }
+                }
+                written
+            })
+        });
+        let finish = Finish(&finish);
+        await_merged(lonely);
+        drop(finish);
+        writer.join().unwrap()
+    });
+    fleet.await_whole();
+    fleet.await_same_state();
+    let state = fleet.computers[cut].state().unwrap();
+    let bulk = state.params.as_struct().unwrap().get("bulk").unwrap();
+    let bulk = bulk.as_struct().unwrap();
+    let wrong: Vec<_> = (0..KEYS)
+        .filter_map(|number| {
+            let expected = match number % SHARED {
+                0 => written[number / SHARED],
+                _ => -1,
+            };
+            let found = bulk.get(&format!("k{number}"));
+            (found != Some(&Value::Int(expected))).then_some((number, found, expected))
+        })
+        .collect();
+    assert!(
+        wrong.is_empty(),
+        "{} keys are wrong: {wrong:?}",
+        wrong.len()
+    );
+    println!(
+        "{} writes, {:?} lost, the last one of others: {}",
+        KEYS,
+        lost_writes(&fleet.computers[cut]),
+        written[0]
+    );
+    fleet.assert_nodes_live();
+}
+
+/// Its own calls are answered alone; those that were forwarded to it are made again by the others.
+#[test]
+fn a_leader_without_etcd_keeps_no_call_that_others_make_elsewhere() {
+    let _alone = alone();
+    let mut fleet = Fleet::start(&["--alone", "serve"]);
+    let leader = fleet.await_whole();
+    let rest = fleet.others(leader);
+    let key = |index: usize| format!("/counted_by_{index}");
+    let finish = AtomicBool::new(false);
+    let counts = [0, 1, 2].map(AtomicI32::new);
+    scope(|scope| {
+        let finish = Finish(&finish);
+        for &index in &rest {
+            let (count, finish) = (&counts[index], finish.0);
+            let namespace = fleet.computers[index].namespace.clone();
+            scope.spawn(move || {
+                enter(&namespace);
+                let client = Client::new(PORT);
+                for value in 1.. {
+                    client.ok("setParam", params!["/writer", key(index), value]);
+                    count.store(value, Ordering::Relaxed);
+                    if finish.load(Ordering::Relaxed) {
+                        return;
+                    }
+                }
+            });
+        }
+        let await_more = || {
+            for &index in &rest {
+                let before = counts[index].load(Ordering::Relaxed);
+                eventually("they go on", || {
+                    counts[index].load(Ordering::Relaxed) > before + 20
+                });
+            }
+        };
+        await_more();
+        for &other in &rest {
+            fleet.network.cut_port(leader, other, 2379);
+        }
+        fleet.computers[leader].kill_etcd();
+        fleet.await_leader_of(&rest);
+        let lonely = &fleet.computers[leader];
+        eventually("it says that it is alone", || lonely.role_is("alone"));
+        lonely.set_param("/alone", 1);
+        await_more();
+        for &other in &rest {
+            fleet.network.mend_port(leader, other, 2379);
+        }
+        fleet.computers[leader].start_etcd();
+        fleet.await_whole();
+        await_merged(&fleet.computers[leader]);
+        await_more();
+        drop(finish);
+    });
+    fleet.await_same_state();
+    for computer in &fleet.computers {
+        assert_eq!(computer.param("/alone"), Some(Value::Int(1)));
+        for &index in &rest {
+            let last = counts[index].load(Ordering::Relaxed);
+            assert_eq!(computer.param(&key(index)), Some(Value::Int(last)));
+        }
+    }
+    assert_eq!(lost_writes(&fleet.computers[leader]), Some(0));
+    fleet.assert_nodes_live();
+}
