@@ -13,7 +13,7 @@ use crate::{
 /// What a call changes, as far as another one may be about the same.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Subject {
-    /// A parameter, by its [path](param_path).
+    /// A parameter, by its resolved name, which ends in `/`.
     Param(String),
     /// Somebody has registered something as this node.
     Node(String),
