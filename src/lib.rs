@@ -58,7 +58,6 @@ pub(crate) mod ledger;
 pub mod lifecycle;
 pub(crate) mod limit;
 pub mod log;
-pub mod master;
 pub(crate) mod nodes;
 pub(crate) mod order;
 pub(crate) mod process;
@@ -73,6 +72,6 @@ pub(crate) mod status;
 pub(crate) mod upstream;
 pub(crate) mod wait;
 pub(crate) mod write_queue;
-pub mod xmlrpc;
 
+pub use ros1_master::{master, xmlrpc};
 pub use server::listener;

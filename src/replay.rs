@@ -14,6 +14,8 @@ mod order;
 mod plan;
 mod reconcile;
 mod restore;
+#[cfg(test)]
+mod tests;
 mod token;
 mod treatment;
 

@@ -6,5 +6,5 @@ set -eu
 cd "$(dirname "$0")/.."
 
 cargo fmt --all --check
-cargo clippy --locked --all-targets -- -D warnings
-cargo test --locked --lib --test codec --test checkpoint --test tidy
+cargo clippy --locked --workspace --all-targets -- -D warnings
+cargo test --locked --workspace --lib --test codec --test checkpoint --test tidy

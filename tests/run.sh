@@ -19,8 +19,8 @@ fi
 . tests/install_etcd.sh
 
 cargo fmt --all --check
-cargo clippy --locked --all-targets -- -D warnings
-RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps
+cargo clippy --locked --workspace --all-targets -- -D warnings
+RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps
 if command -v cargo-deny >/dev/null; then
     cargo deny --locked check licenses bans sources
     for advisories in "${CARGO_HOME:-$HOME/.cargo}"/advisory-dbs/*/crates; do
@@ -39,4 +39,4 @@ cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGE
 # Tests with real ROS wait for processes most of the time: twice as many at once as there are cores. Those
 # that measure times (tests/timing) run one at a time in any case.
 threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
-RUST_TEST_THREADS=$threads cargo test --locked --no-fail-fast
+RUST_TEST_THREADS=$threads cargo test --locked --workspace --no-fail-fast

@@ -186,7 +186,7 @@ fn node(changes: &Changes, now: &Master, caller: &str, api: &str) -> Option<Conf
 
 /// Whether another node provides the service that is at `api` here.
 fn service(changes: &Changes, now: &Master, name: &str, api: &str) -> Option<Conflict> {
-    let provider = now.registry.services.get(name)?;
+    let provider = now.registry().services.get(name)?;
     let theirs = changes.has(&Subject::Service(name.to_owned()));
     (provider.api != api && theirs).then(|| Conflict::Service {
         name: name.to_owned(),

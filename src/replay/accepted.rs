@@ -194,7 +194,7 @@ pub(super) fn is_write_error(text: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::xmlrpc::Struct;
+    use crate::{replay::tests::calls::malformed, xmlrpc::Struct};
 
     #[test]
     fn two_refusals_are_alike_and_a_refusal_is_no_success() {
@@ -297,7 +297,7 @@ mod tests {
 
     #[test]
     fn what_came_before_a_malformed_entry_has_run() {
-        let call = Request::multicall([set("/a", 1)]).malformed();
+        let call = malformed(Request::multicall([set("/a", 1)]));
         let found = of(&Master::default(), &call);
         assert_eq!(found.calls.len(), 1);
         assert!(!found.certain);
@@ -309,7 +309,7 @@ mod tests {
         let count = 20_000;
         let sets = (0..count).map(|index| set(&format!("/p{index}"), 1));
         let fails = (0..count)
-            .map(|index| Request::multicall([set("/q", index), set("/", index)]).malformed());
+            .map(|index| malformed(Request::multicall([set("/q", index), set("/", index)])));
         let call = Request::multicall(sets.chain(fails));
         let found = of(&Master::default(), &call);
         assert!(!found.certain);

@@ -12,7 +12,7 @@ const MOST: usize = 20;
 /// are equal. Names keys, nodes and addresses, never the value of a parameter.
 pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     let mut words = Words(Vec::new());
-    let (a, b) = (&mirror.registry, &master.registry);
+    let (a, b) = (mirror.registry(), master.registry());
     words.map("the node", &a.nodes, &b.nodes, |words, caller_id, a, b| {
         if a.api != b.api {
             words.say(|| {
@@ -59,7 +59,7 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     if a.had_services != b.had_services {
         words.say(|| "only one of both has ever had a service".to_owned());
     }
-    let (a, b) = (&mirror.topic_types, &master.topic_types);
+    let (a, b) = (mirror.topic_types(), master.topic_types());
     words.map("the type of", a, b, |words, topic, a, b| {
         if a != b {
             words.say(|| {

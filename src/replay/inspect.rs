@@ -62,11 +62,11 @@ impl Inspection {
 
     /// Puts everything into the order of `mirror`, as far as it is there: the master has none of its own.
     pub fn arrange_like(&mut self, mirror: &Master) {
-        let registry = &mirror.registry;
+        let registry = mirror.registry();
         order::arrange(&mut self.publishers, &registry.publishers);
         order::arrange(&mut self.subscribers, &registry.subscribers);
         order::arrange(&mut self.services, &registry.services);
-        order::arrange(&mut self.topic_types, &mirror.topic_types);
+        order::arrange(&mut self.topic_types, mirror.topic_types());
         if let Some(params) = &mut self.params {
             order::arrange_params(params, mirror.params());
         }
@@ -233,7 +233,7 @@ impl Inspection {
                 .clone()
                 .unwrap_or_else(|| previous.params().clone()),
             topic_types: self.topic_types.clone(),
-            had_services: previous.registry.had_services,
+            had_services: previous.registry().had_services,
             ..Snapshot::default()
         };
         for caller_id in self.nodes(previous) {
@@ -246,7 +246,7 @@ impl Inspection {
             }
         }
         for (service, provider) in &self.services {
-            let known = previous.registry.services.get(service);
+            let known = previous.registry().services.get(service);
             let known = known.filter(|known| known.node == *provider);
             let api = address(
                 Method::LookupService,
@@ -266,7 +266,7 @@ impl Inspection {
         };
         found.publishers = only(self.publishers, |node| found.nodes.contains_key(node));
         found.subscribers = only(self.subscribers, |node| found.nodes.contains_key(node));
-        let subscriptions = previous.registry.param_subscribers.clone();
+        let subscriptions = previous.registry().param_subscribers.clone();
         found.param_subscribers = only(subscriptions, same);
         for topic in found.publishers.keys() {
             if !found.topic_types.contains_key(topic) {
@@ -274,11 +274,9 @@ impl Inspection {
             }
         }
         keep_references(&mut found, previous);
-        let master = Master::from_snapshot(found).map_err(|_| form(Method::GetSystemState))?;
-        Ok(Master {
-            inexact: self.params.is_none(),
-            ..master
-        })
+        let mut master = Master::from_snapshot(found).map_err(|_| form(Method::GetSystemState))?;
+        master.set_inexact(self.params.is_none());
+        Ok(master)
     }
 }
 
@@ -298,7 +296,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
     let held: HashSet<String> = registered.chain(providers).collect();
     let services = &found.services;
     found.nodes.retain(|caller_id, node| {
-        let before = previous.registry.nodes.get(caller_id);
+        let before = previous.registry().nodes.get(caller_id);
         if let Some(before) = before.filter(|before| before.api == node.api) {
             let lost = |service: &&String| {
                 services

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use super::inspect::lookup;
 use super::restore::{self, Restore};
 use super::{Token, order};
-use crate::master::{CALLER_ID, Master, Method, Request, multicall, returnable};
+use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
 /// Most mismatches to list.
@@ -204,7 +204,7 @@ impl Plan {
         let mut answer = ListWriter::answer();
         let mut write = |call: Request, predicted: Reply| {
             request.push(&call.into_entry());
-            answer.push(&multicall::reply_entry(predicted));
+            answer.push(&reply_entry(predicted));
         };
         // Tokens are not a part of the mirror. They subscribe unset keys.
         let aside = |call: Request| {
@@ -318,9 +318,9 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     if returnable::is_writable(model.params()) {
         calls.push(Request::new(Method::GetParam, [CALLER_ID, "/"]));
     }
-    let nodes = found.registry.nodes.keys();
+    let nodes = found.registry().nodes.keys();
     calls.extend(nodes.filter_map(|node| lookup(Method::LookupNode, node)));
-    let services = found.registry.services.keys();
+    let services = found.registry().services.keys();
     calls.extend(services.filter_map(|service| lookup(Method::LookupService, service)));
     calls
 }

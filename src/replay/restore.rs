@@ -30,8 +30,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Brings a model of `found` to `target`. `types_win`: `found` has no registrations, and where it has another
     /// type for a topic it gets the target's.
     pub(super) fn run(target: &'a Master, found: &'a Master, types_win: bool, write: W) -> Self {
-        let known = found.topic_types.keys();
-        let first = target.topic_types.keys().take(known.len());
+        let known = found.topic_types().keys();
+        let first = target.topic_types().keys().take(known.len());
         let mut restore = Self {
             ordered: known.eq(first),
             write,
@@ -51,7 +51,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         restore.star_types();
         restore.changed_types();
         restore.subscribers();
-        restore.types_before(target.topic_types.len());
+        restore.types_before(target.topic_types().len());
         restore.param_subscribers();
         restore
     }
@@ -149,8 +149,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     fn publishers(&mut self) {
         let (target, found) = (self.target, self.found);
-        for (topic, callers) in &target.registry.publishers {
-            let there = found.registry.publishers.get(topic);
+        for (topic, callers) in &target.registry().publishers {
+            let there = found.registry().publishers.get(topic);
             let mut missing = self.missing(topic, callers, there, names::name_for);
             if missing.is_empty() {
                 continue;
@@ -185,7 +185,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     fn take_out_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
         let found = self.found;
         let subscribers = found
-            .registry
+            .registry()
             .subscribers
             .get(topic)
             .map_or(&[][..], Vec::as_slice);
@@ -203,12 +203,12 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     fn services(&mut self) {
         let target = self.target;
         let mut losers: HashMap<&str, Vec<&str>> = HashMap::new();
-        for (caller_id, node) in &target.registry.nodes {
+        for (caller_id, node) in &target.registry().nodes {
             for service in target.taken_over(caller_id, node) {
                 losers.entry(service).or_default().push(caller_id);
             }
         }
-        for (service, entry) in &target.registry.services {
+        for (service, entry) in &target.registry().services {
             let losers = losers.remove(service.as_str()).unwrap_or_default();
             if self.leave_service(service, &losers) {
                 continue;
@@ -229,7 +229,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
                 }
             }
         }
-        for (caller_id, node) in &target.registry.nodes {
+        for (caller_id, node) in &target.registry().nodes {
             for service in target.taken_over(caller_id, node) {
                 if let Some(losers) = losers.remove(service.as_str())
                     && !self.leave_service(service, &losers)
@@ -242,8 +242,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     /// A master that has ever had a service answers `unregisterService` with a different message.
     fn had_services(&mut self) {
-        if self.target.registry.had_services
-            && !self.model.registry.had_services
+        if self.target.registry().had_services
+            && !self.model.registry().had_services
             && let Some((helper, name)) = self.helper("/rosrescue")
         {
             self.take_and_give_up(&helper, &name);
@@ -258,10 +258,10 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Whether a service has a provider in the new master. Then the service and its former providers are left
     /// out.
     fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
-        let Some(found) = self.found.registry.services.get(service) else {
+        let Some(found) = self.found.registry().services.get(service) else {
             return false;
         };
-        let entry = self.target.registry.services.get(service);
+        let entry = self.target.registry().services.get(service);
         if let Some(entry) = entry.filter(|entry| *entry != found)
             && self.api(&entry.node).is_some()
         {
@@ -272,7 +272,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             });
         }
         for caller_id in losers {
-            let node = self.found.registry.nodes.get(*caller_id);
+            let node = self.found.registry().nodes.get(*caller_id);
             let there = node.is_some_and(|node| node.services.contains(service));
             if self.api(caller_id).is_some() && !there {
                 self.skipped.push(Skipped::Reference {
@@ -319,8 +319,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     fn subscribers(&mut self) {
         let (target, found) = (self.target, self.found);
-        for (topic, callers) in &target.registry.subscribers {
-            let there = found.registry.subscribers.get(topic);
+        for (topic, callers) in &target.registry().subscribers {
+            let there = found.registry().subscribers.get(topic);
             let missing = self.missing(topic, callers, there, names::name_for);
             if missing.is_empty() {
                 continue;
@@ -338,8 +338,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
 
     fn param_subscribers(&mut self) {
         let (target, found) = (self.target, self.found);
-        for (key, callers) in &target.registry.param_subscribers {
-            let there = found.registry.param_subscribers.get(key);
+        for (key, callers) in &target.registry().param_subscribers {
+            let there = found.registry().param_subscribers.get(key);
             for (caller_id, name, api) in self.missing(key, callers, there, names::param_name_for) {
                 self.push(Method::SubscribeParam, [caller_id, api, &name]);
             }
@@ -349,8 +349,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Adds the types that precede that of a topic about to be registered.
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
-            && !self.model.topic_types.contains_key(topic)
-            && let Some(index) = self.target.topic_types.get_index_of(topic)
+            && !self.model.topic_types().contains_key(topic)
+            && let Some(index) = self.target.topic_types().get_index_of(topic)
         {
             self.types_before(index);
         }
@@ -360,8 +360,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// the subscribers, who would be notified of it.
     fn star_types(&mut self) {
         let target = self.target;
-        for (topic, topic_type) in &target.topic_types {
-            if topic_type == "*" && !self.model.topic_types.contains_key(topic) {
+        for (topic, topic_type) in target.topic_types() {
+            if topic_type == "*" && !self.model.topic_types().contains_key(topic) {
                 self.types_up_to(topic);
                 self.bring_type(topic, topic_type);
             }
@@ -372,7 +372,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// subscribers, who would be notified of it.
     fn changed_types(&mut self) {
         let target = self.target;
-        for (topic, topic_type) in &target.topic_types {
+        for (topic, topic_type) in target.topic_types() {
             let known = self.model.type_of(topic);
             let differs = known.is_some_and(|known| known != topic_type);
             if self.types_win && differs && topic_type != "*" {
@@ -384,7 +384,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// Adds the first `end` of the target's types.
     fn types_before(&mut self, end: usize) {
         let target = self.target;
-        let types = target.topic_types.iter().take(end).skip(self.types_in);
+        let types = target.topic_types().iter().take(end).skip(self.types_in);
         for (topic, topic_type) in types {
             self.bring_type(topic, topic_type);
         }
@@ -394,18 +394,18 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     /// A caller id that is not a node's, and the name with which it addresses `key`.
     fn helper(&self, key: &str) -> Option<(String, String)> {
         let is_node = |caller_id: &str| {
-            let nodes = [self.target, self.found].map(|master| &master.registry.nodes);
+            let nodes = [self.target, self.found].map(|master| &master.registry().nodes);
             nodes.iter().any(|nodes| nodes.contains_key(caller_id))
         };
         names::reach(key, HELPER, |caller_id| !is_node(caller_id))
     }
 
     fn bring_type(&mut self, topic: &str, topic_type: &str) {
-        if self.model.topic_types.contains_key(topic) {
+        if self.model.topic_types().contains_key(topic) {
             return;
         }
         let is_star = topic_type == "*";
-        if is_star && self.model.registry.subscribers.contains_key(topic) {
+        if is_star && self.model.registry().subscribers.contains_key(topic) {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };

@@ -65,6 +65,13 @@ fn weight(entry: &Entry) -> usize {
 mod tests {
     use super::*;
 
+    /// The multicall with a malformed entry at its end.
+    fn malformed(call: Request) -> Request {
+        let mut entries = call.into_entries();
+        entries.push(Entry::Malformed("malformed".into()));
+        Request::of_entries(entries)
+    }
+
     fn set(value: &str) -> Request {
         Request::new(Method::SetParam, ["/n", "/a", value])
     }
@@ -114,7 +121,7 @@ mod tests {
             with(of(Method::Shutdown)),
             with(of(Method::named("system.listMethods"))),
             with(Request::multicall([])),
-            Request::multicall(many(1000)).malformed(),
+            malformed(Request::multicall(many(1000))),
         ] {
             let mut whole = Some(call.clone());
             assert!(Parts::of(&mut whole, 0).is_none());

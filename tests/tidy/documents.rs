@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeSet, fs, process::Command};
 
-use super::{blocks::documents, commands::quoted, read, root, rust_files};
+use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
 /// A longer README is read by nobody: one screen and a half, and tables.
 const README_BYTES_MOST: usize = 12 << 10;
@@ -113,8 +113,11 @@ fn there_is_a_reason_for_every_dependency_and_for_no_other() {
     let mut names = BTreeSet::new();
     for line in manifest.lines() {
         if line.starts_with('[') {
-            listed = ["[dependencies]", "[dev-dependencies]"].contains(&line);
-        } else if listed && let Some((name, _)) = line.split_once(" = ") {
+            listed = line == "[workspace.dependencies]";
+        } else if listed
+            && let Some((name, of)) = line.split_once(" = ")
+            && !of.contains("path = ")
+        {
             assert!(
                 document.contains(&format!("\n| `{name}`")),
                 "no reason for `{name}` in CONTRIBUTING.md"
@@ -182,7 +185,7 @@ fn links_in_documents_lead_somewhere() {
 /// Comments name documents by their path from the top, too.
 #[test]
 fn documents_that_the_source_names_exist() {
-    for file in rust_files(&root().join("src")) {
+    for file in sources() {
         for name in read(&file).split("`docs/").skip(1) {
             let name = format!("docs/{}", name.split('`').next().unwrap());
             assert!(
@@ -197,7 +200,7 @@ fn documents_that_the_source_names_exist() {
 /// A file that is renamed leaves its name behind in documents.
 #[test]
 fn files_and_functions_that_documents_name_exist() {
-    let sources: Vec<_> = rust_files(&root().join("src")).iter().map(read).collect();
+    let sources: Vec<_> = sources().iter().map(read).collect();
     let is_in_source = |text: &str| sources.iter().any(|source| source.contains(text));
     let (mut files, mut functions) = (0, 0);
     for document in documents() {
@@ -205,8 +208,9 @@ fn files_and_functions_that_documents_name_exist() {
         for name in quoted(&text) {
             let is_path = name.ends_with(".rs") && !name.contains([' ', '*']);
             if is_path {
-                let mut places = ["", "src", "tests"].iter().map(|place| root().join(place));
-                let exists = places.any(|place| place.join(name).exists());
+                let mut places = ["", "tests"].map(|place| root().join(place)).to_vec();
+                places.extend(source_folders());
+                let exists = places.iter().any(|place| place.join(name).exists());
                 assert!(exists, "{} names the file {name}", document.display());
                 files += 1;
             }
@@ -234,11 +238,8 @@ fn tests_that_the_table_of_decisions_names_exist() {
     let text = read(root().join("docs/architecture.md"));
     let (_, table) = text.split_once("## Where it is decided").unwrap();
     let table = table.split("\n## ").next().unwrap();
-    let sources: Vec<_> = ["src", "tests"]
-        .iter()
-        .flat_map(|folder| rust_files(&root().join(folder)))
-        .map(read)
-        .collect();
+    let tests = rust_files(&root().join("tests"));
+    let sources: Vec<_> = sources().into_iter().chain(tests).map(read).collect();
     let mut tests = 0;
     for row in table.lines().filter(|line| line.starts_with("| ")) {
         let column = row.split('|').nth(3).unwrap();

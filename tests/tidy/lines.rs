@@ -1,6 +1,6 @@
 //! `docs/operations.md` has each line of the log that may ask for something, and each metric; and no others.
 
-use super::{code, read, root, rust_files};
+use super::{code, read, sources};
 
 /// The arguments of each `name(…)` in `code`.
 fn arguments<'a>(code: &'a str, name: &str) -> Vec<&'a str> {
@@ -35,7 +35,7 @@ fn text(arguments: &str) -> Option<String> {
 /// Messages of the warnings and errors of the source.
 fn messages() -> Vec<String> {
     let mut messages = Vec::new();
-    for file in rust_files(&root().join("src")) {
+    for file in sources() {
         let Some(code) = code(&file) else { continue };
         let limited = ["rarely!", "alarm!", "all_clear!"];
         let always = ["tracing::warn!", "tracing::error!", "log_once"];

@@ -169,9 +169,9 @@ impl Changes {
                 }
             }
         }
-        for (name, service) in &is.registry.services {
+        for (name, service) in &is.registry().services {
             let node = is.api_of(&service.node).unwrap_or_default();
-            if was.registry.services.get(name) != Some(service)
+            if was.registry().services.get(name) != Some(service)
                 && !self.own.registers(&service.node, node)
             {
                 self.add(Subject::Service(name.clone()));

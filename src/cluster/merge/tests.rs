@@ -336,7 +336,7 @@ proptest! {
             }
         }
         for key in ["/a/b/c", "/d"] {
-            let value = |of: &Master| of.params.get(key);
+            let value = |of: &Master| of.param(key);
             if changes.has_param(&param_path(key)) {
                 prop_assert_eq!(value(&after), value(&now), "{}", key);
             }

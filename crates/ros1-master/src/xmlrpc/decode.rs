@@ -25,14 +25,14 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 /// Decodes a request.
 ///
 /// ```
-/// use rosrescue::xmlrpc::{Value, decode_call};
+/// use ros1_master::xmlrpc::{Value, decode_call};
 ///
 /// let call = decode_call(
 ///     b"<methodCall><methodName>getPid</methodName>\
 ///       <params><param><value>/me</value></param></params></methodCall>",
 /// )?;
 /// assert_eq!((call.method.as_str(), call.params), ("getPid", vec![Value::from("/me")]));
-/// # Ok::<(), rosrescue::xmlrpc::DecodeError>(())
+/// # Ok::<(), ros1_master::xmlrpc::DecodeError>(())
 /// ```
 ///
 /// # Errors

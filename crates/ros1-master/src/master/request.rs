@@ -15,7 +15,7 @@ const TOO_MANY: usize = 5;
 /// A call to a master, parsed once.
 ///
 /// ```
-/// use rosrescue::master::{Kind, Method, Request};
+/// use ros1_master::master::{Kind, Method, Request};
 ///
 /// let body = b"<methodCall><methodName>setParam</methodName><params>\
 ///     <param><value>/node</value></param><param><value>/gain</value></param>\
@@ -24,7 +24,7 @@ const TOO_MANY: usize = 5;
 /// assert_eq!(request.method(), &Method::SetParam);
 /// assert_eq!(request.caller(), Some("/node"));
 /// assert_eq!(request.kind(), Kind::Mutate);
-/// # Ok::<(), rosrescue::xmlrpc::DecodeError>(())
+/// # Ok::<(), ros1_master::xmlrpc::DecodeError>(())
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Request {
@@ -62,7 +62,7 @@ impl Request {
     }
 
     /// `system.multicall` with these entries.
-    pub(crate) fn of_entries(entries: Vec<Entry>) -> Self {
+    pub fn of_entries(entries: Vec<Entry>) -> Self {
         Self {
             method: Method::Multicall,
             params: Vec::new(),
@@ -104,7 +104,7 @@ impl Request {
         &self.entries
     }
 
-    pub(crate) fn into_entries(self) -> Vec<Entry> {
+    pub fn into_entries(self) -> Vec<Entry> {
         self.entries
     }
 
@@ -112,7 +112,7 @@ impl Request {
         self.text(0)
     }
 
-    pub(crate) fn text(&self, index: usize) -> Option<&str> {
+    pub fn text(&self, index: usize) -> Option<&str> {
         self.params.get(index)?.as_str()
     }
 
@@ -175,7 +175,7 @@ impl Request {
     }
 
     /// This call as an encoded entry of a multicall.
-    pub(crate) fn into_entry(self) -> Value {
+    pub fn into_entry(self) -> Value {
         Call::from(self).into_entry()
     }
 }
@@ -272,15 +272,6 @@ fn items(value: Value) -> Option<Vec<Value>> {
             Some(characters.map(|c| Value::String(c.into())).collect())
         }
         _ => None,
-    }
-}
-
-#[cfg(test)]
-impl Request {
-    /// Adds a malformed entry at the end of this multicall.
-    pub(crate) fn malformed(mut self) -> Self {
-        self.entries.push(Entry::Malformed("malformed".into()));
-        self
     }
 }
 

@@ -27,7 +27,7 @@ pub struct Snapshot {
 
 impl Snapshot {
     /// Removes nodes, topics, services and parameters whose names begin with `prefix`.
-    pub(crate) fn remove_named(&mut self, prefix: &str) {
+    pub fn remove_named(&mut self, prefix: &str) {
         let stays = |name: &str| !name.starts_with(prefix);
         self.nodes.retain(|name, _| stays(name));
         self.topic_types.retain(|topic, _| stays(topic));

@@ -46,7 +46,7 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
 
 /// The document without its document type, if that is a name alone, which declares nothing; none if it has no such
 /// document type.
-pub(crate) fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
+pub fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
     const DOCTYPE: &[u8] = b"<!DOCTYPE";
     let declared = match body.starts_with(b"<?xml") {
         true => body.windows(2).position(|it| it == b"?>")? + 2,

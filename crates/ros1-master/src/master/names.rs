@@ -28,7 +28,7 @@ pub(crate) fn canonicalize(name: &str) -> Cow<'_, str> {
 }
 
 /// The non-empty parts of a name.
-pub(crate) fn parts(name: &str) -> impl Iterator<Item = &str> {
+pub fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 
@@ -42,7 +42,7 @@ pub(crate) fn namespace(name: &str) -> &str {
 }
 
 /// `resolve_name` of a non-empty name.
-pub(crate) fn resolve(name: &str, caller_id: &str) -> String {
+pub fn resolve(name: &str, caller_id: &str) -> String {
     let name = canonicalize(name);
     if name.starts_with('/') {
         name.into_owned()
@@ -65,7 +65,7 @@ pub(crate) fn join(namespace: &str, name: &str) -> String {
 }
 
 /// The stored and announced form of parameter subscriptions: with a trailing slash.
-pub(crate) fn param_key(key: &str) -> String {
+pub fn param_key(key: &str) -> String {
     let mut key = canonicalize(key).into_owned();
     if key != "/" {
         key.push('/');
@@ -80,7 +80,7 @@ pub(crate) fn has_illegal_chars(name: &str) -> bool {
 
 /// A name that the master resolves to `key` for `caller_id`. It exists for each key that a caller has ever
 /// registered.
-pub(crate) fn name_for(key: &str, caller_id: &str) -> Option<String> {
+pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
     let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
     if plain && canonicalize(key) == key {
         return Some(key.to_owned());
@@ -91,7 +91,7 @@ pub(crate) fn name_for(key: &str, caller_id: &str) -> Option<String> {
 }
 
 /// As [`name_for`], for a key of a parameter subscription.
-pub(crate) fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
+pub fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
     let trimmed = if key == "/" {
         key
     } else {
@@ -120,7 +120,7 @@ fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<Str
 
 /// A caller id and a name that the master resolves to `key`. The caller id must be `usable`, and is
 /// `preferred` if possible. None if no call can name `key`, as for a node that calls itself `/a/`.
-pub(crate) fn reach(
+pub fn reach(
     key: &str,
     preferred: &str,
     usable: impl Fn(&str) -> bool,

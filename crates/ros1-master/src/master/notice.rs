@@ -1,8 +1,6 @@
 //! The callbacks that a master sends to nodes.
 
-#[cfg(test)]
-use crate::xmlrpc::Call;
-use crate::xmlrpc::Value;
+use crate::xmlrpc::{Call, Value};
 
 #[derive(Clone, Debug, PartialEq)]
 pub enum Notice {
@@ -31,10 +29,9 @@ pub enum Notice {
     },
 }
 
-#[cfg(test)]
 impl Notice {
     /// The address of the node.
-    pub(crate) fn to(&self) -> &str {
+    pub fn to(&self) -> &str {
         match self {
             Self::PublisherUpdate { to, .. }
             | Self::ParamUpdate { to, .. }
@@ -42,7 +39,8 @@ impl Notice {
         }
     }
 
-    pub(crate) fn call(&self) -> Call {
+    /// The call of the node's slave API.
+    pub fn call(&self) -> Call {
         match self {
             Self::PublisherUpdate {
                 topic, publishers, ..

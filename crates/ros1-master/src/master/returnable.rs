@@ -45,17 +45,17 @@ fn holds_markup(value: &Value) -> bool {
 const DEEPEST_NAMESPACE: usize = MAX_REPLY_DEPTH - 4;
 
 /// Whether a multicall can return the whole tree.
-pub(crate) fn is_writable(tree: &Struct) -> bool {
+pub fn is_writable(tree: &Struct) -> bool {
     tree.values().all(is_readable)
 }
 
 /// Whether a multicall can return a value of the tree.
-pub(crate) fn is_readable(value: &Value) -> bool {
+pub fn is_readable(value: &Value) -> bool {
     is_returnable(value, DEEPEST_NAMESPACE)
 }
 
 /// The tree without values that a master accepts but cannot return, and the keys that were left out.
-pub(crate) fn writable(tree: &Struct) -> (Struct, Vec<String>) {
+pub fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();
     let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);
     (kept, left_out)

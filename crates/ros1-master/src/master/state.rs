@@ -112,6 +112,16 @@ pub enum InvalidSnapshot {
 }
 
 impl Master {
+    /// Publishers, subscribers, services and the references of nodes.
+    pub fn registry(&self) -> &Registry {
+        &self.registry
+    }
+
+    /// The type of each topic, in the order in which the master learnt of the topics.
+    pub fn topic_types(&self) -> &IndexMap<String, String> {
+        &self.topic_types
+    }
+
     /// Sets the answers to `getPid` and `getUri`.
     pub fn set_identity(&mut self, pid: i32, uri: String) {
         self.pid = pid;
@@ -132,6 +142,11 @@ impl Master {
     /// Whether the answers to reads may differ from rosmaster's. The state itself is compared without that.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()
+    }
+
+    /// Says whether something is kept otherwise than rosmaster keeps it.
+    pub fn set_inexact(&mut self, inexact: bool) {
+        self.inexact = inexact;
     }
 
     /// Sets whether the dictionaries of the master behind have no order, as in Python 2.
@@ -319,7 +334,7 @@ impl Master {
     }
 
     /// Services that the node registered and no longer provides.
-    pub(crate) fn taken_over<'a>(
+    pub fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,
         node: &'a Node,
@@ -328,6 +343,11 @@ impl Master {
             let entry = self.registry.services.get(*service);
             entry.is_none_or(|entry| entry.node != caller_id)
         })
+    }
+
+    /// The value of the parameter with this resolved name, as `getParam` returns it.
+    pub fn param(&self, key: &str) -> Option<Value> {
+        self.params.get(key)
     }
 
     /// The master with this state.

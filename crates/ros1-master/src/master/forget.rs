@@ -10,7 +10,7 @@ impl Master {
     ///
     /// To a reference by a service that another node took over, the node takes the service back, gives it up,
     /// and the other one registers it anew.
-    pub(crate) fn forget_calls(&self, caller_id: &str) -> Vec<Request> {
+    pub fn forget_calls(&self, caller_id: &str) -> Vec<Request> {
         let mut calls = self.unregister_calls(caller_id);
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return calls;

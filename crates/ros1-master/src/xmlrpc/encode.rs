@@ -39,7 +39,7 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
 /// for that. As there, a date's text is not escaped.
 ///
 /// ```
-/// use rosrescue::xmlrpc::{Reply, Value, decode_reply, encode_reply};
+/// use ros1_master::xmlrpc::{Reply, Value, decode_reply, encode_reply};
 ///
 /// let reply = Reply::Value(vec![Value::from(1), "".into(), 42.into()].into());
 /// assert_eq!(decode_reply(&encode_reply(&reply)), Ok(reply));

@@ -50,7 +50,7 @@ fn what_may_differ_from_the_master_is_not_answered_exactly() {
         assert_eq!(master.exact_answer(&with(other)), None);
     }
     assert!(master.exact_answer(&with(get.clone())).is_some());
-    assert_eq!(master.exact_answer(&with(get.clone()).malformed()), None);
+    assert_eq!(master.exact_answer(&malformed(with(get.clone()))), None);
 }
 
 #[test]

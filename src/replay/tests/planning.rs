@@ -196,14 +196,13 @@ fn a_state_is_replaced_in_silence() {
         (&other, &roscore),
         (&other, &Master::default()),
     ] {
-        let mut target = target.clone();
+        let mut wanted = target.snapshot();
         // Types stay for ever.
-        for (topic, topic_type) in &found.topic_types {
-            target
-                .topic_types
-                .entry(topic.clone())
-                .or_insert(topic_type.clone());
+        for (topic, topic_type) in found.topic_types() {
+            let known = wanted.topic_types.entry(topic.clone());
+            known.or_insert(topic_type.clone());
         }
+        let target = Master::from_snapshot(wanted).unwrap();
         let plan = Plan::replace(&target, found, &Token::new("m", 0), &token());
         let (master, notices) = run(&plan, found);
         assert_eq!(notices, []);

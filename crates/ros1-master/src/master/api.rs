@@ -164,7 +164,7 @@ impl Master {
     /// that no ROS client provokes are our own.
     ///
     /// ```
-    /// use rosrescue::master::{Master, Method, Notice, Request, is_success};
+    /// use ros1_master::master::{Master, Method, Notice, Request, is_success};
     ///
     /// let mut master = Master::default();
     /// let subscribe = ["/listener", "/chatter", "std_msgs/String", "http://robot:2/"];

@@ -5,7 +5,7 @@ use indexmap::{IndexMap, IndexSet};
 use super::snapshot::ServiceEntry;
 
 /// Caller ids by topic or parameter key, in the order in which they registered.
-pub(crate) type Registrations = IndexMap<String, Vec<String>>;
+pub type Registrations = IndexMap<String, Vec<String>>;
 
 /// Kinds of registration that several nodes may share.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -17,13 +17,17 @@ pub(crate) enum Shared {
 
 /// A node reference: rosmaster forgets a node once it has no registration left.
 #[derive(Clone, Default, PartialEq)]
-pub(crate) struct Node {
-    pub(crate) api: String,
-    pub(crate) publications: IndexSet<String>,
-    pub(crate) subscriptions: IndexSet<String>,
-    pub(crate) param_subscriptions: IndexSet<String>,
+pub struct Node {
+    /// The address of its slave API.
+    pub api: String,
+    /// The topics that it publishes.
+    pub publications: IndexSet<String>,
+    /// The topics to which it subscribes.
+    pub subscriptions: IndexSet<String>,
+    /// The keys of the parameters to which it subscribes.
+    pub param_subscriptions: IndexSet<String>,
     /// Services that this node registered, including those that another node has taken over since.
-    pub(crate) services: IndexSet<String>,
+    pub services: IndexSet<String>,
 }
 
 impl Node {
@@ -45,15 +49,19 @@ impl Node {
 
 /// rosmaster's `RegistrationManager`.
 #[derive(Clone, Default)]
-pub(crate) struct Registry {
-    /// Node references. No reply shows their order.
-    pub(crate) nodes: IndexMap<String, Node>,
-    pub(crate) publishers: Registrations,
-    pub(crate) subscribers: Registrations,
-    pub(crate) param_subscribers: Registrations,
-    pub(crate) services: IndexMap<String, ServiceEntry>,
+pub struct Registry {
+    /// Node references by caller id. No reply shows their order.
+    pub nodes: IndexMap<String, Node>,
+    /// The publishers of each topic.
+    pub publishers: Registrations,
+    /// The subscribers of each topic.
+    pub subscribers: Registrations,
+    /// The subscribers of each parameter key.
+    pub param_subscribers: Registrations,
+    /// The provider of each service.
+    pub services: IndexMap<String, ServiceEntry>,
     /// Whether any service was ever registered. Shows only in a message of `unregisterService`.
-    pub(crate) had_services: bool,
+    pub had_services: bool,
 }
 
 impl Registry {

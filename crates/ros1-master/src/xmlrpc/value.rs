@@ -60,7 +60,6 @@ impl FromIterator<(String, Value)> for Struct {
 }
 
 /// For tests.
-#[cfg(test)]
 impl From<&[(&str, Value)]> for Struct {
     fn from(members: &[(&str, Value)]) -> Self {
         let members = members.iter().cloned();

@@ -15,5 +15,5 @@ pub use decode::{MAX_DEPTH, decode_call, decode_reply};
 pub use encode::{ListWriter, encode_call, encode_reply, encode_result};
 pub(crate) use encode::{MAX_REPLY_DEPTH, TOO_DEEP, refusal};
 pub use error::DecodeError;
-pub(crate) use prolog::without_doctype;
+pub use prolog::without_doctype;
 pub use value::{Call, Reply, Struct, Value};

@@ -115,7 +115,7 @@ fn fault_entry(text: String) -> Value {
 }
 
 /// A reply as an entry of a multicall's result.
-pub(crate) fn reply_entry(reply: Reply) -> Value {
+pub fn reply_entry(reply: Reply) -> Value {
     match reply {
         Reply::Value(value) => Value::Array(vec![value]),
         Reply::Fault { text, .. } => fault_entry(text),
