@@ -9,7 +9,7 @@ use std::{
 /// What the test of the documents does not run, why, and what tests it otherwise. A block that has one of these
 /// words is left out.
 #[rustfmt::skip]
-pub(crate) const NOT_RUN: [(&str, &str); 20] = [
+pub(crate) const NOT_RUN: [(&str, &str); 21] = [
     ("sudo ", "changes this computer: `tests/robot/service/booted.rs` and `tests/robot/service/package.rs` have their own"),
     ("rosrescue install", "changes this computer: `tests/robot/service/install.rs`"),
     ("systemctl ", "needs systemd: `tests/robot/service/booted.rs`"),
@@ -28,6 +28,7 @@ pub(crate) const NOT_RUN: [(&str, &str); 20] = [
     ("ROSRESCUE_CLUSTER=", "settings of a unit: `tests/robot/service/install.rs`"),
     ("etcdctl ", "needs several computers: `tests/robot/computers.rs` has them"),
     ("openssl ", "needs several computers: `tests/robot/computers.rs` has them"),
+    ("check --cluster ", "needs several computers: `tests/robot/computers.rs` has them"),
     ("core --cluster ", "needs several computers: `tests/robot/computers.rs` has them"),
     ("rosrescue handover", "needs several computers: `tests/robot/computers.rs` has them"),
 ];
