@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path, time::Duration};
 
-const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/benchmarks.md");
+const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/results.md");
 
 /// The time below which this share of `sorted` is, in milliseconds.
 pub(crate) fn at(sorted: &[Duration], share: f64) -> f64 {
@@ -35,7 +35,7 @@ pub(crate) fn write(path: &Path, text: &str) {
     eprintln!("written: {}", path.display());
 }
 
-/// Puts `text` into `docs/benchmarks.md`, between the marks of this bench.
+/// Puts `text` into `benches/results.md`, between the marks of this bench.
 pub(crate) fn write_document(bench: &str, text: &str) {
     let document = fs::read_to_string(DOCUMENT).expect("the document");
     let document = between_marks(&document, bench, text).expect("marks for the tables");

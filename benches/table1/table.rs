@@ -62,7 +62,7 @@ impl Spread {
     }
 }
 
-/// Prints the tables between the marks that `docs/benchmarks.md` has for them.
+/// Prints the tables between the marks that `benches/results.md` has for them.
 pub(crate) fn print(tables: &[(Kind, Vec<Row>)]) {
     println!("<!-- table1:begin -->");
     println!(

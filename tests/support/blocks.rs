@@ -59,8 +59,15 @@ impl Block {
 /// Every document of the repository.
 pub(crate) fn documents() -> Vec<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let folders =
-        ["", "docs", "docs/decisions", "fuzz", "examples/robot"].map(|name| root.join(name));
+    let folders = [
+        "",
+        "docs",
+        "docs/decisions",
+        "benches",
+        "fuzz",
+        "examples/robot",
+    ]
+    .map(|name| root.join(name));
     let files = folders.iter().flat_map(fs::read_dir).flatten();
     let files = files.map(|entry| entry.unwrap().path());
     let mut files: Vec<_> = files

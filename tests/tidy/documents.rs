@@ -4,8 +4,8 @@ use std::{collections::BTreeSet, fs, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
-/// A longer README is read by nobody: one screen and a half, and tables.
-const README_BYTES_MOST: usize = 12 << 10;
+/// The most bytes of the README. Nobody reads a longer one.
+const README_BYTES_MOST: usize = 8 << 10;
 
 /// What `rosrescue ARGUMENTS` prints at a width of 100, without any setting of this computer.
 fn printed(arguments: &[&str]) -> String {

@@ -1,4 +1,5 @@
-//! `docs/operations.md` has each line of the log that may ask for something, and each metric; and no others.
+//! `docs/operations.md` has each line of the log that may ask for something, `docs/monitoring.md` each metric; and no
+//! others.
 
 use super::{code, read, sources};
 
@@ -97,7 +98,7 @@ fn the_document_has_every_line_that_may_ask_for_something() {
 
 #[test]
 fn the_document_has_every_metric() {
-    let document = read("docs/operations.md");
+    let document = read("docs/monitoring.md");
     let (_, tables) = document.split_once("\n## Metrics\n").unwrap();
     let tables = tables.split("\n## ").next().unwrap();
     let metrics = read("src/status/metrics.rs");
@@ -122,14 +123,14 @@ fn the_document_has_every_metric() {
             .unwrap();
         assert!(
             tables.contains(&format!("| `{name}` | {meaning}")),
-            "docs/operations.md lacks: | `{name}` | {meaning} |"
+            "docs/monitoring.md lacks: | `{name}` | {meaning} |"
         );
         names.push(name);
     }
     for name in &names {
         assert!(
             tables.contains(&format!("`{name}`")),
-            "docs/operations.md lacks `{name}`"
+            "docs/monitoring.md lacks `{name}`"
         );
     }
     let cells = tables

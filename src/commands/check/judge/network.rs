@@ -61,7 +61,7 @@ impl Findings {
                     );
                 }
                 if let Some(why) = unprotected {
-                    let todo = "see docs/operations.md, Troubleshooting";
+                    let todo = "see docs/operations.md";
                     self.bad(
                         "checkpoint",
                         format!("the running one is unprotected: {why}"),
