@@ -274,7 +274,7 @@ fn every_decision_is_numbered_dated_and_in_the_index() {
         let (_, date) = text.split_once("\nDate: ").expect("a date");
         let row = format!("| [{number}]({name}) | {title} | {} |", &date[..10]);
         assert!(index.contains(&row), "the index lacks: {row}");
-        for section in ["Context", "Decision", "Why", "Consequences"] {
+        for section in ["Context", "Decision", "Consequences", "Alternatives"] {
             assert!(
                 text.contains(&format!("\n## {section}\n")),
                 "{name} lacks {section}"
