@@ -1,4 +1,4 @@
-//! Assembles the program: startup, running, orderly stop.
+//! Assembles the program: startup, running, and orderly stop.
 
 use std::{
     io,
@@ -54,12 +54,12 @@ use self::{
     startup::{Beginning, begin, kernel_id},
 };
 
-/// How long connections may take to end at the stop.
+/// How long connections may take to end when rosrescue stops.
 const DRAIN: Duration = Duration::from_millis(500);
-/// How long a start waits for the reports of earlier rescues: calls wait meanwhile.
+/// How long a start waits for the reports of earlier rescues. Calls wait during this time.
 const REPORTS: Duration = Duration::from_secs(1);
 
-/// Why rosrescue cannot start or continue. Exit status 1.
+/// Why rosrescue cannot start or continue. The exit status is 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
@@ -71,13 +71,13 @@ pub enum RunError {
     /// No master can be started.
     #[error(transparent)]
     Supervisor(#[from] ProcessError),
-    /// The master's address is our own.
+    /// The master's address leads back to this rosrescue.
     #[error(
         "--master {master} is this rosrescue itself: give the address of the real rosmaster, and \
          serve another one with --listen"
     )]
     Loop { master: MasterUri },
-    /// Two computers would depose each other for ever.
+    /// Two computers have the same name. They would depose each other for ever.
     #[error(
         "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give \
          this one a name of its own with --cluster-name"
@@ -87,16 +87,17 @@ pub enum RunError {
         uri: String,
         own: String,
     },
-    /// The same, and their addresses are the same, too.
+    /// Two computers have the same name and the same address.
     #[error(
         "another computer of this robot has the same name, `{name}`, and the same address, {uri}. Set ROS_IP on \
          each computer to its own address; a name that is given with --cluster-name must be its own, too"
     )]
     Double { name: String, uri: String },
-    /// Several computers: etcd's options cannot be used.
+    /// The etcd options cannot be used.
     #[error(transparent)]
     Cluster(#[from] EtcdError),
-    /// Cannot happen with the kernel's ids.
+    /// The kernel's random id is not a valid header value. This does not happen with the kernel's
+    /// own ids.
     #[error("the kernel's random id is not usable: {0}")]
     Instance(#[from] InvalidHeaderValue),
 }
@@ -129,12 +130,12 @@ pub async fn run(
     say(&beginning.story);
     let last = beginning.session.master_uri.as_deref();
     let last = last.and_then(|uri| MasterUri::parse(uri).ok());
-    // No master can be at our own port.
+    // A recorded master cannot be at rosrescue's own port.
     let last = last.filter(|uri| uri.port != config.advertised.port);
     let address = match (&config.master, &last) {
         (MasterConfig::External(address), _) => address.clone(),
         (_, Some(last)) => last.clone(),
-        // Until there is a master.
+        // A placeholder until there is a master.
         (_, None) => MasterUri {
             host: "127.0.0.1".to_owned(),
             port: 0,
@@ -163,7 +164,7 @@ pub async fn run(
         None => Earlier::default(),
     };
     earlier.worker_restarts = earlier.worker_restarts.max(handover::restarts());
-    // Lives as long as the process.
+    // The statistics live as long as the process.
     let stats: &'static Stats = Box::leak(Box::default());
     let (gate_tx, gate) = gate::gate();
     let (mode, supervision) = match rosmaster {
@@ -185,7 +186,7 @@ pub async fn run(
         config.sync,
         stats,
     ));
-    // Where there are several computers, each leads with a new master.
+    // In a cluster each leader starts with a new master.
     if restored && config.cluster.is_none() {
         ledger.set_unconfirmed();
         ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
@@ -265,7 +266,8 @@ pub async fn run(
         }
         _ => {
             if restored {
-                // The mirror answers before it is known what an earlier rosrescue has left running.
+                // The mirror answers while orphans of an earlier rosrescue are still being looked
+                // for.
                 post.gate_tx.set(State::StandingIn);
             }
             (None, Runs::Single(Box::new(post)))
@@ -339,7 +341,8 @@ pub async fn run(
     drop(server);
     let is_proxy = matches!(config.master, MasterConfig::External(_));
     let proxied = is_proxy.then(|| (upstream.clone(), board.clone()));
-    // The mirror answers reads meanwhile; writes wait, and so does what the master may be told.
+    // Meanwhile the mirror answers reads; writes wait, and so does everything that goes to the
+    // master.
     let checkpointer = Checkpointer::begin(
         ledger.clone(),
         board,
@@ -390,34 +393,34 @@ pub async fn run(
         () = looped.notified() => return Err(RunError::Loop { master: upstream.address() }),
     };
     connections.close();
-    // Calls that still wait cannot be answered: their connections are closed.
+    // Calls that still wait cannot be answered any more, so their connections are closed.
     let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
     tasks.shutdown().await;
     close(ledger).await;
     if let Some(process) = process {
         process.stop().await;
     }
-    // systemd may read nothing.
+    // systemd may not be reading.
     let _ = tokio::time::timeout(DRAIN, notified).await;
     Ok(())
 }
 
-/// Which computer sees to the master.
+/// Whether this computer manages the master alone or as one of several.
 enum Runs {
-    /// This one.
+    /// The only computer.
     Single(Box<Post>),
-    /// One of several.
+    /// One of several computers.
     Member(Box<Member>),
 }
 
-/// What sees to the master.
+/// The running manager of the master.
 enum Begun {
-    /// With what is to be done first.
+    /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
     Member(Box<Member>),
 }
 
-/// Writes the closing checkpoint, if the disk answers within [`DISK_PATIENCE`].
+/// Writes the closing checkpoint if the disk answers within [`DISK_PATIENCE`].
 async fn close(ledger: Arc<Ledger>) {
     let has_store = ledger.seen_store().is_some();
     ledger.update_session(|session| session.closed = true);

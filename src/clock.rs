@@ -1,9 +1,9 @@
-//! The wall clock, only for display. No decision may depend on it: robots start without a battery-backed
-//! clock, and it jumps by years when the network comes up.
+//! The wall clock, for display only. No decision may depend on it: robots start without a
+//! battery-backed clock, and the clock jumps by years when the network comes up.
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// Seconds since 1970, with microseconds; 0 before that.
+/// Wall time in seconds since 1970, with microseconds; 0 for earlier times.
 #[allow(
     clippy::disallowed_methods,
     reason = "the one place that reads the wall clock"
@@ -14,19 +14,20 @@ pub fn wall_time() -> f64 {
         .map_or(0.0, |since| since.as_secs_f64())
 }
 
-/// The wall time at `moment`, by the clock as it is set now.
+/// Wall time at `moment`, according to the clock as it is set now.
 pub fn wall_time_of(moment: Instant) -> f64 {
     (wall_time() - moment.elapsed().as_secs_f64()).max(0.0)
 }
 
-/// The moment of a wall time, by the clock as it is set now; the present for one that is not past.
+/// The moment of a wall time, according to the clock as it is set now. A time in the future gives
+/// the present.
 pub fn moment_of(seconds: f64) -> Instant {
     let now = Instant::now();
     let since = Duration::try_from_secs_f64(wall_time() - seconds).unwrap_or_default();
     now.checked_sub(since).unwrap_or(now)
 }
 
-/// A wall time as text in UTC, such as `2026-11-21T09:26:53Z`.
+/// Formats a wall time in UTC, as in `2026-11-21T09:26:53Z`.
 pub fn wall_text(seconds: f64) -> String {
     let seconds = seconds.max(0.0) as i64;
     let (days, time) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
@@ -49,7 +50,7 @@ pub fn wall_text(seconds: f64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
-/// A time span for people, such as `2 h 5 min`.
+/// Formats a time span for people, as in `2 h 5 min`.
 pub fn span(seconds: f64) -> String {
     let whole = seconds.max(0.0) as u64;
     let (days, hours, minutes) = (whole / 86_400, whole / 3_600 % 24, whole / 60 % 60);

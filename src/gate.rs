@@ -8,25 +8,25 @@ use std::time::Duration;
 
 use tokio::{sync::watch, time::Instant};
 
-/// Where calls go.
+/// Who answers calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// To the master of this incarnation.
+    /// The master of this incarnation.
     Open {
-        /// See [`Token`](crate::replay::Token).
+        /// Number of the incarnation; see [`Token`](crate::replay::Token).
         incarnation: u64,
     },
-    /// The mirror answers reads and writes: the master is away.
+    /// The mirror answers reads and writes, because the master is away.
     StandingIn,
-    /// The same, but the master has a batch or a look under way, and is given what it missed when it has
-    /// answered that.
+    /// The mirror answers reads and writes, because the master is late. A batch or a look is still
+    /// under way; when the master answers it, it is given what it missed.
     Late,
-    /// The mirror answers reads, and writes that change nothing. Other writes wait: an injection is under
-    /// way.
+    /// An injection is under way: the mirror answers reads, and writes that change nothing. Other
+    /// writes wait.
     Injecting,
-    /// Another computer has the master, or is about to: calls go there.
+    /// Another computer has the master or is about to get it: calls go there.
     Elsewhere,
-    /// Nowhere: no master has been seen yet, so its state is unknown.
+    /// No master has been seen yet, so the state is unknown and calls wait.
     Unknown,
 }
 
@@ -40,11 +40,11 @@ impl State {
 #[derive(Clone, Copy, Debug)]
 struct Gate {
     state: State,
-    /// Since when it has been open, or shut.
+    /// When the gate was last opened or shut.
     since: Instant,
 }
 
-/// A shut gate, as its two halves.
+/// Creates a shut gate, as its writing and its reading half.
 pub(crate) fn gate() -> (Tx, Rx) {
     let (tx, rx) = watch::channel(Gate {
         state: State::Unknown,
@@ -53,12 +53,12 @@ pub(crate) fn gate() -> (Tx, Rx) {
     (Tx(tx), Rx(rx))
 }
 
-/// Opens and shuts the gate.
+/// The writing half, which opens and shuts the gate.
 #[derive(Debug, Clone)]
 pub(crate) struct Tx(watch::Sender<Gate>);
 
 impl Tx {
-    /// Changes the state; waiters see it at once. Setting the same state wakes no waiter.
+    /// Changes the state and wakes waiters at once. Setting the same state again wakes nobody.
     pub(crate) fn set(&self, state: State) {
         self.0.send_if_modified(|gate| {
             if gate.state == state {
@@ -78,7 +78,7 @@ impl Tx {
     }
 }
 
-/// Reads the gate and waits for it.
+/// The reading half, which reads the gate and waits for it.
 #[derive(Clone, Debug)]
 pub struct Rx(watch::Receiver<Gate>);
 
@@ -92,21 +92,21 @@ impl Rx {
         self.state().is_open()
     }
 
-    /// Since when calls have been passing, or not.
+    /// Since when calls have been passing, or not passing.
     pub fn since(&self) -> Instant {
         self.0.borrow().since
     }
 
-    /// Returns when the state has changed since the last [`Self::look`] or the last return of this method.
-    /// Cancel safe. Never returns once the sender is gone.
+    /// Returns when the state has changed since the last [`Self::look`] or the last return of this
+    /// method. Cancel safe. Never returns once the sender is gone.
     pub async fn changed(&mut self) {
         if self.0.changed().await.is_err() {
             std::future::pending::<()>().await;
         }
     }
 
-    /// As [`Self::look`]. Also returns whether the state has changed since the last look, or since
-    /// [`Self::changed`] returned.
+    /// Like [`Self::look`], and also tells whether the state has changed since the last look or
+    /// since [`Self::changed`] returned.
     pub fn look_changed(&mut self) -> (State, bool) {
         let gate = self.0.borrow_and_update();
         (gate.state, gate.has_changed())
@@ -128,14 +128,15 @@ impl Rx {
         }
     }
 
-    /// Returns when no call has passed for an uninterrupted `time`, counted from now at the earliest. Never
-    /// returns while the gate is open. Cancel safe, but the count restarts.
+    /// Returns when no call has passed for an uninterrupted `time`, counted from now at the
+    /// earliest. Never returns while the gate is open. Cancel safe, but cancelling restarts the
+    /// count.
     pub async fn shut_for(&mut self, time: Duration) {
         loop {
             self.wait_for(|state| !state.is_open()).await;
             let deadline = Instant::now() + time;
             tokio::select! {
-                // On a busy computer both may be ready.
+                // On a busy computer both branches may be ready.
                 biased;
                 _ = self.wait_for(State::is_open) => {}
                 () = tokio::time::sleep_until(deadline) => return,

@@ -37,20 +37,20 @@ use restart::{End, Next, Restarts};
 /// The running program, even after its file has been replaced by another version.
 const PROGRAM: &str = "/proc/self/exe";
 
-/// As `OOMScoreAdjust=` in the systemd unit.
+/// The value of `OOMScoreAdjust=` in the systemd unit.
 const OOM_SCORE_ADJUST: &str = "-500";
 
 /// How long to wait for a worker to handle signals before one is sent anyway.
 const START_TIME: Duration = Duration::from_secs(1);
 
-/// Why there is no worker. Exit status 1.
+/// Why there is no worker. The exit status is 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GuardianError {
     /// The system refused to start it.
     #[error("cannot start the worker process: {0}; --no-guardian runs rosrescue without one")]
     Spawn(#[from] io::Error),
-    /// Cannot happen: every descriptor gets its own number.
+    /// This cannot happen, because every descriptor gets its own number.
     #[error("cannot pass the sockets on: {0}")]
     Handover(#[from] FdMappingCollision),
 }
@@ -59,7 +59,8 @@ pub enum GuardianError {
 ///
 /// # Errors
 ///
-/// If the first worker cannot be started, or signals cannot be received. Later the guardian never gives up.
+/// If the first worker cannot be started, or signals cannot be received. Later the guardian never
+/// gives up.
 pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     evade_oom_killer();
     let signals = receive_signals()?;
@@ -96,8 +97,8 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
     }
 }
 
-/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is returned with
-/// the worker, which must end what the dead one left running.
+/// Starts a worker after `pause`, retrying until it succeeds. A signal ends the pause and is
+/// returned with the worker, which must end what the dead one left running.
 fn start_again(
     listeners: &[TcpListener],
     signals: &Receiver<i32>,
@@ -122,7 +123,7 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
     let until = Instant::now() + pause;
     loop {
         match signals.recv_timeout(until.saturating_duration_since(Instant::now())) {
-            // An orphan that we inherited has ended.
+            // An orphan that this process inherited has ended.
             Ok(SIGCHLD) => drop(reap(None)),
             Ok(signal) => return Ok(Some(signal)),
             Err(RecvTimeoutError::Timeout) => return Ok(None),
@@ -165,17 +166,18 @@ impl Worker {
             .env(handover::RESTARTS, restarts.to_string())
             .env_remove(handover::LISTEN_PID)
             .env_remove(handover::LISTEN_FDNAMES)
-            // In a group of its own: terminal signals reach only the guardian, which passes them on once.
+            // The worker gets its own process group, so that terminal signals reach only the
+            // guardian, which passes them on once.
             .process_group(0);
         if sd_notify::watchdog_enabled().is_none() {
-            // It is meant for another process.
+            // The variable is meant for another process.
             command.env_remove("WATCHDOG_USEC");
         }
         let (name, value) = handover::TUNABLES;
         if std::env::var_os(name).is_none() {
             command.env(name, value);
         }
-        // The worker feeds systemd's watchdog for us.
+        // The worker feeds systemd's watchdog in the guardian's place.
         command.env_remove("WATCHDOG_PID");
         command.fd_mappings(mappings.collect())?;
         let pid = command.spawn()?.id();
@@ -205,7 +207,7 @@ impl Worker {
         }
     }
 
-    /// Passes on `signal` once the worker handles signals: before, a signal would kill it.
+    /// Passes on `signal` once the worker handles signals. Before that, a signal would kill it.
     fn pass_on(&mut self, signal: i32) {
         if !std::mem::replace(&mut self.handles_signals, true) {
             self.has_said(handover::HANDLES_SIGNALS);
@@ -216,13 +218,14 @@ impl Worker {
             SIGQUIT => Signal::QUIT,
             _ => Signal::TERM,
         };
-        // Our child, not waited for yet: its process id cannot be reused.
+        // The child has not been waited for, so its process id cannot have been reused.
         if let Some(pid) = i32::try_from(self.pid).ok().and_then(Pid::from_raw) {
             let _ = kill_process(pid, signal);
         }
     }
 
-    /// Whether the worker writes `word` before it ends, or within [`START_TIME`]. Skips earlier words.
+    /// Whether the worker writes `word` before it ends, or within [`START_TIME`]. Skips earlier
+    /// words.
     fn has_said(&self, word: u8) -> bool {
         let mut said = [0];
         while (&self.link).read(&mut said).is_ok_and(|length| length > 0) {
@@ -234,8 +237,8 @@ impl Worker {
     }
 }
 
-/// Reaps all children that have ended: the first process of a container also inherits other processes.
-/// Returns the end of `worker` if it is among them.
+/// Reaps all children that have ended, because the first process of a container also inherits other
+/// processes. Returns the end of `worker` if it is among them.
 fn reap(worker: Option<u32>) -> Option<End> {
     let mut end = None;
     while let Ok(Some((pid, status))) = rustix::process::wait(WaitOptions::NOHANG) {
@@ -250,12 +253,12 @@ fn reap(worker: Option<u32>) -> Option<End> {
     end
 }
 
-/// Lets the kernel end nodes first when memory runs out, as the systemd unit does. Our children inherit this. Only
-/// with CAP_SYS_RESOURCE, and only if no value was chosen.
+/// Lets the kernel kill nodes first when memory runs out, as the systemd unit does. Children
+/// inherit this. It works only with CAP_SYS_RESOURCE, and is skipped if a value was chosen already.
 fn evade_oom_killer() {
     const SCORE: &str = "/proc/self/oom_score_adj";
     if std::fs::read_to_string(SCORE).is_ok_and(|score| score.trim() == "0") {
-        // Without it, the guardian is still the smallest process.
+        // If this fails, the guardian is still the smallest process.
         let _ = std::fs::write(SCORE, OOM_SCORE_ADJUST);
     }
 }
@@ -279,7 +282,8 @@ fn receive_signals() -> io::Result<Receiver<i32>> {
     Ok(receiver)
 }
 
-/// Whether we were started with SIGHUP ignored, as by nohup: then we must outlive the terminal.
+/// Whether this process was started with SIGHUP ignored, as by nohup. It must then outlive the
+/// terminal.
 pub fn is_hangup_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

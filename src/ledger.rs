@@ -1,8 +1,8 @@
-//! Mirror and journal under one lock: a write is applied and given to the journal in one step. The
-//! answer waits until it is [written](journal).
+//! The ledger: mirror and journal under one lock. A write is applied and given to the journal in
+//! one step, and its answer waits until it is [written](journal).
 //!
-//! The lock also orders both against the takeover by a new incarnation: a reply of the old master that
-//! arrives after the injection's state was taken is not acknowledged.
+//! The lock also orders both against the takeover by a new incarnation: a reply of the old master
+//! that arrives after the state for the injection was taken is not acknowledged.
 
 pub(crate) mod activity;
 mod answers;
@@ -51,17 +51,17 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// The answer does not count, and the master must be asked again: another incarnation has taken over, or the
-/// mirror has changed since.
+/// The answer does not count, because another incarnation has taken over or the mirror has changed
+/// since. The master must be asked again.
 #[derive(Debug)]
 pub struct Superseded;
 
 /// The result of recording answered calls.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Recorded {
-    /// Where their last record is.
+    /// Mark of the calls' last record.
     pub mark: Mark,
-    /// Whether the mirror is no longer known to equal the master.
+    /// Whether the mirror may differ from the master now.
     pub doubtful: bool,
 }
 
@@ -74,18 +74,18 @@ pub struct Basis {
     pub pending: Vec<Request>,
 }
 
-/// The mirror, the journal and their bookkeeping.
+/// The mirror, the journal, and the state that keeps them together.
 pub struct Ledger {
     inner: Mutex<Inner>,
     sync: SyncPolicy,
     stats: &'static Stats,
     /// The last record that an answer need not wait for.
     durable: watch::Sender<u64>,
-    /// The disk has been asked for a sync that is late.
+    /// Whether a sync that the disk was asked for is late.
     sync_is_late: AtomicBool,
-    /// Wakes what tells of a disk that is silent.
+    /// Wakes the task that reports a silent disk.
     disk_silent: Notify,
-    /// What other computers have of our writes.
+    /// The last of this computer's records that the other computers have.
     agreed: watch::Sender<Agreed>,
     /// See [`Ledger::set_lease`].
     lease: watch::Sender<Option<Instant>>,
@@ -93,7 +93,7 @@ pub struct Ledger {
     attempted: watch::Sender<u64>,
     /// Wakes the checkpointer.
     pub work: Notify,
-    /// Wakes the task that gives our writes to other computers.
+    /// Wakes the task that sends this computer's writes to the others.
     pub shared: Notify,
     /// Wakes the task that notifies nodes.
     pub outbox_changed: Notify,
@@ -102,7 +102,7 @@ pub struct Ledger {
 
 struct Inner {
     mirror: Master,
-    /// The answers to getPid and getUri; not a part of the state.
+    /// The answers to getPid and getUri, which are not part of the state.
     identity: (i32, String),
     session: Session,
     /// None if no checkpoint could be opened: the state is unprotected.
@@ -115,25 +115,26 @@ struct Inner {
     activity: Activity,
     order: Order,
     diverged: HashSet<Method>,
-    /// An injection is under way: the mirror must not change.
+    /// Whether an injection is under way, so that the mirror must not change.
     injecting: bool,
-    /// The present master may differ from the mirror and must be read again.
+    /// Whether the present master may differ from the mirror and must be read again.
     doubted: bool,
-    /// The present incarnation may still run a batch whose reply is no longer awaited.
+    /// Whether the present incarnation may still run a batch whose reply nobody awaits any more.
     abandoned: bool,
-    /// What the present incarnation holds when it has answered what it is late with.
+    /// What the present incarnation will hold once it has answered what it is late with.
     behind: Option<Behind>,
     /// The incarnation that was served last.
     served: Option<u64>,
-    /// The mirror is a checkpoint's, and no master has been compared with it: a living one may be newer.
+    /// Whether the mirror comes from a checkpoint and no master has been compared with it. A living
+    /// master may be newer.
     unconfirmed: bool,
-    /// The session has changed, and its record is not in the journal.
+    /// Whether the session has changed and the journal does not have its record yet.
     session_unwritten: bool,
 }
 
 impl Ledger {
-    /// A ledger of `mirror`, recorded in `store`. `pending`: writes that the incarnation of `session` may not
-    /// have run. `sync`: when a record must be on the disk.
+    /// Creates a ledger of `mirror`, recorded in `store`. `pending` are writes that the incarnation
+    /// of `session` may not have run. `sync` tells when a record must be on the disk.
     pub fn new(
         mirror: Master,
         session: Session,
@@ -194,7 +195,7 @@ impl Ledger {
         look(&self.lock().mirror)
     }
 
-    /// The mirror is a checkpoint's, which may be older than a master that lives.
+    /// Notes that the mirror comes from a checkpoint, which may be older than a living master.
     pub fn set_unconfirmed(&self) {
         self.lock().unconfirmed = true;
     }
@@ -204,7 +205,7 @@ impl Ledger {
         self.lock().set_identity((pid, uri));
     }
 
-    /// The answer to getUri: our own address.
+    /// The answer to getUri: rosrescue's own address.
     pub fn uri(&self) -> String {
         self.lock().identity.1.clone()
     }
@@ -236,7 +237,7 @@ impl Ledger {
         self.lock().token()
     }
 
-    /// As [`Self::record_from`], of calls that were made here.
+    /// Like [`Self::record_from`], for calls that were made on this computer.
     #[cfg(test)]
     pub(crate) fn record(
         &self,
@@ -251,8 +252,8 @@ impl Ledger {
         self.record_from(now, incarnation, &batch)
     }
 
-    /// Records and applies calls that the master of `incarnation` has answered, in the order in which it ran
-    /// them.
+    /// Records and applies calls that the master of `incarnation` has answered, in the order in
+    /// which it ran them.
     pub(crate) fn record_from(
         &self,
         now: Instant,
@@ -278,7 +279,7 @@ impl Ledger {
         let mut sources = Vec::with_capacity(answered.len());
         let mut unrecorded = false;
         for (index, (answered, source)) in answered.into_iter().enumerate() {
-            // If so, the mirror is known to differ: the master holds what cannot be read from it.
+            // Then the mirror is known to differ: the master holds what cannot be read from it.
             let is_inexact = inner.mirror.is_inexact();
             let outcome = inner.apply(now, answered.call, None, &self.outbox_changed);
             if !answered.agrees(&outcome, index < last_write) {
@@ -314,7 +315,7 @@ impl Ledger {
         Ok(recorded)
     }
 
-    /// Records and applies a call of our own before there is a master.
+    /// Records and applies a call made by rosrescue before there is a master.
     pub fn seed(&self, call: &Request) {
         let mut inner = self.lock();
         inner.apply(Instant::now(), call, None, &self.outbox_changed);
@@ -323,7 +324,7 @@ impl Ledger {
         self.write_soon();
     }
 
-    /// Wakes those who take records further.
+    /// Wakes the tasks that write and replicate records.
     fn recorded(&self) {
         self.work.notify_one();
         self.shared.notify_one();
@@ -334,13 +335,13 @@ impl Ledger {
         self.lock().pending.calls().len()
     }
 
-    /// Parameter subscriptions that the present incarnation may hold; they cannot be read from it.
+    /// Parameter subscriptions that the present incarnation may hold. They cannot be read from it.
     pub fn may_hold(&self) -> Master {
         let inner = self.lock();
         replay::may_hold(&inner.mirror, inner.pending.calls())
     }
 
-    /// The present master may differ from the mirror and must be read again.
+    /// Notes that the present master may differ from the mirror and must be read again.
     pub fn doubt(&self) {
         let mut inner = self.lock();
         inner.doubted = true;
@@ -351,26 +352,26 @@ impl Ledger {
         self.order_changed.send_replace(());
     }
 
-    /// Whether there is such a doubt.
+    /// Whether the present master may differ from the mirror.
     pub fn is_doubted(&self) -> bool {
         self.lock().doubted
     }
 
-    /// The mirror's version: equal versions mean equal states.
+    /// The mirror's version. Equal versions mean equal states.
     pub fn version(&self) -> u64 {
         self.lock().version
     }
 
-    /// Sets the mirror to `state`, which the master holds. Returns the differences, in a few sentences
-    /// without values.
+    /// Sets the mirror to `state`, which the master holds. Returns the differences in a few
+    /// sentences without values.
     pub fn adopt(&self, state: Master) -> Vec<String> {
         let difference = self.lock().adopt(state);
         self.recorded();
         difference
     }
 
-    /// As [`Self::adopt`], if `state` was read from the master of `incarnation` when the mirror was at
-    /// `version`.
+    /// Like [`Self::adopt`], if `state` was read from the master of `incarnation` when the mirror
+    /// was at `version`.
     pub fn adopt_if(
         &self,
         incarnation: u64,
@@ -402,7 +403,7 @@ impl Ledger {
 }
 
 impl Inner {
-    /// Applies `call`. `standing_in`: whether it changes anything; none if a master notifies nodes of it.
+    /// Applies `call`. `standing_in` collects its notifications; none if a master notifies nodes.
     fn apply(
         &mut self,
         now: Instant,
@@ -451,7 +452,7 @@ impl Inner {
             self.version += 1;
         }
         let (unordered, old) = (self.mirror.is_unordered(), self.mirror.is_old());
-        // Also if it is equal: it may be known more exactly.
+        // An equal state is replaced too, because it may be known more exactly.
         self.mirror = state;
         self.mirror.set_unordered(unordered);
         self.mirror.set_old(old);
@@ -464,7 +465,8 @@ impl Inner {
 
     fn add_pending(&mut self, writes: impl IntoIterator<Item = Request>) {
         if self.pending.extend(writes).is_err() {
-            // If the present incarnation comes back, the mirror's state replaces everything it holds.
+            // If the present incarnation comes back, the mirror's state replaces everything that it
+            // holds.
             self.raise_incarnation();
             self.write_session();
         }
@@ -486,7 +488,7 @@ impl Inner {
 
     fn write_session(&mut self) {
         if std::mem::take(&mut self.session_unwritten) {
-            // What was not recorded is not in the file.
+            // The file does not contain what was not recorded.
             self.session.cluster_seq = match self.whole.is_due() {
                 true => 0,
                 false => self.cluster_seq(),
@@ -500,7 +502,8 @@ impl Inner {
         Token::new(&self.session.mark, self.session.incarnation)
     }
 
-    /// The mirror has changed without a journaled call: a whole checkpoint is due.
+    /// Notes that the mirror has changed without a journaled call, so that a whole checkpoint is
+    /// due.
     fn changed_unrecorded(&mut self) {
         self.whole.unrecorded = self.version;
         self.share_state();
@@ -511,12 +514,12 @@ impl Inner {
         self.last_seq().unwrap_or_default()
     }
 
-    /// The same; none without a journal.
+    /// Number of the journal's last record; none without a journal.
     fn last_seq(&self) -> Option<u64> {
         self.journal.as_ref().map(Journal::seq)
     }
 
-    /// Where the last record is.
+    /// Mark of the last record.
     fn mark(&self) -> Mark {
         Mark {
             disk: self.last_seq(),
@@ -524,14 +527,14 @@ impl Inner {
         }
     }
 
-    /// Gives `entries` to the journal. A failure is kept by the store and does not fail the call.
+    /// Gives `entries` to the journal. The store keeps a failure, which does not fail the call.
     fn append(&mut self, entries: Vec<Entry>) {
         self.append_from(entries, &[]);
     }
 
-    /// As [`Self::append`], with where each call comes from; from here if it is not said.
+    /// Like [`Self::append`], with the source of each call; missing sources mean this computer.
     fn append_from(&mut self, entries: Vec<Entry>, sources: &[&Source]) {
-        // First: what follows is to reach the incarnation that it names.
+        // Comes first, because the following entries belong to the incarnation that it names.
         self.write_session();
         self.share(&entries, sources);
         if let Some(journal) = self.journal.as_mut().filter(|_| !entries.is_empty()) {

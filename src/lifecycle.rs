@@ -1,8 +1,9 @@
-//! Decides when to connect, examine, probe, spawn, kill, and when calls may pass to the master and when no
-//! longer. In between, `recovery::examine` shuts the gate to writes for the time of an injection.
+//! Decides when to connect to, examine, probe, spawn and kill a master, and when calls may pass to
+//! it. In between, `recovery::examine` shuts the gate to writes during an injection.
 //!
-//! A state machine without IO: the shell passes in what happened and when, and carries out the returned
-//! actions. It owns every deadline, so that each can be tested without waiting.
+//! This is a state machine without IO: the shell passes in what happened and when, and carries out
+//! the returned actions. The machine owns every deadline, so that each can be tested without
+//! waiting.
 
 use std::{
     collections::VecDeque,
@@ -20,20 +21,21 @@ pub use types::{Action, Cause, Input, Probing, Supervision};
 
 /// Older deaths do not count towards a crash loop.
 const DEATH_MEMORY: Duration = Duration::from_secs(60);
-/// Deaths within [`DEATH_MEMORY`] after which a new master is started at once.
+/// Number of deaths within [`DEATH_MEMORY`] after each of which a new master is started at once.
 const DEATHS_AT_ONCE: usize = 5;
-/// The first pause in a crash loop; doubles with each further death.
+/// The first pause in a crash loop. It doubles with each further death.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// The longest pause in a crash loop.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// A master that has served for this time ends the report of a crash loop. The pauses go on for as long as
-/// more than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
+/// A master that has served for this time ends the crash loop. The pauses continue as long as more
+/// than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
 const CALM: Duration = Duration::from_secs(10);
-/// A spawned master that has used the processor for so many times [`Probing::start_limit`] will never listen.
+/// A spawned master that has used this many times [`Probing::start_limit`] of processor time will
+/// never listen.
 const STARTS_AT_MOST: u32 = 10;
 /// Pause between two samples of a master that starts slowly.
 const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
-/// Pause before trying again after a server that is not a master.
+/// Pause before the next attempt after a server that is not a master.
 const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,9 +46,9 @@ enum Phase {
     Examining,
     /// The gate is open.
     Serving,
-    /// The mirror answers until the master answers.
+    /// The mirror answers until the late master answers.
     Late,
-    /// The master that was late is given what the mirror has answered.
+    /// The late master is given what the mirror has answered.
     CatchingUp,
     Stopped,
 }
@@ -58,49 +60,51 @@ enum Timer {
     Spawn,
 }
 
-/// The state machine.
+/// Decides what happens to the master; see the [module](self).
 #[derive(Debug)]
 pub struct Lifecycle {
     supervision: Supervision,
     probing: Probing,
     phase: Phase,
     served: bool,
-    /// The mirror is from a checkpoint whose session continues.
+    /// Whether the mirror comes from a checkpoint whose session continues.
     restored: bool,
-    /// The mirror is known to be a master's state.
+    /// Whether the mirror is known to be a master's state.
     known: bool,
-    /// When our child was spawned; for an orphan, when rosrescue started. None while there is no child.
+    /// When our child was spawned; for an orphan, when rosrescue started. None while there is no
+    /// child.
     child: Option<Instant>,
     /// Since when no master has been connected.
     seeking_since: Option<Instant>,
     /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
     deaths: VecDeque<Instant>,
     total_deaths: u64,
-    /// More than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`], and no master has served for [`CALM`]
-    /// since.
+    /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`],
+    /// and no master that has served for [`CALM`] since.
     crash_loop: bool,
     /// When the gate was opened; none while it is shut.
     serving_since: Option<Instant>,
-    /// An external master has closed its connection; it is not known yet whether it died.
+    /// Whether an external master has closed its connection and it is not yet known whether it
+    /// died.
     lost: bool,
-    /// An external master was counted as dead. Since then its port has not refused, and no master has been
-    /// examined there.
+    /// Whether an external master was counted as dead, and since then its port has not refused and
+    /// no master has been examined there.
     dying: bool,
     missed: u32,
     patience: Patience,
-    /// What was seen of our silent master.
+    /// The samples of our silent master.
     evidence: Evidence,
-    /// Consecutive failed spawns.
+    /// Number of consecutive failed spawns.
     failed_spawns: usize,
-    /// Masters in a row whose port another program took.
+    /// Number of consecutive masters whose port another program took.
     taken_ports: usize,
-    /// The last of them has not ended yet.
+    /// Whether the last master whose port was taken still runs.
     port_taken: bool,
     timer: Option<(Instant, Timer)>,
 }
 
 impl Lifecycle {
-    /// A machine at rest; it starts with [`Input::Start`].
+    /// Creates a machine that does nothing until [`Input::Start`].
     pub fn new(supervision: Supervision, probing: Probing) -> Self {
         Self {
             supervision,
@@ -127,7 +131,7 @@ impl Lifecycle {
         }
     }
 
-    /// When to pass in [`Input::Wake`]. Changes with every input.
+    /// When to pass in [`Input::Wake`]. It changes with every input.
     pub fn deadline(&self) -> Option<Instant> {
         let timer = self.timer.map(|(at, _)| at);
         timer.into_iter().chain(self.calm_at()).min()
@@ -139,12 +143,13 @@ impl Lifecycle {
         Some(since + CALM)
     }
 
-    /// Deaths of masters since the start.
+    /// Number of masters that died since the start.
     pub fn deaths(&self) -> u64 {
         self.total_deaths
     }
 
-    /// Whether the mirror may stand in while the gate is shut: it must be a master's state.
+    /// Whether the mirror may stand in while the gate is shut, because it is known to be a master's
+    /// state.
     pub fn may_stand_in(&self) -> bool {
         self.known
     }
@@ -159,7 +164,7 @@ impl Lifecycle {
         &self.patience
     }
 
-    /// Whether the decision that follows on `input` needs a [`Sample`] of our master.
+    /// Whether the decision about `input` needs a [`Sample`] of our master.
     pub fn needs_sample(&self, now: Instant, input: Input) -> bool {
         let sampled = self.evidence.last_at();
         let is_old = sampled.is_none_or(|at| now.duration_since(at) >= SAMPLE_PAUSE);
@@ -171,7 +176,7 @@ impl Lifecycle {
             }
     }
 
-    /// Takes what was seen of our master.
+    /// Takes a sample of our master.
     pub fn observe(&mut self, sample: Sample) {
         self.evidence.add(sample);
     }
@@ -234,7 +239,8 @@ impl Lifecycle {
                 self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
                 Vec::new()
             }
-            // It died during the examination, or closes every connection: wait before connecting.
+            // The master died during the examination or closes every connection, so wait before
+            // connecting.
             Input::ConnectionLost if self.phase == Phase::Examining => {
                 let mut actions = self.connect_later(now, false);
                 let again = std::mem::replace(&mut self.dying, true);
@@ -265,8 +271,8 @@ impl Lifecycle {
             Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
             Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
             Input::Slow => self.probe_now().into_iter().collect(),
-            // If the master was killed, the rest of its end follows within milliseconds; if not, the next
-            // connect shows that it lives.
+            // If the master was killed, the rest of its end follows within milliseconds. If not,
+            // the next connection shows that it lives.
             Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
                 self.lost = self.supervision == Supervision::Theirs;
                 let cause = match input {
@@ -338,7 +344,8 @@ impl Lifecycle {
     fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
         self.seek(now);
         self.restored = restored;
-        // A new master of ours is empty, so the mirror is right. What an orphan holds must be read first.
+        // A new master of ours is empty, so the mirror is right. The state of an orphan must be
+        // read first.
         self.known = restored || (self.supervision == Supervision::Ours && !left);
         if self.supervision == Supervision::Ours && !left {
             return vec![Action::Spawn];
@@ -347,19 +354,19 @@ impl Lifecycle {
         vec![Action::Connect]
     }
 
-    /// Whether calls pass to the master, or would if it was not late.
+    /// Whether calls pass to the master, or would if it were not late.
     fn is_serving(&self) -> bool {
         matches!(self.phase, Phase::Serving | Phase::Late | Phase::CatchingUp)
     }
 
-    /// The master has answered us.
+    /// Notes that the master has answered.
     fn answered(&mut self, now: Instant) {
         self.missed = 0;
         self.evidence.clear();
         self.timer = Some((now + self.probing.interval, Timer::Probe));
     }
 
-    /// A probe before its time, but not while one is under way.
+    /// Probes before the next regular time, unless a probe is under way.
     fn probe_now(&mut self) -> Option<Action> {
         let due = self.timer.take_if(|(_, timer)| *timer == Timer::Probe);
         due.map(|_| Action::Probe)
@@ -372,13 +379,13 @@ impl Lifecycle {
         self.seeking_since.get_or_insert(now);
     }
 
-    /// The master is gone. Shuts the gate, then does `then`.
+    /// Handles the loss of the master: shuts the gate, then does `then`.
     fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
         let timer = self.timer;
         let was_serving = self.is_serving();
         self.seek(now);
         if cause == Cause::Exited {
-            // Set by `spawn`.
+            // `spawn` has set this timer.
             self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
         }
         let shut = was_serving.then_some(Action::ShutGate(cause));
@@ -399,8 +406,8 @@ impl Lifecycle {
         actions
     }
 
-    /// Whether our child has had enough time to listen, if it was not busy. A rosmaster whose port was taken stays
-    /// alive without ever listening.
+    /// Whether our child has had enough time to listen, given that it was not busy. A rosmaster
+    /// whose port was taken stays alive without ever listening.
     fn is_slow_to_start(&self, now: Instant) -> bool {
         let limit = self.probing.start_limit;
         self.child
@@ -439,7 +446,7 @@ impl Lifecycle {
                 }
                 actions
             }
-            // It does not even accept connections: it is stopped, and its backlog is full.
+            // The master does not even accept connections: it is stopped, and its backlog is full.
             _ if self.is_hopeless(now) => self.give_up_if_hung(now, BUSY_LIMIT, true),
             _ => self.connect_later(now, true),
         }
@@ -472,7 +479,7 @@ impl Lifecycle {
         actions
     }
 
-    /// A master of ours has died: starts the next one.
+    /// Starts the next master after one of ours has died.
     fn spawn(&mut self, now: Instant) -> Vec<Action> {
         self.count_death(now);
         let pause = self.pause_before_spawn();
@@ -484,7 +491,7 @@ impl Lifecycle {
         vec![Action::ReportCrashLoop(self.deaths.len())]
     }
 
-    /// The master that never got its port has ended. That is no death.
+    /// Handles the end of a master that never got its port. This does not count as a death.
     fn spawn_elsewhere(&mut self, now: Instant) -> Vec<Action> {
         match self.taken_ports.checked_sub(DEATHS_AT_ONCE + 1) {
             None => vec![Action::Spawn],
@@ -495,7 +502,8 @@ impl Lifecycle {
         }
     }
 
-    /// An external master has died. rosrescue does not slow its restarts; a crash loop is reported once.
+    /// Counts the death of an external master. rosrescue does not slow its restarts; a crash loop
+    /// is reported once.
     fn their_death(&mut self, now: Instant) -> Option<Action> {
         self.lost = false;
         let said = self.crash_loop;
@@ -522,7 +530,7 @@ impl Lifecycle {
     }
 }
 
-/// Says why a master is not killed.
+/// Reports why a master is not killed.
 fn spare(verdict: Verdict) -> Option<Action> {
     match verdict {
         Verdict::Unproved(why) => Some(Action::Spare(why)),
@@ -536,8 +544,9 @@ fn pause_after(further: usize) -> Duration {
     (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
 }
 
-/// Short at first, when a restart may take only milliseconds, longer later. A refused connect on one computer
-/// costs some 20 us. `far`: the connect itself has waited for an answer.
+/// The pause before the next connect. It is short at first, when a restart may take only
+/// milliseconds, and longer later. A refused connect on the same computer costs some 20 µs. `far`
+/// means that the connect itself has waited for an answer.
 fn pause_before_connect(waited: Duration, far: bool) -> Duration {
     let pause = match waited.as_millis() {
         0..2_000 => Duration::from_millis(1),

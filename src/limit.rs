@@ -1,24 +1,24 @@
-//! What could come by the thousand, such as lines of the log and files of a crash loop: so many at once, then one
-//! from time to time.
+//! Rate limits for what could come by the thousand, such as log lines and files during a crash
+//! loop: a burst at first, then one from time to time.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
-/// At once.
+/// Number of times that are allowed at once.
 const BURST: u32 = 10;
-/// Afterwards one more for each of these: some 300 a day.
+/// Time after which one more is allowed: some 300 a day.
 const REFILL: Duration = Duration::from_secs(300);
 
-/// How often one thing is done.
+/// A rate limit for one thing.
 #[derive(Debug)]
 pub(crate) struct Limit(Mutex<Bucket>);
 
 #[derive(Debug)]
 struct Bucket {
     left: u32,
-    /// When the last one was added.
+    /// When the bucket was last refilled.
     filled: Option<Instant>,
     left_out: u64,
 }
@@ -28,7 +28,8 @@ impl Limit {
         Self(Mutex::new(Bucket::FULL))
     }
 
-    /// Whether it is done now. If so, the number of those left out before it; none if there are none.
+    /// Whether the thing may be done now. If so, also the number of times that were left out before
+    /// it; none if there are none.
     pub(crate) fn pass(&self, now: Instant) -> Option<Option<u64>> {
         let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         bucket.pass(now)
@@ -62,7 +63,7 @@ impl Bucket {
     }
 }
 
-/// How often an alarm and its all-clear are logged: both, or neither.
+/// A rate limit for an alarm and its all-clear: both are logged, or neither.
 #[derive(Debug)]
 pub(crate) struct Pair(Mutex<Episode>);
 
@@ -85,7 +86,7 @@ impl Pair {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// As [`Limit::pass`], for an alarm.
+    /// Like [`Limit::pass`], for an alarm.
     pub(crate) fn alarm(&self, now: Instant) -> Option<Option<u64>> {
         let mut episode = self.lock();
         let passed = episode.bucket.pass(now);
@@ -93,8 +94,8 @@ impl Pair {
         passed
     }
 
-    /// As [`Limit::pass`], for the all-clear. It passes if an alarm did since the last one; without any alarm it
-    /// is limited as a line of its own.
+    /// Like [`Limit::pass`], for the all-clear. It passes if an alarm passed since the last
+    /// all-clear. Without an alarm it is limited like any other line.
     pub(crate) fn all_clear(&self, now: Instant) -> Option<Option<u64>> {
         let mut episode = self.lock();
         match episode.told.take() {
@@ -103,13 +104,15 @@ impl Pair {
         }
     }
 
-    /// Another line has told of the same trouble: the all-clear follows.
+    /// Notes that another log line has reported the same trouble, so that the all-clear is logged
+    /// as well.
     pub(crate) fn told(&self) {
         self.lock().told = Some(true);
     }
 }
 
-/// As the macro of `tracing` of that level, but [rate-limited](self). The rest is logged at level debug.
+/// Logs like the `tracing` macro of that level, but [rate-limited](self). The rest is logged at
+/// level debug.
 macro_rules! rarely {
     ($level:ident, $($line:tt)+) => {{
         static LIMIT: $crate::limit::Limit = $crate::limit::Limit::new();
@@ -121,7 +124,7 @@ macro_rules! rarely {
 }
 pub(crate) use rarely;
 
-/// As [`rarely!`], for the alarm of a [`Pair`].
+/// Like [`rarely!`], for the alarm of a [`Pair`].
 macro_rules! alarm {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.alarm(std::time::Instant::now()) {
@@ -132,7 +135,7 @@ macro_rules! alarm {
 }
 pub(crate) use alarm;
 
-/// As [`rarely!`], for the all-clear of a [`Pair`].
+/// Like [`rarely!`], for the all-clear of a [`Pair`].
 macro_rules! all_clear {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.all_clear(std::time::Instant::now()) {
@@ -186,7 +189,7 @@ mod tests {
         }
         let later = now + REFILL;
         assert_eq!(pair.alarm(later), Some(Some(5)), "so many were left out");
-        // The same trouble goes on, and is not told again.
+        // The same trouble continues, and is not logged again.
         assert_eq!(pair.alarm(later), None);
         assert_eq!(pair.all_clear(later), Some(None));
     }

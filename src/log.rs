@@ -1,5 +1,5 @@
-//! Where the log goes: to standard error. If that is journald, each line begins with its priority, as
-//! `sd-daemon(3)` says, so that `journalctl -p warning` works and colours are right.
+//! Writes the log to standard error. If journald reads it, each line begins with its priority, as
+//! described in `sd-daemon(3)`, so that `journalctl -p warning` and its colours work.
 
 use std::io::{self, Write};
 
@@ -14,8 +14,9 @@ pub struct Stderr {
 }
 
 impl Stderr {
-    /// Finds out who reads it. `stream`: the value of `JOURNAL_STREAM`, device and inode of what systemd has given us;
-    /// standard error may have been redirected since.
+    /// Finds out whether journald reads standard error. `stream` is the value of `JOURNAL_STREAM`:
+    /// device and inode of the stream that systemd gave us. Standard error may have been redirected
+    /// since.
     pub fn of(stream: Option<&str>) -> Self {
         let own = fstat(io::stderr()).ok();
         let own = own.map(|file| format!("{}:{}", file.st_dev, file.st_ino));
@@ -43,7 +44,7 @@ impl<'a> MakeWriter<'a> for Stderr {
     }
 }
 
-/// Writes one line with this before it, and without what a terminal would take for commands.
+/// Writes one line after this prefix, without characters that a terminal would take for commands.
 #[derive(Debug)]
 pub struct Prefixed(&'static str);
 
@@ -52,7 +53,7 @@ impl Write for Prefixed {
         self.write_all(line).map(|()| line.len())
     }
 
-    /// All of it at once: other processes may write to the same stream.
+    /// Writes the whole line at once, because other processes may write to the same stream.
     fn write_all(&mut self, line: &[u8]) -> io::Result<()> {
         let line = safe(&String::from_utf8_lossy(line));
         io::stderr().write_all(format!("{}{line}", self.0).as_bytes())
@@ -63,16 +64,17 @@ impl Write for Prefixed {
     }
 }
 
-/// In place of a character that a terminal must not get.
+/// Replaces a character that must not reach a terminal.
 const REPLACEMENT: char = '\u{fffd}';
 
-/// Whether a terminal would take a character for a command, or for another order of the letters.
+/// Whether a terminal would take the character for a command, or for a change of the writing
+/// direction.
 fn is_unsafe(c: char) -> bool {
     let turns = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     turns || c.is_control() && c != '\n'
 }
 
-/// The JSON `text` with such characters escaped: it means the same.
+/// Escapes such characters in JSON `text` without changing its meaning.
 pub(crate) fn plain_json(text: &str) -> String {
     let mut plain = String::with_capacity(text.len());
     for c in text.chars() {
@@ -84,14 +86,15 @@ pub(crate) fn plain_json(text: &str) -> String {
     plain
 }
 
-/// `text` without what a terminal would take for commands, or for another order of the letters: names come from the
-/// network.
+/// Replaces characters in `text` that a terminal would take for commands or for a change of the
+/// writing direction. Names come from the network, so they may contain any.
 pub(crate) fn plain(text: &str) -> String {
     let safe = |c: char| if is_unsafe(c) { REPLACEMENT } else { c };
     text.chars().map(safe).collect()
 }
 
-/// A line of the log as [`plain`] text with the formatter's colours. The formatter itself escapes ESC in values.
+/// Makes a log line [`plain`] but keeps the formatter's colours. The formatter itself escapes ESC
+/// in values.
 fn safe(line: &str) -> String {
     let mut parts = line.split('\u{1b}');
     let mut safe = plain(parts.next().unwrap_or_default());

@@ -24,14 +24,15 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::EnvFilter;
 
-/// How long threads may still run after everything is done.
+/// How long threads may still run after all work is done.
 const LAST_JOBS: Duration = Duration::from_millis(500);
-/// A signal to all processes named rosrescue, as by killall, reaches a worker twice: directly and through
-/// its guardian. A second signal within this time counts as the first.
+/// A signal to all processes named rosrescue, as sent by killall, reaches a worker twice: directly
+/// and through its guardian. A second signal within this time counts as the first one.
 const SAME_SIGNAL: Duration = Duration::from_millis(250);
 
 fn main() -> ExitCode {
-    // Must be first: it removes them from the environment, which requires a single thread.
+    // This must come first: it removes the sockets from the environment, which is only safe with a
+    // single thread.
     let sockets = match Sockets::inherited() {
         Ok(sockets) => sockets,
         Err(error) => {
@@ -40,7 +41,7 @@ fn main() -> ExitCode {
         }
     };
     if sockets.is_some() {
-        // A worker is started as /proc/self/exe, and would be listed as `exe`.
+        // The worker is started as /proc/self/exe, and would otherwise be listed as `exe`.
         let _ = rustix::thread::set_name(c"rosrescue");
     }
     let cli = Cli::read();
@@ -73,7 +74,7 @@ fn main() -> ExitCode {
     };
     let mut config = match config {
         Ok(config) => config,
-        // Exit status 2, like all usage errors.
+        // Exit status 2, as for all usage errors.
         Err(error) => Cli::command()
             .error(ErrorKind::ValueValidation, error)
             .exit(),
@@ -120,16 +121,17 @@ fn start(
 }
 
 fn run(config: Config, sockets: Sockets, hostname: String) -> Result<(), Box<dyn Error>> {
-    // With more threads each call wakes others, which costs a third more time of a core. One answers tens of
-    // thousands of reads a second, and what takes long goes elsewhere (`block_in_place`, `spawn_blocking`).
+    // One thread: with more threads each call wakes others, which costs a third more CPU time. One
+    // thread answers tens of thousands of reads per second, and slow work goes elsewhere
+    // (`block_in_place`, `spawn_blocking`).
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
         .build()?;
     let ended = runtime.block_on(serve(config, sockets, hostname));
-    // The closing checkpoint is on the disk and newer than any write still under way. A thread may still wait
-    // for a name server that never answers: the end of the process does not wait for it, but dropping the
-    // runtime would.
+    // The closing checkpoint is on the disk and newer than any write still under way. A thread may
+    // still wait for a name server that never answers. Ending the process does not wait for it, but
+    // dropping the runtime would.
     runtime.shutdown_timeout(LAST_JOBS);
     ended
 }
@@ -140,7 +142,7 @@ async fn serve(config: Config, sockets: Sockets, hostname: String) -> Result<(),
         signal(SignalKind::interrupt())?,
         signal(SignalKind::terminate())?,
     );
-    // The terminal was closed. Ignored under nohup.
+    // SIGHUP: the terminal was closed. It is ignored under nohup.
     let mut hangup = match guardian::is_hangup_ignored() {
         true => None,
         false => Some(signal(SignalKind::hangup())?),
@@ -199,7 +201,7 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
         .with_env_filter(filter)
         .with_writer(Stderr::of(std::env::var("JOURNAL_STREAM").ok().as_deref()))
         .with_target(false)
-        // They would go to stderr, and panic if the terminal is gone.
+        // These errors would go to stderr, and panic if the terminal is gone.
         .log_internal_errors(false)
         .with_ansi(ansi);
     match args.log_format {
@@ -209,7 +211,8 @@ fn start_log(args: &CommonArgs, verbose: bool) -> Result<(), String> {
     Ok(())
 }
 
-/// Raises the limit on open files as far as allowed; the usual 1024 are soon reached. Returns the limit.
+/// Raises the limit on open files as far as allowed, because the usual 1,024 are soon reached.
+/// Returns the limit.
 fn raise_file_limit() -> u64 {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);

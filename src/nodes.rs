@@ -1,4 +1,4 @@
-//! What is known of the nodes beyond their registrations, and the watch over it.
+//! Watches the nodes, and knows what is not in their registrations.
 
 pub(crate) mod client;
 pub(crate) mod health_check;
@@ -43,18 +43,18 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// How long the master must be away before rosrescue sends the notifications that it may not have sent. Most
-/// masters that only closed an idle connection are back by then.
+/// How long the master must be away before rosrescue sends the notifications that it may not have
+/// sent. Most masters that only closed an idle connection are back by then.
 const OWED_AFTER: Duration = Duration::from_millis(50);
 
-/// When a new worker tells nodes what its predecessor may not have told them: by then a master that it has adopted
-/// has sent what it was going to send, unless it has a long backlog.
+/// Delay after which a new worker sends nodes what its predecessor may not have sent. By then an
+/// adopted master has sent its own notifications, unless it has a long backlog.
 const ADOPTED_AFTER: Duration = Duration::from_secs(1);
 
 /// Most nodes that are remembered for not answering `paramUpdate`.
 const MUTE_MOST: usize = 1024;
 
-/// What is known of the nodes beyond their registrations.
+/// The state of the nodes beyond their registrations.
 pub struct Nodes {
     ledger: Arc<Ledger>,
     gate: gate::Rx,
@@ -67,22 +67,22 @@ pub struct Nodes {
     liveness: Liveness,
     new: New,
     unreachable: Mutex<Unreachable>,
-    /// Ports of nodes that do not answer `paramUpdate`, but answer otherwise.
+    /// Ports of nodes that do not answer `paramUpdate` but answer other calls.
     mute: Mutex<HashSet<String>>,
     pub(crate) removed: Removed,
-    /// This computer is cut off from the others.
+    /// Whether this computer is cut off from the others.
     alone: AtomicBool,
     served: Served,
-    /// Recoveries whose health check is not over.
+    /// Number of recoveries whose health check has not ended.
     checks: AtomicUsize,
-    /// Nodes that have not been asked yet, or have not answered yet.
+    /// Number of nodes that have not been asked or have not answered yet.
     pub(super) unanswered: AtomicUsize,
     changed: Notify,
 }
 
 impl Nodes {
-    /// `ledger` knows the nodes. `timeout`: how long one may take to answer. `served`: hosts whose nodes have this
-    /// rosrescue for their master.
+    /// Creates the state for the nodes of `ledger`. `timeout` is how long a node may take to
+    /// answer. `served` are the hosts whose nodes use this rosrescue as their master.
     pub fn new(
         ledger: Arc<Ledger>,
         gate: gate::Rx,
@@ -112,13 +112,13 @@ impl Nodes {
         }
     }
 
-    /// Whether this computer is cut off from the others.
+    /// Sets whether this computer is cut off from the others.
     pub(crate) fn set_alone(&self, alone: bool) {
         self.alone.store(alone, Ordering::Relaxed);
     }
 
-    /// Whether the node at `port` may be told something. A computer that is alone tells the others' nodes nothing:
-    /// they hear the state of the computer that leads.
+    /// Whether the node at `port` may be notified. A computer that is cut off does not notify nodes
+    /// of other computers, because they get the state of the leader.
     pub(super) async fn may_tell(&self, port: &str) -> bool {
         !self.alone.load(Ordering::Relaxed)
             || self.served.has(port)
@@ -139,7 +139,7 @@ impl Nodes {
         self.mute.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether the node at `port` does not answer `paramUpdate`, but answers otherwise.
+    /// Whether the node at `port` does not answer `paramUpdate` but answers other calls.
     fn is_mute(&self, port: &str) -> bool {
         self.lock_mute().contains(port)
     }
@@ -153,7 +153,7 @@ impl Nodes {
         }
     }
 
-    /// The names of the nodes that are unreachable.
+    /// The names of the unreachable nodes.
     pub fn unreachable(&self) -> Vec<String> {
         // Never hold both locks here.
         let unreachable = self.lock().clone();
@@ -166,25 +166,26 @@ impl Nodes {
         names
     }
 
-    /// The node at `port` did not answer.
+    /// Notes that the node at `port` did not answer.
     pub(super) fn mark_unreachable(&self, port: &str) {
         let now = Instant::now();
         let new = self.lock().add(port, now);
-        // It may be due before the others.
+        // This node may be due before the others.
         self.changed.notify_one();
         if !new {
             return;
         }
         tracing::debug!(port, "a node does not answer");
         if self.update_notifying() {
-            // The master may be about to notify this very node of recent changes, before all others.
+            // The master may be about to notify this very node of recent changes, before all
+            // others.
             self.ledger
                 .with_activity(|_, activity| activity.repeat_changes(now));
             self.ledger.outbox_changed.notify_one();
         }
     }
 
-    /// The node at `port` has answered, or is gone. Returns whether it was unreachable.
+    /// Notes that the node at `port` has answered or is gone. Returns whether it was unreachable.
     pub(super) fn clear(&self, port: &str) -> bool {
         let was = self.lock().remove(port);
         if was {
@@ -193,10 +194,10 @@ impl Nodes {
         was
     }
 
-    /// rosrescue notifies nodes beside the master while a node is unreachable, or a check is under way.
-    /// Returns whether that begins now.
+    /// Decides whether rosrescue notifies nodes in addition to the master: while a node is
+    /// unreachable or a check is under way. Returns whether that begins now.
     fn update_notifying(&self) -> bool {
-        // Nested locks, only here: otherwise an older result could be stored last.
+        // The locks are nested only here: otherwise an older result could be stored last.
         let unreachable = self.lock();
         let notifying = !unreachable.is_empty() || self.checks.load(Ordering::Relaxed) > 0;
         self.ledger
@@ -204,8 +205,8 @@ impl Nodes {
             && notifying
     }
 
-    /// rosrescue notifies nodes beside the master until the result is dropped: it is not known yet which
-    /// nodes are unreachable.
+    /// Lets rosrescue notify nodes in addition to the master until the result is dropped, because
+    /// it is not known yet which nodes are unreachable.
     pub(super) fn begin_check(nodes: &Arc<Self>) -> CheckUnderWay {
         nodes.checks.fetch_add(1, Ordering::Relaxed);
         nodes.update_notifying();
@@ -223,8 +224,8 @@ impl Drop for CheckUnderWay {
     }
 }
 
-/// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again, identifies
-/// new nodes, and runs the regular health check.
+/// Watches the nodes as long as it is polled: sends notifications, asks unreachable nodes again,
+/// identifies new nodes, and runs the regular health check.
 pub(crate) async fn watch(nodes: Arc<Nodes>, reap_interval: Option<Duration>) {
     let mut reaping = reap_interval
         .map(|pause| tokio::time::interval_at(tokio::time::Instant::now() + pause, pause));
@@ -290,8 +291,8 @@ fn empty_outbox(nodes: &Arc<Nodes>, repeats: &mut Repeats<Change>) {
     }
 }
 
-/// Takes the notifications of topics and parameters that a master lost at `outage` may not have sent, and begins to
-/// shut nodes down that it may not have told.
+/// Takes the notifications that a master lost at `outage` may not have sent, as topics and
+/// parameters. Also begins to shut down nodes that it may not have told.
 fn take_owed(nodes: &Arc<Nodes>, outage: Instant) -> (Vec<String>, Vec<(String, Arc<str>)>) {
     let owed = nodes
         .ledger
@@ -312,9 +313,9 @@ pub(super) fn notify_owed(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     topics
 }
 
-/// Tells nodes, after a second, what a rosrescue that died may not have told them. Returns the topics.
+/// Sends nodes, after a second, what a rosrescue that died may not have sent. Returns the topics.
 ///
-/// The master lives and may still have notifications to send: the state goes last.
+/// The master lives and may still have notifications to send, so the present state goes last.
 pub(super) fn notify_later(nodes: &Arc<Nodes>, outage: Instant) -> Vec<String> {
     let (mut topics, params) = take_owed(nodes, outage);
     let at = Instant::now() + ADOPTED_AFTER;
@@ -381,7 +382,7 @@ fn say(outcome: &CheckResult, what: &str) {
     rarely!(info, ?names, ?removed, ?reconciled, "{what}");
 }
 
-/// The regular health check.
+/// Runs the regular health check.
 async fn reap(nodes: Arc<Nodes>) {
     let HealthCheck {
         removed,

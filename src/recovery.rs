@@ -1,4 +1,4 @@
-//! Watches the master and brings it back: the shell around [`crate::lifecycle`].
+//! Watches the master and brings it back. This is the shell around [`crate::lifecycle`].
 
 pub(crate) mod examine;
 pub(crate) mod master_process;
@@ -41,14 +41,15 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// That masters die again and again, and that the present one lives.
+/// Limits the log lines that masters keep dying and that the present one lives.
 static CRASH_LOOP: Pair = Pair::new();
 
 /// The result of a step. At most one step runs at a time.
 enum Done {
     Connected(Arc<Sentinel>),
     NotConnected(ConnectError),
-    /// Another program, with this process id if it is known, listens at the port of the master just started.
+    /// Another program listens at the port of the master that was just started, with its process id
+    /// if known.
     PortTaken(Option<u32>),
     Examined(Arc<Sentinel>, Result<Examination, ExamineError>),
     Probed(Result<(), VerifyError>),
@@ -68,18 +69,18 @@ pub(crate) struct Driver {
     lifecycle: Lifecycle,
     process: Option<MasterProcess>,
     rescues: Rescues,
-    /// The gate opens to a master that has just been restored, in the rescue of this number.
+    /// The rescue in which the present master was restored, until the gate opens.
     restored: Option<u64>,
     /// Why the last master could not be started.
     spawn_error: Option<ProcessError>,
     sentinel: Option<Arc<Sentinel>>,
-    /// Resolves when the sentinel ends.
+    /// Resolves when the sentinel's connection ends.
     ended: Option<Ended>,
     /// Resolves when a thread of the master ends, once for each master.
     thread_ended: Option<Ended>,
     step: Option<Step>,
     probe_deadline: Option<tokio::time::Instant>,
-    /// By how much timers were late, all together.
+    /// Total delay of timers that fired late.
     timers_late: Duration,
     prepared: Option<JoinHandle<Prepared>>,
     outage: Outage,
@@ -87,8 +88,8 @@ pub(crate) struct Driver {
 }
 
 impl Driver {
-    /// A driver that examines masters with `examiner` and starts them with `process`. `slow` is notified when
-    /// a master takes too long to answer a call.
+    /// Creates a driver that examines masters with `examiner` and starts them with `process`.
+    /// `slow` is notified when a master takes too long to answer a call.
     pub(crate) fn new(
         examiner: Examiner,
         write_queue: WriteQueue,
@@ -125,14 +126,15 @@ impl Driver {
         }
     }
 
-    /// As [`Self::start`], after another computer has had the master. `cause`: why this one has it now.
+    /// Like [`Self::start`], after another computer has had the master. `cause` tells why this
+    /// computer has it now.
     pub(crate) fn take_over(&mut self, cause: &'static str) -> Vec<Action> {
         self.outage.cause = cause;
         self.start(true)
     }
 
-    /// Lets the mirror stand in, if it may, and returns what is to be done first. `restored`: the mirror is
-    /// from a checkpoint whose session continues.
+    /// Lets the mirror stand in, if it may, and returns the first actions. `restored` tells whether
+    /// the mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
         let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
         let actions = self
@@ -142,7 +144,7 @@ impl Driver {
         actions
     }
 
-    /// Watches the master until `stop`, after the actions that [`Self::start`] has returned.
+    /// Watches the master until `stop`, beginning with the actions that [`Self::start`] returned.
     ///
     /// # Errors
     ///
@@ -152,7 +154,7 @@ impl Driver {
         mut actions: Vec<Action>,
         stop: CancellationToken,
     ) -> Result<Option<MasterProcess>, ProcessError> {
-        // None for the first actions.
+        // The first actions follow from no input.
         let mut input = None;
         loop {
             let mut next = None;
@@ -194,7 +196,7 @@ impl Driver {
         }
     }
 
-    /// Looks at the process of our master, if the lifecycle needs that to decide.
+    /// Samples the master's process, if the lifecycle needs that to decide.
     async fn sample_for(&mut self, input: Input) {
         let process = self.process.as_ref();
         let pid = process.and_then(MasterProcess::pid);
@@ -210,8 +212,8 @@ impl Driver {
         });
     }
 
-    /// After an input that ends the contact with the master: tells the lifecycle first whether that master had
-    /// answered, and drops the step under way.
+    /// Handles an input that ends the contact with the master: tells the lifecycle first whether
+    /// that master had answered, and drops the step under way.
     fn end_contact(&mut self, input: Input) {
         if !matches!(
             input,
@@ -275,12 +277,13 @@ impl Driver {
         }
     }
 
-    /// Carries out `action`. Returns its result if that is known at once.
+    /// Carries out `action`. Returns its result if it is known at once.
     async fn carry_out(&mut self, action: Action) -> Option<Input> {
         match action {
             Action::Connect => {
                 self.disconnect();
-                // Always prepared anew: the previous plan may have gone to a master that died meanwhile.
+                // Always prepared afresh, because the previous plan may have gone to a master that
+                // died meanwhile.
                 let ledger = &self.examiner.ledger;
                 self.prepared
                     .get_or_insert_with(|| examine::prepare(ledger.clone()));
@@ -291,7 +294,7 @@ impl Driver {
                         Ok(sentinel) => Arc::new(sentinel),
                         Err(error) => return Done::NotConnected(error),
                     };
-                    // Before the first call: a stranger must not be given the state.
+                    // This precedes the first call, because a stranger must not be given the state.
                     match holder(new).await {
                         Holder::Stranger(pid) => Done::PortTaken(pid),
                         Holder::Master | Holder::Unknown => Done::Connected(sentinel),
@@ -316,7 +319,7 @@ impl Driver {
                 self.step = Some(Box::pin(examined.instrument(span)));
             }
             Action::Probe => {
-                // A late probe continues: its answer counts whenever it comes.
+                // A late probe continues, and its answer counts whenever it comes.
                 self.probe_deadline =
                     Some(tokio::time::Instant::now() + self.examiner.probe_timeout);
                 if self.step.is_none()
@@ -354,7 +357,7 @@ impl Driver {
             ),
             Action::OpenGate => self.open_gate(),
             Action::Spawn => return self.spawn().await,
-            // Handled by the caller.
+            // The caller handles this action.
             Action::GiveUp => {}
             Action::Kill => {
                 self.disconnect();
@@ -418,7 +421,7 @@ impl Driver {
                     ConnectError::Unreachable { .. } => Input::Unreachable,
                 })
             }
-            // What was read and written may have been two masters'.
+            // The data that was read and written may belong to two different masters.
             Done::Examined(sentinel, Ok(_)) if !sentinel.is_open() => Some(Input::ConnectionLost),
             Done::Examined(sentinel, Ok(examination)) => {
                 let outcome = examination.outcome;
@@ -454,9 +457,10 @@ impl Driver {
                 tracing::debug!(?result, "the master must be examined");
                 Some(Input::NotCaughtUp)
             }
-            // Another incarnation answers, although the connection to the previous one is still open.
+            // Another incarnation answers, although the connection to the previous one is still
+            // open.
             Done::Probed(Err(VerifyError::OtherIncarnation)) => Some(Input::ConnectionLost),
-            // No answer. If the master has just died, the older connection will end and show it.
+            // No answer. If the master has just died, the end of the older connection will show it.
             Done::Probed(Err(_)) => None,
             Done::Probed(Ok(())) => {
                 self.probe_deadline = None;
@@ -526,7 +530,7 @@ impl Driver {
         self.said = None;
         self.examiner.open_gate();
         if let Some(number) = self.restored.take() {
-            // Not before: calls need not wait for a copy of the state.
+            // This comes last, so that calls need not wait for a copy of the state.
             self.rescues.keep(number, Instant::now());
         }
     }
@@ -546,12 +550,13 @@ impl Driver {
     }
 }
 
-/// Resolves at the end of a thread of the master `pid`. None if it runs elsewhere. Never resolves if the kernel
-/// cannot watch threads.
+/// Resolves when a thread of the master `pid` ends. None if the master runs elsewhere. Never
+/// resolves if the kernel cannot watch threads.
 fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     let id = u32::try_from(pid).ok().filter(|_| sentinel.is_local())?;
     Some(Box::pin(async move {
-        // Outside of the runtime: the command line is read under the lock of the master's memory.
+        // Runs off the runtime, because the command line is read under the lock of the master's
+        // memory.
         let watched = spawn_blocking(move || process::runs(id, "rosmaster")).await;
         if let (Ok(true), Ok(ended)) = (watched, thread_exit::of(pid)) {
             ended.await;
@@ -561,7 +566,7 @@ fn thread_of(sentinel: &Sentinel, pid: i32) -> Option<Ended> {
     }))
 }
 
-/// Who listens at the port of a master just started. Looked up outside of the runtime.
+/// Finds the process that listens at the port of a master just started. Runs off the runtime.
 async fn holder(new: Option<(u32, u16, bool)>) -> Holder {
     let Some((pid, port, own)) = new else {
         return Holder::Unknown;

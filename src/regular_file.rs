@@ -1,5 +1,6 @@
-//! Opens regular files in folders that other users may write to. No call follows a planted symbolic link, waits for
-//! the other end of a pipe, or changes a file that has another name elsewhere.
+//! Opens regular files in folders that other users may write to. It never follows a planted
+//! symbolic link, waits for the other end of a pipe, or changes a file that is hard-linked
+//! elsewhere.
 
 use std::{
     fs::{self, File, OpenOptions},
@@ -20,11 +21,13 @@ pub(crate) fn open(path: &Path) -> io::Result<File> {
     check(&file).map(|_| file)
 }
 
-/// Opens the file at `path` for reading and writing, or creates it for its owner only. Keeps what is in it.
+/// Opens the file at `path` for reading and writing, or creates it with access for its owner only.
+/// Keeps existing content.
 ///
 /// # Errors
 ///
-/// If the file cannot be opened, is a symbolic link, is not a regular file, or has several names.
+/// If the file cannot be opened, is a symbolic link, is not a regular file, or has several hard
+/// links.
 pub(crate) fn open_or_create(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.mode(0o600).read(true).write(true).create(true);
@@ -41,11 +44,12 @@ pub(crate) fn open_or_create(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Creates an empty file at `path` for reading and appending by its owner only. Removes a regular file that is there.
+/// Creates an empty file at `path` for reading and appending, with access for its owner only.
+/// Replaces a regular file that is there.
 ///
 /// # Errors
 ///
-/// If the file cannot be created, or what is there is not a regular file.
+/// If the file cannot be created, or another kind of file is there.
 pub(crate) fn create(path: &Path) -> io::Result<File> {
     match fs::symlink_metadata(path) {
         Ok(present) if present.is_file() => fs::remove_file(path)?,
@@ -53,7 +57,7 @@ pub(crate) fn create(path: &Path) -> io::Result<File> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => {}
         Err(error) => return Err(error),
     }
-    // O_EXCL: whatever another process puts there meanwhile is refused.
+    // O_EXCL: fails if another process has created something there meanwhile.
     let mut options = OpenOptions::new();
     options.read(true).append(true).create_new(true);
     options.mode(0o600).open(path)
@@ -63,7 +67,7 @@ fn with(options: &mut OpenOptions, flags: OFlags) -> &mut OpenOptions {
     options.custom_flags(flags.bits().cast_signed())
 }
 
-/// The number of names of a regular file.
+/// Number of hard links of a regular file.
 fn check(file: &File) -> io::Result<u64> {
     let metadata = file.metadata()?;
     match metadata.is_file() {
@@ -101,7 +105,7 @@ mod tests {
         }
         assert!(open(&fifo).is_err());
         assert!(open(&path("link")).is_ok());
-        // One name of two is removed; the other one keeps its content.
+        // Only one of the two names is removed; the content remains under the other.
         create(&path("second")).unwrap().write_all(b"new").unwrap();
         assert_eq!(fs::read_to_string(path("target")).unwrap(), "kept");
         assert_eq!(fs::read_to_string(path("second")).unwrap(), "new");

@@ -1,5 +1,5 @@
-//! Resolves host names. Concurrent lookups of a name share one, in a thread of its own: neither the runtime
-//! nor the end of the process waits for a name server that does not answer.
+//! Resolves host names. Concurrent lookups of one name share a lookup, each in a thread of its own,
+//! so neither the runtime nor the end of the process waits for a name server that does not answer.
 
 use std::{
     collections::BTreeMap,
@@ -13,10 +13,10 @@ use tokio::sync::{Semaphore, watch};
 
 use crate::ros_env::MasterUri;
 
-/// Most lookups at a time. A name server that does not answer costs a thread for some ten seconds.
+/// Most lookups at a time. A name server that does not answer blocks a thread for some ten seconds.
 const LOOKUPS: usize = 64;
 
-/// A name's addresses, without a port, or why there are none.
+/// The addresses of a name without a port, or why there are none.
 type Found = Result<Arc<[SocketAddr]>, Arc<io::Error>>;
 
 static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
@@ -27,11 +27,11 @@ fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Fo
     UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The addresses of `host` with `port`. IPv4 first, as in roscpp.
+/// Looks up the addresses of `host` and adds `port`. IPv4 addresses come first, as in roscpp.
 ///
 /// # Errors
 ///
-/// If it has none, or the lookup fails.
+/// If the host has no address, or the lookup fails.
 pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(vec![SocketAddr::new(address, port)]);
@@ -57,8 +57,8 @@ pub(crate) async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAdd
     }
 }
 
-/// Whether an address belongs to this computer: then the kernel routes to it from the same address. Nothing
-/// is sent.
+/// Whether an address belongs to this computer: then the kernel uses it as the source address of a
+/// route to itself. Nothing is sent.
 pub(crate) fn is_own(address: IpAddr) -> bool {
     let any = match address {
         IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
@@ -72,8 +72,8 @@ pub(crate) fn is_own(address: IpAddr) -> bool {
     address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
 }
 
-/// Whether a node's `api` is on another computer. Not if its host has no address, or if that is not known within
-/// `patience`.
+/// Whether a node's `api` is on another computer. False if its host has no address, or if the
+/// lookup takes longer than `patience`.
 pub(crate) async fn is_elsewhere(api: &str, patience: Duration) -> bool {
     let Ok(MasterUri { host, port }) = MasterUri::parse(api) else {
         return false;
@@ -84,14 +84,14 @@ pub(crate) async fn is_elsewhere(api: &str, patience: Duration) -> bool {
     }
 }
 
-/// Keeps the scope of an IPv6 address.
+/// Sets the port and keeps the scope of an IPv6 address.
 fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
     address.set_port(port);
     address
 }
 
 async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
-    // Never closed.
+    // The semaphore is never closed.
     let permit = PERMITS.acquire().await;
     let name = host.clone();
     let search = move || {
@@ -103,11 +103,12 @@ async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
             addresses.dedup();
             addresses.into()
         });
-        // Removed first: later callers get a fresh answer.
+        // The entry is removed before the result is sent, so that later callers look the name up
+        // afresh.
         under_way().remove(&name);
         tell.send_replace(Some(found));
     };
-    // Without a thread the sender is dropped, which waiters notice.
+    // If no thread can be started, the sender is dropped, and the waiters notice.
     let named = std::thread::Builder::new().name("lookup".to_owned());
     if named.spawn(search).is_err() {
         under_way().remove(&host);
@@ -139,7 +140,7 @@ mod tests {
                 "{own}"
             );
         }
-        // Set apart for documentation.
+        // This network is reserved for documentation.
         assert!(is_elsewhere("http://198.51.100.7:4711/", LONG).await);
         for nobody in ["http://nobody.invalid:4711/", "nonsense"] {
             assert!(!is_elsewhere(nobody, LONG).await, "{nobody}");

@@ -1,4 +1,4 @@
-//! ROS environment variables, as rosgraph and rospkg read them.
+//! ROS environment variables, read as rosgraph and rospkg read them.
 //!
 //! Sources: `rosgraph/network.py`, `rosgraph/rosenv.py`, `rospkg/environment.py` of Noetic.
 
@@ -9,17 +9,18 @@ use std::{
 
 use thiserror::Error;
 
-/// The master's port if `ROS_MASTER_URI` has none.
+/// The master's port if `ROS_MASTER_URI` contains none.
 pub const DEFAULT_MASTER_PORT: u16 = 11311;
 
-/// Looks up an environment variable. A parameter, so that tests need not change the environment.
+/// Looks up an environment variable. It is a parameter so that tests need not change the
+/// environment.
 pub type Lookup<'a> = &'a dyn Fn(&str) -> Option<String>;
 
 /// An invalid `ROS_MASTER_URI` or `--master`.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum UriError {
-    /// Not of the form `http://HOST:PORT/`.
+    /// The address is not of the form `http://HOST:PORT/`.
     #[error(
         "`{uri}` is not the URI of a master; write http://HOST:PORT/, as in http://localhost:11311/"
     )]
@@ -29,7 +30,7 @@ pub enum UriError {
 /// The address of a master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MasterUri {
-    /// Name or address, without the brackets of IPv6.
+    /// Host name or address, without the brackets of IPv6.
     pub host: String,
     pub port: u16,
 }
@@ -72,9 +73,10 @@ impl MasterUri {
         })
     }
 
-    /// Whether this, named by a node as its master, is the master at `own`. `addresses` are those of the host, as
-    /// seen from here; `is_own` tells this computer's own addresses. A loopback address is one of the node's own
-    /// computer, so it counts only if `node_is_here`.
+    /// Whether this address, which a node uses as its master, is the master at `own`. `addresses`
+    /// are the host's addresses as resolved here; `is_own` recognises this computer's own
+    /// addresses. A loopback address counts only if `node_is_here`, because it means the node's own
+    /// computer.
     pub(crate) fn names(
         &self,
         own: &Self,
@@ -109,7 +111,7 @@ impl std::fmt::Display for MasterUri {
     }
 }
 
-/// The port in `ROS_MASTER_URI`, else 11311.
+/// The port in `ROS_MASTER_URI`, or 11311.
 pub fn master_port(env: Lookup<'_>) -> Result<u16, UriError> {
     match env("ROS_MASTER_URI").filter(|uri| !uri.is_empty()) {
         Some(uri) => Ok(MasterUri::parse(&uri)?.port),
@@ -117,17 +119,17 @@ pub fn master_port(env: Lookup<'_>) -> Result<u16, UriError> {
     }
 }
 
-/// This computer's own address from `ROS_HOSTNAME`, else `ROS_IP`.
+/// This computer's own address from `ROS_HOSTNAME`, or else from `ROS_IP`.
 pub fn address_override(env: Lookup<'_>) -> Option<String> {
     env("ROS_HOSTNAME")
         .or_else(|| env("ROS_IP"))
         .filter(|address| !address.is_empty())
 }
 
-/// The variable and value of an invalid [`address_override`].
+/// Name and value of the variable if [`address_override`] is invalid; none if it is valid or unset.
 pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     let host = address_override(env)?;
-    // A scope as in fe80::1%eth0 is not checked.
+    // The scope of an address such as fe80::1%eth0 is not checked.
     let bare = host.split('%').next().unwrap_or_default();
     let is_name = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
     if host.chars().all(is_name) || bare.parse::<IpAddr>().is_ok() && !host.contains(['/', ' ']) {
@@ -140,8 +142,9 @@ pub fn bad_override(env: Lookup<'_>) -> Option<(&'static str, String)> {
     Some((variable, host))
 }
 
-/// The addresses to listen on, as a master does: all, or only loopback if its own address is a loopback one.
-/// The first is tried first; an address family that the computer lacks may be left out.
+/// The addresses to listen on, chosen as a master does: all, or only loopback if the computer's own
+/// address is a loopback address. The first is tried first; an address family that the computer
+/// lacks may be left out.
 pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     match address_override(env) {
         Some(address) if address.starts_with("127.") => {
@@ -161,8 +164,8 @@ pub fn bind_addresses(env: Lookup<'_>) -> Vec<IpAddr> {
     }
 }
 
-/// This computer's host for others, as rosgraph chooses it: the override, else the host name unless it is a
-/// loopback one, else `local_address`.
+/// The host of this computer that is announced to others, chosen as rosgraph does: the override,
+/// else the host name unless it is a loopback name, else `local_address`.
 pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<IpAddr>) -> String {
     if let Some(address) = address_override(env) {
         return address;
@@ -175,7 +178,7 @@ pub fn advertised_host(env: Lookup<'_>, hostname: &str, local_address: Option<Ip
         .to_string()
 }
 
-/// `$ROS_HOME`, else `~/.ros`.
+/// The folder `$ROS_HOME`, or `~/.ros`.
 pub fn ros_home(env: Lookup<'_>) -> PathBuf {
     match env("ROS_HOME").filter(|home| !home.is_empty()) {
         Some(home) => PathBuf::from(home),
@@ -183,7 +186,7 @@ pub fn ros_home(env: Lookup<'_>) -> PathBuf {
     }
 }
 
-/// `$ROS_LOG_DIR`, else `log` in [`ros_home`].
+/// The folder `$ROS_LOG_DIR`, or `log` in [`ros_home`].
 pub fn log_dir(env: Lookup<'_>) -> PathBuf {
     match env("ROS_LOG_DIR").filter(|dir| !dir.is_empty()) {
         Some(dir) => PathBuf::from(dir),
@@ -263,7 +266,7 @@ mod tests {
             assert!(names_us(named, &[at], own, true), "{named}");
             assert!(names_us(named, &[at], own, false), "{named}");
         }
-        // The loopback address is that of the node's own computer.
+        // A loopback address means the node's own computer.
         for named in ["http://localhost:11311", "http://127.0.0.1:11311"] {
             assert!(names_us(named, &["127.0.0.1"], own, true));
             assert!(!names_us(named, &["127.0.0.1"], own, false));

@@ -1,4 +1,4 @@
-//! What roscore does besides running a master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
+//! The duties of roscore besides the master: `/run_id`, `/rosversion`, `/rosdistro`, and rosout.
 
 use std::{
     path::PathBuf,
@@ -23,23 +23,23 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// How long `rosversion` may take: it is a Python program.
+/// Time limit for `rosversion`, which is a Python program.
 const VERSION_TIME: Duration = Duration::from_secs(20);
-/// Pause before rosout is restarted, as with roslaunch's respawn. It doubles after each rosout that did not
-/// live for [`LONGEST_RESPAWN`].
+/// Pause before rosout is restarted, as with roslaunch's `respawn`. It doubles after each rosout
+/// that did not run for [`LONGEST_RESPAWN`].
 const RESPAWN: Duration = Duration::from_secs(1);
 const LONGEST_RESPAWN: Duration = Duration::from_secs(10);
 const ROSOUT: &str = "/rosout";
 
 pub(crate) struct Roscore {
-    /// Knows whether the parameters are set already.
+    /// Tells whether the parameters are set already.
     pub ledger: Arc<Ledger>,
     pub write_queue: WriteQueue,
-    /// Whether calls pass to the master.
+    /// Tells whether calls pass to the master.
     pub gate: gate::Rx,
-    /// Our own address.
+    /// The address that rosrescue serves.
     pub uri: String,
-    /// The checkpoint's path. It distinguishes our rosout from others.
+    /// Path of the checkpoint, which distinguishes our rosout from others.
     pub checkpoint: PathBuf,
     /// How long a node may take to answer.
     pub node_timeout: Duration,
@@ -61,18 +61,19 @@ fn run_id(roscore: &Roscore) -> Request {
     set("/run_id", &roscore.ledger.session().id)
 }
 
-/// Sets a new session's run id before there is a master: it is injected with the rest, so no roslaunch ever
-/// sees a master without one. Not set if the master may have one already.
+/// Sets the run id of a new session before there is a master. It is injected with the rest of the
+/// state, so no roslaunch ever sees a master without one. The run id stays unset if the master may
+/// already have one.
 pub(crate) fn seed_run_id(roscore: &Roscore) {
     if !has(roscore, "/run_id") {
         roscore.ledger.seed(&run_id(roscore));
     }
 }
 
-/// Does the rest once there is a master, until `stop`; then ends rosout.
+/// Sets the versions and runs rosout once there is a master, until `stop`; then ends rosout.
 pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken) {
     let duties = async {
-        // Slow, so they run while the master starts.
+        // These are slow, so they run while the master starts.
         let versions = tokio::join!(
             version(&roscore, "/rosversion", "roslaunch"),
             version(&roscore, "/rosdistro", "-d"),
@@ -99,7 +100,7 @@ pub(crate) async fn run(roscore: Roscore, rosout: bool, stop: CancellationToken)
         () = stop.cancelled() => {}
     }
     stop.cancelled().await;
-    // After this point none is started. rosout still unregisters itself from the master.
+    // No rosout is started after this point. It can still unregister itself from the master.
     end_rosout(&roscore).await;
 }
 
@@ -107,7 +108,8 @@ async fn first_opening(roscore: &Roscore) {
     roscore.gate.clone().wait_for(gate::State::is_open).await;
 }
 
-/// The call that sets `key` as `roscore.xml` does: to the output of `rosversion`, including the line feed.
+/// The call that sets `key` to the output of `rosversion`, including the line feed, as
+/// `roscore.xml` does.
 async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request> {
     if has(roscore, key) {
         return None;
@@ -121,10 +123,10 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     version.map(|version| set(key, &version))
 }
 
-/// That rosout has ended or cannot be started, and that it is started.
+/// Limits the log lines that rosout has ended or cannot be started, and that it has been started.
 static ENDED: Pair = Pair::new();
 
-/// Keeps a rosout running: ours, or an existing one.
+/// Keeps one rosout running: ours, or one that exists already.
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!(
@@ -173,7 +175,7 @@ async fn keep_rosout(roscore: &Roscore) {
     }
 }
 
-/// The process id of the registered rosout, if it answers.
+/// Process id of the registered rosout; none if it does not answer.
 async fn living_rosout(roscore: &Roscore) -> Option<u32> {
     let api = roscore
         .ledger

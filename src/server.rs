@@ -33,13 +33,14 @@ use crate::status::stats::Stats;
 pub struct Server {
     /// Names of this computer, for the checks on `Host` and `Origin`.
     pub names: Vec<String>,
-    /// Who may call and change.
+    /// Who may call, and who may change something.
     pub(crate) access: Access,
-    /// Which refused addresses the log has named lately.
+    /// Refused addresses that the log has named lately.
     pub(crate) refused: Mutex<Said>,
     /// Identifies this process; see [`INSTANCE_HEADER`](crate::upstream::INSTANCE_HEADER).
     pub instance: String,
-    /// Notified when a request of our own arrives here: the master's address is our own.
+    /// Notified when a request by rosrescue itself arrives here: the master's address is
+    /// rosrescue's own.
     pub looped: Arc<Notify>,
     pub clients: Arc<Clients>,
     /// Connections without a request.

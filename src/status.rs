@@ -1,4 +1,5 @@
-//! The status: plain data for people and monitors, filled by other modules. Nothing waits for it.
+//! The status of rosrescue as plain data for people and monitors. Other modules fill it; nothing
+//! waits for it.
 
 pub(crate) mod cluster;
 pub(crate) mod computers;
@@ -21,33 +22,34 @@ use serde::{Deserialize, Serialize};
 use self::report::{DIED, HealthCheck, Report, STARTED};
 use crate::{cluster::machine::Role, gate::State};
 
-/// Reports that are kept.
+/// Number of recovery reports that are kept.
 const REPORTS: usize = 20;
 
-/// Who starts masters.
+/// Which of rosrescue's modes this process runs in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
-    /// rosrescue.
+    /// `rosrescue core`: rosrescue starts the master.
     Core,
-    /// Somebody else.
+    /// `rosrescue proxy`: another program starts the master.
     Proxy,
 }
 
-/// What the checkpointer knows.
+/// State of the checkpoint's disk, as the checkpointer sees it.
 #[derive(Clone, Copy, Debug)]
 pub struct Disk {
-    /// Whether changes are recorded, and since when it is so.
+    /// Whether changes are recorded, and when this last changed.
     pub protected: bool,
     pub since: Instant,
-    /// When the checkpoint was written as a whole, and the journal's last record then.
+    /// When the checkpoint was last rewritten as a whole, and the journal's last record at that
+    /// time.
     pub compacted: Option<(Instant, u64)>,
-    /// Bytes that are free for the checkpoint.
+    /// Free bytes on the checkpoint's disk.
     pub free: Option<u64>,
 }
 
 impl Disk {
-    /// Since when changes are not recorded. It is noticed a little later than it is so.
+    /// When recording stopped. It is noticed shortly after the failure.
     fn unprotected_since(&self) -> Instant {
         match self.protected {
             true => Instant::now(),
@@ -56,63 +58,67 @@ impl Disk {
     }
 }
 
-/// The health of the master and of rosrescue.
+/// What is known about the health of the master and of rosrescue.
 #[derive(Clone, Debug)]
 pub struct Facts {
     pub mode: Mode,
     pub started: Instant,
-    /// Since when the master keeps dying.
+    /// When the crash loop began; none while there is no crash loop.
     pub crash_loop: Option<Instant>,
-    /// When it no longer did.
+    /// When the last crash loop ended.
     pub calm_since: Option<Instant>,
-    /// Masters that have died in this session.
+    /// Number of masters that have died in this session.
     pub deaths: u64,
-    /// The latest reports of this session, the oldest first.
+    /// The latest reports of this session, oldest first.
     pub reports: VecDeque<Report>,
-    /// Masters examined since the start.
+    /// Number of masters examined since this process started.
     pub recoveries: u64,
-    /// Rescues in this session.
+    /// Number of rescues in this session.
     pub rescues: u64,
     pub earlier: Earlier,
     pub guarded: Guarded,
-    /// What talks to the master of `proxy` past rosrescue.
+    /// Processes, users and computers that bypass rosrescue and talk directly to the master of
+    /// `proxy`.
     pub(crate) bypassing: Vec<String>,
-    /// Whether the master of `proxy` is on this computer and takes connections from others.
+    /// Whether the master of `proxy` runs on this computer and accepts connections from other
+    /// computers.
     pub(crate) master_is_open: bool,
     pub disk: Disk,
-    /// None without other computers.
+    /// What is known of the other computers; none without `--cluster`.
     pub cluster: Option<cluster::ClusterFacts>,
 }
 
-/// What this session was before this process.
+/// What happened in this session before this process started.
 #[derive(Clone, Debug, Default)]
 pub struct Earlier {
-    /// The reports of its rescues, the oldest first.
+    /// The reports of this session's rescues, oldest first.
     pub(crate) reports: Vec<Report>,
     pub(crate) rescues: u64,
-    /// Masters that had died.
+    /// Number of masters that died.
     pub(crate) deaths: u64,
-    /// Times that rosrescue has died and was started again, this process included.
+    /// Number of times rosrescue died and was restarted, this process included.
     pub(crate) worker_restarts: u64,
-    /// Whether the process before this one died.
+    /// Whether the previous process died.
     pub(crate) died: bool,
-    /// The last number of a rescue, in any session.
+    /// The highest rescue number used in any session.
     pub(crate) last_number: u64,
 }
 
-/// Who keeps the port and restarts rosrescue when it dies.
+/// The supervisor that keeps the port and restarts rosrescue when it dies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Guarded {
-    /// No known supervisor.
+    /// There is no known supervisor.
     #[default]
     Nobody,
     /// systemd, with a socket unit.
     Systemd,
-    /// The guardian, with this process id. `restarted`: whether something starts it again when it dies, too.
+    /// The guardian process with this process id. `restarted`: whether something restarts the
+    /// guardian when it dies.
     Guardian { pid: u32, restarted: bool },
-    /// The guardian, with this process id, was stopped, as by Ctrl-Z. It does nothing until it is continued.
+    /// The guardian with this process id is stopped, as by Ctrl-Z. It does nothing until it is
+    /// resumed.
     Stopped(u32),
-    /// Nothing any more: the guardian, with this process id, has ended.
+    /// The guardian with this process id has ended, and nothing has replaced it.
     NoLonger(u32),
 }
 
@@ -150,7 +156,7 @@ impl fmt::Display for Guarded {
 }
 
 impl Facts {
-    /// What is known at the start.
+    /// The facts known when rosrescue starts.
     pub fn new(mode: Mode) -> Self {
         let started = Instant::now();
         Self {
@@ -176,12 +182,12 @@ impl Facts {
         }
     }
 
-    /// Since when there is nothing to complain of, if there is nothing now and calls pass.
+    /// Since when everything has been in order, given that it is in order now and calls pass.
     fn settled_since(&self) -> Instant {
         self.disk.since.max(self.calm_since.unwrap_or(self.started))
     }
 
-    /// Whether calls are answered: by the master, the mirror, or another computer.
+    /// Whether calls are answered by the master, the mirror, or another computer.
     pub(crate) fn answers(&self, gate: State) -> bool {
         match gate {
             State::Open { .. } | State::StandingIn | State::Late | State::Injecting => true,
@@ -193,7 +199,7 @@ impl Facts {
         }
     }
 
-    /// Goes on from what the session was before this process.
+    /// Continues the counts and reports of the session from before this process.
     pub(crate) fn go_on(&mut self, mut earlier: Earlier) {
         self.reports.extend(earlier.reports.drain(..));
         self.deaths = earlier.deaths;
@@ -201,12 +207,12 @@ impl Facts {
         self.earlier = earlier;
     }
 
-    /// The masters that this process has seen die, beside those before it.
+    /// Sets the number of masters that this process has seen die, in addition to those before it.
     pub(crate) fn set_deaths(&mut self, deaths: u64) {
         self.deaths = self.earlier.deaths + deaths;
     }
 
-    /// Adds a report and returns it with its number.
+    /// Numbers and stores a report, and returns it with its number.
     pub fn add(&mut self, mut report: Report) -> Report {
         self.recoveries += 1;
         if report.cause == STARTED && std::mem::take(&mut self.earlier.died) {
@@ -224,9 +230,9 @@ impl Facts {
         report
     }
 
-    /// Adds the health check after the recovery of that number, and returns the whole report.
+    /// Adds the health check to the recovery with this number, and returns the complete report.
     pub(crate) fn add_check(&mut self, number: u64, check: HealthCheck) -> Option<Report> {
-        // The last one: all ordinary starts have the same number.
+        // Search from the end, because all ordinary starts share the number 0.
         let mut reports = self.reports.iter_mut().rev();
         let report = reports.find(|report| report.number == number)?;
         report.add(check);
@@ -234,7 +240,7 @@ impl Facts {
     }
 }
 
-/// Holds the present [`Facts`].
+/// Shares the present [`Facts`] between modules.
 #[derive(Debug)]
 pub struct Board(Mutex<Facts>);
 

@@ -34,13 +34,13 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Largest accepted reply of the master, in bytes. A parameter tree of 64 MiB, encoded again as XML, is
+/// Largest accepted reply of the master, in bytes. The XML of a parameter tree of 64 MiB is
 /// smaller.
 const MAX_REPLY: usize = 512 << 20;
-/// Limit on a connect: a host that drops packets never answers.
+/// Time limit for a connect, because a host that drops packets never answers.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
-/// In each request to the master, so that a proxy that points at itself notices.
+/// Header in each request to the master, by which a proxy notices that it points at itself.
 pub(crate) const INSTANCE_HEADER: &str = "x-rosrescue-instance";
 
 /// Why a connection could not be made.
@@ -54,26 +54,26 @@ pub enum ConnectError {
     Unreachable { master: String, source: io::Error },
 }
 
-/// A call without a reply. Whether the master may have run it decides what may follow.
+/// Why a call got no reply. Whether the master may have run it decides what may follow.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CallError {
-    /// No byte was sent: it may be sent again.
+    /// No byte was sent, so the call may be sent again.
     #[error("the call was not sent: {0}")]
     NotSent(hyper::Error),
-    /// No byte was sent: the connection for it could not be made.
+    /// No byte was sent, because no connection could be made.
     #[error("there is no connection for the call: {0}")]
     NotConnected(io::Error),
-    /// The master may have run it.
+    /// The master may have run the call.
     #[error("the master gave no reply: {0}")]
     MaybeSent(hyper::Error),
-    /// The reply may be that of another incarnation.
+    /// The reply may come from another incarnation.
     #[error("the reply does not count: {0}")]
     Unverified(Box<VerifyError>),
-    /// The reply's body broke off, or exceeded all limits.
+    /// The reply's body ended early or exceeded a limit.
     #[error("the master's reply is not whole: {0}")]
     BrokenReply(Box<dyn std::error::Error + Send + Sync>),
-    /// The reply is whole, but not XML-RPC; only for calls of our own.
+    /// The reply is complete, but not XML-RPC. Only for calls made by rosrescue.
     #[error("the master's reply is no XML-RPC (HTTP status {status}): {reason}")]
     NotXmlRpc { status: StatusCode, reason: String },
 }
@@ -83,7 +83,7 @@ pub enum CallError {
 pub struct Head {
     /// The request's target, such as `/RPC2`.
     pub path: String,
-    /// The body's content encoding, if any.
+    /// Content encoding of the body, if there is one.
     pub encoding: Option<HeaderValue>,
 }
 
@@ -97,8 +97,8 @@ impl Default for Head {
 }
 
 impl RawReply {
-    /// Whether the connection may be used again. rosmaster does not read the body of a request whose head it
-    /// refuses, and would take it for the next request.
+    /// Whether the connection may be used again. rosmaster does not read the body of a request
+    /// whose head it refuses, and would take it for the next request.
     pub fn leaves_connection_usable(&self) -> bool {
         self.status.is_success() && self.keeps_alive
     }
@@ -116,7 +116,7 @@ pub struct RawReply {
 }
 
 impl RawReply {
-    /// Whether the other end's dictionaries have an order: all but Python's before 3.6.
+    /// Whether the other end's dictionaries are ordered, as in every Python since 3.6.
     pub fn keeps_order(&self) -> bool {
         keeps_order(self.headers.get(SERVER).and_then(|it| it.to_str().ok()))
     }
@@ -142,14 +142,14 @@ fn python(server: &str) -> Option<(u32, u32)> {
     Some((numbers.next()??, numbers.next()??))
 }
 
-/// Connects to the master, wherever it is.
+/// Makes connections to the master, wherever it is.
 #[derive(Debug)]
 pub struct Upstream {
     address: watch::Sender<MasterUri>,
     instance: HeaderValue,
     probe_timeout: Duration,
     probe_count: u32,
-    /// The master's addresses as resolved last.
+    /// The master's addresses as they were last resolved.
     found: watch::Sender<Option<(MasterUri, Vec<SocketAddr>)>>,
     /// Number of connections for writes.
     writers: watch::Sender<usize>,
@@ -168,8 +168,8 @@ impl Drop for Writer {
 }
 
 impl Upstream {
-    /// Connections to `address`. `instance` identifies this process. A connection ends when the kernel's
-    /// probes, the same number with the same timeout, are not answered either.
+    /// Creates the connections to `address`. `instance` identifies this process. A connection ends
+    /// when the kernel's probes, with the same count and timeout, are not answered either.
     pub fn new(
         address: MasterUri,
         instance: HeaderValue,
@@ -191,7 +191,7 @@ impl Upstream {
         self.address.borrow().clone()
     }
 
-    /// Sets the master's address; open connections stay as they are.
+    /// Changes the master's address; open connections stay as they are.
     pub fn relocate(&self, address: MasterUri) {
         self.address.send_replace(address);
     }
@@ -200,7 +200,7 @@ impl Upstream {
         self.connect_with(None).await
     }
 
-    /// A new connection for writes; see [`Self::no_writers`].
+    /// Opens a connection for writes; see [`Self::no_writers`].
     pub async fn connect_for_writes(&self) -> Result<Connection, ConnectError> {
         self.writers.send_modify(|count| *count += 1);
         self.connect_with(Some(Writer(self.writers.clone()))).await
@@ -208,11 +208,11 @@ impl Upstream {
 
     /// Returns when every connection for writes has ended.
     pub async fn no_writers(&self) {
-        // We own a sender.
+        // This cannot fail: we hold a sender.
         let _ = self.writers.subscribe().wait_for(|count| *count == 0).await;
     }
 
-    /// A new connection on which nothing is to be sent.
+    /// Opens a connection on which nothing will be sent.
     pub(crate) async fn connect_sentinel(&self) -> Result<Sentinel, ConnectError> {
         let (address, stream) = self.bounded_stream().await?;
         Sentinel::new(stream).map_err(|source| ConnectError::Unreachable {
@@ -223,7 +223,7 @@ impl Upstream {
 
     async fn bounded_stream(&self) -> Result<(MasterUri, TcpStream), ConnectError> {
         let (address, stream) = self.stream().await?;
-        // Best effort: the connection works without it.
+        // Best effort: the connection also works without it.
         let _ = self.silence().bound(&stream);
         Ok((address, stream))
     }
@@ -233,7 +233,7 @@ impl Upstream {
         self.lock_verification().clone()
     }
 
-    /// Sets it. The sentinel of an earlier one is closed when no call needs it any more.
+    /// Sets how calls are verified. The previous sentinel is closed when no call needs it any more.
     pub(crate) fn set_verification(&self, verification: Option<Verification>) {
         *self.lock_verification() = verification;
     }
@@ -274,15 +274,15 @@ impl Upstream {
         }
     }
 
-    /// The addresses of the master. When its name cannot be resolved, those resolved last: a failing name
-    /// server must not cut off a master that lives.
+    /// The addresses of the master. If its name cannot be resolved, the last known ones: a failing
+    /// name server must not cut off a living master.
     async fn find(&self, address: &MasterUri) -> io::Result<Vec<SocketAddr>> {
         if let Ok(ip) = address.host.parse() {
             return Ok(vec![SocketAddr::new(ip, address.port)]);
         }
         let (found, asked) = (self.found.clone(), address.clone());
-        // In a task: a late answer serves the next connection, so that a moved master is found however slow
-        // the name server is.
+        // This runs in a task: a late answer serves the next connection, so a moved master is found
+        // however slow the name server is.
         let lookup = tokio::spawn(async move {
             let addresses = resolver::addresses(&asked.host, asked.port).await?;
             found.send_replace(Some((asked, addresses)));
@@ -303,7 +303,7 @@ impl Upstream {
     }
 
     fn silence(&self) -> Silence {
-        // The kernel counts whole seconds here.
+        // The kernel only takes whole seconds here.
         let interval = self.probe_timeout.max(Duration::from_secs(1));
         Silence {
             interval,
@@ -312,10 +312,10 @@ impl Upstream {
     }
 }
 
-/// After which silence a connection to another computer ends: one whose other side has acknowledged nothing for a
-/// little longer than the probes take to find a dead master. The kernel of a hung master still acknowledges. If a
-/// cable is cut, or a router has forgotten the connection, nothing is acknowledged, and TCP itself would take a
-/// quarter of an hour. Not needed on this computer.
+/// Ends connections to another computer after a silence: when its side has acknowledged nothing for
+/// a little longer than the probes take to find a dead master. The kernel of a hung master still
+/// acknowledges. After a cut cable, or in a router that has forgotten the connection, nothing is
+/// acknowledged, and TCP itself would take a quarter of an hour. On this computer it is not needed.
 #[derive(Clone, Copy, Debug)]
 struct Silence {
     interval: Duration,
@@ -332,13 +332,13 @@ impl Silence {
             .with_interval(self.interval);
         let socket = SockRef::from(stream);
         socket.set_tcp_keepalive(&probes)?;
-        // This limit, not a count, also ends the probes.
+        // This limit, rather than a count, also ends the probes.
         socket.set_tcp_user_timeout(Some(self.limit))
     }
 }
 
-/// Connects to the first of `addresses` that accepts. A refusal is reported before an unreachable address: it
-/// shows more about the master.
+/// Connects to the first of `addresses` that accepts. A refusal is reported in preference to an
+/// unreachable address, because it shows more about the master.
 async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     let mut failure = io::Error::from(io::ErrorKind::NotFound);
     for address in addresses {
@@ -351,7 +351,8 @@ async fn open(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     Err(failure)
 }
 
-/// Whether the other end is on this computer, or seems to be: a tunnel's end is here too.
+/// Whether the other end is, or seems to be, on this computer. The end of a tunnel is on this
+/// computer, too.
 fn is_local(stream: &TcpStream) -> io::Result<bool> {
     let peer = stream.peer_addr()?.ip();
     Ok(peer.is_loopback() || peer == stream.local_addr()?.ip())

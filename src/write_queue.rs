@@ -1,6 +1,6 @@
-//! The write queue: writes go to the master one batch at a time, so the journal's order is the order in which
-//! the master ran them. Writes that arrive meanwhile form the next batch. While the master is away the mirror
-//! answers them, in the same order.
+//! The write queue sends writes to the master one batch at a time, so the journal's order is the
+//! order in which the master ran them. Writes that arrive meanwhile form the next batch. While the
+//! master is away the mirror answers them, in the same order.
 
 pub(crate) mod batch;
 mod drain;
@@ -31,10 +31,11 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Calls between the clients and the queue. The worker always empties it at once.
+/// Number of calls between the clients and the queue. The worker always empties this channel at
+/// once.
 const CHANNEL: usize = 64;
 
-/// The way into the queue.
+/// The clients' handle to the queue.
 #[derive(Clone, Debug)]
 pub struct WriteQueue {
     items: mpsc::Sender<Item>,
@@ -48,29 +49,29 @@ impl WriteQueue {
         let _ = self.items.send(item).await;
     }
 
-    /// When the unanswered batch was sent, if there is one.
+    /// When the unanswered batch was sent; none if there is none.
     pub(crate) fn unanswered_since(&self) -> Option<Instant> {
         *self.sent.borrow()
     }
 
-    /// Makes a call of rosrescue's own, recorded like any other. None if there is no answer.
+    /// Makes a call by rosrescue itself, recorded like any other. None if there is no answer.
     pub async fn call(&self, call: Request) -> Option<Reply> {
         self.call_own(call, None).await
     }
 
-    /// As [`Self::call`], but drops the call if `condition` no longer holds when it is due.
+    /// Like [`Self::call`], but drops the call if `condition` no longer holds when it is due.
     pub async fn call_if(&self, call: Request, condition: Condition) -> Option<Reply> {
         self.call_own(call, Some(condition)).await
     }
 
-    /// Makes the calls of `ask`, but for those about something that others have changed since. None if there is
-    /// no answer.
+    /// Makes the calls of `ask`, except those that conflict with changes by others. None if there
+    /// is no answer.
     pub(crate) async fn merge(&self, ask: Ask) -> Option<wire::Answer> {
         let (item, answered, judged) = merge::item(ask);
         self.items.send(item).await.ok()?;
         let reply = match answered.await.ok()?.0 {
             Answer::Made(reply) => reply,
-            // One that cannot be read is that of a master that could not write it.
+            // A reply that cannot be decoded comes from a master that could not encode it.
             Answer::Raw(raw) => xmlrpc::decode_reply(&raw.body).unwrap_or(Reply::Value(Value::Nil)),
             Answer::Close | Answer::Elsewhere => return None,
         };
@@ -88,30 +89,30 @@ impl WriteQueue {
         }
     }
 
-    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent until the
-    /// gate has changed. Called by the gate's only writer.
+    /// Returns when a batch was lost: the master may have run it, and may be dead. Nothing is sent
+    /// until the gate has changed. Called by the gate's only writer.
     pub async fn lost(&self) {
         self.signals.lost.notified().await;
     }
 
-    /// Returns when a write has waited for the [patience](Self::set_patience), and the mirror can answer it and
-    /// all that is under way.
+    /// Returns when a write has waited for the [patience](Self::set_patience), and the mirror can
+    /// answer it and everything under way.
     pub(crate) async fn late(&self) {
         self.signals.is_late.notified().await;
     }
 
-    /// Returns when the master, which was late, has answered what was under way.
+    /// Returns when the late master has answered what was under way.
     pub(crate) async fn late_answered(&self) {
         self.signals.has_answered.notified().await;
     }
 
-    /// How long writes wait for the master from now on.
+    /// Sets how long writes wait for the master from now on.
     pub(crate) fn set_patience(&self, patience: Patience) {
         self.signals.patience.send_replace(patience);
     }
 }
 
-/// What the worker and the recovery tell each other.
+/// Signals between the worker and the recovery.
 #[derive(Debug)]
 struct Signals {
     /// How long writes wait for the master.
@@ -121,9 +122,9 @@ struct Signals {
     has_answered: Notify,
 }
 
-/// Makes a write queue and the worker to run. `resync_interval`: how often the master is compared with the
-/// mirror, if at all. `evicts`: whether a node whose port another one registers is taken out. `patience`: how long
-/// writes wait for the master.
+/// Creates a write queue and the worker to run. `resync_interval` is how often the master is
+/// compared with the mirror; none for never. `evicts` tells whether a node is unregistered when
+/// another node registers its port. `patience` is how long writes wait for the master.
 pub(crate) fn write_queue(
     ledger: Arc<Ledger>,
     upstream: Arc<Upstream>,

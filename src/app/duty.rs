@@ -1,4 +1,4 @@
-//! What the computer does that has the master: recovery, and what roscore does besides.
+//! The duty of the computer that has the master: recovery, and the other duties of roscore.
 
 use std::{
     path::PathBuf,
@@ -25,7 +25,7 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// What the duty needs.
+/// The handles and settings that the duty needs.
 pub(super) struct Post {
     pub(super) ledger: Arc<Ledger>,
     pub(super) upstream: Arc<Upstream>,
@@ -39,7 +39,7 @@ pub(super) struct Post {
     pub(super) supervision: Supervision,
     pub(super) probing: Probing,
     pub(super) probe_timeout: Duration,
-    /// Most space for the states of rescues, in bytes.
+    /// Most space for kept rescue states, in bytes.
     pub(super) history: u64,
     pub(super) uri: String,
     pub(super) checkpoint: PathBuf,
@@ -67,7 +67,8 @@ impl Post {
         )
     }
 
-    /// Does what roscore does besides, until `stop`. `seeds`: whether the run id is set if there is none.
+    /// Starts the other duties of roscore, until `stop`. `seeds` tells whether to set a run id if
+    /// there is none.
     pub(super) fn roscore(
         &self,
         rosout: bool,
@@ -89,10 +90,11 @@ impl Post {
         tokio::spawn(roscore::run(roscore, rosout, stop))
     }
 
-    /// The driver of the only computer, with what is to be done first. `rosmaster` starts masters, of which the
-    /// last one was at `port`; none for a master of others. `rosout`: whether it runs rosout, too; none for
-    /// nothing of what roscore does. `restored`: the mirror is from a checkpoint whose session continues. At the
-    /// first of `ends` rosout is ended, then the second is cancelled.
+    /// Creates the driver of a single computer, with its first actions. `rosmaster` starts masters,
+    /// the last of which was at `port`; none for an external master. `rosout` tells whether to run
+    /// rosout; none for none of roscore's other duties. `restored` tells whether the mirror comes
+    /// from a checkpoint whose session continues. When the first of `ends` is cancelled, rosout is
+    /// ended, and then the second is cancelled.
     pub(super) async fn alone(
         self,
         rosmaster: Option<Rosmaster>,
@@ -115,7 +117,7 @@ impl Post {
         tokio::spawn(async move {
             stop.cancelled().await;
             if let Some(duties) = duties {
-                // A panic there must not prevent the stop.
+                // A panic in that task must not prevent the stop.
                 let _ = duties.await;
             }
             halt.cancel();
@@ -125,9 +127,9 @@ impl Post {
         (driver, first)
     }
 
-    /// Begins the duty of one computer among several, with a master of its own that is given the mirror's
-    /// state. `rosout`: whether it runs rosout, too; none for nothing of what roscore does. `cause`: why it
-    /// begins.
+    /// Begins the duty of one computer among several, with a new master that gets the mirror's
+    /// state. `rosout` tells whether to run rosout; none for none of roscore's other duties.
+    /// `cause` is the reason for reports.
     pub(super) fn begin(
         &self,
         process: MasterProcess,
@@ -148,7 +150,7 @@ impl Post {
     }
 }
 
-/// The duty of one computer among several.
+/// The running duty of one computer among several.
 pub(super) struct Duty {
     driver: JoinHandle<Result<Option<MasterProcess>, ProcessError>>,
     roscore: Option<JoinHandle<()>>,
@@ -157,30 +159,31 @@ pub(super) struct Duty {
 }
 
 impl Duty {
-    /// Returns when it has ended by itself, which is an error. Cancel safe.
+    /// Returns the error if the duty ends by itself. Cancel safe.
     pub(super) async fn failed(&mut self) -> ProcessError {
         match (&mut self.driver).await {
             Ok(Err(error)) => error,
-            // It ends only by `stop` otherwise.
+            // Otherwise the driver ends only after `stop`.
             Ok(Ok(_)) => std::future::pending().await,
             Err(panic) => resume(panic),
         }
     }
 
-    /// Ends what roscore does besides, while calls still pass to the master: rosout unregisters itself there.
+    /// Ends roscore's other duties while calls still pass to the master, because rosout unregisters
+    /// itself there.
     pub(super) fn end_roscore(&mut self) -> impl Future<Output = ()> + Send + 'static {
         self.roscore_stop.cancel();
         let roscore = self.roscore.take();
         async move {
             if let Some(roscore) = roscore {
-                // A panic there must not prevent the rest.
+                // A panic in that task must not prevent the rest.
                 let _ = roscore.await;
             }
         }
     }
 
-    /// Ends it, and the master at once: another computer may lead, and no node is to hear this one's master any
-    /// more. What is returned waits for the processes.
+    /// Ends the duty and kills the master at once: another computer may lead, and no node may hear
+    /// from this computer's master any more. The returned future waits for the processes.
     pub(super) async fn end(self) -> impl Future<Output = ()> + Send + 'static {
         self.stop.cancel();
         let process = match self.driver.await {
@@ -190,7 +193,7 @@ impl Duty {
         let ended = process.map(MasterProcess::end);
         async move {
             if let Some(roscore) = self.roscore {
-                // A panic there must not prevent the rest.
+                // A panic in that task must not prevent the rest.
                 let _ = roscore.await;
             }
             if let Some(ended) = ended {

@@ -1,4 +1,4 @@
-//! The checkpoint of an earlier version, in which every port had the same default.
+//! Takes over the checkpoint of an earlier version, in which every port had the same default file.
 
 use std::{fs, io, path::Path};
 
@@ -9,8 +9,8 @@ use crate::{
     regular_file,
 };
 
-/// Copies the old default to the checkpoint of `config`, if that is the default of another port, does not exist, and
-/// the old one may be of this port. What is copied stays where it is.
+/// Copies the old default checkpoint if `config` uses the default of another port, that file does
+/// not exist, and the old one may belong to this port. The old file stays where it is.
 pub(super) fn take_over(config: &Config) {
     let own = &config.checkpoint;
     if config.checkpoint_is_given || own.exists() || store::previous_of(own).exists() {
@@ -34,8 +34,8 @@ pub(super) fn take_over(config: &Config) {
     }
 }
 
-/// Whether no running rosrescue uses the checkpoint at `old`, and an earlier version or a rosrescue at `port` has
-/// written it.
+/// Whether no running rosrescue uses the checkpoint at `old`, and either an earlier version or a
+/// rosrescue at `port` wrote it.
 fn may_be_of(old: &Path, port: u16) -> bool {
     if store::holder_of(old).is_some() {
         return false;
@@ -47,7 +47,8 @@ fn may_be_of(old: &Path, port: u16) -> bool {
     session.is_some_and(|session| [0, port].contains(&session.port))
 }
 
-/// Copies the checkpoint and its companions. The checkpoint itself is last: without it, the next start begins anew.
+/// Copies the checkpoint and its companion files. The checkpoint is copied last, because the next
+/// start begins a new session without it.
 fn copy_all(old: &Path, own: &Path) -> io::Result<()> {
     let previous = (store::previous_of(old), store::previous_of(own));
     let pid_files = PID_FILES.map(|suffix| (beside(old, suffix), beside(own, suffix)));
@@ -60,7 +61,7 @@ fn copy_all(old: &Path, own: &Path) -> io::Result<()> {
 }
 
 fn copy(from: &Path, to: &Path) -> io::Result<()> {
-    // The next start removes what a crash leaves of it.
+    // The next start removes this file if a crash leaves it behind.
     let fresh = beside(to, ".new");
     let mut file = regular_file::create(&fresh)?;
     io::copy(&mut regular_file::open(from)?, &mut file)?;

@@ -1,4 +1,4 @@
-//! Whether nodes of a recorded session are alive.
+//! Tells whether nodes of a recorded session are still alive.
 
 use std::{collections::BTreeSet, time::Duration};
 
@@ -11,12 +11,12 @@ use crate::{
     resolver,
 };
 
-/// How long nodes have to answer, and name servers to resolve their hosts.
+/// How long nodes have to answer, including the time to resolve their hosts.
 const LIFE_SIGN: Duration = Duration::from_secs(1);
 
-/// Whether any node of `state` answers. After a reboot of this computer (`same_boot` is false) only nodes on
-/// other computers count: none of its own processes has survived, and a process at such a port is a different
-/// one.
+/// Whether any node of `state` answers. After a reboot of this computer (`same_boot` is false) only
+/// nodes on other computers count, because no local process survived and a local port may belong to
+/// a new process.
 pub(super) async fn any_alive(state: &Master, same_boot: bool) -> bool {
     let call = master::get_pid();
     let mut questions = JoinSet::new();

@@ -27,16 +27,17 @@ use crate::{
 /// Shortest time between two status messages to systemd.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Pause between two looks whether other computers have been joined.
+/// Pause between two checks whether this computer has joined the others.
 const JOINING: Duration = Duration::from_millis(20);
 
-/// Time between two looks whether the guardian is stopped.
+/// Pause between two checks whether the guardian is stopped.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// That the guardian is stopped, and that it runs again.
+/// Limits the log lines that the guardian is stopped and that it runs again.
 static STOPPED: Pair = Pair::new();
 
-/// Starts reporting. The task that is returned reports `stop` and ends.
+/// Starts the reports to the guardian and systemd. The returned task ends after it has reported
+/// `stop`.
 pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
@@ -65,7 +66,7 @@ pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> Join
     })
 }
 
-/// What the reports need.
+/// Where the reports get their data.
 #[derive(Clone)]
 pub(super) struct Source {
     pub(super) board: Arc<Board>,
@@ -87,8 +88,9 @@ impl Source {
             .line()
     }
 
-    /// Looks whether the guardian `pid` is stopped: then it starts no worker. It shows neither by the link nor by its
-    /// end. `guarded`: what holds while it runs.
+    /// Checks whether the guardian `pid` is stopped, because a stopped guardian starts no worker.
+    /// Neither the link to the guardian nor its exit would show that. `guarded` is what applies
+    /// while it runs.
     fn see_guardian(&self, pid: u32, guarded: Guarded) {
         let now = match Stat::of(pid).is_some_and(Stat::is_stopped) {
             true => Guarded::Stopped(pid),
@@ -116,7 +118,7 @@ impl Source {
         }
     }
 
-    /// Returns when calls are answered, by the master, the mirror, or another computer.
+    /// Returns when calls are answered by the master, the mirror, or another computer.
     async fn answers(&self) {
         let mut gate = self.gate.clone();
         loop {
@@ -124,23 +126,24 @@ impl Source {
             if self.board.update(|facts| facts.answers(state)) {
                 return;
             }
-            // It joins other computers; what it has found out wakes nobody.
+            // Polled, because the end of joining wakes no waiter.
             sleep(JOINING).await;
         }
     }
 }
 
-/// Whether something starts the guardian `pid` again when it ends: systemd, or what runs the container of which it is
-/// the first process.
+/// Whether something restarts the guardian `pid` when it ends: systemd, or the runtime of the
+/// container whose first process it is.
 fn is_restarted(pid: u32) -> bool {
     let parent = process::parent_of(pid);
     let of_systemd = |parent| process::name_of(parent) == "systemd";
-    // systemd sets it for all that it starts; terminals inherit it.
+    // systemd sets INVOCATION_ID for everything that it starts, but terminals inherit it, so the
+    // parent is checked too.
     pid == 1 || (std::env::var_os("INVOCATION_ID").is_some() && parent.is_some_and(of_systemd))
 }
 
-/// Reports to the guardian when calls are answered, and logs that the guardian is stopped or has ended. `guarded`: what
-/// holds while it runs.
+/// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended.
+/// `guarded` is what applies while it runs.
 async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source) {
     let link = link
         .set_nonblocking(true)
@@ -152,7 +155,7 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source
         // If the guardian is gone, the read below notices.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
-    // The guardian never writes: the read ends only with it.
+    // The guardian never writes, so this read ends only when the guardian ends.
     let mut byte = [0];
     let ended = from.read(&mut byte);
     let look = async {
@@ -183,8 +186,9 @@ async fn report_ready(told: Source) {
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }
 
-/// Reports the state to systemd in a line, and feeds its watchdog. Feeding needs what calls need, so it shows
-/// that they work: a timer and a thread of the runtime, and the locks of the board and the mirror.
+/// Reports the status to systemd in one line and feeds the watchdog. Feeding needs the same things
+/// as a call: a timer, a runtime thread, and the locks of the board and the mirror. So it proves
+/// that calls work.
 async fn report_status(told: Source, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
@@ -208,8 +212,8 @@ async fn report_status(told: Source, stop: CancellationToken) {
     }
 }
 
-/// Sends a message to systemd. That blocks while systemd reads none, and must not hold up a thread of the
-/// runtime then.
+/// Sends a message to systemd in a thread of its own, because sending blocks while systemd does not
+/// read.
 async fn send(notify: impl FnOnce() -> io::Result<()> + Send + 'static) {
     let sent = tokio::task::spawn_blocking(notify).await;
     if let Err(error) = sent.map_err(io::Error::other).flatten() {

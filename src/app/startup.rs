@@ -21,23 +21,23 @@ use crate::{
     wait,
 };
 
-/// How long the disk may take to open the checkpoint: calls wait meanwhile.
+/// How long the disk may take to open the checkpoint. Calls wait during this time.
 const OPENING: Duration = Duration::from_secs(20);
 
-/// The initial state.
+/// The state that rosrescue starts with.
 pub(super) struct Beginning {
     pub(super) mirror: Master,
     pub(super) session: Session,
     /// Writes that the session's last master may not have run.
     pub(super) pending: Vec<Request>,
-    /// Nodes that may not have been told to shut down.
+    /// Nodes that may still need a `shutdown`.
     pub(super) displaced: Vec<Displaced>,
-    /// Not begun yet.
+    /// The store, before it has begun a generation.
     pub(super) store: Option<Store>,
     pub(super) restored: bool,
-    /// Whether it continues a session whose process died while this computer went on.
+    /// Whether the session continues and its last process died without a reboot of this computer.
     pub(super) died: bool,
-    /// In words, for the operator.
+    /// What happened at the start, in words for the operator.
     pub(super) story: String,
 }
 
@@ -55,7 +55,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
     let (mut store, loaded) = match opened.await {
         Some(Ok((store, loaded))) => (Some(store), loaded),
         Some(Err((loaded, error @ OpenError::Io { .. }))) => {
-            // A robot without a working disk still needs its master.
+            // Continue without a checkpoint: a robot with a broken disk still needs its master.
             tracing::error!(
                 %error,
                 "unprotected: the checkpoint cannot be used; nodes run as usual, but a crash of \
@@ -114,7 +114,8 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
             Decision::Fresh(why) => {
                 // A master that a crashed rosrescue left running is taken over.
                 master_uri = session.master_uri.filter(|_| !session.closed);
-                // A copy of that checkpoint must be found to be older than the masters of this session.
+                // With this token, a copy of the old checkpoint is recognised as older than the
+                // masters of this session.
                 token = (session.mark, session.incarnation);
                 let kept;
                 (store, kept) = set_aside(store).await;
@@ -168,8 +169,8 @@ fn say_silent(checkpoint: &Path) {
     );
 }
 
-/// Keeps the checkpoint of the session before under another name, which is returned. No store is left of a disk
-/// that is silent.
+/// Keeps the previous session's checkpoint under another name, and returns that name. Returns no
+/// store if the disk does not answer.
 async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
     let Some(mut store) = store else {
         return (None, None);
@@ -192,7 +193,7 @@ async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
     }
 }
 
-/// What the operator should know of the checkpoint's folder.
+/// Problems of the checkpoint's folder that the operator should know about.
 struct Folder<'a> {
     checkpoint: &'a Path,
     is_missing: bool,
@@ -209,7 +210,7 @@ impl<'a> Folder<'a> {
         }
     }
 
-    /// Logs it, after the checkpoint was opened or was not.
+    /// Logs the problems, once the checkpoint has been opened or has failed to open.
     fn report(&self, is_open: bool) {
         let checkpoint = self.checkpoint.display();
         if self.is_missing && is_open {
@@ -229,7 +230,7 @@ impl<'a> Folder<'a> {
     }
 }
 
-/// An id from the kernel, or a constant if there is none: it is compared, not trusted.
+/// Reads an id from the kernel. It is only compared, so a constant does if the kernel has none.
 pub(super) fn kernel_id(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(path).map_or_else(|_| "unknown".to_owned(), |id| id.trim().to_owned())
 }

@@ -1,12 +1,12 @@
-//! Addresses that are served, and the one that others are told.
+//! The addresses to serve, and the address announced to others.
 
 use std::net::{IpAddr, SocketAddr};
 
 use super::UsageError;
 use crate::ros_env::{self, Lookup};
 
-/// The host name or address for others. Unless the environment sets it, it is the served address, if there is
-/// only one: nothing listens at the others.
+/// The host name or address announced to others. Unless the environment sets one, a single served
+/// address is used, because nothing listens at the others.
 pub(super) fn advertised_host(
     listen: &[SocketAddr],
     env: Lookup<'_>,
@@ -32,7 +32,7 @@ pub(super) fn parse_address(text: &str, form: &'static str) -> Result<IpAddr, Us
     }
 }
 
-/// `ADDR:PORT`, `ADDR`, `:PORT`, `PORT` or nothing.
+/// Parses `ADDR:PORT`, `ADDR`, `:PORT`, `PORT`, or no option.
 pub(super) fn listen_addresses(
     given: Option<&str>,
     env: Lookup<'_>,
@@ -42,7 +42,7 @@ pub(super) fn listen_addresses(
     let usual_addresses = || ros_env::bind_addresses(env);
     let (addresses, port) = match given.map(|text| (text, text.parse())) {
         None => (usual_addresses(), usual_port()?),
-        // As for `core`: both may use the same environment.
+        // The same default as for `core`, because both may use the same environment.
         Some((_, Ok(address))) => (vec![address], usual_port()?),
         Some((text, Err(_))) => {
             let (address, port) = text.rsplit_once(':').unwrap_or(("", text));

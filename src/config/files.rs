@@ -2,17 +2,18 @@
 
 use super::Config;
 
-/// Reserved: health check and notifications open up to 320 at a time.
+/// File descriptors reserved for nodes: health check and notifications open up to 320 at a time.
 const RESERVED: u64 = 320;
-/// With few descriptors, clients get one in four. The checkpoint, the connections to the master and its
-/// process take some 30 of the others; health check and notifications share the rest, and retry.
+/// Clients get one descriptor in four if there are few. The checkpoint, the connections to the
+/// master and its process take some 30 of the rest; health check and notifications share the others
+/// and retry.
 const SHARE: u64 = 4;
-/// Client connections that are always allowed, if configured.
+/// Client connections that are always allowed, unless fewer are configured.
 const FEWEST: u64 = 16;
 
 impl Config {
-    /// Reserves file descriptors for the master, the nodes and the checkpoint, out of the process's limit of
-    /// `files`.
+    /// Lowers the number of client connections so that descriptors remain for the master, the nodes
+    /// and the checkpoint, given the process's limit of `files`.
     pub fn fit_into(&mut self, files: u64) {
         let most = files
             .saturating_sub(RESERVED)

@@ -1,10 +1,10 @@
-//! Listening sockets inherited at the start, by the LISTEN_FDS protocol of systemd (`sd_listen_fds(3)`), and
-//! who passed them.
+//! Listening sockets inherited at the start, by systemd's LISTEN_FDS protocol (`sd_listen_fds(3)`),
+//! and who passed them.
 //!
-//! In the protocol LISTEN_PID is the process that the sockets are meant for. A guardian cannot know its
-//! worker's before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. The last of its sockets is
-//! not a listener but one end of a pair, the *link*: through it the worker reports its progress, and sees the
-//! end of the guardian.
+//! In the protocol LISTEN_PID is the process that the sockets are meant for. A guardian cannot know
+//! its worker's process id before the fork, so it sets `ROSRESCUE_GUARDIAN` to its own instead. The
+//! last of its sockets is not a listener but one end of a pair, the *link*. Through it the worker
+//! reports its progress and notices the end of the guardian.
 
 use std::{
     io::{self, Write},
@@ -22,31 +22,31 @@ use thiserror::Error;
 
 use crate::ros_env::Lookup;
 
-/// The number of the first socket.
+/// Descriptor number of the first socket.
 pub(super) const FIRST: RawFd = 3;
-/// How many there are.
+/// Environment variable with the number of sockets.
 pub(super) const LISTEN_FDS: &str = "LISTEN_FDS";
-/// The process that they are meant for.
+/// Environment variable with the id of the process that the sockets are meant for.
 pub(super) const LISTEN_PID: &str = "LISTEN_PID";
 pub(super) const LISTEN_FDNAMES: &str = "LISTEN_FDNAMES";
-/// The process id of the worker's guardian.
+/// Environment variable with the process id of the worker's guardian.
 pub(super) const GUARDIAN: &str = "ROSRESCUE_GUARDIAN";
-/// How many workers have died before this one.
+/// Environment variable with the number of workers that have died before this one.
 pub(super) const RESTARTS: &str = "ROSRESCUE_WORKER_RESTARTS";
-/// The worker's memory, unless the user has said otherwise: one heap, and large pieces apart from it. What a
-/// large call has taken goes back to the system after it. By default glibc keeps most of it, in a heap for
-/// each thread.
+/// Memory settings of the worker, unless the user has set others: one heap, with large pieces apart
+/// from it. The memory of a large call then goes back to the system. By default glibc keeps most of
+/// it, in a heap for each thread.
 pub const TUNABLES: (&str, &str) = (
     "GLIBC_TUNABLES",
     "glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=131072:glibc.malloc.trim_threshold=131072",
 );
 
-/// Sent by a worker once it handles signals: before, a signal would kill it.
+/// Sent by a worker once it handles signals. Before that, a signal would kill it.
 pub(super) const HANDLES_SIGNALS: u8 = b'h';
 /// Sent by a worker once it answers calls.
 pub const SERVES: u8 = b's';
 
-/// Why inherited sockets cannot be served. Exit status 1.
+/// Why inherited sockets cannot be served. The exit status is 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum HandoverError {
@@ -60,21 +60,21 @@ pub enum HandoverError {
     Link(io::Error),
 }
 
-/// Sockets to serve.
+/// The sockets to serve.
 #[derive(Debug)]
 pub struct Sockets {
-    /// Non-blocking.
+    /// The listening sockets, in non-blocking mode.
     pub listeners: Vec<TcpListener>,
-    /// Who else keeps them.
+    /// Who else keeps the sockets open.
     pub guard: Guard,
 }
 
 /// Who keeps the sockets and restarts rosrescue when it dies.
 #[derive(Debug)]
 pub enum Guard {
-    /// No known supervisor.
+    /// There is no known supervisor.
     Nobody,
-    /// systemd, or another supervisor with its protocol.
+    /// systemd, or another supervisor that uses its protocol.
     Systemd,
     Guardian {
         pid: u32,
@@ -84,17 +84,18 @@ pub enum Guard {
 }
 
 impl Sockets {
-    /// The sockets that this process has inherited, if any. Must be called once, before anything else.
+    /// The sockets that this process has inherited; none if there are none. Must be called once,
+    /// before anything else.
     ///
     /// # Errors
     ///
-    /// If they cannot be served.
+    /// If the sockets cannot be served.
     pub fn inherited() -> Result<Option<Self>, HandoverError> {
         let env = |name: &str| std::env::var(name).ok();
         let Some(giver) = giver(&env, std::process::id(), parent_id()) else {
             return Ok(None);
         };
-        // Removes the variables from the environment.
+        // This removes the variables from the environment.
         let mut given = ListenFd::from_env();
         let guard = match giver {
             Giver::Systemd => Guard::Systemd,
@@ -128,7 +129,7 @@ impl Sockets {
         Ok(Some(Self { listeners, guard }))
     }
 
-    /// Sockets that this process has bound itself.
+    /// Wraps sockets that this process has bound itself.
     pub fn own(listeners: Vec<TcpListener>) -> Self {
         Self {
             listeners,
@@ -136,7 +137,7 @@ impl Sockets {
         }
     }
 
-    /// Where they listen.
+    /// The addresses of the listening sockets.
     pub fn addresses(&self) -> Vec<SocketAddr> {
         let addresses = self.listeners.iter().map(TcpListener::local_addr);
         addresses.filter_map(Result::ok).collect()
@@ -161,8 +162,8 @@ enum Giver {
     Guardian(u32),
 }
 
-/// Who passed the sockets, by the environment `env`; none if they are not meant for the process `own`, whose
-/// parent is `parent`.
+/// Who passed the sockets, according to the environment `env`; none if they are not meant for the
+/// process `own`, whose parent is `parent`.
 fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     let number = |name: &str| env(name)?.parse::<u32>().ok();
     number(LISTEN_FDS).filter(|count| *count > 0)?;
@@ -172,7 +173,7 @@ fn giver(env: Lookup<'_>, own: u32, parent: u32) -> Option<Giver> {
     }
 }
 
-/// How many workers of the guardian have died before this one.
+/// Number of workers of this guardian that have died before this one.
 pub fn restarts() -> u64 {
     let restarts = std::env::var(RESTARTS).ok();
     restarts.and_then(|count| count.parse().ok()).unwrap_or(0)

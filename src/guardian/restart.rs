@@ -1,4 +1,4 @@
-//! What to do after the end of a worker. Pure: the time is an argument.
+//! Decides what to do after the end of a worker. Pure: the time is an argument.
 
 use std::{
     collections::VecDeque,
@@ -6,22 +6,22 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Workers in a row that fail before they serve, each followed by another one at once; and deaths within
-/// [`SPAN`] that are not *again and again* yet.
+/// Number of workers in a row that may fail before they serve and are still restarted at once. Also
+/// the number of deaths within [`SPAN`] that are not yet reported as repeated.
 const AT_ONCE: usize = 5;
 const SPAN: Duration = Duration::from_secs(60);
-/// The first pause; each further one is twice as long.
+/// The first pause. Each further one is twice as long.
 const PAUSE_LEAST: Duration = Duration::from_millis(500);
 /// The longest pause.
 pub const PAUSE_MOST: Duration = Duration::from_secs(10);
 
-/// The exit status of a Rust program that panicked.
+/// Exit status of a Rust program that panicked.
 const PANIC: i32 = 101;
 
 /// How a worker ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// By itself, with this exit status.
+    /// It ended by itself, with this exit status.
     Code(i32),
     Signal(i32),
 }
@@ -52,7 +52,7 @@ pub enum Next {
     /// Start another worker.
     Restart {
         pause: Duration,
-        /// More than five have died within a minute.
+        /// Whether more than five workers have died within a minute.
         again_and_again: bool,
     },
 }
@@ -62,28 +62,29 @@ pub enum Next {
 pub struct Restarts {
     /// Deaths within the last [`SPAN`], at most one more than [`AT_ONCE`].
     deaths: VecDeque<Instant>,
-    /// Workers that have ended before they served since the last one that did.
+    /// Number of workers that have failed since the last one that served.
     failures: usize,
     /// Whether any worker has served.
     served: bool,
-    /// The signal that asks for the end.
+    /// The signal that asked rosrescue to stop.
     stop: Option<i32>,
-    /// The present worker was started to end what a killed one left running.
+    /// Whether the present worker was started only to end what a killed one left running.
     cleaning: bool,
 }
 
 impl Restarts {
-    /// After a stop signal no worker is restarted, except one to end what a killed one left running.
+    /// Notes a stop signal. After it no worker is restarted, except to end what a killed one left
+    /// running.
     pub fn stop(&mut self, signal: i32) {
         self.stop = Some(signal);
     }
 
-    /// The signal that asked for the end, if one did.
+    /// The signal that asked rosrescue to stop, if there was one.
     pub fn stopped_by(&self) -> Option<i32> {
         self.stop
     }
 
-    /// Whether a worker that was to stop ended otherwise, and may have left its master running.
+    /// Whether a worker that was to stop died instead, and may have left its master running.
     fn died_stopping(&self, end: End) -> bool {
         match end {
             End::Signal(signal) => self.stop.is_some_and(|stop| stop != signal),
@@ -91,11 +92,13 @@ impl Restarts {
         }
     }
 
-    /// A worker has ended at `now`. `served`: whether it had answered calls.
+    /// Decides what follows the end of a worker at `now`. `served` tells whether it had answered
+    /// calls.
     ///
-    /// Before any worker has served, an exit status is an error of the start, such as a missing rosmaster.
-    /// Later the same error may be temporary. A worker that has served is followed by another one at once: calls
-    /// wait for it, and only those that fail before they serve would keep the processor busy for nothing.
+    /// Before any worker has served, an exit status is an error of the start, such as a missing
+    /// rosmaster. Later the same error may be temporary. A worker that has served is replaced at
+    /// once, because calls wait. Only workers that fail before they serve would keep the processor
+    /// busy for nothing.
     pub fn ended(&mut self, end: End, served: bool, now: Instant) -> Next {
         self.served |= served;
         self.failures = match served {
@@ -128,7 +131,7 @@ impl Restarts {
         })
     }
 
-    /// Counts a death, and returns how many there were lately.
+    /// Counts a death, and returns the number of recent deaths.
     fn died(&mut self, now: Instant) -> usize {
         self.deaths
             .retain(|death| now.saturating_duration_since(*death) < SPAN);
@@ -177,7 +180,7 @@ mod tests {
             } => (pause.is_zero(), again_and_again),
             Next::Exit(status) => panic!("exit {status}"),
         };
-        // For longer than a minute.
+        // This takes longer than a minute.
         for number in 0..40 {
             assert_eq!(die(2 * number), (true, number >= 5), "{number}");
         }
@@ -191,7 +194,7 @@ mod tests {
         assert_eq!(restarts.ended(End::Code(1), false, now), Next::Exit(1));
         assert_eq!(restarts.ended(KILLED, false, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(PANIC), false, now), AT_ONCE);
-        // Still none has served.
+        // No worker has served yet.
         assert_eq!(restarts.ended(End::Code(2), false, now), Next::Exit(2));
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(End::Code(1), false, now), AT_ONCE);
@@ -210,7 +213,8 @@ mod tests {
         ] {
             assert_eq!(restarts.ended(end, true, now), Next::Exit(status));
         }
-        // The one that was to stop has left its master; so may the one after it, but only once.
+        // The worker that was to stop has left its master running. So may its successor, but only
+        // once.
         assert_eq!(restarts.ended(KILLED, true, now), AT_ONCE);
         assert_eq!(restarts.ended(KILLED, true, now), Next::Exit(137));
         let mut restarts = Restarts::default();

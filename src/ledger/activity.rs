@@ -14,68 +14,68 @@ use crate::{
     xmlrpc::{Call, Value},
 };
 
-/// How long before an outage a change may lie whose notifications the dead master may not have sent.
-/// Unreachable nodes can hold up its three notifier threads.
+/// A dead master may not have sent the notifications of changes in this time before the outage,
+/// because unreachable nodes can hold up its three notifier threads.
 pub(super) const NOTICE_MEMORY: Duration = Duration::from_secs(30);
-/// How long it may take to tell a node to shut down, with all retries.
+/// Time it may take to tell a node to shut down, including all retries.
 const TELLING: Duration = Duration::from_secs(60);
-/// Most remembered topics, and parameters of one node; also most changes in the outbox.
+/// Most remembered topics, most remembered parameters of one node, and most changes in the outbox.
 const NOTICES: usize = 4096;
-/// Longest names of a lost registration that is remembered, in bytes, all together.
+/// Most bytes of names in a lost registration that is remembered.
 const LOST_MOST: usize = 1024;
-/// Nodes to remember although they are no longer registered.
+/// Most nodes that are remembered after they unregistered.
 const NODES: usize = 1024;
 
-/// A change whose notification a master may send late.
+/// A change for which a master may send a late notification.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Change {
-    /// The publishers of a topic.
+    /// The publishers of a topic changed.
     Topic(String),
-    /// A parameter, for the subscriber at an address. The key ends in a slash.
+    /// A parameter changed, for the subscriber at an address. The key ends in a slash.
     Param(String, Arc<str>),
 }
 
 /// Notifications that a dead master may not have sent.
 #[derive(Debug, Default)]
 pub struct Owed {
-    /// Topics, for all their subscribers.
+    /// Topics whose subscribers must all be notified.
     pub topics: Vec<String>,
     /// Parameters, each as the address of a subscriber and a key.
     pub params: Vec<(String, Arc<str>)>,
-    /// Nodes that are to shut down.
+    /// Nodes that must shut down.
     pub displaced: Vec<Displaced>,
 }
 
-/// New notifications since the last time.
+/// Notifications collected since the outbox was last taken.
 #[derive(Debug, Default)]
 pub struct Outbox {
-    /// Nodes that are to shut down.
+    /// Nodes that must shut down.
     pub displaced: Vec<Displaced>,
-    /// Changes that the master sends too, but maybe late.
+    /// Changes that the master also sends, but perhaps late.
     pub changes: IndexSet<Change>,
 }
 
-/// When a node's registrations last changed. The numbers grow with every call: equal numbers mean no change
-/// in between.
+/// Numbers of the last calls that changed a node's registrations. Each call has a higher number
+/// than the one before, so an equal number means no change.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LastCalls {
-    /// The last call that registered something.
+    /// Number of the last call that registered something.
     pub registered: u64,
-    /// The last call that unregistered something.
+    /// Number of the last call that unregistered something.
     pub unregistered: u64,
 }
 
-/// A topic that a node had registered, and that was unregistered.
+/// A topic that a node had registered and that was then unregistered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Lost {
     node: String,
     api: String,
-    /// Whether the node published the topic; else it subscribed it.
+    /// Whether the node published the topic; otherwise it subscribed to it.
     publishes: bool,
     topic: String,
 }
 
-/// A process id that was behind a node's port.
+/// A process id seen behind a node's port.
 #[derive(Clone, Debug)]
 struct Pid {
     api: String,
@@ -86,56 +86,59 @@ struct Pid {
 #[derive(Clone, Copy, Debug)]
 struct Noted {
     at: Instant,
-    /// rosrescue has notified the nodes itself, not only a master that may have died before it could.
+    /// Whether rosrescue itself has notified the nodes, instead of a master that may have died
+    /// before it could.
     told: bool,
 }
 
-/// Recent effects of calls. Bounded.
+/// Recent effects of calls. All lists are bounded.
 #[derive(Debug, Default)]
 pub struct Activity {
     count: u64,
     topics: IndexMap<String, Noted>,
-    /// By address and key.
+    /// Changed parameters, by subscriber address and key.
     params: IndexMap<(String, Arc<str>), Noted>,
     last_calls: HashMap<String, LastCalls>,
-    /// Nodes that are no longer registered are forgotten when `last_calls` is longer than this.
+    /// Unregistered nodes are forgotten when `last_calls` grows longer than this.
     prune_at: usize,
     pids: HashMap<String, Pid>,
-    /// When nodes registered that have not been asked for their process id since.
+    /// Nodes that have not been asked for their process id since they registered, with the time of
+    /// the registration.
     unidentified: IndexMap<String, Instant>,
-    /// The last registrations of topics that were taken back, by whatever client.
+    /// The latest topic registrations that any client has removed.
     lost: VecDeque<Lost>,
     /// Nodes that a master had to shut down, and when.
     displaced: Vec<(Instant, Displaced)>,
-    /// All nodes that were displaced lately, and when: whether they have been told is not known at the next start.
+    /// All recently displaced nodes, with the time. The next start cannot know whether they were
+    /// told to shut down.
     lately: Vec<(Instant, Displaced)>,
-    /// Nodes of which the checkpoint does not tell whether they were told to shut down.
+    /// Displaced nodes from a checkpoint, which does not tell whether they were told to shut down.
     restored: Vec<Displaced>,
     /// Whether changes that a master sends are collected.
     notifying: bool,
     outbox: Outbox,
 }
 
-/// A notification that no master sends: to whom, of what, and the call.
+/// A notification that no master sends: receiver, subject, and call.
 type Unsent = (String, Subject, Arc<Call>);
 
-/// Who is to be notified of a call.
+/// The nodes to be notified of a call.
 #[derive(Debug, Default)]
 pub(super) struct Noticed {
     topics: IndexSet<String>,
-    /// Most subscribers of one of them.
+    /// Most subscribers of any single topic.
     subscribers: usize,
-    /// By address and key.
+    /// Subscribers of parameters, by address and key.
     params: IndexSet<(String, Arc<str>)>,
-    /// Whether no master sends the notifications.
+    /// Whether the mirror stands in, so that no master sends the notifications.
     standing_in: bool,
-    /// The notifications themselves, if so.
+    /// The notifications to send while the mirror stands in.
     calls: Vec<Unsent>,
     pub(super) displaced: Vec<Displaced>,
 }
 
 impl Noticed {
-    /// `standing_in`: no master sends notifications.
+    /// Creates an empty set. `standing_in`: no master sends notifications.
     pub(super) fn new(standing_in: bool) -> Self {
         Self {
             standing_in,
@@ -153,12 +156,12 @@ impl Noticed {
         }
     }
 
-    /// The notifications that no master sends; none if a master sends them.
+    /// Takes the notifications that no master sends; none if a master sends them.
     pub(super) fn take_calls(&mut self) -> Option<Vec<Unsent>> {
         self.standing_in.then(|| std::mem::take(&mut self.calls))
     }
 
-    /// Of what nodes are notified, and how many.
+    /// The subjects of the notifications, each with its number of nodes.
     pub(super) fn subjects(&self) -> impl Iterator<Item = (Subject, usize)> {
         let topics = self.topics.iter().cloned().map(Subject::Topic);
         let topics = topics.map(|topic| (topic, self.subscribers));
@@ -189,8 +192,8 @@ impl NoticeSink for Noticed {
 }
 
 impl Activity {
-    /// Notes an applied call and its notifications. `registered`: whether the mirror knows a node. Returns
-    /// whether the outbox has something new.
+    /// Notes an applied call and its notifications. `registered` tells whether the mirror knows a
+    /// node. Returns whether the outbox has something new.
     pub(super) fn applied(
         &mut self,
         now: Instant,
@@ -246,7 +249,7 @@ impl Activity {
         changed
     }
 
-    /// The present holders of the names that `call` would take.
+    /// The present holders of the node names that `call` would take over.
     pub(super) fn displaced_by(&self, mirror: &Master, call: &Request) -> Vec<Displaced> {
         let found = call.calls().into_iter().filter_map(|call| {
             let displaced = mirror.displaced_by(call)?;
@@ -259,7 +262,7 @@ impl Activity {
         found.collect()
     }
 
-    /// Notes the registrations of topics that `call`, not applied to `mirror` yet, takes back.
+    /// Notes the topic registrations that `call` removes, before it is applied to `mirror`.
     pub(super) fn note_lost(&mut self, mirror: &Master, call: &Request) {
         for call in call.calls() {
             let publishes = match call.method() {
@@ -288,7 +291,8 @@ impl Activity {
         }
     }
 
-    /// Whether the master had this registration of a topic by `node` at `api`, and it was unregistered.
+    /// Whether `node` at `api` had registered this topic with the master and has unregistered it
+    /// since.
     pub fn has_lost(&self, node: &str, api: &str, publishes: bool, topic: &str) -> bool {
         self.lost.iter().any(|lost| {
             lost.publishes == publishes
@@ -326,13 +330,14 @@ impl Activity {
         self.prune_at = 2 * self.last_calls.len();
     }
 
-    /// When the registrations of `node` last changed.
+    /// Numbers of the last calls that changed the registrations of `node`.
     pub fn last_calls(&self, node: &str) -> LastCalls {
         self.last_calls.get(node).copied().unwrap_or_default()
     }
 
-    /// Recent changes before `now`, and all later ones, of which rosrescue has not notified nodes and a
-    /// master that died then may not have. They count as sent from now on.
+    /// Takes all changes of which rosrescue has not notified nodes: recent ones before `now`, which
+    /// a master that died then may not have sent, and all later ones. They count as sent
+    /// afterwards.
     pub fn take_owed(&mut self, now: Instant) -> Owed {
         fn take<K: Clone>(noted: &mut IndexMap<K, Noted>, now: Instant) -> Vec<K> {
             let untold = noted.iter_mut().filter(|(_, noted)| !noted.told);
@@ -353,7 +358,8 @@ impl Activity {
         }
     }
 
-    /// Marks recent changes as not sent: a master that continues may send outdated notifications.
+    /// Marks recent changes as not sent, because a master that continues may send outdated
+    /// notifications.
     pub fn tell_again(&mut self) {
         let params = self.params.values_mut();
         for noted in self.topics.values_mut().chain(params) {
@@ -361,7 +367,8 @@ impl Activity {
         }
     }
 
-    /// Starts or stops collecting changes that a master sends. Returns whether that is a change.
+    /// Starts or stops collecting changes that a master sends. Returns whether this changed the
+    /// setting.
     pub fn set_notifying(&mut self, notifying: bool) -> bool {
         if !notifying {
             self.outbox.changes.clear();
@@ -373,7 +380,7 @@ impl Activity {
         std::mem::take(&mut self.outbox)
     }
 
-    /// Remembers `displaced`, by the journal, until [`Self::notice_all`].
+    /// Stores the `displaced` nodes of the journal until [`Self::notice_all`].
     pub fn restore_displaced(&mut self, displaced: Vec<Displaced>) {
         self.restored = displaced;
     }
@@ -387,8 +394,8 @@ impl Activity {
         all.into_values().cloned().collect()
     }
 
-    /// Treats everything that nodes subscribe as changed now, and nodes that the journal shows as displaced as
-    /// displaced now. `mirror` must be what the master holds: a node that has taken its name back stays.
+    /// Treats everything that nodes subscribe to as changed now, and the journal's displaced nodes
+    /// as displaced now. `mirror` must equal the master: a node that has taken its name back stays.
     pub fn notice_all(&mut self, mirror: &Master, now: Instant) {
         let noted = Noted {
             at: now,
@@ -406,7 +413,7 @@ impl Activity {
         self.displaced.extend(displaced);
     }
 
-    /// Collects once more what the master may not have sent by `now`.
+    /// Collects again the changes that the master may not have sent by `now`.
     pub fn repeat_changes(&mut self, now: Instant) {
         let recent = |noted: &Noted| is_recent(noted.at, now);
         let topics = self.topics.iter().filter(|(_, noted)| recent(noted));
@@ -416,8 +423,8 @@ impl Activity {
         self.outbox.changes.extend(topics.chain(params));
     }
 
-    /// Notes that `pid` is behind `api`, where `node` is registered. `registered`: the node's last
-    /// registration when it was asked.
+    /// Notes that process `pid` is behind `api`, where `node` is registered. `registered` is the
+    /// number of the node's last registration when it was asked.
     pub fn remember_pid(&mut self, node: &str, api: &str, registered: u64, pid: i32) {
         if self.last_calls(node).registered == registered {
             self.unidentified.shift_remove(node);
@@ -431,20 +438,20 @@ impl Activity {
         }
     }
 
-    /// The process id last seen behind `api`, where `node` is registered, and whether the node has registered
-    /// something since: a different process that takes an old port under the same name does.
+    /// The process id last seen behind `api`, where `node` is registered, and whether the node has
+    /// registered since. A new process that takes an old port under the same name registers again.
     pub fn pid_of(&self, node: &str, api: &str) -> Option<(i32, bool)> {
         let pid = self.pids.get(node).filter(|pid| pid.api == api)?;
         Some((pid.pid, pid.registered != self.last_calls(node).registered))
     }
 
-    /// The earliest registration of a node that has not been asked for its process id.
+    /// The earliest registration of a node that has not been asked for its process id since.
     pub fn next_unidentified(&self) -> Option<Instant> {
         self.unidentified.values().min().copied()
     }
 
-    /// Nodes whose last registration was at `before` or earlier, and which have not been asked for their
-    /// process id since. Each is returned once.
+    /// Takes the nodes whose last registration was at `before` or earlier and that have not been
+    /// asked for their process id since.
     pub fn take_unidentified(&mut self, before: Instant) -> Vec<String> {
         let ripe = |_: &String, at: &mut Instant| *at <= before;
         let mut taken = Vec::new();

@@ -1,4 +1,4 @@
-//! The mirror's answers: for the master, beside it, and while it is away.
+//! The mirror's answers: for the master, in parallel with it, and while it is away.
 
 use std::{sync::Arc, time::Instant};
 
@@ -11,33 +11,35 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Most pending writes beside which unregistrations without effect on the mirror are kept.
+/// Up to this many pending writes, unregistrations without effect on the mirror are also kept as
+/// pending.
 pub(super) const UNCHANGED_PENDING_MAX: usize = 1000;
 
-/// Memory for the answers to the reads of one multicall, in bytes. A few short reads of a large state could
-/// ask for any amount; larger ones wait for the master.
+/// Most memory for the answers to the reads of one multicall, in bytes. A few short reads of a
+/// large state could otherwise need any amount; larger ones wait for the master.
 const ANSWER_MOST: usize = 64 << 20;
 
-/// The same for a multicall of reads while there is a master, which answers larger ones.
+/// The same limit while there is a master, which then answers larger multicalls.
 const EXACT_ANSWER_MOST: usize = 1 << 20;
 
 impl Ledger {
-    /// The master's predicted answer to a read; none if it is a multicall that asks for too much.
+    /// The master's predicted answer to a read; none for a multicall whose answer would be too
+    /// large.
     pub fn answer(&self, read: &Request) -> Option<Reply> {
         let mirror = &mut self.lock().mirror;
         let fits = mirror.fits(read, ANSWER_MOST);
         fits.then(|| mirror.apply_telling(read, &mut ()))
     }
 
-    /// The result of a read, if the present master's is the same to the byte. It shows every write that was
-    /// acknowledged.
+    /// The result of a read, if the present master would answer the same bytes. It includes every
+    /// acknowledged write.
     pub fn exact_answer(&self, read: &Request) -> Option<Value> {
         let mut inner = self.lock();
         if inner.doubted || !inner.mirror.fits(read, EXACT_ANSWER_MOST) {
             return None;
         }
         if *read.method() == Method::GetParamNames {
-            // Walks the whole tree, of which there is a copy at no cost.
+            // Working on the parameters alone walks the whole tree, but copying it costs nothing.
             let mut params = inner.mirror.with_params_only();
             drop(inner);
             return params.exact_answer(read);
@@ -45,10 +47,10 @@ impl Ledger {
         inner.mirror.exact_answer(read)
     }
 
-    /// As [`Self::answer`], to a write of the Master API that changes nothing; none if it changes something.
-    /// Nodes are notified as by a master. Returns where the last record is, too: the earlier write that made
-    /// this one redundant may be as new as that. None also if the master may notify the caller of something newer
-    /// before it has the answer.
+    /// Like [`Self::answer`], for a write that changes nothing; none if it changes something. Nodes
+    /// are notified as by a master. Also returns the mark of the last record, because the earlier
+    /// write that made this one redundant may be that recent. None as well if the master may notify
+    /// the caller of something newer before the answer arrives.
     pub(crate) fn answer_if_unchanged(
         self: &Arc<Self>,
         now: Instant,
@@ -69,7 +71,7 @@ impl Ledger {
         }
         let number = inner.order.begin(now, heard);
         let reply = inner.apply(now, write, Some(false), &self.outbox_changed);
-        // A refusal is the master's, in its own words.
+        // Refusals are left to the master, which has its own words for them.
         let refused = match &reply {
             Reply::Value(value) => {
                 let code = value.as_array().and_then(<[Value]>::first);
@@ -89,18 +91,19 @@ impl Ledger {
         model.apply_telling(call, &mut ())
     }
 
-    /// Answers a call of the Master API as an absent master would: records its changes as pending, applies
-    /// them, and has nodes notified. Returns where the last record is, too: that of the call or, if it
-    /// changes nothing, of what made it redundant.
+    /// Answers a call as an absent master would: applies it, records its changes as pending, and
+    /// notifies nodes. Also returns the mark of the last record: this call's, or if it changes
+    /// nothing, that of the call that made it redundant.
     ///
-    /// None during an injection, if another computer has the master, or if the call also reads too much: it has to wait.
+    /// None during an injection, if another computer has the master, or if the call also reads too
+    /// much. The call then has to wait.
     pub fn stand_in(&self, now: Instant, call: &Request) -> Option<(Reply, Mark)> {
         let concern = Concern::default();
         let (reply, mark, _) = self.answer_standing_in(now, call, &concern, &Source::Here)?;
         Some((reply, mark))
     }
 
-    /// As [`Self::stand_in`] for a client's call, of which this is the concern, with its answer under way.
+    /// Like [`Self::stand_in`], for a client's call with this concern, whose answer is under way.
     pub(crate) fn stand_in_for(
         self: &Arc<Self>,
         now: Instant,
@@ -124,13 +127,14 @@ impl Ledger {
         if inner.injecting || inner.is_elsewhere() || !inner.mirror.fits(call, ANSWER_MOST) {
             return None;
         }
-        // First: the caller may be notified of what its own call changes.
+        // Comes first, because the caller may be notified of what its own call changes.
         let heard = concern.heard();
         let number = inner.order.begin(now, heard);
         let changes = inner.mirror.would_change(call);
         let reply = inner.apply(now, call, Some(changes), &self.outbox_changed);
         let mut writes: Vec<&Request> = match reply {
-            // The writes were applied; only the answer could not be encoded. A refused one is refused again.
+            // The writes were applied, but the answer could not be encoded. A call that was refused
+            // is refused again.
             Reply::Fault { .. } => {
                 let writes = call.calls().into_iter();
                 writes.filter(|call| call.kind().mutates()).collect()
@@ -142,9 +146,10 @@ impl Ledger {
             }
         };
         if !changes {
-            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue that died
-            // before the reply, and any state if the checkpoint is older than the master. Parameter subscriptions
-            // cannot be read from it, and loggers repeat them all the time.
+            // The master may hold what the mirror lacks: a registration that it ran for a rosrescue
+            // that died before the reply, or any state if the checkpoint is older than the master.
+            // Parameter subscriptions are not kept, because they cannot be read from the master and
+            // loggers repeat them all the time.
             let room = inner.pending.calls().len() < UNCHANGED_PENDING_MAX;
             let unsure = |call: &Request| {
                 is_unregistration(call)
@@ -155,7 +160,7 @@ impl Ledger {
         if writes.is_empty() {
             return Some((reply, inner.mark(), number));
         }
-        // Makes an inspection under way outdated: it could bring back what this call takes away.
+        // Invalidates an inspection under way, which could restore what this call removes.
         inner.version += u64::from(!changes);
         self.stats.writes_recorded.add(writes.len() as u64);
         let entries = writes.iter().map(|&call| Entry::Call {

@@ -1,6 +1,7 @@
-//! Keeps the checkpoint: syncs the journal, checks that the file is still unchanged at its path, writes new
-//! generations, and re-arms after a disk failure or after another process moved or changed the file. Runs
-//! beside traffic. A call waits for it with `--sync always`, and if its effect is in no journal.
+//! Maintains the checkpoint: syncs the journal, checks that the file at its path is unchanged, and
+//! writes new generations. After a disk failure, or after another process moved or changed the
+//! file, it starts recording again. It runs in parallel with traffic. A call waits for it only with
+//! `--sync always`, or if no journal holds the call's effect.
 
 use std::{
     path::{Path, PathBuf},
@@ -22,16 +23,16 @@ use crate::{
     status::Board,
 };
 
-/// Longest time between two checks of the file: tampering is noticed well within a second.
+/// Longest time between two checks of the file, so that tampering is noticed well within a second.
 const LOOK: Duration = Duration::from_millis(500);
-/// Time between attempts to protect an unprotected store again.
+/// Pause between attempts to record again after a failure.
 const AGAIN: Duration = Duration::from_secs(1);
-/// The journal is compacted after this time without a record,
+/// The journal is compacted after this time without a new record.
 const QUIET: Duration = Duration::from_secs(2);
-/// but not more often than this: a memory card wears out.
+/// Shortest time between two compactions, because memory cards wear out.
 const BETWEEN: Duration = Duration::from_secs(10);
 
-/// That the state is not recorded, and that it is again.
+/// Limits the log lines that the state is not recorded and that it is again.
 static UNPROTECTED: Pair = Pair::new();
 
 pub(crate) struct Checkpointer {
@@ -40,7 +41,7 @@ pub(crate) struct Checkpointer {
     path: PathBuf,
     sync: SyncPolicy,
     sync_interval: Duration,
-    /// The journal's last record in the last round.
+    /// The journal's last record in the previous round.
     seq: u64,
     recorded_at: Instant,
     compacted_at: Option<Instant>,
@@ -48,9 +49,10 @@ pub(crate) struct Checkpointer {
 }
 
 impl Checkpointer {
-    /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be answered before:
-    /// it would be in no journal. Later it is synced every `sync_interval`, unless the ledger's policy
-    /// differs. Does not wait longer than [`DISK_PATIENCE`] for the disk.
+    /// Writes the first generation of the checkpoint of `ledger` at `path`. No write may be
+    /// answered before this, because no journal would hold it. Later the file is synced every
+    /// `sync_interval`, unless the ledger's policy differs. Waits for the disk for
+    /// [`DISK_PATIENCE`] at most.
     pub(crate) async fn begin(
         ledger: Arc<Ledger>,
         board: Arc<Board>,
@@ -58,7 +60,7 @@ impl Checkpointer {
         sync_interval: Duration,
     ) -> Self {
         let opened = ledger.seen_store().is_some();
-        // Logged when the checkpoint was opened.
+        // A failure to open was logged when the checkpoint was opened.
         let said = ledger.unprotected().filter(|_| !opened);
         let mut checkpointer = Self {
             seq: 0,
@@ -86,7 +88,7 @@ impl Checkpointer {
         checkpointer
     }
 
-    /// Keeps the checkpoint until `stop`.
+    /// Maintains the checkpoint until `stop`.
     pub(crate) async fn run(self, stop: CancellationToken) {
         let voice = Arc::clone(&self.voice);
         tokio::select! {
@@ -109,7 +111,7 @@ impl Checkpointer {
         }
     }
 
-    /// Until the next sync. In between, however long that is, the file is still checked.
+    /// Waits until the next sync. The file is still checked during a long pause.
     async fn pause(&mut self) {
         let end = Instant::now() + self.sync_interval;
         loop {
@@ -127,7 +129,8 @@ impl Checkpointer {
             self.open_again().await;
         }
         self.sync(sync && self.sync != SyncPolicy::Never).await;
-        // Before the repair below: a failure is logged even if it is repaired at once.
+        // This precedes the repair below, so that a failure is logged even if it is repaired at
+        // once.
         self.voice.say_protection();
         if self.compaction_is_due() {
             self.compact().await;
@@ -135,7 +138,8 @@ impl Checkpointer {
         self.voice.say_protection();
     }
 
-    /// The result of `work`, however long the disk takes for it. A silence is told when it is too long.
+    /// The result of `work`, however long the disk takes. Calls `silent` when the disk has been
+    /// silent for too long.
     async fn waited_for<T>(&self, work: impl Future<Output = T>, silent: impl FnOnce()) -> T {
         let mut work = std::pin::pin!(work);
         match timeout(DISK_PATIENCE, &mut work).await {
@@ -147,7 +151,7 @@ impl Checkpointer {
         }
     }
 
-    /// As [`Ledger::on_store`]. The store is not expected to be silent.
+    /// Like [`Ledger::on_store`], but reports a disk that is silent for too long.
     async fn on_store<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -156,7 +160,7 @@ impl Checkpointer {
         self.waited_for(done, || self.ledger.give_up_disk()).await
     }
 
-    /// Checks the file and, with `syncs`, syncs it.
+    /// Checks the file, and syncs it if `syncs`.
     async fn sync(&self, syncs: bool) {
         let jobs = self.on_store(move |store| {
             let check = store.check_job();
@@ -175,7 +179,7 @@ impl Checkpointer {
         ledger.set_sync_is_late(false);
         if let Ok((checked, synced, free)) = done {
             self.voice.board.update(|facts| facts.disk.free = free);
-            // The store keeps a failure; `say_protection` logs it.
+            // The store keeps a failure, and `say_protection` logs it.
             let noted = self.on_store(move |store| {
                 let _ = checked.map(|done| store.checked(done));
                 let _ = synced.map(|done| store.synced(done));
@@ -202,7 +206,7 @@ impl Checkpointer {
             .compacted_at
             .is_none_or(|at| now.duration_since(at) >= BETWEEN);
         let quiet = now.duration_since(self.recorded_at) >= QUIET;
-        // On a full disk, do not write a whole snapshot in every round.
+        // On a full disk, not every round may write a whole snapshot.
         let failed = self
             .failed_at
             .is_some_and(|at| now.duration_since(at) < AGAIN);
@@ -237,7 +241,7 @@ impl Checkpointer {
                 let board = &self.voice.board;
                 board.update(|facts| facts.disk.compacted = Some((now, seq)));
                 if self.sync == SyncPolicy::Always {
-                    // The new file's name is not on the disk yet.
+                    // The new file's name is not yet on the disk.
                     self.sync(true).await;
                 }
                 ledger.set_attempted(Ok(()));
@@ -245,8 +249,8 @@ impl Checkpointer {
         }
     }
 
-    /// Tries to open a checkpoint that could not be opened at the start. Its contents are not restored,
-    /// memory is newer; but they are unknown, so the file is kept.
+    /// Tries to open a checkpoint that could not be opened at the start. Its state is not restored,
+    /// because the state in memory is newer. The file is kept, because its contents are unknown.
     async fn open_again(&self) {
         let path = self.path.clone();
         let opened = spawn_blocking(move || Store::open_over(&path)).await;
@@ -256,7 +260,7 @@ impl Checkpointer {
     }
 }
 
-/// Says whether the state is recorded.
+/// Reports whether the state is recorded.
 struct Voice {
     ledger: Arc<Ledger>,
     board: Arc<Board>,
@@ -273,8 +277,8 @@ impl Voice {
         }
     }
 
-    /// Logs once that the state is no longer recorded, and once that it is again; and where a file was kept that
-    /// was found at the path.
+    /// Logs once that the state is no longer recorded and once that it is again. Also logs where a
+    /// file was kept that was found at the checkpoint's path.
     fn say_protection(&self) {
         let path = self.path.display();
         if let Some(kept) = self.ledger.take_kept() {
@@ -310,7 +314,7 @@ impl Voice {
     }
 }
 
-/// Bytes that are free in `folder`.
+/// Free bytes in `folder`.
 fn free_bytes(folder: &Path) -> Option<u64> {
     let folder = match folder.as_os_str().is_empty() {
         true => Path::new("."),

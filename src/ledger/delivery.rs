@@ -1,4 +1,5 @@
-//! Answers on their way to nodes, and what waits for them: the [order](crate::order) beside the mirror.
+//! Answers on their way to nodes, and the work that waits for them: the [order](crate::order), kept
+//! with the mirror.
 
 use std::{sync::Arc, time::Instant};
 
@@ -10,9 +11,9 @@ use crate::{
     order::{Next, Order, heard_by_read},
 };
 
-/// An answer on its way to its caller. Dropped when it has been written, or never will be.
+/// An answer on its way to its caller. It is dropped when it has been written or never will be.
 pub(crate) struct Delivery {
-    /// None in simulations, where time is another one.
+    /// None in simulations, which have their own time.
     ledger: Option<Arc<Ledger>>,
     number: u64,
 }
@@ -24,7 +25,8 @@ impl std::fmt::Debug for Delivery {
 }
 
 impl Delivery {
-    /// The answer with this number in the [`Order`] of `ledger`. Not to be dropped under the ledger's lock.
+    /// The answer with this number in the [`Order`] of `ledger`. It must not be dropped under the
+    /// ledger's lock.
     pub(crate) fn new(ledger: &Arc<Ledger>, number: u64) -> Self {
         let ledger = Some(ledger.clone());
         Self { ledger, number }
@@ -34,14 +36,14 @@ impl Delivery {
         self.number
     }
 
-    /// The answer is ready to be written.
+    /// Notes that the answer is ready to be written.
     pub(crate) fn ready(&self) {
         if let Some(ledger) = &self.ledger {
             ledger.lock().order.ready(Instant::now(), self.number);
         }
     }
 
-    /// Its number. What is done with it is not noticed any more.
+    /// Returns the number and stops tracking the answer.
     #[cfg(test)]
     pub(crate) fn into_number(mut self) -> u64 {
         self.ledger = None;
@@ -58,7 +60,7 @@ impl Drop for Delivery {
     }
 }
 
-/// A read has to wait: what the master does now may concern its caller.
+/// The read has to wait, because what the master is doing now may concern its caller.
 #[derive(Debug)]
 pub(crate) struct Held;
 
@@ -87,7 +89,7 @@ impl Ledger {
         }
     }
 
-    /// The answer to a read; none if nodes are not notified of what it shows.
+    /// Begins the answer to a read; none if nodes are not notified of what it shows.
     pub(crate) fn begin_read(
         self: &Arc<Self>,
         now: Instant,
@@ -104,7 +106,7 @@ impl Ledger {
         Ok(begun?.map(|number| Delivery::new(self, number)))
     }
 
-    /// As [`Self::begin_read`], but does not wait for the master.
+    /// Like [`Self::begin_read`], but without waiting for the master.
     pub(crate) fn begin_read_now(self: &Arc<Self>, read: &Request) -> Option<Delivery> {
         let begun = self.with_order(|order, mirror| {
             let heard = heard_by_read(read, mirror);
@@ -113,18 +115,19 @@ impl Ledger {
         Some(Delivery::new(self, begun?))
     }
 
-    /// The master has no unanswered calls any more.
+    /// Notes that the master has no unanswered calls left.
     pub(crate) fn settled_calls(&self) {
         let awaited = self.lock().order.settled();
         self.report(awaited);
     }
 
-    /// What to do next for the node at `port`.
+    /// The next notification for the node at `port`, or how long to wait.
     pub(crate) fn next_notification(&self, port: &str) -> Next {
         self.with_order(|order, mirror| order.next(Instant::now(), port, mirror))
     }
 
-    /// The notification with this number has been taken, or has not.
+    /// Notes that the delivery of the notification with this number has ended, whether the node
+    /// took it or not.
     pub(crate) fn notification_ended(&self, number: u64) {
         let awaited = self.lock().order.taken(number);
         self.report(awaited);

@@ -1,4 +1,4 @@
-//! The ledger's side of the checkpointer, and how calls wait for it.
+//! The ledger's interface to the checkpointer, and how calls wait for the disk.
 
 use std::{
     path::PathBuf,
@@ -21,17 +21,17 @@ use crate::checkpoint::{
     store::{Store, StoreError},
 };
 
-/// Where a record is: what an answer may have to wait for.
+/// Identifies a record that an answer may have to wait for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Mark {
-    /// Its number in our own journal; none without one.
+    /// The record's number in this computer's journal; none without a journal.
     pub(super) disk: Option<u64>,
-    /// Its place among the writes that other computers are given.
+    /// The record's place among the writes that other computers receive.
     pub(super) shared: Option<Agreed>,
 }
 
 impl Mark {
-    /// The later one of two.
+    /// The later of two marks.
     pub fn max(self, other: Self) -> Self {
         Self {
             disk: self.disk.max(other.disk),
@@ -43,13 +43,13 @@ impl Mark {
 /// Progress of whole checkpoints, in versions of the mirror.
 #[derive(Debug, Default)]
 pub(super) struct Whole {
-    /// After the last change that is in no journal.
+    /// The version after the last change that no journal holds.
     pub(super) unrecorded: u64,
-    /// In the last checkpoint that was taken,
+    /// The version in the last checkpoint that was taken.
     taken: u64,
-    /// and in the last that was written.
+    /// The version in the last checkpoint that was written.
     written: u64,
-    /// Why the last one could not be written.
+    /// Why the last checkpoint could not be written.
     failure: Option<String>,
 }
 
@@ -60,12 +60,13 @@ impl Whole {
 }
 
 impl Ledger {
-    /// Where the last record is.
+    /// Mark of the last record.
     pub fn mark(&self) -> Mark {
         self.lock().mark()
     }
 
-    /// What must be safe before a call whose last record is at `mark` is answered; none if nothing must.
+    /// What must be safe before a call whose last record is at `mark` may be answered; none if
+    /// nothing must.
     pub fn to_await(&self, mark: Mark) -> Option<Mark> {
         let mark = Mark {
             disk: mark.disk.filter(|seq| *self.durable.borrow() < *seq),
@@ -74,9 +75,10 @@ impl Ledger {
         (mark != Mark::default()).then_some(mark)
     }
 
-    /// Returns when the records up to `mark` are safe: written, with `--sync always` also on the disk, or the disk
-    /// has failed; and where other computers find them. False if another one leads by now and may not have them.
-    /// A disk that is silent for [`DISK_PATIENCE`] has failed.
+    /// Returns when the records up to `mark` are safe: written to the file, with `--sync always`
+    /// also synced, and replicated to the other computers. A disk that fails or is silent for
+    /// [`DISK_PATIENCE`] is not waited for. False if another computer leads by now and may not have
+    /// the records.
     pub async fn durable(&self, mark: Mark) -> bool {
         if let Some(seq) = mark.disk {
             self.write();
@@ -93,14 +95,14 @@ impl Ledger {
         }
     }
 
-    /// Writes the records so far. Other tasks go on meanwhile, however long the disk takes for it.
+    /// Writes the pending records. Other tasks continue meanwhile, however long the disk takes.
     fn write(&self) {
         if let Some(worker) = self.worker() {
             block_in_place(|| worker.work());
         }
     }
 
-    /// Has the records written, by another thread.
+    /// Has another thread write the records.
     pub(super) fn write_soon(&self) {
         if let Some(worker) = self.worker() {
             spawn_blocking(move || worker.work());
@@ -111,7 +113,8 @@ impl Ledger {
         self.lock().journal.as_ref().map(Journal::worker)
     }
 
-    /// The disk is silent. Answers wait for it no more, and nothing is recorded before the next whole checkpoint.
+    /// Gives up on a silent disk: answers no longer wait for it, and nothing is recorded before the
+    /// next whole checkpoint.
     pub(super) fn give_up_disk(&self) {
         if let Some(journal) = &mut self.lock().journal {
             journal.give_up();
@@ -125,8 +128,8 @@ impl Ledger {
         self.disk_silent.notify_one();
     }
 
-    /// The version to wait for with [`Self::attempted`] until the file holds the mirror as it is now. None if
-    /// it does, or if the file cannot be written.
+    /// The version to wait for with [`Self::attempted`] until the file holds the present state of
+    /// the mirror. None if it already does, or if the file cannot be written.
     pub fn unwritten(&self) -> Option<u64> {
         let inner = self.lock();
         let journal = inner.journal.as_ref();
@@ -135,8 +138,8 @@ impl Ledger {
         (works && whole.failure.is_none() && whole.is_due()).then_some(whole.unrecorded)
     }
 
-    /// Returns when a whole checkpoint of this or a later version of the mirror has been written, or has
-    /// failed. A disk that is silent for [`DISK_PATIENCE`] has failed.
+    /// Returns when a whole checkpoint of this or a later version of the mirror has been written,
+    /// or has failed. A disk that is silent for [`DISK_PATIENCE`] has failed.
     pub async fn attempted(&self, version: u64) {
         let mut attempted = self.attempted.subscribe();
         let attempt = attempted.wait_for(|reached| *reached >= version);
@@ -158,7 +161,8 @@ impl Ledger {
         raise(&self.attempted, taken);
     }
 
-    /// Runs `work` on the store, after everything recorded so far. None without a store. Waits for the disk.
+    /// Runs `work` on the store, after everything recorded so far. None without a store. Waits for
+    /// the disk.
     pub async fn on_store<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -168,7 +172,7 @@ impl Ledger {
         result.await.ok()
     }
 
-    /// As [`Self::on_store`], for `work` that writes the checkpoint of this moment.
+    /// Like [`Self::on_store`], for `work` that writes a checkpoint of this moment.
     pub async fn on_store_whole<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store, Checkpoint) -> T + Send + 'static,
@@ -183,23 +187,23 @@ impl Ledger {
         result.await.ok()
     }
 
-    /// The store after its last job; none without a store.
+    /// State of the store after its last job; none without a store.
     pub(crate) fn seen_store(&self) -> Option<Seen> {
         Some(self.lock().journal.as_ref()?.seen())
     }
 
-    /// Where a file was kept that was found at the checkpoint's path; returned once.
+    /// Takes the name under which a file found at the checkpoint's path was kept.
     pub(super) fn take_kept(&self) -> Option<PathBuf> {
         self.lock().journal.as_ref()?.take_kept()
     }
 
-    /// Sets a new store, which holds nothing yet.
+    /// Sets a new store, which is still empty.
     pub fn set_store(&self, store: Store) {
         let journal = Journal::new(store, self.durable.clone(), self.sync);
         self.lock().journal = Some(journal);
     }
 
-    /// The checkpoint to write now.
+    /// A checkpoint of the present state.
     pub fn checkpoint(&self) -> Checkpoint {
         self.lock().checkpoint()
     }
@@ -215,7 +219,7 @@ impl Ledger {
         let Some(journal) = &inner.journal else {
             return Some("the checkpoint could not be opened".to_owned());
         };
-        // Then the journal alone is not enough.
+        // After a failed checkpoint the journal alone is not enough.
         let failure = inner.whole.failure.as_deref();
         let failure = failure.filter(|_| inner.whole.is_due());
         let late = self.sync_is_late.load(Ordering::Relaxed).then_some(SILENT);
@@ -245,7 +249,7 @@ impl Inner {
     }
 }
 
-/// Sets what `to` has reached to `value`, if that is more.
+/// Raises the value of `to` to `value`, if that is higher.
 pub(super) fn raise(to: &tokio::sync::watch::Sender<u64>, value: u64) {
     to.send_if_modified(|reached| {
         let more = value > *reached;

@@ -1,4 +1,4 @@
-//! Keeps the state of each rescue beside the checkpoint.
+//! Keeps the state after each rescue next to the checkpoint.
 
 use std::{sync::Arc, time::Instant};
 
@@ -7,9 +7,10 @@ use crate::{checkpoint::store::history, limit::Limit};
 
 pub(crate) struct Rescues {
     ledger: Arc<Ledger>,
-    /// Most space for all that is kept, in bytes; 0 for keeping no rescue.
+    /// Most space for all kept states, in bytes; 0 keeps none.
     bytes_most: u64,
-    /// The masters of a crash loop die every few seconds, with one and the same state, and a memory card wears out.
+    /// The masters of a crash loop die every few seconds with the same state, and memory cards wear
+    /// out.
     limit: Limit,
 }
 
@@ -22,20 +23,20 @@ impl Rescues {
         }
     }
 
-    /// Keeps the present state, to which a new master has just been brought, as that of rescue `number`. It is
-    /// written beside traffic.
+    /// Keeps the present state, to which a new master has just been brought, as that of rescue
+    /// `number`. It is written in parallel with traffic.
     pub(crate) fn keep(&self, number: u64, now: Instant) {
         let bytes_most = self.bytes_most;
         if bytes_most == 0 || self.limit.pass(now).is_none() {
             return;
         }
-        // A disk that is full or broken is not written to more than it must be.
+        // A full or broken disk gets no unnecessary writes.
         let fits = |store: &Seen| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
         let Some(Seen { path, .. }) = self.ledger.seen_store().filter(fits) else {
             tracing::debug!("the state of this rescue is not kept: no room, or no working disk");
             return;
         };
-        // Now: the health check is about to take out nodes that have died.
+        // The checkpoint is taken now, because the health check is about to unregister dead nodes.
         let checkpoint = self.ledger.checkpoint();
         tokio::task::spawn_blocking(move || {
             let kept = history::keep_rescue(&path, number, checkpoint);

@@ -1,10 +1,11 @@
-//! Steps from an examined master to an open gate.
+//! The steps from an examined master to an open gate.
 
 use super::{Basis, Ledger};
 use crate::{master::Master, replay::Token};
 
 impl Ledger {
-    /// Freezes the mirror until [`Self::end_injection`]. Returns what the injection is planned from.
+    /// Freezes the mirror until [`Self::end_injection`]. Returns what the injection is planned
+    /// from.
     pub fn begin_injection(&self) -> Basis {
         let mut inner = self.lock();
         inner.injecting = true;
@@ -15,12 +16,12 @@ impl Ledger {
         }
     }
 
-    /// Sets whether the dictionaries of the present master have no order, as in Python 2.
+    /// Sets whether dictionaries of the present master are unordered, as in Python 2.
     pub fn set_unordered(&self, unordered: bool) {
         self.lock().mirror.set_unordered(unordered);
     }
 
-    /// Sets whether the present master behaves as 1.14.3 and before.
+    /// Sets whether the present master behaves like version 1.14.3 and earlier.
     pub fn set_old(&self, old: Option<bool>) {
         self.lock().mirror.set_old(old);
     }
@@ -32,8 +33,8 @@ impl Ledger {
         (inner.version, inner.mirror.clone(), token)
     }
 
-    /// The checkpoint is older than the master, which is incarnation `number`. The pending writes of the
-    /// checkpoint have reached a master since.
+    /// Notes that the checkpoint is older than the master, which is incarnation `number`. The
+    /// checkpoint's pending writes have reached a master since.
     pub fn catch_up(&self, number: u64) {
         let mut inner = self.lock();
         inner.pending.forget_restored();
@@ -41,19 +42,20 @@ impl Ledger {
         inner.session_unwritten = true;
     }
 
-    /// Starts the next incarnation: replies of the previous one no longer count. Returns the new token.
+    /// Starts the next incarnation, so that replies of the previous one no longer count. Returns
+    /// the new token.
     ///
-    /// The journal has the new number when the master has it. A rosrescue that is started in between finds a
-    /// master of a later number, or one that misses the pending writes.
+    /// The journal has the new number when the master has it. A rosrescue that is started in
+    /// between finds a master with a higher number, or one that lacks the pending writes.
     pub fn succeed(&self) -> Token {
         let mut inner = self.lock();
         inner.raise_incarnation();
-        // Either side is brought to the other's state, so there is no doubt.
+        // Injection brings either side to the other's state, so there is no doubt left.
         (inner.doubted, inner.abandoned) = (false, false);
         inner.token()
     }
 
-    /// The present incarnation holds the mirror's state: no write is pending.
+    /// Notes that the present incarnation holds the mirror's state: no write is pending.
     pub fn delivered(&self) {
         let mut inner = self.lock();
         if !inner.pending.calls().is_empty() {
@@ -67,7 +69,8 @@ impl Ledger {
         self.work.notify_one();
     }
 
-    /// The present incarnation is served from now on: the mirror may change again. Returns its number.
+    /// Serves the present incarnation from now on, so the mirror may change again. Returns the
+    /// incarnation's number.
     pub fn serve(&self) -> u64 {
         let mut inner = self.lock();
         inner.injecting = false;
@@ -83,24 +86,25 @@ impl Ledger {
         inner.served.map(|of| of == inner.session.incarnation)
     }
 
-    /// The mirror may change again.
+    /// Allows the mirror to change again.
     pub fn end_injection(&self) {
         self.lock().injecting = false;
     }
 
-    /// The connection to the present incarnation ended with a batch in flight: it may still be run.
+    /// Notes that the connection to the present incarnation ended with a batch in flight, which the
+    /// master may still run.
     pub fn abandon_batch(&self) {
         let mut inner = self.lock();
         (inner.abandoned, inner.behind) = (true, None);
     }
 
-    /// The present incarnation cannot be running an earlier call any more.
+    /// Notes that the present incarnation cannot be running an earlier call any more.
     pub fn settled(&self) {
         self.lock().abandoned = false;
     }
 
-    /// Whether the present incarnation can go on unchanged: no write is pending, and it runs no abandoned
-    /// batch. If so, the mirror is frozen until [`Self::end_injection`].
+    /// Whether the present incarnation can continue unchanged: no write is pending, and it runs no
+    /// abandoned batch. If so, the mirror is frozen until [`Self::end_injection`].
     pub fn resume(&self) -> bool {
         let mut inner = self.lock();
         let whole = inner.pending.calls().is_empty() && !inner.abandoned;

@@ -1,5 +1,6 @@
-//! What is done to the checkpoint's files, in the order in which it was given. One thread at a time does it, and never
-//! under the ledger's lock: a disk that hangs stops neither calls nor the mirror.
+//! Runs the jobs on the checkpoint's files in the order in which they were given. One thread at a
+//! time runs them, and never under the ledger's lock, so a disk that hangs stops neither calls nor
+//! the mirror.
 
 use std::{
     collections::VecDeque,
@@ -18,8 +19,8 @@ use crate::{
     cli::SyncPolicy,
 };
 
-/// Longest silence of the disk that calls wait for. A memory card may be busy for 0.5 s with one write, and a few
-/// can queue up; calls without an answer stop a robot.
+/// Longest silence of the disk that calls wait for. A memory card may need 0.5 s for one write, and
+/// a few can queue up. Calls that are not answered stop a robot.
 pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Why nothing is recorded after such a silence.
@@ -30,16 +31,17 @@ const JOBS_MAX: usize = 2048;
 
 type Job = Box<dyn FnOnce(&mut Store) + Send>;
 
-/// The store, seen from the ledger. Its methods wait for no disk.
+/// The store as the ledger sees it. No method waits for a disk.
 pub(super) struct Journal {
     shared: Arc<Shared>,
-    /// Number of the last record, recorded or not.
+    /// Number of the last record, whether it was recorded or not.
     seq: u64,
-    /// Whether the store is given records. Not after a silence of the disk, until the next whole checkpoint.
+    /// Whether records are passed to the store. After a silence of the disk they are not, until the
+    /// next whole checkpoint.
     gives: bool,
 }
 
-/// The store, and what is to be done with it.
+/// The store and its queue of jobs.
 pub(super) struct Shared {
     jobs: Mutex<VecDeque<Job>>,
     store: Mutex<Store>,
@@ -49,28 +51,28 @@ pub(super) struct Shared {
     sync: SyncPolicy,
 }
 
-/// The store after its last job.
+/// State of the store after its last job.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seen {
     pub path: PathBuf,
-    /// Number of the last record, recorded or not.
+    /// Number of the last record, whether it was recorded or not.
     pub seq: u64,
     pub journal_bytes: u64,
     pub snapshot_bytes: u64,
     /// Why nothing is recorded; none if records are written.
     pub unprotected: Option<String>,
-    /// Whether the journal is large enough for a new generation.
+    /// Whether the journal has grown enough for a new generation.
     pub outgrown: bool,
-    /// Where a file was kept that was found at the path.
+    /// Where a file found at the checkpoint's path was kept.
     kept: Option<PathBuf>,
-    /// How often records were withheld from the store,
+    /// Number of times records were withheld from the store.
     gaps: u64,
-    /// and how many of these times a whole checkpoint has followed.
+    /// Number of these times that a whole checkpoint has followed.
     gaps_over: u64,
 }
 
 impl Shared {
-    /// Runs all jobs, unless another thread does so already. May take as long as the disk does.
+    /// Runs all jobs, unless another thread is doing so already. May take as long as the disk does.
     pub(super) fn work(&self) {
         loop {
             let mut store = match self.store.try_lock() {
@@ -82,7 +84,7 @@ impl Shared {
                 job(&mut store);
             }
             drop(store);
-            // A job that came before the lock was free was left to us.
+            // A job that came before the lock was free is left to this thread.
             if self.jobs().is_empty() {
                 return;
             }
@@ -131,8 +133,8 @@ impl Shared {
 }
 
 impl Journal {
-    /// The journal of `store`. `durable`: raised to the last record that an answer need not wait for with this
-    /// `sync`.
+    /// The journal of `store`. `durable` is raised to the last record that an answer need not wait
+    /// for, given `sync`.
     pub(super) fn new(store: Store, durable: watch::Sender<u64>, sync: SyncPolicy) -> Self {
         let seq = store.seq();
         let seen = Seen {
@@ -155,27 +157,27 @@ impl Journal {
         }
     }
 
-    /// What runs the jobs.
+    /// Runs the jobs.
     pub(super) fn worker(&self) -> Arc<Shared> {
         Arc::clone(&self.shared)
     }
 
-    /// Number of the last record, recorded or not.
+    /// Number of the last record, whether it was recorded or not.
     pub(super) fn seq(&self) -> u64 {
         self.seq
     }
 
-    /// The store as it was after its last job.
+    /// State of the store after its last job.
     pub(super) fn seen(&self) -> Seen {
         self.shared.seen().clone()
     }
 
-    /// Where a file was kept that was found at the path; returned once.
+    /// Takes the name under which a file found at the path was kept.
     pub(super) fn take_kept(&self) -> Option<PathBuf> {
         self.shared.seen().kept.take()
     }
 
-    /// Records `entries`. A failure is kept by the store.
+    /// Records `entries`. The store keeps any failure.
     pub(super) fn append(&mut self, entries: Vec<Entry>) {
         self.seq += entries.len() as u64;
         if !self.gives {
@@ -191,7 +193,7 @@ impl Journal {
         }
     }
 
-    /// Runs `work` after what was given before. None if too much waits for the disk already.
+    /// Runs `work` after all earlier jobs. None if too many jobs already wait for the disk.
     pub(super) fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Store) -> T + Send + 'static,
@@ -201,7 +203,7 @@ impl Journal {
         let job = move |store: &mut Store| {
             let result = work(store);
             shared.look(store);
-            // The other end may have been dropped.
+            // The receiver may have been dropped.
             let _ = done.send(result);
         };
         let mut jobs = self.shared.jobs();
@@ -211,8 +213,8 @@ impl Journal {
         })
     }
 
-    /// As [`Self::run`], where `work` writes the whole `checkpoint` of this moment. From now on the store is
-    /// given records again.
+    /// Like [`Self::run`], for `work` that writes the whole `checkpoint` of this moment. The store
+    /// receives records again from now on.
     pub(super) fn run_whole<T: Send + 'static>(
         &mut self,
         checkpoint: Checkpoint,
@@ -235,7 +237,8 @@ impl Journal {
         given
     }
 
-    /// The disk is silent: answers wait for it no more, and it gets no records before the next whole checkpoint.
+    /// Gives up on a silent disk: answers no longer wait for it, and it gets no records before the
+    /// next whole checkpoint.
     pub(super) fn give_up(&mut self) {
         if std::mem::take(&mut self.gives) {
             let mut seen = self.shared.seen();

@@ -1,4 +1,4 @@
-//! What a master misses that was late with an answer: the mirror has answered for it meanwhile.
+//! What a late master has missed while the mirror answered in its place.
 
 use std::time::Instant;
 
@@ -10,40 +10,40 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// What a late master holds when it has answered.
+/// What a late master will hold once it has answered.
 pub(super) struct Behind {
     state: Master,
-    /// So many of the pending writes it has run by then.
+    /// Number of pending writes that it will have run by then.
     ran: usize,
-    /// Of what it may notify nodes because of what it was late with.
+    /// Subjects that it may notify nodes of because of the late writes.
     tells: Vec<Subject>,
     answered: bool,
 }
 
-/// What a late master is given.
+/// What a late master must be given.
 #[derive(Debug)]
 pub(crate) enum CatchUp {
-    /// Nothing.
+    /// It has missed nothing.
     Nothing,
-    /// It runs what it missed.
+    /// It must run what it missed.
     Run(Box<Missed>),
 }
 
-/// What a late master missed.
+/// What a late master has missed.
 #[derive(Debug)]
 pub(crate) struct Missed {
-    /// What it holds.
+    /// The state that the master holds.
     pub(crate) behind: Master,
     pub(crate) writes: Vec<Request>,
-    /// What it holds afterwards.
+    /// The state that the master holds after it has run what it missed.
     pub(crate) mirror: Master,
     pub(crate) before: Token,
     pub(crate) token: Token,
 }
 
 impl Ledger {
-    /// The mirror has answered what the present incarnation is late with, and nothing after it. `tells`: of what
-    /// that may notify nodes.
+    /// Notes that the mirror has answered what the present incarnation is late with, and nothing
+    /// after it. `tells` are the subjects that the late writes may notify nodes of.
     pub(crate) fn fall_behind(&self, tells: Vec<Subject>) {
         let mut inner = self.lock();
         inner.behind = Some(Behind {
@@ -54,7 +54,8 @@ impl Ledger {
         });
     }
 
-    /// The present incarnation has answered what it was late with. It may notify nodes of it only now.
+    /// Notes that the present incarnation has answered what it was late with. It may notify nodes
+    /// only now.
     pub(crate) fn late_answered(&self, now: Instant) {
         let mut inner = self.lock();
         let Inner {
@@ -79,11 +80,13 @@ impl Ledger {
         self.outbox_changed.notify_one();
     }
 
-    /// What the present incarnation is given, which was late and has answered. The mirror is frozen until
-    /// [`Self::end_injection`] or [`Self::serve`], and a new incarnation begins if anything is given.
+    /// What to give the present incarnation, which was late and has answered. Freezes the mirror
+    /// until [`Self::end_injection`] or [`Self::serve`], and begins a new incarnation if anything
+    /// is given.
     ///
-    /// None if it must be examined: it has not answered, or a node would hear twice of a subject, and of the
-    /// first time when it has long heard of the second, or a node would be shut down.
+    /// None if the master must be examined instead: it has not answered, or a node would have to
+    /// shut down, or a node would hear of the same subject twice and get the older news after the
+    /// newer.
     pub(crate) fn begin_catch_up(&self, now: Instant) -> Option<CatchUp> {
         let mut inner = self.lock();
         let behind = inner.behind.take().filter(|behind| behind.answered)?;
@@ -112,7 +115,8 @@ impl Ledger {
     }
 }
 
-/// Of what the master notifies how many nodes when it runs `writes`. None if of anything more than once.
+/// The subjects that the master notifies nodes of when it runs `writes`, each with its number of
+/// nodes. None if it notifies of a subject more than once.
 fn once(behind: &Behind, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
     let mut heard = BySubject::default();
     for subject in &behind.tells {
@@ -134,7 +138,7 @@ fn once(behind: &Behind, writes: &[Request]) -> Option<Vec<(Subject, usize)>> {
     Some(told)
 }
 
-/// Of what one call notifies how many nodes.
+/// The subjects that one call notifies nodes of, each with its number of nodes.
 #[derive(Default)]
 struct Tells {
     told: Vec<(Subject, usize)>,

@@ -1,13 +1,13 @@
-//! Writes that the mirror has answered and the present incarnation may not have run.
+//! Writes that the mirror has answered and that the present incarnation may not have run.
 
 use crate::{master::Request, xmlrpc::Value};
 
-/// Most pending writes,
+/// Most pending writes.
 const COUNT_MAX: usize = 10_000;
-/// and their most memory in bytes, about.
+/// Most memory of the pending writes in bytes, approximately.
 const BYTES_MAX: usize = 16 << 20;
 
-/// Too many pending writes to decide what in a master's state is newer than the mirror.
+/// There are too many pending writes to decide what in a master's state is newer than the mirror.
 #[derive(Debug)]
 pub(super) struct TooMany;
 
@@ -16,7 +16,7 @@ pub(super) struct TooMany;
 pub(super) struct PendingWrites {
     calls: Vec<Request>,
     bytes: usize,
-    /// How many of them are a checkpoint's.
+    /// Number of pending writes that come from a checkpoint.
     restored: usize,
 }
 
@@ -25,7 +25,7 @@ impl PendingWrites {
     ///
     /// # Errors
     ///
-    /// If they are too many: all are dropped.
+    /// If there are too many: all are dropped.
     pub(super) fn extend(
         &mut self,
         calls: impl IntoIterator<Item = Request>,
@@ -41,20 +41,20 @@ impl PendingWrites {
         Ok(())
     }
 
-    /// Those so far are a checkpoint's.
+    /// Marks the present pending writes as coming from a checkpoint.
     pub(super) fn are_restored(&mut self) {
         self.restored = self.calls.len();
     }
 
-    /// Drops those of a checkpoint.
+    /// Drops the pending writes that come from a checkpoint.
     pub(super) fn forget_restored(&mut self) {
         let calls = self.calls.split_off(self.restored);
         self.clear();
-        // Fewer than before.
+        // This cannot fail, as there are fewer than before.
         let _ = self.extend(calls);
     }
 
-    /// Whether this process has added `call`. Those of a checkpoint may still be dropped.
+    /// Whether this process has added `call`. Calls from a checkpoint may still be dropped.
     pub(super) fn contains(&self, call: &Request) -> bool {
         let added = self.calls.get(self.restored..).unwrap_or_default();
         added.contains(call)

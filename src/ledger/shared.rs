@@ -1,4 +1,5 @@
-//! What other computers are given of our writes, and what we follow of theirs.
+//! Replication: the writes that other computers receive from this one, and the ones that it
+//! follows.
 
 use std::{collections::VecDeque, sync::Arc, time::Instant};
 
@@ -11,50 +12,50 @@ use crate::{
     master::{Master, Request},
 };
 
-/// Most changes that are remembered for computers that were alone.
+/// Most changes that are remembered for computers that were cut off.
 const RECENT_MOST: usize = 4096;
-/// And their most bytes, about.
+/// Most bytes of these changes, approximately.
 const RECENT_BYTES_MOST: usize = 4 << 20;
 
-/// Which computer's writes the ledger holds.
+/// Whose writes the ledger holds.
 #[derive(Debug)]
 pub(super) enum Shared {
-    /// There is no other computer.
+    /// There are no other computers.
     Nobody,
-    /// Another one has the master: what it records is followed, and nothing else is recorded.
+    /// Another computer has the master: its records are followed, and nothing else is recorded.
     Elsewhere,
-    /// Ours: the others are given them.
+    /// This computer has the master, and the others receive its writes.
     Here {
-        /// The number of the last one.
+        /// Number of the last write.
         last: Agreed,
         changes: Vec<Change>,
         recent: Recent,
     },
 }
 
-/// Where a call that is recorded comes from.
+/// Where a recorded call comes from.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Source {
     /// A node of this computer, or rosrescue itself.
     #[default]
     Here,
-    /// Another computer, which makes it again elsewhere if it gets no answer.
+    /// Another computer, which makes the call again elsewhere if it gets no answer.
     Forwarded,
-    /// A computer that was alone sends what was answered there, all under this name.
+    /// A computer that was cut off and sends what it answered meanwhile, all under this name.
     Merge(Arc<str>),
 }
 
-/// What was changed lately, the oldest first.
+/// Recent changes, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct Recent {
-    /// All changes after this record are here.
+    /// All changes after this record are in the list.
     after: u64,
     changes: VecDeque<(u64, Source, Vec<Subject>)>,
     bytes: usize,
 }
 
 impl Recent {
-    /// All changes after record `seq` will be here.
+    /// An empty list that will hold all changes after record `seq`.
     fn from(seq: u64) -> Self {
         Self {
             after: seq,
@@ -74,7 +75,8 @@ impl Recent {
         }
     }
 
-    /// What was changed after record `seq`, and not by `merge`. None if that is not known any more.
+    /// The changes after record `seq` that were not made by `merge`. None if they are no longer all
+    /// known.
     fn since(&self, seq: u64, merge: &str) -> Option<Changes> {
         if seq < self.after {
             return None;
@@ -94,7 +96,7 @@ fn bytes_of(subjects: &[Subject]) -> usize {
     subjects.iter().map(Subject::size).sum()
 }
 
-/// A place in the journal of all computers: which time that this one has the master, and the number of a
+/// A place in the journal of all computers: the count of this computer's terms, and the number of a
 /// record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
@@ -102,11 +104,11 @@ pub(crate) struct Agreed {
     seq: u64,
 }
 
-/// A change to be given to the other computers.
+/// A change that the other computers must receive.
 #[derive(Clone, Debug)]
 pub(crate) enum Change {
     Call(Record, Source),
-    /// The state was replaced as a whole by record `seq`.
+    /// Record `seq` replaced the state as a whole.
     State {
         seq: u64,
         state: Box<Master>,
@@ -114,7 +116,7 @@ pub(crate) enum Change {
 }
 
 impl Change {
-    /// Its number in the journal of all computers.
+    /// Number of the change in the journal of all computers.
     pub(crate) fn seq(&self) -> u64 {
         match self {
             Self::Call(record, _) => record.seq,
@@ -133,9 +135,9 @@ impl Shared {
 }
 
 impl Ledger {
-    /// Another computer has the master, or may have it: from now on nothing is recorded but what
-    /// [`Self::follow`] is given. Calls whose records the others lack are not acknowledged, and no node is
-    /// notified: the other computer does that.
+    /// Notes that another computer has the master, or may have it: from now on only what
+    /// [`Self::follow`] is given is recorded. Calls whose records the others lack are not
+    /// acknowledged. No node is notified, because the other computer does that.
     pub fn leave(&self) {
         let mut inner = self.lock();
         inner.shared = Shared::Elsewhere;
@@ -149,8 +151,9 @@ impl Ledger {
         });
     }
 
-    /// This computer has the master: its records are given to the others, with numbers after `seq`. `held`:
-    /// the state that they hold; if ours differs, they are given ours as a whole.
+    /// Notes that this computer has the master: the others receive its records, numbered after
+    /// `seq`. `held` is the state that they hold; if this computer's differs, they receive it as a
+    /// whole.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
         let reign = self.agreed.borrow().reign;
@@ -163,17 +166,18 @@ impl Ledger {
             inner.share_state();
         }
         drop(inner);
-        // They have these. A write that changes nothing waits for the last of them only.
+        // The others have these records. A write that changes nothing waits only for the last of
+        // them.
         self.agree(seq);
         self.shared.notify_one();
     }
 
-    /// Whether this computer's calls are recorded, and not another one's.
+    /// Whether this computer's own calls are recorded, and not another computer's.
     pub fn records_here(&self) -> bool {
         !self.lock().is_elsewhere()
     }
 
-    /// What is to be given to the others, once.
+    /// Takes the changes that the others have not been given yet.
     pub(crate) fn take_changes(&self) -> Vec<Change> {
         match &mut self.lock().shared {
             Shared::Here { changes, .. } => std::mem::take(changes),
@@ -181,7 +185,8 @@ impl Ledger {
         }
     }
 
-    /// The same as one change: the state that they have led to. None if this computer does not have the master.
+    /// Takes the same changes as one change: the state that they have led to. None if this computer
+    /// does not have the master.
     pub(crate) fn take_as_state(&self) -> Option<Change> {
         let mut inner = self.lock();
         let state = Box::new(inner.mirror.clone());
@@ -193,9 +198,9 @@ impl Ledger {
         Some(Change::State { seq, state })
     }
 
-    /// What becomes of `calls`, which a computer has answered while it was alone, if they are made now. It sends
-    /// them under the name `merge`, and knows what others have changed up to record `seq`. None if the changes
-    /// after that are not known any more.
+    /// Tells what would become of `calls`, which a computer answered while it was cut off, if they
+    /// were made now. The computer sends them under the name `merge` and knows the others' changes
+    /// up to record `seq`. None if the changes after that are no longer known.
     pub(crate) fn judge(&self, seq: u64, merge: &str, calls: &[&Request]) -> Option<Vec<Verdict>> {
         let inner = self.lock();
         let Shared::Here { recent, .. } = &inner.shared else {
@@ -207,12 +212,12 @@ impl Ledger {
         Some(verdicts.collect())
     }
 
-    /// The last record that the others have, or need not have, in this time that this computer has the master.
+    /// The last record of this term that the others have, or need not have.
     pub fn last_agreed(&self) -> u64 {
         self.agreed.borrow().seq
     }
 
-    /// The others have the records up to `seq`, or need not have them.
+    /// Notes that the others have the records up to `seq`, or need not have them.
     pub fn agree(&self, seq: u64) {
         self.agreed.send_if_modified(|agreed| {
             let more = seq > agreed.seq;
@@ -221,12 +226,13 @@ impl Ledger {
         });
     }
 
-    /// Until when no other computer can lead; none if that does not matter. After that no call is given to this
-    /// computer's master and no node is notified: another leader may have acknowledged newer writes while this
-    /// process stood still.
+    /// Sets until when no other computer can lead; none if that does not matter. After that no call
+    /// is given to this computer's master and no node is notified, because another leader may have
+    /// acknowledged newer writes while this process stood still.
     pub fn set_lease(&self, until: Option<Instant>) {
         self.lease.send_if_modified(|lease| {
-            // A longer lease is seen by whoever looks. Those that wait want to hear only of a new one.
+            // Extending a lease wakes nobody: readers see it anyway, and waiters need only a new
+            // lease.
             let now = Instant::now();
             let held = lease.is_none_or(|until| now < until);
             *lease = until;
@@ -234,7 +240,7 @@ impl Ledger {
         });
     }
 
-    /// Whether the lease holds at this moment.
+    /// Whether the lease is valid now.
     pub fn has_lease(&self) -> bool {
         self.lease
             .borrow()
@@ -246,28 +252,29 @@ impl Ledger {
         self.lease.subscribe()
     }
 
-    /// Returns when the lease holds.
+    /// Returns when the lease is valid.
     pub(crate) async fn await_lease(&self) {
         let mut changed = self.lease_changed();
         while !self.has_lease() {
-            // We own the sender.
+            // This cannot fail: the ledger owns the sender.
             let _ = changed.changed().await;
         }
     }
 
-    /// Returns when the others have the record at `place`. False if this computer no longer has the master.
+    /// Returns when the others have the record at `place`. False if this computer no longer has the
+    /// master.
     pub(super) async fn agreed(&self, place: Agreed) -> bool {
         let mut agreed = self.agreed.subscribe();
-        // We own the sender.
+        // This cannot fail: the ledger owns the sender.
         let reached = agreed.wait_for(|reached| *reached >= place).await;
         reached.is_ok_and(|reached| reached.reign == place.reign)
     }
 
-    /// Applies and records what the computer that has the master has recorded.
+    /// Applies and records the records of the computer that has the master.
     ///
     /// # Errors
     ///
-    /// If this computer has it.
+    /// If this computer has the master itself.
     pub fn follow(&self, records: &[Record]) -> Result<(), Superseded> {
         let mut inner = self.lock();
         if !inner.is_elsewhere() {
@@ -293,7 +300,7 @@ impl Ledger {
     ///
     /// # Errors
     ///
-    /// If this computer has it.
+    /// If this computer has the master itself.
     pub fn follow_state(&self, state: Master) -> Result<(), Superseded> {
         let mut inner = self.lock();
         if !inner.is_elsewhere() {
@@ -315,7 +322,8 @@ impl Inner {
         matches!(self.shared, Shared::Elsewhere)
     }
 
-    /// `sources`: where each comes from; from here if it is not said.
+    /// Passes `entries` to the other computers. `sources` tells where each comes from; missing ones
+    /// come from here.
     pub(super) fn share(&mut self, entries: &[Entry], sources: &[&Source]) {
         let Shared::Here {
             last,
@@ -334,7 +342,7 @@ impl Inner {
                 seq: last.seq + 1,
                 entry: Entry::call(call.clone()),
             };
-            // What cannot be written is in no journal, as in that of one computer.
+            // An entry that cannot be written is in no journal, as on a single computer.
             if format::push_record(&mut Vec::new(), &record).is_ok() {
                 last.seq += 1;
                 recent.add(last.seq, source, &Request::from(call.clone()));
@@ -343,7 +351,7 @@ impl Inner {
         }
     }
 
-    /// The state has changed otherwise than by calls.
+    /// Notes that the state has changed otherwise than by calls.
     pub(super) fn share_state(&mut self) {
         if let Shared::Here {
             last,
@@ -353,10 +361,10 @@ impl Inner {
         {
             last.seq += 1;
             let (seq, state) = (last.seq, Box::new(self.mirror.clone()));
-            // Anything may have changed.
+            // The new state may have changed anything.
             *recent = Recent::from(seq);
             changes.push(Change::State { seq, state });
-            // The calls that follow have other numbers than the session tells.
+            // The following calls have other numbers than the session record says.
             self.session_unwritten = true;
         }
     }
@@ -412,7 +420,7 @@ mod tests {
         state
     }
 
-    /// Answers `call` in place of a master; gives what must be safe before the answer counts.
+    /// Answers `call` in place of a master, and returns what must be safe before the answer counts.
     fn answer(ledger: &Ledger, call: &Request) -> Mark {
         ledger.stand_in(Instant::now(), call).unwrap().1
     }
@@ -422,7 +430,7 @@ mod tests {
         changes.iter().map(Change::seq).collect()
     }
 
-    /// Whether a call with this mark is acknowledged, or that it waits.
+    /// Whether a call with this mark is acknowledged; none if it still waits.
     async fn acknowledged(ledger: &Ledger, mark: Mark) -> Option<bool> {
         let Some(mark) = ledger.to_await(mark) else {
             return Some(true);
@@ -478,7 +486,7 @@ mod tests {
         assert_eq!(acknowledged(&ledger, marks[0]).await, Some(true));
         assert_eq!(acknowledged(&ledger, marks[1]).await, None);
         ledger.agree(9);
-        // Late news takes nothing back.
+        // Late news does not undo anything.
         ledger.agree(8);
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(true));
     }
@@ -494,7 +502,7 @@ mod tests {
         assert_eq!(cluster_seq(), 8);
         ledger.update_session(|session| session.term = 3);
         assert_eq!(ledger.session().cluster_seq, 8);
-        // A state that no record tells is in the next checkpoint, and not in the file before that.
+        // A state without a record is in the next checkpoint, and not in the file before it.
         ledger.adopt(state_of([set(2)]));
         answer(&ledger, &set(3));
         assert_eq!(ledger.session().cluster_seq, 0);
@@ -522,7 +530,7 @@ mod tests {
         ledger.leave();
         assert!(seqs(&ledger).is_empty());
         assert_eq!(acknowledged(&ledger, marks[1]).await, Some(false));
-        // Nor when this one leads again, and the numbers are used for other calls.
+        // The same holds when this computer leads again and uses the numbers for other calls.
         ledger.follow_state(state_of([set(1)])).unwrap();
         ledger.lead(1, &state_of([set(1)]));
         let again = answer(&ledger, &set(3));
@@ -536,7 +544,7 @@ mod tests {
         Request::new(Method::SetParam, params)
     }
 
-    /// What becomes of setting these parameters to -1.
+    /// The verdicts on setting these parameters to -1.
     fn judged(ledger: &Ledger, seq: u64, keys: &[&str]) -> Option<Vec<bool>> {
         let calls: Vec<_> = keys.iter().map(|key| set_of(key, -1)).collect();
         let calls: Vec<_> = calls.iter().collect();
@@ -574,7 +582,7 @@ mod tests {
         let forwarded = |change: &Change| matches!(change, Change::Call(_, Source::Forwarded));
         let forwarded = changes.iter().filter(|change| forwarded(change));
         assert_eq!(forwarded.map(Change::seq).collect::<Vec<_>>(), [9]);
-        // A state may have changed anything.
+        // A new state may have changed anything.
         ledger.adopt(state_of([set(1)]));
         assert_eq!(judged(&ledger, 11, &["/x"]), None);
         assert_eq!(judged(&ledger, 12, &["/x"]), Some(vec![true]));

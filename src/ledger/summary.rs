@@ -1,4 +1,4 @@
-//! Replies as logged.
+//! Summaries of replies for the log.
 
 use super::Inner;
 use crate::{
@@ -7,10 +7,10 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Limit on a reply in a log line, in bytes.
+/// Most bytes of a reply in a log line.
 const LOGGED_REPLY: usize = 300;
 
-/// A reply for the log, without values of parameters.
+/// Summarizes a reply for the log, without values of parameters.
 fn summary(method: &Method, reply: &Reply) -> String {
     let text = match reply {
         Reply::Value(Value::Array(answer)) if *method == Method::SubscribeParam => {

@@ -102,7 +102,7 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
     let answer = |call: &Request| ledger.stand_in(now, call).unwrap().0;
     assert_eq!(answer(&set(1)), answered(&set(1), &mut Master::default()));
     answer(&set(2));
-    // What changes nothing needs no master, and what is refused never ran.
+    // A call that changes nothing needs no master, and a refused call never ran.
     answer(&set(2));
     answer(&call("deleteParam", &["/n", "/b"]));
     answer(&call("setParam", &["/n", "/"]));
@@ -152,7 +152,8 @@ fn a_mirror_that_is_being_injected_takes_no_write() {
     assert!(ledger.stand_in(now, &bye).is_some());
 }
 
-/// What is in flight when a master goes away may be run when it is back, also if it changes nothing now.
+/// A call in flight when a master goes away may still run when it is back, even if it changes
+/// nothing now.
 #[test]
 fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
     let ledger = ledger();
@@ -177,7 +178,7 @@ fn a_master_goes_on_as_it_is_only_if_nothing_is_owed_or_under_way() {
     assert!(ledger.resume());
 }
 
-/// A registration that it takes back may be on its way to a master that takes its time.
+/// The registration that it removes may be on its way to a master that takes its time.
 #[test]
 fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     let ledger = ledger();
@@ -193,7 +194,8 @@ fn an_unregistration_of_what_is_not_there_is_left_to_the_master() {
     assert!(ledger.answer_if_unchanged(now, &bye).is_none());
 }
 
-/// What loggers say all the time takes no room, and does not outdate an injection that is made ready.
+/// Loggers repeat these calls all the time. They take no room, and do not outdate a prepared
+/// injection.
 #[test]
 fn what_changes_nothing_leaves_no_trace() {
     let ledger = ledger();
@@ -242,7 +244,7 @@ fn a_write_behind_a_subscription_is_no_divergence() {
     assert!(!recorded.doubtful);
 }
 
-/// Also what the mirror knows nothing of, for the master that comes back may know it.
+/// Also calls that are unknown to the mirror, because a master that comes back may know them.
 #[test]
 fn what_takes_nothing_away_is_pending_within_limits() {
     let ledger = ledger();
@@ -281,7 +283,7 @@ fn who_the_master_is_outlasts_a_resync() {
     assert_eq!(ledger.answer(&get_pid), before);
 }
 
-/// A short call asks for what would take all the memory of a computer.
+/// A short call could ask for answers that need all the memory of a computer.
 #[test]
 fn reads_are_answered_together_within_limits() {
     let ledger = ledger();
@@ -331,7 +333,7 @@ fn a_look_counts_if_nothing_came_between() {
     assert!(!ledger.with_mirror(Master::is_empty));
 }
 
-/// What is in no journal is waited for only while there is a file to write it to.
+/// A write that no journal holds is waited for only while there is a file to write it to.
 #[tokio::test]
 async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     let ledger = ledger();
@@ -341,7 +343,7 @@ async fn a_write_that_changes_nothing_is_safe_as_soon_as_this_computer_leads() {
     held.apply(&publish);
     ledger.follow_state(held.clone()).unwrap();
     ledger.lead(7, &held);
-    // A node sends it again: the computer that led before has recorded it, and died before the answer.
+    // A node sends the write again: the previous leader recorded it and died before the answer.
     let (_, mark) = ledger.stand_in(Instant::now(), &publish).unwrap();
     let safe = ledger.durable(ledger.to_await(mark).unwrap());
     let safe = tokio::time::timeout(std::time::Duration::from_secs(5), safe).await;
@@ -376,7 +378,7 @@ async fn what_was_adopted_is_waited_for_until_a_checkpoint_was_attempted() {
     ledger.set_attempted(Ok(()));
     ledger.attempted(first).await;
     assert_eq!(ledger.unwritten(), Some(second));
-    // The next one fails.
+    // The next checkpoint fails.
     checkpoint(&ledger).await;
     let error = StoreError::Stale {
         snapshot: 0,
@@ -425,7 +427,7 @@ fn who_was_displaced_lately_is_in_the_snapshot() {
     let rebuilt = crate::checkpoint::session::rebuild(Some(read), Vec::new());
     let apis: Vec<_> = rebuilt.displaced.iter().map(|it| &*it.api).collect();
     assert_eq!(apis, ["http://n:1/"]);
-    // Also in the snapshot of the next start, until the master is examined.
+    // They are also in the snapshot of the next start, until the master is examined.
     let next = self::ledger();
     next.with_activity(|_, activity| activity.restore_displaced(rebuilt.displaced));
     assert_eq!(next.checkpoint().displaced, checkpoint.displaced);

@@ -1,68 +1,71 @@
-//! Whether a master that does not answer hangs, by what the kernel tells of its process.
+//! Decides whether a master that does not answer hangs, from what the kernel shows of its process.
 //!
-//! Silence alone is no evidence: on a busy computer a healthy master gets no processor, or rosrescue gets
-//! none and its probes are late. A process that hangs has no use for the processor: it is stopped, or its threads
-//! get the processor when they want it, use little of it, and wait for something else.
+//! Silence alone is no evidence. On a busy computer a healthy master may get no processor time, or
+//! rosrescue gets none and its probes are late. A process that hangs has no use for the processor:
+//! it is stopped, or its threads get the processor when they want it, use little of it, and wait
+//! for something else.
 
 use std::time::{Duration, Instant};
 
-/// Silence must have been watched for this long, or nothing is known.
+/// Shortest time a silence must have been watched before it proves anything.
 pub const WATCHED_LEAST: Duration = Duration::from_millis(300);
-/// For this long, if it was not stopped.
+/// Shortest time a silence must have been watched if the process was not stopped.
 const IDLE_LEAST: Duration = Duration::from_millis(900);
-/// A master that has used the processor for this long since its last answer is in an endless loop.
+/// A master that has used this much processor time since its last answer is in an endless loop.
 pub const BUSY_LIMIT: Duration = Duration::from_secs(30);
-/// One part in so many of the time: a process that has used more of the processor is busy. The threads of an idle
-/// rosmaster wake a hundred times a second, and use one part in two hundred, in thirty on a small computer.
+/// A process that has used more than this fraction (1/n) of the time is busy. The threads of an
+/// idle rosmaster wake a hundred times a second and use 1/200 of the time, or 1/30 on a small
+/// computer.
 const BUSY_PART: u32 = 10;
-/// A process whose threads wait for longer than this each time they want the processor is starved. An answer takes
-/// some ten such turns.
+/// A process is starved if its threads wait longer than this each time they want the processor. An
+/// answer takes some ten such turns.
 const STARVED_WAIT: Duration = Duration::from_millis(10);
-/// One that wants the processor and had fewer turns than this is starved, too.
+/// A process that wants the processor and had fewer turns than this is starved, too.
 const TURNS_LEAST: u64 = 5;
-/// One part in so many of the time: if rosrescue has waited for the processor for longer, its probes had no fair
-/// chance.
+/// If rosrescue itself has waited for the processor for more than this fraction (1/n) of the time,
+/// its probes had no fair chance.
 const UNFAIR_PART: u32 = 2;
 
-/// What the threads of a process do, together with those of its children.
+/// What the threads of a process and of its children do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
-    /// A thread runs, or waits for the processor.
+    /// Whether a thread runs, or waits for the processor.
     pub runnable: bool,
-    /// A thread waits for a disk, and for nothing else.
+    /// Whether a thread waits for a disk, and for nothing else.
     pub on_disk: bool,
-    /// Every thread was stopped, by SIGSTOP or a debugger.
+    /// Whether every thread was stopped, by SIGSTOP or a debugger.
     pub stopped: bool,
-    /// How long they have run since they were started.
+    /// Processor time that they have used since they were started.
     pub ran: Duration,
-    /// How long they have waited for the processor. The kernel adds a wait when it ends.
+    /// Time that they have waited for the processor. The kernel adds a wait when it ends.
     pub waited: Duration,
-    /// How often they were given the processor.
+    /// Number of times they were given the processor.
     pub turns: u64,
 }
 
-/// What was seen at one moment.
+/// The state of a process at one moment.
 #[derive(Clone, Copy, Debug)]
 pub struct Sample {
     pub at: Instant,
-    /// None if the system does not show it.
+    /// What the master's threads do; none if the system does not show it.
     pub master: Option<Effort>,
-    /// How long rosrescue's own threads have waited for the processor, and how late its timers were.
+    /// How long rosrescue's own threads have waited for the processor, and how late its timers
+    /// were.
     pub own_wait: Duration,
 }
 
-/// What follows from a silence.
+/// The conclusion from a silence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
     /// The master hangs, or the system does not show what it does.
     Hung,
-    /// Not proved, and why.
+    /// There is no proof that the master hangs, and why.
     Unproved(&'static str),
-    /// It has not been watched for long enough.
+    /// The master has not been watched for long enough.
     Unknown,
 }
 
-/// What was seen of a master since its last answer.
+/// The samples of a master since its last answer.
 #[derive(Debug, Default)]
 pub struct Evidence {
     /// The first sample since the last answer.
@@ -70,18 +73,19 @@ pub struct Evidence {
     /// The first sample of those that are judged.
     first: Option<Sample>,
     last: Option<Sample>,
-    /// The first of the latest samples in a row that show it stopped, without progress in between.
+    /// The first of the latest consecutive samples in which the master was stopped and made no
+    /// progress.
     stopped: Option<Sample>,
-    /// Any of the judged samples shows a thread that wants the processor,
+    /// Whether any judged sample shows a thread that wants the processor.
     runnable: bool,
-    /// or one that waits for a disk,
+    /// Whether any judged sample shows a thread that waits for a disk.
     on_disk: bool,
-    /// or that all were stopped.
+    /// Whether in any judged sample all threads were stopped.
     was_stopped: bool,
 }
 
 impl Evidence {
-    /// Adds what was seen.
+    /// Adds a sample.
     pub fn add(&mut self, sample: Sample) {
         let before = self.last.replace(sample);
         self.silent.get_or_insert(sample);
@@ -104,14 +108,14 @@ impl Evidence {
         self.last.map(|sample| sample.at)
     }
 
-    /// The master has answered.
+    /// Forgets all samples, because the master has answered.
     pub fn clear(&mut self) {
         *self = Self::default();
     }
 
-    /// What follows from the samples if the master has been silent all the time. One that has used the
-    /// processor for `busy_limit` without an answer hangs. After a verdict without proof only later samples are
-    /// judged, and the last one.
+    /// Judges a master that has been silent during all samples. A master that has used the
+    /// processor for `busy_limit` without an answer hangs. After a verdict without proof only the
+    /// last sample and later ones are judged.
     pub fn judge(&mut self, busy_limit: Duration) -> Verdict {
         let verdict = self.verdict(busy_limit);
         if verdict != Verdict::Unknown
@@ -181,7 +185,8 @@ mod tests {
         Duration::from_millis(ms)
     }
 
-    /// Idle for so many milliseconds, as a rosmaster is, all in all.
+    /// An idle rosmaster after `at` milliseconds: what its threads and rosrescue's have done in
+    /// total.
     fn idle(at: u64) -> (Effort, Duration) {
         let effort = Effort {
             ran: Duration::from_secs(1) + ms(at) / 200,
@@ -193,7 +198,7 @@ mod tests {
         (effort, ms(at) / 500)
     }
 
-    /// The verdict after samples at 0, 500 and 1,000 ms, of what `seen` makes of an idle master's.
+    /// The verdict after samples at 0, 500 and 1,000 ms. `seen` changes what an idle master shows.
     fn verdict(seen: impl Fn(u64, &mut Effort, &mut Duration)) -> Verdict {
         let start = Instant::now();
         let mut evidence = Evidence::default();
@@ -224,7 +229,7 @@ mod tests {
             effort.ran = ms(7);
         };
         assert_eq!(verdict(|_, effort, _| stop(effort)), Verdict::Hung);
-        // Whatever rosrescue gets of the processor.
+        // This holds however much processor time rosrescue gets.
         let starved = |at: u64, effort: &mut Effort, own: &mut Duration| {
             stop(effort);
             *own = ms(at);
@@ -254,7 +259,7 @@ mod tests {
         is_unproved(verdict(|_, effort, _| effort.on_disk = true), "disk");
         let found = verdict(|at, _, own| *own += ms(at) / 3 * 2);
         is_unproved(found, "rosrescue gets too little");
-        // Stopped and continued in turns: at each moment stopped, and it goes on in between.
+        // Stopped and continued in turns: it is stopped in each sample, and runs in between.
         for going_on in [500, 1000, 2000] {
             let found = verdict(|at, effort, _| effort.stopped = at != going_on);
             is_unproved(found, "part of the time");
@@ -305,7 +310,7 @@ mod tests {
         assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
     }
 
-    /// A start: busy for five seconds, then it waits for nothing for ever.
+    /// A start that is busy for five seconds and then waits for ever.
     #[test]
     fn progress_of_long_ago_does_not_count() {
         let start = Instant::now();

@@ -7,22 +7,23 @@ use std::{
 
 /// Older false alarms do not count.
 const MEMORY: Duration = Duration::from_secs(60);
-/// So many within [`MEMORY`] cost nothing; each further one doubles the patience.
+/// Number of false alarms within [`MEMORY`] that change nothing. Each further one doubles the
+/// patience.
 const FREE: usize = 5;
 /// The longest patience.
 const LONGEST: Duration = Duration::from_secs(10);
 
-/// The patience with the master. It grows when the mirror stands in again and again for a master that was only
-/// late, and shrinks when those times lie a minute back.
+/// The patience with a slow master. It grows when the mirror stands in repeatedly for a master that
+/// was only late, and shrinks again when those times are a minute old.
 #[derive(Clone, Debug)]
 pub struct Patience {
     base: Duration,
-    /// When the master was late and answered, the oldest first.
+    /// Times when a late master answered, oldest first.
     alarms: VecDeque<Instant>,
 }
 
 impl Patience {
-    /// With `base` while the master is mostly in time.
+    /// Creates a patience of `base` for a master that is mostly in time.
     pub fn new(base: Duration) -> Self {
         Self {
             base,
@@ -30,7 +31,7 @@ impl Patience {
         }
     }
 
-    /// The mirror stood in for a master that has answered now.
+    /// Notes that the mirror stood in for a master that has answered now.
     pub fn was_late(&mut self, now: Instant) {
         self.forget(now);
         self.alarms.push_back(now);
@@ -78,7 +79,7 @@ mod tests {
         assert_eq!(patience.at(now), BASE);
     }
 
-    /// However late it answers: how often the mirror stands in within any minute.
+    /// The mirror stands in only so many times within any minute, however late the master answers.
     #[test]
     fn the_gate_does_not_flap_without_bounds() {
         const MOST: usize = 18;

@@ -37,7 +37,7 @@ impl Script {
         self
     }
 
-    /// The connection to a master that was served ends.
+    /// The connection to a serving master ends.
     fn lose(&mut self) -> &mut Self {
         let shut = Action::ShutGate(Cause::ConnectionLost);
         self.feed(Input::ConnectionLost, &[shut, Action::Connect])
@@ -113,7 +113,7 @@ fn a_thread_that_ends_shuts_the_gate_before_the_process_has_ended() {
             Input::ThreadEnded,
             &[Action::ShutGate(Cause::ThreadEnded), Action::Connect],
         )
-        // The dying process still takes connections.
+        // The dying process still accepts connections.
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ThreadEnded, &[])
         .feed(Input::ConnectionLost, &[])
@@ -132,7 +132,7 @@ fn a_master_of_others_whose_thread_ends_dies_once() {
     assert_eq!(script.machine.deaths(), 1);
     script
         .feed(Input::ThreadEnded, &lost)
-        // The dying process still takes connections.
+        // The dying process still accepts connections.
         .feed(Input::Connected, &[Action::Examine])
         .feed(Input::ConnectionLost, &[])
         .feed(Input::Refused, &[])
@@ -194,7 +194,7 @@ fn a_master_that_was_left_hanging_is_killed() {
         .feed(Input::Exited, &[Action::Spawn]);
 }
 
-/// A process that was stopped with as many connections waiting as there may be takes no more.
+/// A stopped process whose backlog of connections is full accepts no more.
 #[test]
 fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     let mut script = Script::new(Supervision::Ours);
@@ -212,7 +212,7 @@ fn a_master_that_was_left_and_takes_no_connection_is_killed() {
         .feed(Input::Wake, &[Action::Connect])
         .feed(Input::Unreachable, &[Action::Kill])
         .feed(Input::Exited, &[Action::Spawn]);
-    // Those of others are waited for.
+    // External masters are waited for.
     let mut script = Script::new(Supervision::Theirs);
     script.feed(
         Input::Start {
@@ -225,7 +225,7 @@ fn a_master_that_was_left_and_takes_no_connection_is_killed() {
     script.feed(Input::Unreachable, &[]);
 }
 
-/// Whatever answers at the port of our child instead of it.
+/// Something else than a master answers at the port of our child.
 #[test]
 fn a_child_at_whose_port_there_is_no_master_is_replaced() {
     for answer in [Input::NotAMaster, Input::ConnectionLost] {
@@ -247,7 +247,7 @@ fn a_child_at_whose_port_there_is_no_master_is_replaced() {
             .feed(Input::Connected, &[Action::Examine])
             .feed(answer, &[Action::Kill])
             .feed(Input::Exited, &[Action::Spawn]);
-        // Those of others are never given up.
+        // External masters are never given up.
         let mut script = Script::new(Supervision::Theirs);
         script.feed(
             Input::Start {
@@ -347,7 +347,7 @@ fn a_child_whose_port_was_taken_is_replaced_at_once_and_is_no_death() {
     for _ in 0..DEATHS_AT_ONCE {
         take(&mut script, &[Action::Spawn]);
     }
-    // Whoever takes each one does not keep the processor busy.
+    // A program that takes each port in turn does not keep the processor busy.
     take(&mut script, &[]);
     script.wake(FIRST_PAUSE, &[Action::Spawn]);
     take(&mut script, &[]);
@@ -385,8 +385,8 @@ fn nothing_happens_after_a_stop() {
     assert_eq!(script.machine.deadline(), None);
 }
 
-/// A dying process takes connections until its listening socket is closed, which comes last; and a
-/// relay before a dead master takes and closes them for ever.
+/// A dying process accepts connections until its listening socket is closed, which comes last. A
+/// relay in front of a dead master accepts and closes them for ever.
 #[test]
 fn a_master_that_is_still_dying_dies_once() {
     let mut script = Script::serving(Supervision::Theirs);

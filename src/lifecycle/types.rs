@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-/// Who starts masters.
+/// Whether rosrescue or another program starts the masters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Supervision {
-    /// rosrescue.
+    /// rosrescue starts the masters.
     Ours,
-    /// Another program; rosrescue waits.
+    /// Another program starts the masters; rosrescue waits for them.
     Theirs,
 }
 
@@ -16,26 +16,27 @@ pub enum Supervision {
 pub struct Probing {
     /// Pause between an answered probe and the next.
     pub interval: Duration,
-    /// The master is taken for hung after this many missed probes in a row.
+    /// Number of probes missed in a row after which the master counts as hung.
     pub count: u32,
     /// How long a write waits for the master before the mirror answers it.
     pub patience: Duration,
-    /// How long a master that was spawned may take to listen without any progress.
+    /// How long a spawned master may take to listen without making progress.
     pub start_limit: Duration,
 }
 
-/// What happened.
+/// An event that the lifecycle reacts to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Input {
     /// rosrescue starts.
     Start {
-        /// Whether a master of an earlier rosrescue still runs. Its end is reported like a child's.
+        /// Whether a master of an earlier rosrescue still runs. Its end is reported like that of a
+        /// child.
         left: bool,
-        /// Whether the mirror is from a checkpoint whose session continues.
+        /// Whether the mirror comes from a checkpoint whose session continues.
         restored: bool,
     },
-    /// The examined master has answered and is being brought to the mirror's state: if it ends now, that
-    /// counts as another death.
+    /// The examined master has answered and is being brought to the mirror's state. If it ends now,
+    /// that counts as another death.
     Answered,
     /// A connection to the master has been made.
     Connected,
@@ -53,17 +54,18 @@ pub enum Input {
     BatchLost,
     /// The master takes too long to answer a call.
     Slow,
-    /// A write has waited for [`Lifecycle::patience`](super::Lifecycle::patience), and the mirror can answer it.
+    /// A write has waited for [`Lifecycle::patience`](super::Lifecycle::patience), and the mirror
+    /// can answer it.
     Late,
     /// The master has answered what was under way when it was [late](Self::Late).
     LateAnswered,
-    /// The master that was late holds what the mirror has answered meanwhile.
+    /// The late master has received what the mirror answered meanwhile.
     CaughtUp,
-    /// The master could not be given that.
+    /// The late master could not be given what it missed.
     NotCaughtUp,
     /// The master holds the whole state.
     Examined {
-        /// Whether it is a new incarnation.
+        /// Whether the master is a new incarnation.
         new: bool,
     },
     /// The server at the master's address is not a master.
@@ -92,13 +94,13 @@ pub enum Input {
 pub enum Cause {
     /// The master's connection ended: it died, or it closed an idle connection.
     ConnectionLost,
-    /// A thread of the master ended: it is dying, or being stopped in order.
+    /// A thread of the master ended: the master is dying, or being stopped in order.
     ThreadEnded,
     /// The master's process ended.
     Exited,
     /// The master no longer answers.
     Hung,
-    /// The master was late, and must be examined.
+    /// The master was late and must be examined.
     Late,
     /// rosrescue stops.
     Stopping,
@@ -118,21 +120,21 @@ impl Cause {
     }
 }
 
-/// What the shell must do, in order. A new `Connect`, `Examine` or `CatchUp` cancels the step under way; a
-/// `Probe` does not.
+/// An action that the shell must carry out, in order. A new `Connect`, `Examine` or `CatchUp`
+/// cancels the step under way; a `Probe` does not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Action {
-    /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or
-    /// `Unreachable`.
+    /// Connect to the master. Results: `Connected`, `Refused`, `PortTaken` or `Unreachable`.
     Connect,
     /// Bring the connected master to the mirror's state, or the mirror to the master's. Results: `Examined`,
     /// `NotAMaster` or `Unreachable`.
     Examine,
     /// Let no call pass.
     ShutGate(Cause),
-    /// Let the mirror answer until the master has answered what is under way. Results: `LateAnswered`.
+    /// Let the mirror answer until the master has answered what is under way. Result:
+    /// `LateAnswered`.
     StandIn,
-    /// Give the master that was late what the mirror has answered meanwhile. Results: `CaughtUp` or
+    /// Give the late master what the mirror has answered meanwhile. Results: `CaughtUp` or
     /// `NotCaughtUp`.
     CatchUp,
     /// Let calls pass.
@@ -143,10 +145,10 @@ pub enum Action {
     Spawn,
     /// Kill the master.
     Kill,
-    /// The master does not answer, and is not killed for this reason.
+    /// Report why a master that does not answer is not killed.
     Spare(&'static str),
-    /// Stop rosrescue: no master can be started, and there is no state to give to a later one. Reporting the
-    /// error is better than retrying for ever.
+    /// Stop rosrescue: no master can be started, and there is no state to give to a later one.
+    /// Reporting the error is better than retrying for ever.
     GiveUp,
     /// Report a crash loop, with the number of deaths within a minute.
     ReportCrashLoop(usize),

@@ -1,4 +1,4 @@
-//! Talking to a node at its own port.
+//! Calls a node at its own port.
 
 use std::{
     net::{IpAddr, SocketAddr},
@@ -26,7 +26,7 @@ pub(crate) async fn ask(api: &str, call: &Call, limit: Duration) -> Sign {
     ask_for(api, call, limit).await.0
 }
 
-/// As [`ask`], with the value that the node returned.
+/// Like [`ask`], and also returns the value that the node answered.
 pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, Option<Value>) {
     let Ok(address) = MasterUri::parse(api) else {
         return (Sign::Silent, None);
@@ -43,24 +43,24 @@ pub(crate) async fn ask_for(api: &str, call: &Call, limit: Duration) -> (Sign, O
         .unwrap_or((Sign::Silent, None))
 }
 
-/// The host of `api`, or the first of its addresses; none if it gets none within `limit`.
+/// The host of `api`, resolved to its first address; none if it has no address within `limit`.
 pub(super) async fn host(api: &str, limit: Duration) -> Option<IpAddr> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;
     found.ok()?.ok()?.first().map(SocketAddr::ip)
 }
 
-/// What a node reports of itself.
+/// What a node reports about itself.
 #[derive(Debug)]
 pub(crate) struct Interview {
     pub sign: Sign,
     pub pid: Option<i32>,
-    /// What it publishes and subscribes, if known.
+    /// The topics that it publishes and subscribes to, if known.
     pub claims: Option<Claims>,
 }
 
 impl Interview {
-    /// There was no answer.
+    /// The result for a node that did not answer.
     pub(super) const SILENT: Self = Self {
         sign: Sign::Silent,
         pid: None,
@@ -68,8 +68,9 @@ impl Interview {
     };
 }
 
-/// Asks the node at `api` for its process id, within `limit`. If it answers, also for what it publishes and
-/// subscribes, within `limit` again. `getName` would help more, but roscpp lacks it.
+/// Asks the node at `api` for its process id, within `limit`. If it answers, also asks for its
+/// publications and subscriptions, within another `limit`. `getName` would help more, but roscpp
+/// lacks it.
 pub(crate) async fn interview(api: &str, limit: Duration) -> Interview {
     let (sign, pid) = ask_for(api, &master::get_pid(), limit).await;
     let mut interview = Interview {
@@ -102,7 +103,7 @@ async fn connect(address: &MasterUri) -> Result<Connection, Sign> {
                 return connection.await.map_err(|_| Sign::Silent);
             }
             Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => refused = true,
-            // An address cannot be reached: the node may live there.
+            // An address cannot be reached, so the node may live there.
             Err(_) => return Err(Sign::Silent),
         }
     }

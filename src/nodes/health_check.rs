@@ -1,8 +1,8 @@
-//! The health check: which nodes live, whether they are the ones that registered, and where the mirror
-//! differs from what they report.
+//! The health check: which nodes are alive, whether they are the ones that registered, and where
+//! the mirror differs from what they report.
 //!
-//! Nothing here may delay a call: a roscpp node that waits for its registration cannot answer rosrescue
-//! before that call is done.
+//! It must not delay any call: a roscpp node that waits for its registration cannot answer
+//! rosrescue before that call is done.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -33,12 +33,12 @@ use crate::{
     xmlrpc::{Reply, Value},
 };
 
-/// Pause before a node is asked again, to confirm what is to be removed from it.
+/// Pause before a node is asked again to confirm what is to be removed.
 const SECOND_QUESTION: Duration = Duration::from_millis(1200);
-/// Most questions to a node with changing answers.
+/// Most questions to a node whose answers keep changing.
 const QUESTIONS: u32 = 4;
 
-/// The result of asking one port.
+/// The result of asking the nodes at one port.
 #[derive(Debug)]
 pub(crate) struct CheckResult {
     pub(crate) sign: Sign,
@@ -47,8 +47,8 @@ pub(crate) struct CheckResult {
     pub(crate) reconciled: Vec<String>,
 }
 
-/// Follows a recovery from `outage`, beside traffic: sends the notifications that were missed, and asks all
-/// nodes. None if the next recovery has begun meanwhile.
+/// Follows a recovery from `outage`, in parallel with traffic: sends the missed notifications and
+/// asks all nodes. None if the next recovery begins meanwhile.
 pub(crate) async fn after_recovery(
     nodes: Arc<Nodes>,
     outage: Instant,
@@ -62,13 +62,14 @@ pub(crate) async fn after_recovery(
         .await;
     let start = Instant::now();
     let incarnation = nodes.ledger.incarnation();
-    // Queued calls first: they are newer than a node's answers.
+    // Queued calls come first, because they are newer than a node's answers.
     barrier(&nodes).await;
     let mut notified = match outcome {
-        // This master notifies nodes itself, but the rosrescue before us may have died while it stood in for another.
+        // This master notifies nodes itself, but the previous rosrescue may have died while it
+        // stood in for another master.
         Outcome::Adopted => super::notify_later(&nodes, outage),
         Outcome::Reconciled => {
-            // It may send old notifications now.
+            // The master may send outdated notifications now.
             nodes
                 .ledger
                 .with_activity(|_, activity| activity.tell_again());
@@ -96,7 +97,7 @@ async fn barrier(nodes: &Nodes) {
     nodes.write_queue.call(last).await;
 }
 
-/// Asks every node, all at the same time, with the limits of [`Visits`](super::visits::Visits).
+/// Asks all nodes at the same time, with the limits of [`Visits`](super::visits::Visits).
 pub(crate) async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
     collect(begin_visits(nodes)).await
 }
@@ -104,7 +105,7 @@ pub(crate) async fn check_all(nodes: &Arc<Nodes>) -> HealthCheck {
 fn begin_visits(nodes: &Arc<Nodes>) -> JoinSet<CheckResult> {
     let ports: BTreeSet<String> = nodes.ledger.with_mirror(|mirror| {
         let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
-        // Addresses that rosrescue cannot call, the master cannot call either.
+        // The master cannot call addresses that rosrescue cannot call.
         let nodes = nodes.filter(|(_, api)| MasterUri::parse(api).is_ok());
         nodes.map(|(_, api)| port_of(api).to_owned()).collect()
     });
@@ -192,7 +193,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
             Sign::Alive => {
                 refused = None;
                 if nodes.clear(port) {
-                    // Notifications that were held back meanwhile.
+                    // These notifications were held back meanwhile.
                     notifications::notify_of_all(nodes, port);
                 }
             }
@@ -216,7 +217,7 @@ async fn converse(nodes: &Arc<Nodes>, port: &str, waiting: Waiting) -> CheckResu
     outcome
 }
 
-/// Counts a question for as long as it has no answer.
+/// Counts a question as unanswered while this value exists.
 struct Waiting(Arc<Nodes>);
 
 impl Waiting {
@@ -240,7 +241,7 @@ struct Asked {
     unregistered: Vec<u64>,
 }
 
-/// What an answer implies.
+/// What an answer implies for the names at the address.
 #[derive(Default)]
 struct Findings {
     others: Vec<Name>,
@@ -248,7 +249,7 @@ struct Findings {
 }
 
 impl Asked {
-    /// The addresses with this port.
+    /// All addresses with this port.
     fn all(nodes: &Nodes, port: &str) -> Vec<Self> {
         nodes.ledger.with_activity(|mirror, activity| {
             let mut all = BTreeMap::<_, Self>::new();
@@ -305,7 +306,7 @@ impl Asked {
                 if let Some(pid) = *pid {
                     activity.remember_pid(&name.node, api, name.registered, pid);
                 }
-                // With two candidates neither is reconciled.
+                // If two names could be meant, neither is reconciled.
                 let sure = verdict == Verdict::Itself || self.names.len() == 1;
                 if let Some(claims) = claims
                     && sure
@@ -330,8 +331,8 @@ impl Asked {
     }
 }
 
-/// Whether the node at `api` says that we are its master. If not, what it says of itself may be meant for
-/// another master. roscpp cannot say.
+/// Whether the node at `api` names this rosrescue as its master. If it does not, its answers may be
+/// meant for another master. roscpp cannot tell.
 async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     let limit = nodes.timeout;
     let Some(_admitted) = nodes.visits.admit(port_of(api), limit).await else {
@@ -350,7 +351,7 @@ async fn has_our_master(nodes: &Nodes, api: &str) -> bool {
     named.names(&own, &named_at, node_is_here, resolver::is_own)
 }
 
-/// The addresses of a host; none if it gets none within `limit`.
+/// The addresses of a host; none if it has none within `limit`.
 async fn addresses(at: &MasterUri, limit: Duration) -> Vec<IpAddr> {
     let found = tokio::time::timeout(limit, resolver::addresses(&at.host, at.port)).await;
     let found = found.ok().and_then(Result::ok).unwrap_or_default();
@@ -375,9 +376,9 @@ impl Findings {
             && reconciliations.all(|(_, _, reconciliation)| reconciliation.is_empty())
     }
 
-    /// Applies what is certain. A removal must have been found by the previous question, too. Removals come
-    /// first: a registration that rosrescue makes for a node counts as the node's own, and voids its other
-    /// findings.
+    /// Applies the findings that are certain. A removal must also have been found by the previous
+    /// question. Removals come first, because a registration that rosrescue makes for a node counts
+    /// as the node's own and voids its other findings.
     async fn act(&self, nodes: &Nodes, api: &str, before: &Self, outcome: &mut CheckResult) {
         for name in &self.others {
             let mut earlier = before.others.iter();
@@ -436,13 +437,14 @@ async fn reconcile(
     }
 }
 
-/// Whether the single entry of a multicall succeeded. A node may claim a type that the master refuses.
+/// Whether the only entry of a multicall succeeded. A node may report a type that the master
+/// refuses.
 fn is_done(reply: &Reply) -> bool {
     let replies = batch::unpack(reply, 1).unwrap_or_default();
     replies.iter().any(master::is_success)
 }
 
-/// Unregisters all of `asked`: their port refuses. Returns who was.
+/// Unregisters all nodes of `asked`, because their port refuses. Returns the unregistered names.
 async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     let mut removals = JoinSet::new();
     for asked in asked {
@@ -457,10 +459,10 @@ async fn remove_all(nodes: &Arc<Nodes>, asked: Vec<Asked>) -> Vec<String> {
     removals.join_all().await.into_iter().flatten().collect()
 }
 
-/// Unregisters a node as it would do itself. Not if it has come back since it was asked: its address is
-/// different, or its last calls are not the `same`.
+/// Unregisters a node as the node itself would do, unless it has come back since it was asked: its
+/// address is different, or its last calls are not the `same`.
 async fn remove(nodes: &Nodes, node: &str, api: &str, same: impl Fn(LastCalls) -> bool) -> bool {
-    // Its queued calls come first.
+    // The node's queued calls come first.
     barrier(nodes).await;
     let found = nodes.ledger.with_activity(|mirror, activity| {
         let last_calls = activity.last_calls(node);

@@ -1,5 +1,5 @@
-//! Asks newly registered nodes for their process ids. A different process id at the same port will mean a
-//! different node.
+//! Asks newly registered nodes for their process ids. A different process id at the same port will
+//! later mean a different node.
 
 use std::{
     collections::BTreeMap,
@@ -10,10 +10,10 @@ use std::{
 use super::{Nodes, client};
 use crate::{health::port_of, master};
 
-/// A node is asked this long after its last registration: starting nodes are busy.
+/// Delay between a node's last registration and the question, because starting nodes are busy.
 pub(super) const IDENTIFY_AFTER: Duration = Duration::from_secs(2);
 
-/// The names that wait for an answer, by port. One question is for all of a port.
+/// The names that wait for an answer, by port. One question serves all names at a port.
 #[derive(Debug, Default)]
 pub(super) struct New(Mutex<BTreeMap<String, Vec<Name>>>);
 
@@ -21,7 +21,7 @@ pub(super) struct New(Mutex<BTreeMap<String, Vec<Name>>>);
 struct Name {
     node: String,
     api: String,
-    /// Its last registration.
+    /// Number of its last registration.
     registered: u64,
 }
 
@@ -30,7 +30,7 @@ impl New {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether any names wait at `port`. If not, the next one needs a task of its own.
+    /// Whether any names wait at `port`. If not, the next one needs a new task.
     fn go_on(&self, port: &str) -> bool {
         let mut new = self.lock();
         let waiting = new.get(port).is_some_and(|names| !names.is_empty());
@@ -73,9 +73,9 @@ pub(super) fn new_nodes(nodes: &Arc<Nodes>) {
 async fn identify(nodes: Arc<Nodes>, port: String) {
     while nodes.new.go_on(&port) {
         let admitted = nodes.visits.admit(&port, nodes.timeout).await;
-        // With those that have come meanwhile.
+        // This includes the names that have come meanwhile.
         let names = nodes.new.lock().get_mut(&port).map(std::mem::take);
-        // An unreachable one is asked again by the health check.
+        // The health check asks unreachable nodes again.
         let answer = match admitted.is_some() && !nodes.is_unreachable(&port) {
             true => {
                 client::ask_for(&port, &master::get_pid(), nodes.timeout)

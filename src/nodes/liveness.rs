@@ -1,5 +1,6 @@
-//! Finds out which nodes live, for reports. A node of this computer lives as long as a process listens at its
-//! port, by the kernel's table of sockets. Others are asked every 30 s.
+//! Finds out which nodes are alive, for reports only. A node on this computer is alive as long as a
+//! process listens at its port, according to the kernel's socket table. Other nodes are asked every
+//! 30 s.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashSet},
@@ -28,12 +29,12 @@ use crate::{
     upstream::sockets,
 };
 
-/// Pause between two looks at the table of sockets.
+/// Pause between two looks at the socket table.
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
-/// Nodes asked at the same time.
+/// Number of nodes asked at the same time.
 const AT_ONCE: usize = 8;
 
-/// The evidence so far.
+/// The evidence collected so far.
 #[derive(Debug)]
 pub(super) struct Liveness {
     known: Mutex<Known>,
@@ -43,15 +44,15 @@ pub(super) struct Liveness {
 #[derive(Debug, Default)]
 struct Known {
     liveness: health::Liveness,
-    /// The addresses of ports on this computer.
+    /// For each port on this computer, its addresses.
     here: BTreeMap<String, Vec<SocketAddr>>,
 }
 
-/// What is known of a registered node's life.
+/// What is known about the life of a registered node.
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub(crate) health: Health,
-    /// When there was evidence last; none if there was none.
+    /// When there was evidence last; none if there never was.
     pub(crate) checked: Option<Instant>,
 }
 
@@ -71,7 +72,7 @@ impl Liveness {
 }
 
 impl Nodes {
-    /// What is known of the life of each registered node, by name.
+    /// What is known about the life of each registered node, by name.
     pub(crate) fn lives(&self) -> BTreeMap<String, Life> {
         let now = Instant::now();
         // Never hold two locks here.
@@ -105,7 +106,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
             let nodes = mirror.nodes().filter(|(name, _)| !Token::is_ours(name));
             nodes.map(|(_, api)| port_of(api).to_owned()).collect()
         });
-        // A blocking read of some kilobytes that the kernel makes up, in less than a millisecond.
+        // A blocking read of some kilobytes that the kernel generates in less than a millisecond.
         let listening = match registered.is_empty() {
             true => HashSet::new(),
             false => sockets::listening(),
@@ -124,7 +125,7 @@ pub(crate) async fn watch(nodes: Arc<Nodes>) {
     }
 }
 
-/// Whether any of `addresses` is among those where processes listen.
+/// Whether a process listens at any of `addresses`.
 fn is_among(addresses: &[SocketAddr], listening: &HashSet<SocketAddr>) -> bool {
     addresses.iter().any(|address| {
         let port = address.port();
@@ -135,7 +136,7 @@ fn is_among(addresses: &[SocketAddr], listening: &HashSet<SocketAddr>) -> bool {
 
 /// Asks the node at `port`, unless a process on this computer listens there.
 async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>>) {
-    // Never closed.
+    // The semaphore is never closed.
     let permit = nodes.liveness.permits.acquire().await;
     let here = addresses_here(&port, nodes.timeout).await;
     let sign = match &here {
@@ -154,7 +155,8 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
         }
         known.liveness.answered(&port, sign, Instant::now())
     };
-    // While the mirror stands in, the health check after it tells of the dead.
+    // While the mirror stands in, nothing is logged, because the following health check reports
+    // dead nodes.
     if has_died && matches!(nodes.gate.state(), State::Open { .. }) {
         let names: Vec<_> = nodes.ledger.with_mirror(|mirror| {
             let nodes = mirror.nodes().filter(|(_, api)| port_of(api) == port);
@@ -169,7 +171,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
     }
 }
 
-/// Those of the addresses of `api` that belong to this computer. None if it gets no address within `limit`.
+/// The addresses of `api` that belong to this computer. None if it has no address within `limit`.
 async fn addresses_here(api: &str, limit: Duration) -> Option<Vec<SocketAddr>> {
     let MasterUri { host, port } = MasterUri::parse(api).ok()?;
     let found = timeout(limit, resolver::addresses(&host, port)).await;
@@ -196,7 +198,7 @@ mod tests {
             drop(listener);
             assert!(!is_among(&here, &sockets::listening()), "{host}");
         }
-        // Reserved for documentation, and for names that do not exist.
+        // These networks and names are reserved for documentation.
         assert_eq!(
             addresses_here("http://192.0.2.1:80", limit).await,
             Some(Vec::new())

@@ -1,7 +1,7 @@
-//! Notifications to nodes that the master would send, has not sent, or will send late.
+//! Sends notifications that the master would send, has not sent, or will send late.
 //!
-//! Each port gets its notifications in [order](crate::order), one at a time; a node that does not answer delays
-//! no other.
+//! Each port gets its notifications in [order](crate::order), one at a time. A node that does not
+//! answer delays no other node.
 
 use std::{
     pin::pin,
@@ -25,17 +25,19 @@ use crate::{
 
 /// Nodes notified at the same time. Each takes a file descriptor.
 const AT_ONCE: usize = 64;
-/// A node that takes longer yields its place to the next one: living nodes answer within milliseconds.
+/// A node that takes longer than this lets the next node begin. Living nodes answer within
+/// milliseconds.
 const PROMPT: Duration = Duration::from_millis(10);
-/// How long to wait for the answer to a `paramUpdate` of a node that has not answered one, but answers
-/// otherwise, as rosnodejs does: it only has to be read.
+/// How long to wait for the answer to a `paramUpdate` from a node that never answers it but answers
+/// other calls, like rosnodejs. The notification only has to be read.
 const MUTE: Duration = Duration::from_millis(500);
-/// Further slow nodes that may be waited for: many nodes on a computer whose packets vanish.
+/// Most slow nodes that are waited for in addition: there may be many on a computer whose packets
+/// vanish.
 const SLOW: usize = 128;
-/// Pauses before asking a node again to shut down, if it does not answer.
+/// Pauses in seconds before each request to shut down, for a node that does not answer.
 const SHUTDOWN_PAUSES: [u64; 6] = [0, 1, 2, 4, 8, 16];
 
-/// The notifications under way.
+/// The notifications that are under way.
 #[derive(Debug)]
 pub(crate) struct Notifications {
     permits: Semaphore,
@@ -62,14 +64,14 @@ pub(crate) fn notify_subscribers(nodes: &Arc<Nodes>, topic: &str) -> bool {
     !subscribers.is_empty()
 }
 
-/// Notifies the node at `port` of every topic and parameter that it subscribes.
+/// Notifies the node at `port` of every topic and parameter that it subscribes to.
 pub(crate) fn notify_of_all(nodes: &Arc<Nodes>, port: &str) {
     nodes.ledger.with_order(|order, mirror| {
         for (name, _) in mirror.nodes().filter(|(_, api)| port_of(api) == port) {
             for topic in mirror.subscriptions(name) {
                 order.tell_state(port, Subject::Topic(topic.to_owned()));
             }
-            // Nothing to send for a parameter that is not set, and may never have been.
+            // There is nothing to send for a parameter that is not set and may never have been.
             for key in mirror
                 .param_subscriptions(name)
                 .filter(|key| mirror.is_set(key))
@@ -89,7 +91,8 @@ pub(crate) fn tell(nodes: &Arc<Nodes>, api: &str, subject: Subject) {
     send_waiting(nodes);
 }
 
-/// Sends the notifications that wait for nodes. A node that is unreachable gets everything once it answers.
+/// Sends the notifications that wait for nodes. A node that is unreachable gets everything once it
+/// answers.
 pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     let ports = nodes.ledger.with_order(|order, _| order.take_idle_ports());
     for port in ports {
@@ -100,13 +103,14 @@ pub(super) fn send_waiting(nodes: &Arc<Nodes>) {
     }
 }
 
-/// Sends a node its notifications, in order, one at a time. One that does not take a notification becomes
-/// unreachable. One that only does not answer `paramUpdate` gets the next notification all the same.
+/// Sends a node its notifications in order, one at a time. A node that does not take a notification
+/// becomes unreachable. A node that only does not answer `paramUpdate` still gets the next
+/// notification.
 async fn deliver(nodes: Arc<Nodes>, port: String) {
     let notifications = &nodes.notifications;
     let mut changed = nodes.ledger.order_changed();
     loop {
-        // Never closed.
+        // The semaphore is never closed.
         let permit = notifications.permits.acquire().await.ok();
         nodes.ledger.await_lease().await;
         if !nodes.may_tell(&port).await {
@@ -118,7 +122,7 @@ async fn deliver(nodes: Arc<Nodes>, port: String) {
             Next::Wait { until } => {
                 drop(permit);
                 tokio::select! {
-                    // The ledger lives as long.
+                    // The ledger lives as long as this task.
                     _ = changed.changed() => {}
                     () = wait::until(until.map(Into::into)) => {}
                 }
@@ -162,8 +166,8 @@ async fn answers(nodes: &Nodes, port: &str) -> bool {
     client::ask(port, &master::get_pid(), nodes.timeout).await == Sign::Alive
 }
 
-/// Asks a node to shut down because another one has taken its name, as a master does. Never a different node
-/// that has its address by now.
+/// Asks a node to shut down because another one has taken its name, as a master does. A different
+/// node that has taken over the address is never shut down.
 pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
     let nodes = nodes.clone();
     tokio::spawn(async move {
@@ -178,7 +182,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
             if is_taken(&nodes, &displaced.api) {
                 return;
             }
-            // Held until it has been told.
+            // The permit is held until the node has been told.
             let Some(_admitted) = nodes
                 .visits
                 .admit(port_of(&displaced.api), nodes.timeout)
@@ -221,7 +225,7 @@ async fn answers_are_written(nodes: &Nodes, port: &str, subject: &Subject) {
             return;
         };
         tokio::select! {
-            // The ledger lives as long.
+            // The ledger lives as long as this task.
             _ = changed.changed() => {}
             () = wait::until(held.until.map(Into::into)) => {}
         }

@@ -1,4 +1,4 @@
-//! Nodes that were found dead and taken out, for the page.
+//! Dead nodes that were unregistered, for the status page.
 
 use std::{
     collections::VecDeque,
@@ -6,10 +6,10 @@ use std::{
     time::Instant,
 };
 
-/// So many are remembered.
+/// Number of nodes that are remembered.
 const MOST: usize = 100;
 
-/// The nodes that were taken out last, the oldest first.
+/// The most recently unregistered dead nodes, oldest first.
 #[derive(Debug, Default)]
 pub(crate) struct Removed(Mutex<VecDeque<(String, Instant)>>);
 
@@ -23,7 +23,7 @@ impl Removed {
         removed.push_back((node.to_owned(), at));
     }
 
-    /// Their names, and when they were taken out. They may have come back.
+    /// The names of the nodes, and when they were unregistered. Some may have come back.
     pub(crate) fn list(&self) -> Vec<(String, Instant)> {
         let removed = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         removed.iter().cloned().collect()

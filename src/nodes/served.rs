@@ -1,4 +1,4 @@
-//! Hosts whose nodes have this rosrescue for their master, where there are several computers.
+//! The hosts whose nodes use this rosrescue as their master, in a robot with several computers.
 
 use std::{
     collections::HashSet,
@@ -19,7 +19,7 @@ impl Served {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A client of this rosrescue makes `call`. If it registers a node, the node's host is one of ours.
+    /// Notes the host of a node that a client of this rosrescue registers with `call`.
     pub(crate) fn add(&self, call: &Request) {
         for call in call.calls() {
             let Some(host) = call.registrant().and_then(|(_, api)| host_of(api)) else {
@@ -32,7 +32,7 @@ impl Served {
         }
     }
 
-    /// Whether nodes at the host of `api` are ours.
+    /// Whether nodes at the host of `api` use this rosrescue.
     pub(crate) fn has(&self, api: &str) -> bool {
         host_of(api).is_some_and(|host| self.lock().contains(&host))
     }

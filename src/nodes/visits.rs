@@ -1,5 +1,5 @@
-//! Limits on the questions to nodes, whose addresses anybody can register: one at a time to each port, so many a
-//! second to each host, so many in all.
+//! Limits the questions to nodes, because anybody can register any address: one at a time to each
+//! port, a bounded rate to each host, and a bounded number in all.
 
 use std::{
     collections::HashMap,
@@ -13,7 +13,7 @@ use tokio::sync::{Mutex as Turn, OwnedMutexGuard, Semaphore, SemaphorePermit};
 use super::client;
 use crate::health::Rates;
 
-/// Nodes asked at the same time. Each takes two file descriptors for at most the deadline.
+/// Nodes asked at the same time. Each takes two file descriptors until its deadline at most.
 const AT_ONCE: usize = 64;
 
 /// The visits that wait or are under way.
@@ -24,7 +24,7 @@ pub(super) struct Visits {
     permits: Semaphore,
 }
 
-/// Permission for one visit: up to three connections.
+/// Permission for one visit with up to three connections.
 #[derive(Debug)]
 pub(super) struct Admitted<'a> {
     _turn: OwnedMutexGuard<()>,
@@ -42,8 +42,8 @@ impl Default for Visits {
 }
 
 impl Visits {
-    /// Waits until the node at `port` may be asked. None if its host has no address, or gets none within
-    /// `limit`: it cannot be asked.
+    /// Waits until the node at `port` may be asked. None if its host has no address within `limit`,
+    /// so that it cannot be asked.
     pub(super) async fn admit(&self, port: &str, limit: Duration) -> Option<Admitted<'_>> {
         let turn = self.turn(port).lock_owned().await;
         let host = client::host(port, limit).await?;
@@ -54,7 +54,8 @@ impl Visits {
         tokio::time::sleep_until(from.into()).await;
         Some(Admitted {
             _turn: turn,
-            // Last, so that a host that must wait keeps no other out. Never closed.
+            // Comes last, so that a host that must wait blocks no other one. The semaphore is never
+            // closed.
             _permit: self.permits.acquire().await.ok(),
         })
     }

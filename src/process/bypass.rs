@@ -1,5 +1,5 @@
-//! Finds what talks to the master of `proxy` past rosrescue, by the kernel's table of TCP sockets. It is reported, and
-//! decides nothing.
+//! Finds clients that bypass rosrescue and talk directly to the master of `proxy`, from the
+//! kernel's table of TCP sockets. They are only reported.
 
 use std::{
     collections::{BTreeMap, HashMap, HashSet},
@@ -27,22 +27,22 @@ use crate::{
     },
 };
 
-/// Pause between two looks.
+/// Pause between two looks at the table.
 const LOOK_AGAIN: Duration = Duration::from_secs(5);
-/// How long a computer or a user counts after its last connection. Clients of XML-RPC connect again for each call, or
-/// after a while.
+/// How long a computer or a user counts after its last connection. XML-RPC clients connect again
+/// for each call, or after a while.
 const REMEMBERED: Duration = Duration::from_secs(600);
 
-/// What talks to the master.
+/// A client that talks directly to the master.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) enum Who {
     Process {
         name: String,
         pid: u32,
-        /// With the process id it identifies the process.
+        /// Start time, which identifies the process together with its id.
         started: u64,
     },
-    /// A process of this user, which we may not look at.
+    /// A process of this user, which rosrescue may not inspect.
     User(u32),
     /// Another computer.
     Host(IpAddr),
@@ -57,7 +57,7 @@ impl Who {
         })
     }
 
-    /// Whether it still counts, `since` after its last connection was seen.
+    /// Whether the client still counts when its last connection was seen `since` ago.
     fn counts(&self, since: Duration) -> bool {
         match self {
             Self::Process { pid, started, .. } => {
@@ -78,7 +78,7 @@ impl fmt::Display for Who {
     }
 }
 
-/// The program that the process `pid` runs; for one in Python the script.
+/// The program that the process `pid` runs; for a Python program, its script.
 fn program_of(pid: u32) -> String {
     let name = super::name_of(pid);
     if !name.starts_with("python") {
@@ -92,17 +92,17 @@ fn program_of(pid: u32) -> String {
     script.map_or(name, |script| script.to_string_lossy().into_owned())
 }
 
-/// Where a master is.
+/// The addresses of a master.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     port: u16,
     addresses: Vec<IpAddr>,
-    /// Whether one of the addresses is of this computer.
+    /// Whether one of the addresses belongs to this computer.
     is_here: bool,
 }
 
 impl Place {
-    /// None if its host has no address.
+    /// Resolves the master's address; none if its host has no address.
     pub(crate) async fn of(master: &MasterUri) -> Option<Self> {
         let found = resolver::addresses(&master.host, master.port).await.ok()?;
         let addresses: Vec<_> = found.iter().map(|at| at.ip().to_canonical()).collect();
@@ -119,26 +119,27 @@ impl Place {
         address.port() == self.port && is_master()
     }
 
-    /// Whether the master takes connections from other computers, so that they can go past rosrescue. False if it is
-    /// not on this computer.
+    /// Whether the master accepts connections from other computers, so that they can bypass
+    /// rosrescue. False if it is not on this computer.
     pub(crate) fn is_open(&self) -> bool {
         let open = |at: &SocketAddr| at.port() == self.port && !at.ip().is_loopback();
         self.is_here && sockets::listening().iter().any(open)
     }
 }
 
-/// What talks to a master past this process.
+/// The clients that bypass this rosrescue.
 #[derive(Debug, Default)]
 pub(crate) struct Bypass {
-    /// When a connection was seen last.
+    /// When a connection of each client was last seen.
     seen: BTreeMap<Who, Instant>,
-    /// Whose the sockets are that the last look found.
+    /// The owners of the sockets that the last look found.
     sockets: HashMap<u64, Who>,
 }
 
 impl Bypass {
-    /// Looks once, and returns what is new. Blocks for a millisecond per some hundred sockets of this computer; longer
-    /// if the owner of a new one is searched for.
+    /// Looks at the table once, and returns the clients that are new. Blocks for a millisecond per
+    /// some hundred sockets of this computer, and longer if the owner of a new socket must be
+    /// searched for.
     pub(crate) fn look(&mut self, place: &Place) -> Vec<Who> {
         let own = listeners::open_sockets(std::process::id());
         let table = sockets::established();
@@ -184,7 +185,7 @@ impl Bypass {
         if unknown.is_empty() {
             return;
         }
-        // What was closed meanwhile has no owner any more.
+        // A socket that was closed meanwhile no longer has an owner.
         let still: HashSet<_> = sockets::established().iter().map(|it| it.inode).collect();
         let hidden = unknown
             .drain()
@@ -198,8 +199,8 @@ impl Bypass {
     }
 }
 
-/// The clients of the master at `place`: the inodes and users of their sockets on this computer, without those in
-/// `own`, and other computers.
+/// The clients of the master at `place`: inode and user of their sockets on this computer, except
+/// those in `own`, and the addresses of other computers.
 fn split(
     table: Vec<Established>,
     place: &Place,
@@ -225,7 +226,8 @@ fn split(
     (clients, hosts)
 }
 
-/// Watches the master of `proxy` as long as it is polled. `uri` is what nodes should use.
+/// Watches the master of `proxy` as long as it is polled. `uri` is the address that nodes should
+/// use.
 pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: String) {
     let mut looks = interval(LOOK_AGAIN);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -1,5 +1,5 @@
-//! What the threads of a process do and how much of the processor they get (`proc_pid_task(5)`). None of these
-//! reads needs the lock of the process's memory.
+//! What the threads of a process do, and how much processor time they get (`proc_pid_task(5)`).
+//! None of these reads needs the lock of the process's memory.
 
 use std::{fs, time::Duration};
 
@@ -8,8 +8,8 @@ use crate::lifecycle::evidence::Effort;
 /// Most processes of a family.
 const FAMILY_MOST: usize = 64;
 
-/// That of the process `pid` and its children, since a wrapper may have started the master; none if there is no
-/// such process.
+/// The effort of the process `pid` and its children, because a wrapper may have started the master;
+/// none if there is no such process.
 pub(crate) fn of(pid: u32) -> Option<Effort> {
     let mut threads = Threads::default();
     let mut family = vec![pid.to_string()];
@@ -47,7 +47,7 @@ struct Threads {
 }
 
 impl Threads {
-    /// Adds a thread, by its `stat` and `schedstat`.
+    /// Adds a thread, given its `stat` and `schedstat`.
     fn add(&mut self, stat: &str, sched: Option<&str>) {
         // The command's name in parentheses comes first and may contain anything.
         let mut fields = stat
@@ -64,7 +64,7 @@ impl Threads {
         self.effort.runnable |= state == "R";
         self.effort.on_disk |= state == "D";
         let (ran, waited, turns) = sched.and_then(schedstat).unwrap_or_else(|| {
-            // A kernel without statistics of its scheduler counts ticks of 10 ms only.
+            // A kernel without scheduler statistics only counts ticks of 10 ms.
             let ticks = fields
                 .skip(10)
                 .take(2)
@@ -89,7 +89,8 @@ impl Threads {
     }
 }
 
-/// How long a thread has run, how long it has waited for the processor, and how often it was given it.
+/// Parses how long a thread has run, how long it has waited for the processor, and how often it was
+/// given it.
 fn schedstat(text: &str) -> Option<(Duration, Duration, u64)> {
     let mut fields = text.split_whitespace().map(str::parse);
     let mut next = || fields.next()?.ok();

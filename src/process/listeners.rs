@@ -1,4 +1,4 @@
-//! Which processes listen at a port, as far as the system lets us see.
+//! Finds the processes that listen at a port, as far as the system shows them.
 
 use std::{
     collections::HashSet,
@@ -10,20 +10,20 @@ use std::{
 /// State of a listening socket in the kernel's tables.
 const LISTENING: &str = "0A";
 
-/// Who listens at the port of a master that we have started.
+/// Who listens at the port of a master that rosrescue started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Holder {
     /// The master, or a process that it has started.
     Master,
-    /// Another program, with its process id if we may see it. The master can never listen there.
+    /// Another program, with its process id if it can be seen. The master can never listen there.
     Stranger(Option<u32>),
-    /// Nobody any more, or nobody whom we may see.
+    /// Nobody, or nobody who can be seen.
     Unknown,
 }
 
 impl Holder {
-    /// Who listens at `port`, of which the master `child` has been told. `own`: it is ROS's own program, which starts
-    /// no other one.
+    /// Finds who listens at `port`, which the master `child` was given. `own` means that the master
+    /// is ROS's own program, which starts no other one.
     pub(crate) fn of(child: u32, port: u16, own: bool) -> Self {
         let sockets = sockets(port);
         if holds_one(child, &sockets) {
@@ -35,24 +35,25 @@ impl Holder {
     }
 }
 
-/// `taken`: somebody listens, and not the child itself.
+/// Judges what was found. `taken`: somebody other than the child itself listens.
 fn judge(taken: bool, seen: &[u32], own: bool, descends: impl Fn(u32) -> bool) -> Holder {
     match seen.first() {
         _ if !taken => Holder::Unknown,
         _ if seen.iter().any(|pid| descends(*pid)) => Holder::Master,
-        // Processes of another user, of which we see none.
+        // The listeners are processes of another user, which are invisible to us.
         None if !own => Holder::Unknown,
         first => Holder::Stranger(first.copied()),
     }
 }
 
-/// Whether `ancestor` has started the process `pid`, directly or not.
+/// Whether `ancestor` started the process `pid`, directly or indirectly.
 fn descends(pid: u32, ancestor: u32) -> bool {
     let parent = |pid: &u32| super::parent_of(*pid).filter(|parent| *parent > 1);
     std::iter::successors(Some(pid), parent).any(|pid| pid == ancestor)
 }
 
-/// The processes that listen at `port`, in our network namespace. Those of other users are seen by root only.
+/// The processes that listen at `port` in our network namespace. Only root sees those of other
+/// users.
 pub(crate) fn at(port: u16) -> Vec<u32> {
     let sockets = sockets(port);
     if sockets.is_empty() {
@@ -81,7 +82,7 @@ pub(crate) fn ports(pid: u32) -> Vec<u16> {
     ports
 }
 
-/// The listening sockets at `port`, as links in `/proc/PID/fd` name them.
+/// The listening sockets at `port`, named like the links in `/proc/PID/fd`.
 pub(super) fn sockets(port: u16) -> HashSet<PathBuf> {
     let listening = listening().into_iter();
     listening
@@ -92,14 +93,15 @@ pub(super) fn sockets(port: u16) -> HashSet<PathBuf> {
 fn listening() -> Vec<(u16, PathBuf)> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
-        // The kernel lists those that listen first. There may be ten thousands of others, and each costs it time.
+        // The kernel lists listening sockets first. Tens of thousands of others may follow, and
+        // each costs time.
         let lines = BufReader::new(table).lines().skip(1);
         lines.map_while(|line| socket(&line.ok()?))
     });
     sockets.collect()
 }
 
-/// Port and socket of a table's line, if it listens.
+/// Port and socket of a line of the table, if the socket listens.
 fn socket(line: &str) -> Option<(u16, PathBuf)> {
     let columns: Vec<_> = line.split_whitespace().collect();
     if *columns.get(3)? != LISTENING {
@@ -113,7 +115,8 @@ fn socket(line: &str) -> Option<(u16, PathBuf)> {
     ))
 }
 
-/// The inodes of the sockets that the process `pid` has open. None of another user's, unless we are root.
+/// The inodes of the sockets that the process `pid` has open. For another user's process there are
+/// none, except for root.
 pub(crate) fn open_sockets(pid: u32) -> HashSet<u64> {
     let sockets = open_files(pid).filter_map(|file| {
         let inode = file.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;

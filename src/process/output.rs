@@ -1,4 +1,4 @@
-//! Where a child process prints to: a file beside the checkpoint. No call waits for the disk that it is on.
+//! The output of a child process, in a file next to the checkpoint. No call waits for the disk.
 
 use std::{
     fs::File,
@@ -15,12 +15,12 @@ use std::{
 use super::beside;
 use crate::{limit::rarely, regular_file, wait};
 
-/// A disk that takes longer does not delay a master any more: it starts without the file.
+/// How long the disk may delay a master. After that the master starts without the file.
 pub(super) const LIMIT: Duration = Duration::from_millis(250);
-/// The part of the output that messages show, in bytes.
+/// Number of bytes of the output's end that messages show.
 const TAIL: u64 = 400;
 
-/// The file that takes what a child process prints.
+/// The file that receives the output of a child process.
 #[derive(Clone, Debug)]
 pub(super) struct Output {
     path: PathBuf,
@@ -31,12 +31,12 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// The disk has not answered yet. It is not asked again before.
+    /// Whether the disk still owes an answer. It is not asked again before it has answered.
     asked: AtomicBool,
 }
 
 impl Output {
-    /// The file at `checkpoint` with `suffix` behind its name. Nothing is opened yet.
+    /// The file named like `checkpoint` plus `suffix`. Nothing is opened yet.
     pub(super) fn beside(checkpoint: &Path, suffix: &str) -> Self {
         Self {
             path: beside(checkpoint, suffix),
@@ -44,7 +44,7 @@ impl Output {
         }
     }
 
-    /// Creates an empty file for the next process. Logs why there is none.
+    /// Creates an empty file for the next process. Logs why if it cannot.
     pub(super) async fn renew(&self) {
         self.set(None);
         let path = self.path.clone();
@@ -79,7 +79,7 @@ impl Output {
             .unwrap_or_else(PoisonError::into_inner) = file;
     }
 
-    /// The present file, for a process to write to; none without one.
+    /// The present file, for a process to write to; none if there is no file.
     pub(super) fn file(&self) -> Option<File> {
         let file = self
             .shared
@@ -89,7 +89,7 @@ impl Output {
         file.as_ref()?.try_clone().ok()
     }
 
-    /// The end of what was printed, for messages; empty if it cannot be read.
+    /// The end of the output, for messages; empty if it cannot be read.
     pub(super) async fn tail(&self) -> String {
         let Some(file) = self.file() else {
             return String::new();
@@ -99,7 +99,8 @@ impl Output {
         String::from_utf8_lossy(&tail).trim().to_owned()
     }
 
-    /// Runs `work` on the disk, in another thread; none if that takes too long or earlier work has not come back.
+    /// Runs `work` on the disk in another thread; none if that takes too long, or if earlier work
+    /// has not ended.
     async fn ask<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         if self.shared.asked.swap(true, Ordering::AcqRel) {
             return None;

@@ -1,6 +1,6 @@
-//! PID files beside the checkpoint: the rosmaster and the rosout that were started last.
+//! PID files next to the checkpoint, for the rosmaster and the rosout that were started last.
 //!
-//! By them a new worker finds what the last one left running, and looks at no other process.
+//! With them a new worker finds what the last one left running, without looking at other processes.
 
 use std::{
     fs,
@@ -17,44 +17,45 @@ use crate::{regular_file, wait};
 #[derive(Clone, Debug)]
 pub(super) struct PidFile(PathBuf);
 
-/// What a PID file tells.
+/// What a PID file tells about the process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Last {
-    /// The process that was started last runs. It was told this port.
+    /// The process runs. It was given this port.
     Running { pid: u32, port: u16 },
-    /// It has ended.
+    /// The process has ended.
     Ended,
-    /// There is no whole file. An earlier version wrote none, the disk was full, or rosrescue was killed
-    /// while it started the process.
+    /// There is no complete file: an earlier version wrote none, the disk was full, or rosrescue
+    /// was killed while it started the process.
     Unknown,
 }
 
 impl PidFile {
-    /// The file of the process `name` beside `checkpoint`.
+    /// The file of the process `name` next to `checkpoint`.
     pub(super) fn beside(checkpoint: &Path, name: &str) -> Self {
         Self(beside(checkpoint, &format!(".{name}-pid")))
     }
 
-    /// Must be called before a process is started: if we are killed before [`Self::write`], that process must
-    /// be searched for. A disk that answers late delays it for [`output::LIMIT`] at most.
+    /// Removes the file. Must be called before a process is started: if rosrescue is killed before
+    /// [`Self::write`], that process must be searched for. A slow disk delays it for
+    /// [`output::LIMIT`] at most.
     pub(super) async fn clear(&self) {
         let file = self.clone();
         wait::within(output::LIMIT, move || file.remove()).await;
     }
 
-    /// Records the process `pid`, which was told `port`. Without the file it must be searched for.
+    /// Records the process `pid`, which was given `port`. Without the file it must be searched for.
     /// Does not wait for the disk.
     pub(super) fn write(&self, pid: u32, port: u16) {
         let file = self.clone();
         spawn_blocking(move || file.record(pid, port));
     }
 
-    /// As [`Self::clear`], but waits for the disk.
+    /// Like [`Self::clear`], but waits for the disk.
     pub(super) fn remove(&self) {
         let _ = fs::remove_file(&self.0);
     }
 
-    /// As [`Self::write`], but waits for the disk.
+    /// Like [`Self::write`], but waits for the disk.
     pub(super) fn record(&self, pid: u32, port: u16) {
         if let Some(stat) = Stat::of(pid) {
             let line = format!("{pid} {} {port} {}\n", stat.started, boot_id());
@@ -86,7 +87,7 @@ impl PidFile {
     }
 }
 
-/// Process ids and times begin anew with each boot.
+/// The boot id, because each boot reuses process ids and start times.
 fn boot_id() -> String {
     let id = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     id.trim_end().to_owned()

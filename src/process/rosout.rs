@@ -1,4 +1,4 @@
-//! rosout, the node that collects the log.
+//! rosout, the node that collects the log messages of all nodes.
 
 use std::{
     ffi::OsString,
@@ -17,16 +17,17 @@ use super::{
 #[derive(Debug)]
 pub(crate) struct Rosout {
     program: PathBuf,
-    /// Stderr of the last one.
+    /// Stderr of the last rosout.
     output: Output,
-    /// The last one.
+    /// PID file of the last rosout.
     pid_file: PidFile,
-    /// Their owner: the checkpoint.
+    /// The checkpoint that identifies our rosouts.
     owner: OsString,
 }
 
 impl Rosout {
-    /// Finds the program, if there is one. Its stderr goes to a file next to `checkpoint`.
+    /// Finds the rosout program; none if it is not installed. Its stderr goes to a file next to
+    /// `checkpoint`.
     pub(crate) fn find(checkpoint: &Path) -> Option<Self> {
         let program = find_program("rosout", &["lib/rosout"]).or_else(|| {
             Some(PathBuf::from("/usr/lib/rosout/rosout")).filter(|path| is_program(path))
@@ -39,8 +40,8 @@ impl Rosout {
         })
     }
 
-    /// The rosout that an earlier rosrescue with this checkpoint left running. It may not have registered
-    /// yet. Blocks for long if it must be searched for.
+    /// Finds the rosout that an earlier rosrescue with this checkpoint left running. It may not
+    /// have registered yet. Blocks for long if all processes must be searched.
     pub(crate) fn left_behind(&self) -> Option<u32> {
         match self.pid_file.last() {
             Last::Running { pid, .. } => Some(pid).filter(|pid| orphan::is_in_our_network(*pid)),
@@ -54,8 +55,8 @@ impl Rosout {
         }
     }
 
-    /// Starts one as a node of the master at `uri`. It outlives rosrescue: dropping the child does not end
-    /// it.
+    /// Starts rosout as a node of the master at `uri`. It outlives rosrescue: dropping the child
+    /// does not end it.
     pub(crate) async fn spawn(&self, uri: &str) -> io::Result<Child> {
         self.output.renew().await;
         let stderr = self.output.file().map_or_else(Stdio::null, Stdio::from);
@@ -82,7 +83,7 @@ impl Rosout {
         command
     }
 
-    /// The last output of the last one.
+    /// The last output of the last rosout.
     pub(crate) async fn last_words(&self) -> String {
         self.output.tail().await
     }

@@ -1,7 +1,8 @@
-//! What the kernel tells about a process without the lock of that process's memory (`proc_pid_stat(5)`).
+//! What the kernel shows of a process without the lock of that process's memory
+//! (`proc_pid_stat(5)`).
 //!
-//! Its environment and its command line do need that lock, and on a busy computer a read waits for 100 ms and
-//! more.
+//! The environment and the command line do need that lock, and on a busy computer reading them
+//! takes 100 ms and more.
 
 use std::fs;
 
@@ -10,13 +11,14 @@ use std::fs;
 pub(crate) struct Stat {
     state: char,
     pub(super) parent: u32,
-    /// When it was started, in clock ticks since the boot. With the process id it identifies the process.
+    /// When it was started, in clock ticks since the boot. This identifies the process together
+    /// with its id.
     pub(crate) started: u64,
     has_memory: bool,
 }
 
 impl Stat {
-    /// That of the process `pid`; none if there is no such process.
+    /// The state of the process `pid`; none if there is no such process.
     pub(crate) fn of(pid: u32) -> Option<Self> {
         Self::parse(&fs::read_to_string(format!("/proc/{pid}/stat")).ok()?)
     }
@@ -41,7 +43,7 @@ impl Stat {
         self.has_memory && !matches!(self.state, 'Z' | 'X')
     }
 
-    /// Whether it was stopped, by Ctrl-Z, SIGSTOP or a debugger.
+    /// Whether it is stopped, by Ctrl-Z, SIGSTOP or a debugger.
     pub(crate) fn is_stopped(self) -> bool {
         matches!(self.state, 'T' | 't')
     }

@@ -28,15 +28,16 @@ use crate::{
     },
 };
 
-/// How long an injection may take. 1000 nodes take 0.3 s on a Xeon.
+/// Time limit for an injection. 1,000 nodes take 0.3 s on a Xeon.
 const INJECTION_LIMIT: Duration = Duration::from_secs(60);
-/// How long a master that was late may take for each step of catching up: writes wait for it.
+/// Time limit for each step in which a late master catches up. Writes wait for it.
 const CATCH_UP_LIMIT: Duration = Duration::from_secs(1);
 /// Most rounds of comparing and repairing a master that differs from what was injected.
 const ROUNDS: u32 = 3;
-/// How long to wait for running calls of closed connections. A `setParam` of 60,000 keys takes some 10 s.
+/// Time limit for running calls of closed connections to end. A `setParam` of 60,000 keys takes
+/// some 10 s.
 const SETTLE_LIMIT: Duration = Duration::from_secs(60);
-/// How often to check whether they have ended: there is no event for it.
+/// Pause between two checks whether these calls have ended. No event reports it.
 const SETTLE_PAUSE: Duration = Duration::from_millis(5);
 
 /// Why a master could not be examined.
@@ -47,7 +48,7 @@ pub(crate) enum ExamineError {
     Silent { limit: Duration },
     #[error(transparent)]
     Connect(#[from] ConnectError),
-    /// A call of ours failed, or the server is no master.
+    /// A call by rosrescue failed, or the server is not a master.
     #[error(transparent)]
     Look(#[from] InspectError),
 }
@@ -80,20 +81,20 @@ impl ExamineError {
 pub(crate) struct Examination {
     /// How the master came to hold the state.
     pub outcome: Outcome,
-    /// The master's process id.
+    /// Process id of the master.
     pub pid: i32,
-    /// What it speaks, for people.
+    /// HTTP and Python of the master, as text.
     pub speaks: String,
-    /// How calls are known to reach it.
+    /// How calls are known to reach this master.
     pub verification: Verification,
     pub counts: Counts,
     /// What was not injected, and why.
     pub skipped: Vec<String>,
-    /// Differences that remain.
+    /// Differences that remain after the last repair.
     pub mismatches: Vec<String>,
-    /// How long reading the master took.
+    /// Time it took to read the master.
     pub look: Duration,
-    /// How long the injection took.
+    /// Time the injection took.
     pub injection: Duration,
 }
 
@@ -101,17 +102,18 @@ pub(crate) struct Examination {
 #[derive(Debug)]
 pub(crate) struct Manner {
     pub known: Known,
-    /// The injection into an empty master, prepared ahead.
+    /// The injection into an empty master, if it was prepared in advance.
     pub prepared: Option<JoinHandle<Prepared>>,
 }
 
-/// An injection that was prepared ahead.
+/// An injection that was prepared in advance.
 #[derive(Debug)]
 pub(crate) struct Prepared {
-    /// The mirror's version and the next token, if prepared ahead; none if planned just now.
+    /// The mirror's version and the next token at the time of preparation; none if it was planned
+    /// just now.
     basis: Option<(u64, Token)>,
     plan: Plan,
-    /// Whether it brings the mirror's state completely.
+    /// Whether it restores the complete state of the mirror.
     complete: bool,
 }
 
@@ -128,7 +130,7 @@ pub(crate) fn prepare(ledger: Arc<Ledger>) -> JoinHandle<Prepared> {
     })
 }
 
-/// The state to bring to a master, and what it holds now.
+/// The state that a master must get, and the state that it has now.
 struct Target {
     state: Master,
     found: Master,
@@ -137,11 +139,11 @@ struct Target {
 
 /// How a master is brought to a state.
 enum Change {
-    /// What it lacks is added.
+    /// Add what it lacks.
     Add,
-    /// It holds the state, and gets a new token in place of this one.
+    /// It holds the state already, and gets a new token in place of this one.
     Renew(Token),
-    /// All that it holds, with this token, is replaced.
+    /// Replace everything that it holds, including this token.
     Replace(Token),
 }
 
@@ -170,8 +172,8 @@ pub(crate) struct Examiner {
 }
 
 impl Examiner {
-    /// What is known of the present master. `new`: the process id of one that has just been started and has
-    /// not been called yet.
+    /// What is known of the present master. `new` is the process id of a master that has just been
+    /// started and not been called yet.
     pub(super) fn known(&self, new: Option<i32>) -> Known {
         match (self.ledger.has_served_present(), new) {
             (None, _) => Known::Nothing,
@@ -187,8 +189,8 @@ impl Examiner {
         self.gate.set(State::Open { incarnation });
     }
 
-    /// Examines the master to which `sentinel` leads. All of it is that master's if the sentinel is still open
-    /// afterwards.
+    /// Examines the master that `sentinel` is connected to. If the sentinel is still open
+    /// afterwards, the result is about that master alone.
     pub(crate) async fn examine(
         &self,
         sentinel: &Arc<Sentinel>,
@@ -226,7 +228,7 @@ impl Examiner {
             self.inject(connection, first, manner, start, &mut examination)
                 .await?;
         }
-        // Those that we start are of one release.
+        // All masters that rosrescue starts are of one release.
         if !is_new || self.ledger.with_mirror(Master::is_old).is_none() {
             let ask = Master::ask_if_old().into();
             let reply = self.while_alive(connection.call(&ask)).await?;
@@ -243,8 +245,8 @@ impl Examiner {
         Ok(examination)
     }
 
-    /// Gives the master to which `sentinel` leads, which was late and has answered, what the mirror has answered
-    /// meanwhile. Returns whether it holds the mirror's state now; if not, it must be examined.
+    /// Gives the late master, which has answered, the writes that the mirror answered meanwhile.
+    /// Returns whether it now holds the mirror's state; if not, it must be examined.
     pub(super) async fn catch_up(&self) -> Result<bool, ExamineError> {
         let connect = self.upstream.connect();
         let mut connection = within(CATCH_UP_LIMIT, connect).await?;
@@ -272,8 +274,8 @@ impl Examiner {
         Ok(verdict.is_ok())
     }
 
-    /// Returns when the master cannot be running a call of a closed connection any more. Its state is
-    /// reliable only then.
+    /// Returns when the master cannot be running a call of a closed connection any more. Its state
+    /// is reliable only then.
     async fn settle(&self, master: SocketAddr) -> Result<(), ExamineError> {
         let settled = async {
             self.upstream.no_writers().await;
@@ -285,7 +287,7 @@ impl Examiner {
             return Ok(());
         }
         match self.supervision {
-            // Replaced, like a master that hangs.
+            // It is replaced, like a master that hangs.
             Supervision::Ours => Err(ExamineError::Silent {
                 limit: SETTLE_LIMIT,
             }),
@@ -322,8 +324,8 @@ impl Examiner {
         let found = match fresh {
             true => Master::default(),
             false => {
-                // What cannot be read back is taken from the mirror, if this master was given the mirror's
-                // state.
+                // If this master was given the mirror's state, the mirror supplies what cannot be
+                // read back.
                 let previous = match bears {
                     Bears::Nothing => Master::default(),
                     _ => self.ledger.may_hold(),
@@ -333,7 +335,8 @@ impl Examiner {
             }
         };
         examination.look = start.elapsed();
-        // From here until the gate opens the mirror must not change: the master is compared with it.
+        // From here until the gate opens the mirror must not change, because the master is compared
+        // with it.
         self.gate.set(State::Injecting);
         let Basis {
             mirror,
@@ -375,7 +378,8 @@ impl Examiner {
                     say_difference(&self.ledger.adopt(found));
                     return Ok(());
                 } else {
-                    // A later start with an older copy of the checkpoint must not take the writes for pending.
+                    // A later start with an older copy of the checkpoint must not treat the writes
+                    // as pending.
                     (state, Change::Renew(before))
                 }
             }
@@ -384,7 +388,7 @@ impl Examiner {
             say_difference(&self.ledger.adopt(state.clone()));
         }
         if bears == Bears::Nothing {
-            // One that is only late goes on to send what it had begun to send.
+            // A master that was only late goes on to send what it had begun to send.
             self.ledger.with_order(|order, _| order.master_is_gone());
         }
         let token = self.ledger.succeed();
@@ -398,7 +402,7 @@ impl Examiner {
             .await
     }
 
-    /// Brings the master to `target`, reads it back and leaves `token` on it.
+    /// Brings the master to `target`, reads it back, and leaves `token` on it.
     async fn bring(
         &self,
         connection: &mut Connection,
@@ -436,7 +440,7 @@ impl Examiner {
                 if !matches!(change, Change::Renew(_)) {
                     self.stats.masters_restored.count();
                 }
-                // Thousands of small allocations: freed in another thread.
+                // Thousands of small allocations are freed in another thread.
                 tokio::task::spawn_blocking(move || drop(plan));
                 return Ok(());
             };
@@ -486,8 +490,8 @@ impl Examiner {
     }
 }
 
-/// Whether a master has answered as planned. The reply is long and calls are waiting: it is decoded only if it differs
-/// from the predicted one.
+/// Whether a master has answered as planned. The reply is long and calls are waiting, so it is
+/// decoded only if it differs from the predicted one.
 fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, ExamineError> {
     Ok(match raw.body == plan.answer() {
         true => Ok(()),
@@ -496,13 +500,14 @@ fn verdict(plan: &Plan, raw: &RawReply) -> Result<Result<(), Vec<String>>, Exami
     })
 }
 
-/// As [`sockets::may_run_a_call`], off the runtime's threads: with 15,000 sockets it takes 100 ms.
+/// Like [`sockets::may_run_a_call`], but off the runtime's threads: with 15,000 sockets it takes
+/// 100 ms.
 async fn may_run_a_call(master: SocketAddr) -> bool {
     let looked = tokio::task::spawn_blocking(move || sockets::may_run_a_call(master));
     looked.await.unwrap_or(false)
 }
 
-/// Whether the process `pid` listens at the port of `master`, as far as the system lets us see.
+/// Whether the process `pid` listens at the port of `master`, as far as the system shows it.
 async fn listens(pid: i32, master: SocketAddr) -> bool {
     let look = move || u32::try_from(pid).is_ok_and(|pid| listeners::listens(pid, master.port()));
     tokio::task::spawn_blocking(look).await.unwrap_or(false)

@@ -1,5 +1,5 @@
-//! The reports of rescues as files beside the checkpoint, for questions next week, and for the process that goes
-//! on with the session.
+//! Stores the reports of rescues as files next to the checkpoint, for later questions and for the
+//! process that continues the session.
 
 use std::{
     fs::{self, OpenOptions},
@@ -18,7 +18,7 @@ use crate::{
     status::{Board, Earlier, report::Report},
 };
 
-/// Reports that are kept.
+/// Number of reports that are kept.
 const KEPT: usize = 20;
 /// Largest file that is read, in bytes.
 const LARGEST: u64 = 16 << 20;
@@ -28,9 +28,9 @@ static LIMIT: Limit = Limit::new();
 /// The last line of a report's file, as JSON. The lines before it are the report for people.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Kept {
-    /// The id of the session.
+    /// Id of the session.
     session: String,
-    /// What had happened in the session by then, as in [`Facts`](crate::status::Facts).
+    /// Totals of the session by then, as in [`Facts`](crate::status::Facts).
     rescues: u64,
     deaths: u64,
     worker_restarts: u64,
@@ -50,7 +50,8 @@ impl Kept {
     }
 }
 
-/// Writes a report beside the checkpoint at `checkpoint`, in another thread. It is not synced.
+/// Writes a report next to the checkpoint at `checkpoint`, in another thread. The file is not
+/// synced.
 pub(super) fn keep(checkpoint: PathBuf, kept: Kept) {
     if LIMIT.pass(Instant::now()).is_none() {
         return;
@@ -81,13 +82,13 @@ fn write(checkpoint: &Path, kept: &Kept) -> io::Result<()> {
         env!("CARGO_PKG_VERSION")
     )?;
     let mut others = files(checkpoint)?;
-    // Not this one: a clock that was set back makes it the oldest.
+    // This report is always kept: if the clock was set back, it would count as the oldest.
     others.retain(|other| *other != path);
     let surplus = (others.len() + 1).saturating_sub(KEPT);
     others.iter().take(surplus).try_for_each(fs::remove_file)
 }
 
-/// How the names of the files begin.
+/// The common beginning of the names of these files.
 fn prefix(checkpoint: &Path) -> Option<String> {
     Some(format!(
         "{}.report-",
@@ -113,8 +114,8 @@ fn files(checkpoint: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// The reports beside the checkpoint at `checkpoint`, by number. Files that cannot be read, and those without a last
-/// line in JSON, are left out.
+/// Reads the reports next to the checkpoint at `checkpoint`, sorted by number. Files that cannot be
+/// read or that lack a last line in JSON are left out.
 pub(crate) fn read(checkpoint: &Path) -> Vec<Kept> {
     let files = files(checkpoint).unwrap_or_default();
     let mut all: Vec<Kept> = files.iter().filter_map(|file| read_one(file)).collect();
@@ -131,8 +132,9 @@ fn read_one(file: &Path) -> Option<Kept> {
     serde_json::from_str(text.lines().next_back()?).ok()
 }
 
-/// What the files beside the checkpoint at `checkpoint` tell of the session with this id. `died`: its last process
-/// did not end in order. `states`: the last number of a state of a rescue.
+/// What the files next to the checkpoint at `checkpoint` tell about the session with this id.
+/// `died` tells whether its last process ended abnormally; `states` is the highest number of a kept
+/// rescue state.
 pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64) -> Earlier {
     let all = read(checkpoint);
     let last = all.last().map_or(0, |kept| kept.report.number);
@@ -150,7 +152,7 @@ pub(crate) fn earlier(checkpoint: &Path, session: &str, died: bool, states: u64)
             report,
             ..
         } = kept;
-        // A rescue that was not kept, as in a crash loop, is in the count of the next one.
+        // A rescue without a kept report, as in a crash loop, is in the count of the next one.
         earlier.rescues = earlier.rescues.max(rescues);
         earlier.deaths = earlier.deaths.max(deaths);
         let restarts = worker_restarts + u64::from(died);
@@ -240,7 +242,7 @@ mod tests {
         for (session, number) in [("a", 1), ("b", 2), ("b", 3)] {
             write(&checkpoint, &kept(session, number)).unwrap();
         }
-        // One of an older version, and a damaged one.
+        // A report of an older version, and a damaged one.
         let other = |name: &str| folder.path().join(format!("chkpt.yaml.report-{name}.txt"));
         fs::write(other("2026-11-21T09-27-18Z-1"), "rosrescue 0.8.0\ntext\n").unwrap();
         fs::write(other("x"), [0xff]).unwrap();

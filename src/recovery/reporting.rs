@@ -1,4 +1,4 @@
-//! What the driver reports: log lines, status and the recovery report.
+//! The driver's reports: log lines, status, and the recovery report.
 
 use std::time::{Duration, Instant};
 
@@ -21,12 +21,12 @@ use crate::{
     },
 };
 
-/// A message about a lasting state is repeated after this time, then after twice that, and so on
+/// Pause before a message about a lasting state is repeated. It doubles with each repetition.
 const REPEAT: Duration = Duration::from_secs(10);
-/// up to this.
+/// Longest pause before such a message is repeated.
 const LONGEST_REPEAT: Duration = Duration::from_secs(600);
 
-/// The time during which calls have not passed.
+/// A period in which calls did not pass to the master.
 #[derive(Clone, Debug)]
 pub(super) struct Outage {
     pub cause: &'static str,
@@ -34,11 +34,11 @@ pub(super) struct Outage {
     wall: f64,
     port_open: Option<Instant>,
     stats: &'static Stats,
-    /// At its begin, as [`counted`].
+    /// Counts at the beginning of the outage, as given by [`counted`].
     before: (u64, u64),
 }
 
-/// Calls that the mirror has answered, and those that waited in vain.
+/// Number of calls that the mirror has answered, and of calls that timed out.
 fn counted(stats: &Stats) -> (u64, u64) {
     (
         stats.calls_without_master.value(),
@@ -47,7 +47,7 @@ fn counted(stats: &Stats) -> (u64, u64) {
 }
 
 impl Outage {
-    /// An outage that begins now.
+    /// Begins an outage at `now`.
     pub(super) fn begin(now: Instant, cause: &'static str, stats: &'static Stats) -> Self {
         Self {
             stats,
@@ -59,12 +59,12 @@ impl Outage {
         }
     }
 
-    /// The master's port is open again.
+    /// Notes that the master's port is open again.
     pub(super) fn port_open(&mut self, now: Instant) {
         self.port_open = Some(now);
     }
 
-    /// The report of an outage that ends now with `examination`.
+    /// The report of an outage that ends at `now` with `examination`.
     pub(super) fn report(&self, now: Instant, examination: Examination) -> Report {
         let total = now.duration_since(self.since);
         let absence = self
@@ -111,7 +111,7 @@ impl Driver {
     /// Reports an examination. Health check and reconciliation add to the report when they end.
     pub(super) fn report(&mut self, mut examination: Examination) {
         if self.lifecycle.begins() && examination.outcome == Outcome::Injected {
-            // It holds only the session's initial state.
+            // The master holds only the session's initial state.
             examination.outcome = Outcome::Begun;
         }
         let (cause, since) = (self.outage.cause, self.outage.since);
@@ -120,12 +120,12 @@ impl Driver {
         self.examiner.ledger.set_master_pid(report.master_pid);
         let quiet = [Cause::ConnectionLost, Cause::ThreadEnded].map(Cause::as_str);
         if report.ended.is_some() && quiet.contains(&cause) {
-            // What was noticed first was the beginning of that.
+            // The first sign of trouble was the beginning of the process's end.
             report.cause = Cause::Exited.as_str().into();
         }
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
-            // Usual: a master with `-t` closes each idle connection, and the threads of a master that is
-            // being stopped end before it does.
+            // This is usual: a master with `-t` closes each idle connection, and the threads of a
+            // master that is being stopped end before it does.
             all_clear!(info, AWAY, "calls pass to the master: the same one goes on");
             return;
         }
@@ -168,7 +168,7 @@ impl Driver {
     }
 
     pub(super) fn log_waiting(&mut self, what: &str) {
-        // No message for a child that is about to listen.
+        // A child that is about to listen needs no message.
         if self.process.is_none() && self.outage.since.elapsed() > Duration::from_millis(500)
             || self.outage.since.elapsed() > REPEAT
         {
@@ -181,7 +181,7 @@ impl Driver {
         }
     }
 
-    /// Warns. The same text is logged again after growing pauses.
+    /// Logs a warning. The same text is logged again only after growing pauses.
     pub(super) fn log_once(&mut self, text: String) {
         let now = Instant::now();
         let pause = match &self.said {

@@ -1,8 +1,9 @@
-//! The earliest sign that a process is being ended: the end of one of its threads.
+//! Watches for the earliest sign that a process is dying: the end of one of its threads.
 //!
-//! A signal that ends a process ends each thread separately. Only the last thread frees the memory and then
-//! closes the descriptors, one by one. A master with 80 nodes has some 100 threads and some 100 descriptors:
-//! its connections end 4 to 12 ms after its death, most of its threads after 1 to 4 ms.
+//! A signal that ends a process ends each thread separately. Only the last thread frees the memory
+//! and then closes the descriptors, one by one. A master with 80 nodes has some 100 threads and
+//! some 100 descriptors. Its connections end 4 to 12 ms after its death, most of its threads after
+//! 1 to 4 ms.
 
 use std::{fs, future::poll_fn, io, task::Poll};
 
@@ -11,21 +12,22 @@ use tokio::net::unix::pipe::Receiver;
 
 use crate::process::pidfd;
 
-/// Threads to watch: more than one, because one may be the last to end. A rosmaster with `-w 1` has only two
-/// that live as long as it does: one calls nodes, one serves.
+/// Number of threads to watch. One is not enough, because it may be the last to end. A rosmaster
+/// with `-w 1` has only two threads that live as long as it does: one calls nodes, one serves.
 const WATCHED: usize = 2;
-/// Makes the descriptor report the end of a thread instead of a process. Linux 6.9 or later.
+/// Flag that makes the descriptor report the end of a thread instead of a process. Needs Linux 6.9
+/// or later.
 const PIDFD_THREAD: PidfdFlags = PidfdFlags::from_bits_retain(OFlags::EXCL.bits());
 
-/// Resolves when one of the oldest threads of the process `pid` has ended, except for the first: Linux
-/// reports the end of that one only with the end of the process. In rosmaster the oldest threads live as long
-/// as the master.
+/// Resolves when one of the oldest threads of the process `pid` has ended. The first thread is not
+/// watched, because Linux reports its end only with the end of the process. In rosmaster the oldest
+/// threads live as long as the master.
 ///
 /// # Errors
 ///
-/// The system's error: the process is gone, or the kernel cannot watch threads.
+/// If the process is gone, or if the kernel cannot watch threads.
 pub(super) fn of(pid: i32) -> io::Result<impl Future<Output = ()> + Send + use<>> {
-    // Listed in the order in which they were started.
+    // Threads are listed in the order in which they were started.
     let threads = fs::read_dir(format!("/proc/{pid}/task"))?;
     let others = threads.skip(1).take(WATCHED).map(|entry| {
         let name = entry?.file_name();
@@ -51,7 +53,8 @@ mod tests {
 
     use super::*;
 
-    /// Starts threads, says so, and ends one of them, or itself, at a line on its standard input.
+    /// A program that starts threads, reports it, and ends one of them or itself when it reads a
+    /// line.
     const PROGRAM: &str = "
 import sys, threading, time
 end = threading.Event()
@@ -63,7 +66,7 @@ end.set()
 time.sleep(3600)
 ";
 
-    /// Whether this kernel can do it: Linux 6.9 or later.
+    /// Whether this kernel can watch threads: Linux 6.9 or later.
     fn is_possible() -> bool {
         let name = rustix::system::uname();
         let mut numbers = name.release().to_str().unwrap().split(['.', '-']);

@@ -1,4 +1,5 @@
-//! Who may call, and who may change something: `--allow` and `--allow-write`, without IO.
+//! Decides who may call and who may change something, according to `--allow` and `--allow-write`.
+//! No IO.
 
 use std::{
     collections::HashMap,
@@ -13,12 +14,13 @@ use ipnet::IpNet;
 use super::admission::Refusal;
 use crate::master::Kind;
 
-/// A refused node calls again up to 20 times a second.
+/// A refused node calls again up to 20 times per second, so each address is logged once in this
+/// time.
 const SAY_AGAIN: Duration = Duration::from_secs(60);
-/// Most addresses that are remembered for that. Others are counted and not spoken of.
+/// Most addresses that are remembered for that. Calls from others are counted but not logged.
 const REMEMBERED: usize = 1000;
 
-/// The networks of `--allow` and `--allow-write`. None given: everybody.
+/// The networks of `--allow` and `--allow-write`. An empty list allows everybody.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Access {
     allow: Vec<IpNet>,
@@ -38,8 +40,9 @@ impl Access {
         Self { allow, allow_write }
     }
 
-    /// Of a connection from `peer` to our address `own`. This computer may do everything: rosmaster,
-    /// rosout and the robot's own nodes live here. Who may change may call.
+    /// What a connection from `peer` to our address `own` may do. This computer may do everything,
+    /// because rosmaster, rosout and the robot's own nodes run here. A client that may change may
+    /// also call.
     pub(crate) fn of(&self, peer: IpAddr, own: Option<IpAddr>) -> Grant {
         let peer = peer.to_canonical();
         let here = peer.is_loopback() || own.map(|own| own.to_canonical()) == Some(peer);
@@ -55,7 +58,7 @@ impl Access {
 }
 
 impl Grant {
-    /// Whether any request is taken.
+    /// Whether any request is accepted.
     pub(crate) fn check(self, peer: IpAddr) -> Result<(), Refusal> {
         match self {
             Self::Nothing => Err(refusal(peer, "call", "--allow")),
@@ -63,8 +66,8 @@ impl Grant {
         }
     }
 
-    /// Whether a call of this kind is taken; none if it could not be decoded. What only the master
-    /// understands may change anything.
+    /// Whether a call of this kind is accepted; none if it could not be decoded. A call that only
+    /// the master understands may change anything.
     pub(crate) fn check_call(self, peer: IpAddr, kind: Option<Kind>) -> Result<(), Refusal> {
         match (self, kind) {
             (Self::Write, _) | (Self::Read, Some(Kind::Read | Kind::Identity)) => Ok(()),
@@ -73,8 +76,8 @@ impl Grant {
     }
 }
 
-/// rospy and roscpp take this status for a master that is not there yet, and call again; an XML-RPC fault would
-/// end a node that starts.
+/// rospy and roscpp treat this status like a master that is not there yet, and call again. An
+/// XML-RPC fault would end a node that is starting.
 fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
     let reason = match what {
         "call" => format!("{peer} may not call this master: rosrescue's {option} does not name it"),
@@ -86,7 +89,7 @@ fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
     }
 }
 
-/// For a person, at the start.
+/// Describes the networks for the log at the start.
 impl fmt::Display for Access {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let list = |nets: &[IpNet]| {
@@ -113,12 +116,12 @@ impl fmt::Display for Access {
     }
 }
 
-/// When each address was last spoken of.
+/// When each address was last logged.
 #[derive(Debug, Default)]
 pub(crate) struct Said(HashMap<IpAddr, Instant>);
 
 impl Said {
-    /// Whether to speak of `peer` now.
+    /// Whether to log `peer` now.
     pub(crate) fn is_due(&mut self, now: Instant, peer: IpAddr) -> bool {
         let is_recent = |said: &Instant| now.duration_since(*said) < SAY_AGAIN;
         if self.0.get(&peer).is_some_and(is_recent) {
@@ -164,12 +167,12 @@ mod tests {
             (&LAN, &["10.0.0.8/32"], "10.0.0.8", Write),
             (&LAN, &["10.0.0.8/32"], "10.0.0.9", Read),
             (&LAN, &["10.0.0.8/32"], "192.0.2.1", Nothing),
-            // Who may change may call.
+            // A client that may change may also call.
             (&LAN, &["192.0.2.1/32"], "192.0.2.1", Write),
             // An address of one family is in no network of the other.
             (&["0.0.0.0/0"], &[], "fd00::9", Nothing),
             (&["::/0"], &[], "10.0.0.9", Nothing),
-            // This computer.
+            // This computer may always change.
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "127.0.0.1", Write),
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "::1", Write),
             (&["192.0.2.0/24"], &["192.0.2.1/32"], "10.0.0.7", Write),

@@ -1,7 +1,7 @@
-//! Checks on a request's head before it is admitted, without IO.
+//! Checks a request's head before the request is admitted. No IO.
 //!
-//! ROS 1 has no authentication. Two things can be refused without any ROS client noticing: a call that a web
-//! page makes through a person's browser, and a `shutdown` from another computer.
+//! ROS 1 has no authentication. Two things can be refused without any ROS client noticing: a call
+//! that a web page makes through a person's browser, and a `shutdown` from another computer.
 
 use std::net::IpAddr;
 
@@ -17,21 +17,21 @@ use crate::master::{MASTER, Request};
 pub(crate) struct Refusal {
     /// The HTTP status to answer.
     pub status: StatusCode,
-    /// Why, for people.
+    /// The reason, for people.
     pub reason: String,
 }
 
-/// Content types that a browser sends to any site without asking it first.
+/// Content types that a browser sends to any site without asking that site first.
 const BROWSER_TYPES: [&str; 3] = [
     "application/x-www-form-urlencoded",
     "multipart/form-data",
     "text/plain",
 ];
 
-/// Whether a POST with these headers may call the master. `names` are those of this computer.
+/// Whether a POST with these headers may call the master. `names` are the names of this computer.
 ///
-/// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client does. The
-/// content type may be missing, as in a browser's POST of a typed array.
+/// A browser sends the page's origin with every POST (`null` if it withholds it); no ROS client
+/// does. The content type may be missing, as in a browser's POST of a typed array.
 pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     if headers.contains_key(ORIGIN) {
         check_name(headers, |name| is_own(name, names))?;
@@ -56,14 +56,14 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     Ok(())
 }
 
-/// Whether a GET with these headers may have a page. A browser keeps its answer from the pages of other sites
-/// anyway, but not the connection to `/events`, of which there are few.
+/// Whether a GET with these headers may have a page. A browser keeps the answer from pages of other
+/// sites anyway, but not the connection to `/events`, of which there are few.
 pub(crate) fn check_get(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_host(headers, names)?;
     check_origin(headers)
 }
 
-/// Whether no other site's page asks.
+/// Whether the request does not come from another site's page.
 fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
     for origin in headers.get_all(ORIGIN) {
         let origin = String::from_utf8_lossy(origin.as_bytes());
@@ -82,11 +82,11 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Whether `Host` is an address or a name of this computer. After DNS rebinding, a page whose own name was
-/// pointed at this computer sends that name.
+/// Whether `Host` is an address or a name of this computer. After DNS rebinding, a page whose own
+/// name was pointed at this computer sends that name.
 ///
-/// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain may follow
-/// its host name. That is safe: the status page changes nothing.
+/// The computer's domains (`robot.local`, `robot.example.com`) are not known here, so any domain
+/// may follow its host name. That is safe, because the status page changes nothing.
 fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     check_name(headers, |name| {
         let short = |name: &str| name.split('.').next().unwrap_or_default().to_lowercase();
@@ -99,7 +99,7 @@ fn check_host(headers: &HeaderMap, names: &[String]) -> Result<(), Refusal> {
     })
 }
 
-/// Whether `name` is an address, or one of `names` exactly.
+/// Whether `name` is an address, or exactly one of `names`.
 fn is_own(name: &str, names: &[String]) -> bool {
     name.parse::<IpAddr>().is_ok()
         || name.eq_ignore_ascii_case("localhost")
@@ -129,8 +129,8 @@ pub(crate) fn may_shut_down(peer: IpAddr) -> bool {
     peer.to_canonical().is_loopback()
 }
 
-/// Whether a `shutdown` is one that a master sends to a node whose name was taken. It arrives here if a
-/// client, on any computer, registered our address as a node's.
+/// Whether a `shutdown` is one that a master sends to a node whose name was taken. It arrives here
+/// if a client, on any computer, registered rosrescue's address as a node's.
 pub(crate) fn is_for_a_node(call: &Request) -> bool {
     call.caller() == Some(MASTER)
 }
@@ -206,7 +206,8 @@ mod tests {
             same_site.insert(HOST, host.parse().unwrap());
             assert_eq!(check_post(&same_site, &own), Ok(()));
         }
-        // Its own domains are not known: what may be looked at may not be changed there.
+        // The computer's domains are not known: such a page may be read from, but it may not change
+        // anything.
         let rebound = [
             ("origin", "http://robot.evil.example"),
             ("host", "robot.evil.example"),

@@ -1,4 +1,4 @@
-//! Large answers under way: how much memory they take in all, and who gives way when there is none left.
+//! Limits the memory of large answers under way, and closes slow readers when it runs out.
 
 use std::{
     collections::HashMap,
@@ -16,24 +16,24 @@ use tokio::sync::{Mutex as Turn, Notify, OwnedSemaphorePermit, Semaphore};
 
 use super::{body::SMALL, replies::HttpReply};
 
-/// A client that takes its answer more slowly, in bytes a second, gives way when there is no room left for
-/// others.
+/// A client that reads its answer more slowly than this, in bytes per second, is closed when there
+/// is no room for others.
 const RATE: u32 = 256 << 10;
-/// How far ahead of [`RATE`] a client can get: after a longer pause it may have to give way.
+/// How far ahead of [`RATE`] a client can get. After a longer pause it counts as slow.
 const AHEAD: Duration = Duration::from_millis(250);
-/// Answers that may wait for room although they are in memory already. They go before those that are not, so
-/// that few answers are made twice.
+/// Number of answers that may wait for room although they are already in memory. They precede those
+/// that are not, so that few answers are made twice.
 const WAITING: usize = 4;
 
-/// How one connection takes its large answers.
+/// Tracks how fast one connection reads its large answers.
 #[derive(Debug)]
 pub(crate) struct Reader {
-    /// Until then it is fast enough.
+    /// Until when it counts as fast enough.
     fast_until: Mutex<Instant>,
-    /// It has had a large answer.
+    /// Whether it has had a large answer.
     counts: AtomicBool,
     close: Notify,
-    /// It has been told to close, and has not answered yet.
+    /// Whether it was told to close and has not reacted yet.
     told: AtomicBool,
 }
 
@@ -55,7 +55,7 @@ impl Reader {
             .unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// It has taken so many bytes.
+    /// Notes that it has read this many bytes.
     pub(crate) fn took(&self, bytes: usize) {
         if self.counts.load(Ordering::Relaxed) {
             let mut until = self.fast_until();
@@ -63,33 +63,35 @@ impl Reader {
         }
     }
 
-    /// Completes when it is to give way, if it [is still slow](Self::is_slow).
+    /// Completes when the connection must close, if it [is still slow](Self::is_slow).
     pub(crate) async fn is_to_close(&self) {
         self.close.notified().await;
         self.told.store(false, Ordering::Relaxed);
     }
 
-    /// Whether it is too slow. Asked after one more attempt to write: it may have been rosrescue that was busy.
+    /// Whether it is too slow. Ask only after one more attempt to write, because rosrescue itself
+    /// may have been busy.
     pub(crate) fn is_slow(&self) -> bool {
         *self.fast_until() <= Instant::now()
     }
 }
 
-/// Until when a reader is fast enough that takes `bytes` at `now` and was so until `before`.
+/// Until when a reader counts as fast enough if it takes `bytes` at `now` and counted so until
+/// `before`.
 fn fast_until(before: Instant, now: Instant, bytes: usize) -> Instant {
     let bytes = u32::try_from(bytes).unwrap_or(u32::MAX);
     let earned = Duration::from_secs(1) * bytes / RATE;
-    // Debts are kept, so that a byte now and then does not do.
+    // Debts are kept, so that a byte now and then is not enough.
     (before + earned).min(now + AHEAD)
 }
 
 /// Memory for large answers.
 #[derive(Debug)]
 pub struct Answers {
-    /// In KiB.
+    /// Size in KiB.
     size: u32,
     room: Arc<Semaphore>,
-    /// Who waits for room with no answer yet, in order.
+    /// The requests that wait for room without an answer yet, in order.
     turn: Turn<()>,
     waiting: Semaphore,
     under_way: Mutex<HashMap<u64, Arc<Reader>>>,
@@ -100,7 +102,7 @@ pub struct Answers {
 #[derive(Debug)]
 pub(crate) struct Room(OwnedSemaphorePermit);
 
-/// An answer's bytes, which hold their room until they have been written.
+/// An answer's bytes, which keep their room until they have been written.
 struct Counted {
     bytes: Bytes,
     number: u64,
@@ -124,7 +126,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The bytes of an answer, if it is a large one.
+/// The size of an answer in bytes, if it is a large one.
 pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
     let size = reply.body().size_hint().exact()?;
     let size = usize::try_from(size).unwrap_or(usize::MAX);
@@ -132,7 +134,7 @@ pub(crate) fn size(reply: &HttpReply) -> Option<usize> {
 }
 
 impl Answers {
-    /// Room for large answers of `bytes` in all. A larger one takes all of it.
+    /// Creates room for large answers of `bytes` in total. A larger answer takes all of it.
     pub(crate) fn within(bytes: usize) -> Arc<Self> {
         let size = u32::try_from(bytes >> 10).unwrap_or(u32::MAX);
         Arc::new(Self {
@@ -150,7 +152,7 @@ impl Answers {
         kib.min(self.size)
     }
 
-    /// `room` if it is enough for `bytes`, or new room if there is some soon.
+    /// Returns `room` if it is enough for `bytes`, or new room if there is some soon.
     pub(crate) async fn enough(&self, room: Option<Room>, bytes: usize) -> Option<Room> {
         let kib = self.kib(bytes);
         if let Some(room) = room
@@ -165,19 +167,19 @@ impl Answers {
         }
     }
 
-    /// Waits for room for an answer that is not made yet.
+    /// Waits for room for an answer that has not been made yet.
     pub(crate) async fn reserve(&self, bytes: usize) -> Room {
         let _turn = self.turn.lock().await;
         self.acquire(bytes).await
     }
 
-    /// Waits for room for an answer that is in memory already; none if too many wait like that.
+    /// Waits for room for an answer that is already in memory; none if too many wait like that.
     async fn reserve_now(&self, bytes: usize) -> Option<Room> {
         let _waiting = self.waiting.try_acquire().ok()?;
         Some(self.acquire(bytes).await)
     }
 
-    /// Waits for room. Clients that read too slowly give way.
+    /// Waits for room, and closes clients that read too slowly.
     async fn acquire(&self, bytes: usize) -> Room {
         let mut room = std::pin::pin!(self.room.clone().acquire_many_owned(self.kib(bytes)));
         loop {
@@ -186,7 +188,7 @@ impl Answers {
                 biased;
                 room = &mut room => match room {
                     Ok(room) => return Room(room),
-                    // Never closed.
+                    // The semaphore is never closed.
                     Err(_) => std::future::pending().await,
                 },
                 () = tokio::time::sleep_until(next.into()) => {}
@@ -194,7 +196,8 @@ impl Answers {
         }
     }
 
-    /// Closes the connection that has been too slow for longest, if any is. Returns when to look again.
+    /// Closes the connection that has been too slow for longest, if there is one. Returns when to
+    /// look again.
     fn close_slowest(&self, now: Instant) -> Instant {
         let under_way = lock(&self.under_way);
         let readers = under_way
@@ -211,11 +214,11 @@ impl Answers {
             reader.told.store(true, Ordering::Relaxed);
             reader.close.notify_one();
         }
-        // The next one, if that was not enough.
+        // If that is not enough, the next one follows.
         now + Duration::from_millis(1)
     }
 
-    /// `reply`, which holds `room` until `reader` has taken all of it.
+    /// Returns `reply`, which keeps `room` until `reader` has read all of it.
     pub(crate) async fn count(
         self: &Arc<Self>,
         reply: HttpReply,
@@ -282,7 +285,7 @@ mod tests {
         assert_eq!(answers.room.available_permits(), 0);
         drop(bytes);
         let room = answers.enough(None, LARGE).await.unwrap();
-        // Room that is there already does, if it is enough.
+        // Existing room is enough if it is large enough.
         assert!(answers.enough(Some(room), LARGE).await.is_some());
         assert_eq!(lock(&answers.under_way).len(), 1);
     }
@@ -295,7 +298,7 @@ mod tests {
         for reader in &readers {
             held.push(sent(&answers, reader).await);
         }
-        // The first one has just read something.
+        // The first reader has just read something.
         let slow = async {
             readers[1].is_to_close().await;
             held.pop();

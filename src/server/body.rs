@@ -1,4 +1,4 @@
-//! Request bodies: limits on size, arrival rate and memory.
+//! Reads request bodies within limits on size, arrival rate and memory.
 
 use std::{io, time::Duration};
 
@@ -12,44 +12,44 @@ use tokio::{
 
 use crate::xmlrpc::Value;
 
-/// Larger bodies, in bytes, reserve memory and are decoded outside the runtime's threads: decoding this much
-/// takes some 0.3 ms.
+/// Bodies larger than this, in bytes, reserve memory and are decoded off the runtime's threads.
+/// Decoding this much takes some 0.3 ms.
 pub(crate) const SMALL: usize = 64 << 10;
-/// Time for every body, plus a second for each [`RATE`] bytes that have arrived. Also the longest pause in
-/// it.
+/// Time allowed for every body, plus a second for each [`RATE`] bytes that have arrived. Also the
+/// longest pause within a body.
 const TIME: Duration = Duration::from_secs(10);
-/// The slowest accepted link, in bytes a second.
+/// The slowest accepted link, in bytes per second.
 const RATE: u64 = 64 << 10;
-/// Deadlock breaker: its holder may exceed the budget. So one body can always be read to its end when several
-/// hold a part of the budget each.
+/// Breaks deadlocks: its holder may exceed the budget. So one body can always be read to its end
+/// when several hold a part of the budget each.
 static LAST: Semaphore = Semaphore::const_new(1);
 
-/// Bodies of the largest size that may be in memory at the same time.
+/// Number of bodies of the largest size that fit into memory at the same time.
 const LARGE_BODIES: usize = 4;
 
-/// Memory for large bodies, in KiB, where none is larger than `max_body` bytes.
+/// Memory for large bodies in KiB, if none is larger than `max_body` bytes.
 pub(crate) fn budget(max_body: usize) -> Semaphore {
     Semaphore::new(LARGE_BODIES * (max_body >> 10))
 }
 
-/// Why there is no body.
+/// Why a body could not be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum BodyError {
-    /// It is larger than this limit, in bytes.
+    /// The body is larger than this limit, in bytes.
     TooLarge { limit: usize },
-    /// It broke off, or is not HTTP.
+    /// The body ended early, or is not HTTP.
     Broken,
-    /// Its bytes came too slowly.
+    /// The bytes of the body came too slowly.
     TooSlow,
     /// Other bodies held the memory for too long.
     NoRoom,
 }
 
-/// Memory reserved for one body; released on drop. A body reserves twice what has arrived of it; an announced
-/// length reserves nothing.
+/// Memory reserved for one body; released on drop. A body reserves twice what has arrived of it. An
+/// announced length reserves nothing.
 #[derive(Debug)]
 pub(crate) struct Room<'a> {
-    /// In KiB.
+    /// The budget, in KiB.
     pool: &'a Semaphore,
     held: Option<SemaphorePermit<'a>>,
     last: Option<SemaphorePermit<'static>>,
@@ -65,7 +65,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// Waits until `bytes` in all are reserved.
+    /// Waits until `bytes` in total are reserved.
     async fn grow(&mut self, bytes: usize) {
         let held = self.held.as_ref().map_or(0, SemaphorePermit::num_permits);
         let missing = bytes.div_ceil(1 << 10).saturating_sub(held);
@@ -73,7 +73,7 @@ impl<'a> Room<'a> {
             return;
         }
         let missing = u32::try_from(missing).unwrap_or(u32::MAX);
-        // Never closed.
+        // The semaphore is never closed.
         tokio::select! {
             biased;
             more = self.pool.acquire_many(missing) => match (&mut self.held, more) {
@@ -84,7 +84,7 @@ impl<'a> Room<'a> {
         }
     }
 
-    /// As [`grow`](Self::grow), within the time that a body of `longest` bytes may take.
+    /// Like [`grow`](Self::grow), within the time that a body of `longest` bytes may take.
     async fn grow_in_time(&mut self, bytes: usize, longest: usize) -> Result<(), BodyError> {
         let grown = timeout(time_for(longest), self.grow(bytes)).await;
         grown.map_err(|_| BodyError::NoRoom)
@@ -130,7 +130,7 @@ pub(crate) async fn read(
             let size = (2 * length).min(most);
             let waits = Instant::now();
             room.grow_in_time(size, most).await?;
-            // Time that the client did not cause.
+            // The client did not cause this delay.
             start += waits.elapsed();
             whole.reserve_exact(size.saturating_sub(whole.len()));
         }
@@ -138,7 +138,8 @@ pub(crate) async fn read(
     }
 }
 
-/// Reserves memory for the decoded values of a large body: short values take many times their text.
+/// Reserves memory for the decoded values of a large body, because short values take many times the
+/// size of their text.
 pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result<(), BodyError> {
     const OPEN: &[u8] = b"<value";
     let searched = text.clone();
@@ -154,7 +155,7 @@ pub(crate) async fn room_for_values(text: &Bytes, room: &mut Room<'_>) -> Result
     room.grow_in_time(size, text.len()).await
 }
 
-/// Runs `work` outside the runtime's threads.
+/// Runs `work` off the runtime's threads.
 async fn in_a_thread<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Option<T> {
@@ -174,7 +175,7 @@ mod tests {
         assert!(pool.available_permits() < (80 << 10) - 100 * 2 * size_of::<Value>());
     }
 
-    /// Each has a part of the room and needs more than is left.
+    /// Each body holds a part of the room and needs more than is left.
     #[tokio::test]
     async fn bodies_with_a_part_of_the_room_do_not_wait_for_each_other() {
         let pool = Semaphore::new(256);

@@ -1,4 +1,4 @@
-//! Answers calls: from the master, or from the mirror.
+//! Answers calls, from the master or from the mirror.
 
 use std::{
     net::SocketAddr,
@@ -37,16 +37,16 @@ use crate::{
     xmlrpc::{self, ListWriter, Reply, Value},
 };
 
-/// The connection is closed without an answer. A node retries after that. An error made up by rosrescue would
-/// cost it its registration, or end the node.
+/// The connection is closed without an answer, after which a node retries. An error made up by
+/// rosrescue would cost the node its registration, or end the node.
 #[derive(Debug, Error)]
 #[error("closed without an answer: {0}")]
 pub(crate) struct Closed(pub(super) &'static str);
 
-/// After this time the mirror answers for the master, where the mirror is exact. A rosmaster answers within a
-/// millisecond, and within some ten behind a call that keeps its interpreter busy.
+/// Time after which the mirror answers for the master, where the mirror is exact. A rosmaster
+/// answers within a millisecond, or within some ten behind a call that keeps its interpreter busy.
 pub(super) const PATIENCE: Duration = Duration::from_millis(100);
-/// Values that take a millisecond to encode, in bytes of memory.
+/// Size in bytes of values that take about a millisecond to encode.
 const LARGE: usize = 64 << 10;
 /// Largest answer that is kept, in bytes.
 const KEPT_MOST: usize = 16 << 20;
@@ -81,10 +81,10 @@ impl From<Unanswered> for Closed {
 }
 
 pub struct Calls {
-    /// Whether calls pass to the master.
+    /// Tells whether calls pass to the master.
     pub gate: gate::Rx,
     pub ledger: Arc<Ledger>,
-    /// Who answers reads while there is a master.
+    /// Whether the mirror or the master answers reads while there is a master.
     pub reads: Reads,
     /// The last large answer of the mirror.
     pub last_large: Mutex<Option<LargeAnswer>>,
@@ -96,11 +96,11 @@ pub struct Calls {
     /// Notified when the master takes too long to answer a call.
     pub slow: Arc<Notify>,
     pub stats: &'static Stats,
-    /// Our own address. Replaces the master's in replies.
+    /// The address of rosrescue, which replaces the master's in replies.
     pub uri: String,
     /// How long a call waits if only a master can answer it.
     pub hold: Duration,
-    /// None without other computers.
+    /// The other computers; none without `--cluster`.
     pub(crate) others: Option<Others>,
 }
 
@@ -110,7 +110,7 @@ pub struct LargeAnswer {
     text: Bytes,
 }
 
-/// The refusal of a `shutdown` that is not for the master, or not from its own computer.
+/// Refuses a `shutdown` that is not meant for the master, or that comes from another computer.
 fn refuse_shutdown(peer: SocketAddr, call: Option<&Request>) -> Option<HttpReply> {
     let call = call.filter(|call| call.kind() == Kind::Shutdown)?;
     if !admission::may_shut_down(peer.ip()) {
@@ -144,7 +144,7 @@ impl Calls {
         }
     }
 
-    /// As [`Self::answer`], if this computer has the master.
+    /// Like [`Self::answer`], if this computer has the master.
     pub(super) async fn answer_here(
         &self,
         head: Head,
@@ -182,15 +182,15 @@ impl Calls {
         Ok(xml(&reply))
     }
 
-    /// What rosmaster makes of a request that [`Request::decode`] does not decode, while it is away: the call, or
-    /// the fault that it answers. None if only a master knows.
+    /// What rosmaster makes of a request that [`Request::decode`] does not decode, while rosmaster
+    /// is away: the call, or the fault that it answers. None if only a master knows.
     fn decode_without_master(&self, head: &Head, body: &Bytes) -> Option<Result<Request, Reply>> {
         let is_away = matches!(self.gate.state(), State::StandingIn | State::Injecting);
         let is_plain = head.encoding.is_none() && matches!(head.path.as_str(), "/" | "/RPC2");
         if !is_away || !is_plain || body.len() > SMALL {
             return None;
         }
-        // The words of Python 2 differ.
+        // Python 2 words its faults differently.
         let is_python_3 = !self.ledger.with_mirror(Master::is_unordered);
         match Request::decode(body)
             .err()?
@@ -213,7 +213,7 @@ impl Calls {
         Some(reply)
     }
 
-    /// The mirror's answer to a read instead of that of a master that is away, or late.
+    /// The mirror's answer to a read in place of a master that is away or late.
     pub(super) async fn stand_in(&self, call: Option<&Request>) -> Option<HttpReply> {
         let read = call?;
         let reply = self.encode(|| self.ledger.answer(read)).await?;
@@ -221,10 +221,10 @@ impl Calls {
         Some(reply)
     }
 
-    /// Encodes what `answer` gives. None if a master cannot marshal it.
+    /// Encodes the result of `answer`. None if a master cannot marshal it.
     ///
-    /// What takes milliseconds is encoded outside of the runtime, one answer at a time. Equal answers in a row
-    /// share one encoding; values are shared, so comparing them is quick.
+    /// An answer that takes milliseconds is encoded off the runtime, one at a time. Equal answers
+    /// in a row share one encoding; values are shared, so comparing them is quick.
     async fn encode(&self, answer: impl Fn() -> Option<Reply>) -> Option<HttpReply> {
         let value = match answer()? {
             Reply::Value(value) => value,
@@ -233,7 +233,7 @@ impl Calls {
         if !value.is_larger_than(LARGE) {
             return Some(encoded(xmlrpc::encode_result(&value).ok()?));
         }
-        // A call that waits holds no copy.
+        // A waiting call must not hold a copy.
         drop(value);
         let mut last = self.last_large.lock().await;
         let value = match answer()? {
@@ -255,8 +255,8 @@ impl Calls {
         Some(encoded(text))
     }
 
-    /// Answers a read from the mirror, or forwards it. The mirror answers while the master is away, fails or
-    /// takes too long.
+    /// Answers a read from the mirror, or forwards it. The mirror answers while the master is away,
+    /// fails or takes too long.
     async fn read(
         &self,
         head: Head,
@@ -271,8 +271,8 @@ impl Calls {
         Ok(delivered(reply.await?, delivery))
     }
 
-    /// The answer to a read is under way from now on. Waits until the master has answered what it may notify the
-    /// caller of, but not for a master that is late: what it notifies nodes of then is told once more.
+    /// Begins the answer to a read. Waits until the master has answered what it may notify the
+    /// caller of, except for a late master, whose notifications are repeated later.
     async fn begin_read(&self, read: Option<&Request>) -> Option<Delivery> {
         let mut changed = self.ledger.order_changed();
         let patience = self.patience();
@@ -291,7 +291,8 @@ impl Calls {
         }
     }
 
-    /// As [`Self::read`], with the answer under way. `known`: the call, if the mirror may answer it.
+    /// Like [`Self::read`], with the answer already begun. `known` is the call, if the mirror may
+    /// answer it.
     async fn read_in_order(
         &self,
         head: Head,
@@ -308,8 +309,8 @@ impl Calls {
                         return Ok(reply);
                     }
                     let patience = self.patience();
-                    // A mirror in doubt waits for the probes' verdict on the master. A master that is late may
-                    // know more methods than rosmaster.
+                    // A mirror in doubt waits for the probes' verdict on the master. A late master
+                    // may know more methods than rosmaster.
                     let is_late =
                         |call: &&Request| call.kind() != Kind::Unknown && !self.ledger.is_doubted();
                     let known_now = known.filter(is_late);
@@ -368,7 +369,7 @@ impl Calls {
         }
     }
 
-    /// Answers a write. A long multicall goes in parts; the answer is that to the whole.
+    /// Answers a write. A long multicall is sent in parts, but gets one answer.
     async fn write(
         &self,
         head: Head,
@@ -385,7 +386,8 @@ impl Calls {
         self.http(call.as_deref(), answer, delivery)
     }
 
-    /// Makes one part after the other. If one gets no result for each entry, its answer is that to the whole.
+    /// Makes one part after the other. If a part gets no result for each entry, its answer is used
+    /// for the whole multicall.
     async fn write_parts(
         &self,
         head: &Head,
@@ -396,8 +398,8 @@ impl Calls {
         for part in parts {
             let part = Arc::new(part);
             let body = xmlrpc::encode_call(&Request::clone(&part).into());
-            // No node both hears and tells of a subject in so many calls at once: each part's answer counts as
-            // written when it is there.
+            // No node hears of a subject and writes about it in so many calls at once, so each
+            // part's answer counts as written when it arrives.
             let (answer, delivery) = self
                 .queue(
                     head.clone(),
@@ -438,8 +440,8 @@ impl Calls {
         Ok(delivered(reply, delivery))
     }
 
-    /// Queues a write. While the master is away, the mirror answers it from the queue. During an injection,
-    /// or while the master takes too long, it does so only if the write changes nothing.
+    /// Queues a write. While the master is away, the mirror answers it from the queue. During an
+    /// injection, or while the master takes too long, it does so only if the write changes nothing.
     async fn queue(
         &self,
         head: Head,
@@ -461,7 +463,7 @@ impl Calls {
             let answerable = call.is_some_and(Request::is_answerable);
             loop {
                 gate.shut_for(self.hold).await;
-                // An injection ends by itself; if it fails, the mirror answers.
+                // An injection ends by itself. If it fails, the mirror answers.
                 if !answerable || gate.state() != State::Injecting {
                     return;
                 }
@@ -492,8 +494,8 @@ impl Calls {
         }
     }
 
-    /// When the mirror answers instead of the master. If the master has kept an earlier call waiting, this
-    /// call gets no [`PATIENCE`] of its own.
+    /// When the mirror answers instead of the master. If the master has kept an earlier call
+    /// waiting, this call gets no [`PATIENCE`] of its own.
     fn patience(&self) -> tokio::time::Instant {
         let now = tokio::time::Instant::now();
         if self.pool.is_stalled() {
@@ -502,7 +504,7 @@ impl Calls {
         self.write_queue.unanswered_since().unwrap_or(now) + PATIENCE
     }
 
-    /// The mirror's answer to a write that changes nothing; none if it does.
+    /// The mirror's answer to a write that changes nothing; none if it changes something.
     async fn answer_if_unchanged(
         &self,
         call: Option<&Request>,

@@ -1,4 +1,4 @@
-//! Connected clients: a table for the status page.
+//! A table of connected clients, for the status page.
 
 use std::{
     collections::HashMap,
@@ -17,19 +17,20 @@ use crate::{
     },
 };
 
-/// Clients listed on the status page; there may be thousands.
+/// Most clients listed on the status page. There may be thousands.
 const LISTED: usize = 1000;
-/// Kept length of a caller id, in characters: a client may send any, and be idle for hours.
+/// Most characters of a caller id that are kept, because a client may send any length and stay
+/// connected for hours.
 const CALLER_ID: usize = 200;
 
-/// Callers of ended connections whose times are kept. Tools have a new name each time.
+/// Most callers of ended connections whose times are kept. Tools have a new name each time.
 const CALLERS: usize = 256;
 
-/// The connections of clients, and how long their calls have taken.
+/// The connections of clients, and how long their calls took.
 #[derive(Debug, Default)]
 pub struct Clients {
     present: DashMap<SocketAddr, Seen>,
-    /// Of connections that have ended, or are used by another caller now.
+    /// Times of callers whose connections have ended or now serve another caller.
     past: Mutex<HashMap<String, Times>>,
 }
 
@@ -37,12 +38,12 @@ pub struct Clients {
 struct Seen {
     caller_id: String,
     calls: u64,
-    /// Of this caller.
+    /// Times of the present caller.
     times: Times,
 }
 
 impl Seen {
-    /// The caller id, or the address of a client that says none.
+    /// The caller id, or the client's address if it sends none.
     fn caller(&self, peer: &SocketAddr) -> String {
         match self.caller_id.as_str() {
             "" => peer.ip().to_string(),
@@ -51,7 +52,7 @@ impl Seen {
     }
 }
 
-/// How long calls have taken.
+/// How long calls took.
 #[derive(Clone, Copy, Debug, Default)]
 struct Times {
     calls: u64,
@@ -92,7 +93,7 @@ impl Clients {
         }
     }
 
-    /// The call of `peer` that began at `start` has been answered, or closed.
+    /// Notes that the call of `peer` that began at `start` was answered, or its connection closed.
     pub fn answered(&self, peer: SocketAddr, start: Instant) {
         let now = Instant::now();
         let longest = now.duration_since(start);
@@ -110,7 +111,8 @@ impl Clients {
         self.past.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps the times of a caller. When there are too many, those without a long call go.
+    /// Keeps the times of a caller. If there are too many, callers without a long call are dropped
+    /// first.
     fn keep(&self, caller: String, times: Times) {
         if times.calls == 0 {
             return;
@@ -129,7 +131,7 @@ impl Clients {
         self.present.len()
     }
 
-    /// The callers whose longest call took longest, at most `most`.
+    /// The callers with the longest calls, at most `most`.
     pub(crate) fn slowest(&self, most: usize) -> Vec<Caller> {
         let mut all = self.past().clone();
         for entry in &self.present {
@@ -151,7 +153,7 @@ impl Clients {
         callers.collect()
     }
 
-    /// The connections, by caller id, at most a thousand.
+    /// The connections sorted by caller id, at most a thousand.
     pub(crate) fn list(&self) -> Vec<Client> {
         let clients = self.present.iter().take(LISTED).map(|entry| Client {
             peer: entry.key().to_string(),
@@ -164,7 +166,7 @@ impl Clients {
     }
 }
 
-/// Takes a connection off the list when it ends.
+/// Removes a connection from the list when it ends.
 #[derive(Debug)]
 pub struct Present<'a> {
     clients: &'a Clients,

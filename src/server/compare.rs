@@ -1,4 +1,5 @@
-//! Finds changes that went past rosrescue: what a master shows a client is compared with the mirror.
+//! Finds changes that bypassed rosrescue, by comparing the master's answers to clients with the
+//! mirror.
 
 use std::{
     sync::{Mutex, PoisonError},
@@ -12,7 +13,7 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Shortest time between two comparisons: each decodes the whole answer.
+/// Shortest time between two comparisons, because each decodes the whole answer.
 const PAUSE: Duration = Duration::from_secs(1);
 
 /// When the next comparison may begin.
@@ -32,18 +33,19 @@ impl Comparisons {
 }
 
 impl Calls {
-    /// The mirror's version, if the master's answer to `read` can be compared with the mirror: it shows the graph,
-    /// and the master has no unanswered writes.
+    /// The mirror's version, if the master's answer to `read` can be compared with the mirror: it
+    /// shows the graph, and the master has no unanswered writes.
     pub(super) fn comparable(&self, read: Option<&Request>) -> Option<u64> {
         let shows_graph = read.is_some_and(|read| *read.method() == Method::GetSystemState);
         (shows_graph && self.write_queue.unanswered_since().is_none())
             .then(|| self.ledger.version())
     }
 
-    /// Compares the master's answer to `read` with the mirror, beside traffic. If they differ, the master is read
-    /// again. `version`: what [`Self::comparable`] returned before the read.
+    /// Compares the master's answer to `read` with the mirror, in parallel with traffic. If they
+    /// differ, the master is read again. `version` is what [`Self::comparable`] returned before the
+    /// read.
     pub(super) fn compare(&self, read: Option<&Request>, version: Option<u64>, raw: &RawReply) {
-        // A write that ran meanwhile may be in the answer, or not.
+        // The answer may or may not include a write that ran meanwhile.
         let (Some(read), Some(version)) = (read, version) else {
             return;
         };

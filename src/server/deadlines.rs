@@ -1,8 +1,8 @@
 //! Ends a connection whose peer sends a request's head too slowly, or does not read its answer.
 //!
-//! hyper's own limit on the time for a head includes the idle time before it, and would close the keep-alive
-//! connections that nodes hold for hours. Here the time starts with the head's first byte. hyper has no limit
-//! for writing.
+//! hyper's limit on the time for a head includes the idle time before it, and would close the
+//! keep-alive connections that nodes hold for hours. Here the time starts with the first byte of
+//! the head. hyper has no limit for writing.
 
 use std::{
     io,
@@ -27,16 +27,16 @@ use super::{
     replies::UntilWritten,
 };
 
-/// Time in which a request's head must arrive, from its first byte.
+/// Time in which a request's head must arrive, counted from its first byte.
 const HEAD_TIME: Duration = Duration::from_secs(10);
 /// Time in which a peer must read a part of an answer.
 const WRITE_TIME: Duration = Duration::from_secs(60);
 
-/// Where a connection stands between requests.
+/// The state of a connection within a request.
 #[derive(Clone, Default)]
 pub(crate) struct Deadlines {
     place: Arc<AtomicU8>,
-    /// Held until the answer has been written.
+    /// Dropped when the answer has been written.
     held: Arc<Mutex<Option<UntilWritten>>>,
     pub(super) reader: Arc<Reader>,
 }
@@ -47,12 +47,13 @@ const SERVING: u8 = 2;
 const REPLYING: u8 = 3;
 
 impl Deadlines {
-    /// The head has been read; the body and the answer have limits of their own.
+    /// Notes that the head has been read. The body and the answer have their own limits.
     pub(crate) fn serving(&self) {
         self.place.store(SERVING, Ordering::Relaxed);
     }
 
-    /// The answer is ready. After it has been sent, `held` is dropped, and the next byte starts a head.
+    /// Notes that the answer is ready. After it has been sent, `held` is dropped, and the next byte
+    /// starts a head.
     pub(crate) fn replying(&self, held: Option<UntilWritten>) {
         *self.held() = held;
         self.place.store(REPLYING, Ordering::Relaxed);
@@ -62,12 +63,12 @@ impl Deadlines {
         self.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// No request has begun since the last answer was sent.
+    /// Whether no request has begun since the last answer was sent.
     pub(crate) fn is_idle(&self) -> bool {
         self.is(IDLE)
     }
 
-    /// An answer is ready and has not been sent in full.
+    /// Whether an answer is ready and has not been sent in full.
     pub(crate) fn is_replying(&self) -> bool {
         self.is(REPLYING)
     }
@@ -82,16 +83,16 @@ pub(crate) struct Timed<'a, S> {
     stream: S,
     deadlines: Deadlines,
     deadline: Pin<Box<Sleep>>,
-    /// The peer does not read.
+    /// Whether the peer does not read.
     stuck: bool,
     idle: &'a Idle,
-    /// Notified when it must close because too many connections are idle.
+    /// Notified when the connection must close because too many are idle.
     close: Arc<Notify>,
     idling: Option<Idling<'a>>,
 }
 
 impl<'a, S> Timed<'a, S> {
-    /// `stream` before its first request. `close` is notified when `idle` has too many.
+    /// Wraps `stream` before its first request. `close` is notified when `idle` has too many.
     pub(crate) fn new(stream: S, deadlines: Deadlines, idle: &'a Idle, close: Arc<Notify>) -> Self {
         Self {
             stream,
@@ -272,7 +273,7 @@ mod tests {
         deadlines.replying(None);
         stream.write_all(b"HTTP").await.unwrap();
         assert!(!deadlines.is_idle());
-        // Another one is idle meanwhile.
+        // Another connection is idle meanwhile.
         drop(idle.enter(&Arc::default()));
         stream.flush().await.unwrap();
         assert!(deadlines.is_idle());

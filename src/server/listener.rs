@@ -25,18 +25,19 @@ use super::{
 };
 use crate::limit::rarely;
 
-/// Connections that the kernel holds while rosrescue is busy, or briefly away.
+/// Connections that the kernel holds while rosrescue is busy or briefly away.
 const BACKLOG: i32 = 1024;
-/// Read buffer of a connection, in bytes. hyper keeps it while the connection is idle. A head must fit into
-/// it.
+/// Read buffer of a connection, in bytes. hyper keeps it while the connection is idle. A head must
+/// fit into it.
 const BUFFER: usize = 16 << 10;
-/// Pause after a failed accept, such as one without a free file descriptor.
+/// Pause after a failed accept, for example without a free file descriptor.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// After this idle time the kernel probes the peer, so that connections of vanished computers do not pile up.
+/// Idle time after which the kernel probes the peer, so that connections of vanished computers do
+/// not pile up.
 const KEEPALIVE: Duration = Duration::from_secs(60);
 
-/// How long a port may stay in use: the kernel closes the sockets of a process that was killed a moment after its
-/// end.
+/// How long a port may stay in use at the start, because the kernel closes the sockets of a killed
+/// process a moment after its end.
 const LINGER: Duration = Duration::from_secs(2);
 const LINGER_PAUSE: Duration = Duration::from_millis(20);
 
@@ -55,7 +56,7 @@ pub enum ListenError {
         /// The option that chooses the port.
         option: &'static str,
     },
-    /// Any other reason.
+    /// The address cannot be served for another reason.
     #[error("cannot listen at {address}: {source}; choose another one with {option}")]
     Other {
         address: SocketAddr,
@@ -65,8 +66,9 @@ pub enum ListenError {
     },
 }
 
-/// Listens at all of `addresses`; the listeners do not block. Waits for up to two seconds for a port that is in use. All but the first are left out if the computer lacks
-/// their address family. With port 0 they share one free port. Errors name `option`, which chooses the port.
+/// Listens at all of `addresses`, without blocking. Waits up to two seconds for a port that is in
+/// use. Addresses after the first are left out if the computer lacks their address family. With
+/// port 0 they share one free port. Errors name `option`, which chooses the port.
 pub fn bind(
     addresses: &[SocketAddr],
     option: &'static str,
@@ -104,7 +106,7 @@ pub fn bind(
     Ok(listeners)
 }
 
-/// As [`bind_one`], again and again until `deadline` while the port is in use.
+/// Retries [`bind_one`] until `deadline` while the port is in use.
 fn bind_lingering(address: SocketAddr, deadline: Instant) -> io::Result<net::TcpListener> {
     loop {
         match bind_one(address) {
@@ -132,7 +134,7 @@ fn bind_one(address: SocketAddr) -> io::Result<net::TcpListener> {
     Ok(socket.into())
 }
 
-/// Serves `listener` until `stop`; requests under way may finish.
+/// Serves `listener` until `stop`. Requests under way may finish.
 pub async fn run(
     listener: TcpListener,
     server: Arc<Server>,
@@ -145,7 +147,7 @@ pub async fn run(
         // The permit comes second, so that an unused listener takes none.
         let accepted = async {
             let accepted = listener.accept().await?;
-            // Never closed.
+            // The semaphore is never closed.
             let permit = permits.clone().acquire_owned().await;
             io::Result::Ok((accepted, permit))
         };
@@ -188,7 +190,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     let close = Arc::new(Notify::new());
     let timed = Timed::new(stream, deadlines.clone(), &here.idle, close.clone());
     let service = |request| {
-        // On the heap, so that idle connections hold no memory for it.
+        // It is boxed so that idle connections hold no memory for it.
         Box::pin(service::serve(
             server.clone(),
             peer,
@@ -216,7 +218,8 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
             () = deadlines.reader.is_to_close() => {
                 if deadlines.is_replying() && deadlines.reader.is_slow() {
                     tracing::debug!(%peer, "closed: it reads too slowly, and others need the room");
-                    // A reset, so that the kernel keeps nothing of the answer, and its client calls again.
+                    // A reset, so that the kernel keeps nothing of the answer and the client calls
+                    // again.
                     let stream = connection.into_parts().io.into_inner();
                     let _ = SockRef::from(stream.stream()).set_linger(Some(Duration::ZERO));
                     return;
@@ -233,15 +236,15 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
     }
 }
 
-/// This computer's address on the network, if it has one: the one that its route to the outside uses. No
-/// packet is sent.
+/// This computer's address on the network, if it has one: the one that its route to the outside
+/// uses. No packet is sent.
 pub fn local_address() -> Option<IpAddr> {
     let routed = |from: SocketAddr, to: SocketAddr| {
         let socket = net::UdpSocket::bind(from).ok()?;
         socket.connect(to).ok()?;
         Some(socket.local_addr().ok()?.ip())
     };
-    // Addresses reserved for documentation: routed like any other.
+    // These addresses are reserved for documentation, but routed like any other.
     let v4 = routed(([0, 0, 0, 0], 0).into(), ([192, 0, 2, 1], 9).into());
     let documentation = Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 1);
     v4.or_else(|| routed((Ipv6Addr::UNSPECIFIED, 0).into(), (documentation, 9).into()))

@@ -1,4 +1,4 @@
-//! Calls where there are several computers: answered here, or by the leader.
+//! Calls in a robot with several computers: answered here, or by the leader.
 
 use std::{
     collections::VecDeque,
@@ -40,43 +40,45 @@ use crate::{
 
 /// Pause before a call is sent to the same leader again.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// The method by which `rosrescue handover` has the leader give up leading.
+/// Method by which `rosrescue handover` asks the leader to give up leading.
 pub(crate) const HANDOVER: &str = "rosrescue/handover";
 
-/// A request to give up leading: in whose favour, and where to say who led, or why it cannot be done.
+/// A request to give up leading: the computer that should lead, and where to report who led or why
+/// it failed.
 pub(crate) type Handover = (String, oneshot::Sender<Result<String, String>>);
 
-/// The way to the other computers.
+/// The connection to the other computers.
 #[derive(Clone, Debug)]
 pub(crate) struct Others {
     pub(crate) way: watch::Receiver<Way>,
     pub(crate) peers: Arc<Peers>,
     pub(crate) handovers: mpsc::Sender<Handover>,
-    /// Hosts whose nodes have this rosrescue for their master.
+    /// Hosts whose nodes use this rosrescue as their master.
     pub(crate) served: Served,
     /// Answers that followers have not passed on yet.
     pub(crate) passing: Arc<Passing>,
     /// Writes of this computer that a leader has not answered yet.
     pub(crate) forwarded: Arc<Forwarded>,
-    /// How far the mirror holds the journal.
+    /// How far the mirror follows the journal.
     pub(crate) followed: watch::Receiver<Place>,
-    /// The furthest place that a leader's answer told of.
+    /// The latest place in the journal that a leader's answer mentioned.
     pub(crate) told: Arc<Mutex<Place>>,
     /// How long a call waits for a leader.
     pub(crate) hold: Duration,
 }
 
-/// The method by which a follower tells the leader that it has passed an answer on to its caller.
+/// Method by which a follower tells the leader that it has passed an answer on to its caller.
 const PASSED_ON: &str = "rosrescue/passedOn";
 
-/// Answers on their way to callers through followers: what is held until they have been written there.
+/// Answers on their way to callers through followers, with what must be held until they have been
+/// written there.
 #[derive(Default)]
 pub(crate) struct Passing(Mutex<Passed>);
 
 #[derive(Default)]
 struct Passed {
     last: u64,
-    /// By number, the oldest first.
+    /// The answers by number, oldest first.
     held: VecDeque<(Instant, u64, UntilWritten)>,
 }
 
@@ -91,8 +93,8 @@ impl Passing {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps what an answer holds. Returns the number by which it is [ended](Self::end). A follower that says
-    /// nothing holds up nobody for longer than a client that does not read.
+    /// Keeps what an answer holds. Returns the number by which it is [ended](Self::end). A follower
+    /// that stays silent delays others no longer than a client that does not read.
     fn keep(&self, now: Instant, held: UntilWritten) -> u64 {
         let mut old = Vec::new();
         let mut passing = self.lock();
@@ -107,7 +109,7 @@ impl Passing {
         *last
     }
 
-    /// The answer with this number has been written to its caller, or never will be.
+    /// Notes that the answer with this number has been written to its caller, or never will be.
     fn end(&self, number: u64) {
         let mut passing = self.lock();
         let at = passing.held.iter().position(|(_, of, _)| *of == number);
@@ -117,7 +119,7 @@ impl Passing {
     }
 }
 
-/// Tells the leader, when it is dropped, that an answer of its has been passed on.
+/// When dropped, tells the leader that its answer has been passed on.
 struct PassOn {
     leader: Arc<Peer>,
     term: u64,
@@ -126,7 +128,7 @@ struct PassOn {
 
 impl Drop for PassOn {
     fn drop(&mut self) {
-        // Without a runtime rosrescue stops.
+        // Without a runtime rosrescue is stopping.
         let Ok(runtime) = Handle::try_current() else {
             return;
         };
@@ -202,7 +204,7 @@ impl Others {
         let mut sent = false;
         let mut unanswered = None;
         loop {
-            // The leader that ran it died before it could answer; the next one would refuse it.
+            // The leader that ran it died before it could answer, and the next one would refuse it.
             if sent && deletes.is_some() && call.deletes().is_none() {
                 return Ok(deleted(deletes.as_deref().unwrap_or_default()));
             }
@@ -237,8 +239,9 @@ impl Others {
                     };
                     let answered = tokio::select! {
                         biased;
-                        // What is answered alone holds only if nobody else changes it: the computer that has
-                        // asked need not be cut off, and may be about to lead itself.
+                        // What is answered while cut off lasts only if nobody else changes it. The
+                        // computer that has asked need not be cut off, and may be about to lead
+                        // itself.
                         _ = leads.wait_for(|way| *way == Way::Here { term: None }), if asked_term.is_some() => continue,
                         answered = calls.answer_here(head, body, request, source) => answered,
                     };
@@ -260,7 +263,7 @@ impl Others {
                 Way::Leader { uri, term } => {
                     let leader = self.peers.at(&uri);
                     if call.hands_over().is_some() {
-                        // Once: the next leader would give up, too.
+                        // It is sent only once, because the next leader would give up, too.
                         let silent = || handed_over(Err("the leader does not answer".to_owned()));
                         return Ok(call.forward(&leader, term).await.unwrap_or_else(silent));
                     }
@@ -276,7 +279,7 @@ impl Others {
                             Some(reply) => return Ok(reply),
                             None => Some(Instant::now() + RETRY_PAUSE),
                         },
-                        // Its answer would never come, or does not count any more.
+                        // The answer would never come, or does not count any more.
                         _ = way.changed(), if call.kind != Kind::Read => continue,
                     }
                 }
@@ -304,7 +307,8 @@ impl Others {
         }
     }
 
-    /// Makes writes of a computer that was alone. None if this one does not lead any more.
+    /// Makes the writes of a computer that was cut off. None if this computer does not lead any
+    /// more.
     async fn merge(&self, calls: &Calls, ask: Ask) -> Option<HttpReply> {
         let mut leads = self.way.clone();
         tokio::select! {
@@ -320,7 +324,7 @@ impl Others {
 
     async fn hand_over(&self, to: &str) -> HttpReply {
         let (tell, told) = oneshot::channel();
-        // It ends only when rosrescue stops.
+        // The channel closes only when rosrescue stops.
         let _ = self.handovers.send((to.to_owned(), tell)).await;
         handed_over(
             told.await
@@ -329,7 +333,7 @@ impl Others {
     }
 }
 
-/// The answer to a handover: who has led, or why it still does.
+/// The answer to a handover: who has led, or why it still leads.
 fn handed_over(result: Result<String, String>) -> HttpReply {
     let (code, text, who) = match result {
         Ok(who) => (1, "another computer may lead now".to_owned(), who),
@@ -340,26 +344,27 @@ fn handed_over(result: Result<String, String>) -> HttpReply {
 }
 
 impl Call<'_> {
-    /// In whose favour the leader is to give up leading, if that is what is asked.
+    /// The computer that should lead, if the call asks the leader to give up leading.
     fn hands_over(&self) -> Option<&str> {
         let call = self.call.as_ref()?;
         let is_it = matches!(call.method(), Method::Unknown(name) if **name == *HANDOVER);
         is_it.then(|| call.text(1).unwrap_or_default())
     }
 
-    /// What a computer that was alone asks for, if it is that.
+    /// The merge that the call asks for, if it comes from a computer that was cut off.
     fn merges(&self) -> Option<Ask> {
         Ask::read(self.call.as_ref()?)
     }
 
-    /// The number of the answer that a follower has passed on, if that is what is told.
+    /// The number of the answer that a follower has passed on, if the call reports that.
     fn was_passed_on(&self) -> Option<u64> {
         let call = self.call.as_ref()?;
         let is_it = matches!(call.method(), Method::Unknown(name) if **name == *PASSED_ON);
         is_it.then(|| call.text(1)?.parse().ok()).flatten()
     }
 
-    /// The leader's answer, to be passed on to the caller. This computer's nodes know of it from now on.
+    /// Passes the leader's answer on to the caller. This computer's nodes know of its content from
+    /// now on.
     fn pass_on(&self, leader: &Arc<Peer>, term: u64, raw: RawReply) -> HttpReply {
         let seq = raw.headers.get(peer::SEQ_HEADER);
         let seq = seq.and_then(|seq| seq.to_str().ok()?.parse().ok());
@@ -382,7 +387,7 @@ impl Call<'_> {
         reply
     }
 
-    /// The leader's answer, or to a read the mirror's if that of the leader takes long; none if there is none
+    /// The leader's answer. For a read that takes long, the mirror's answer. None if there is none
     /// now.
     async fn forward(&self, leader: &Arc<Peer>, term: u64) -> Option<HttpReply> {
         if self.kind != Kind::Read {
@@ -399,7 +404,8 @@ impl Call<'_> {
         {
             return Some(reply);
         }
-        // Goes on when the mirror has answered: the next answer in time shows that the leader is there again.
+        // This continues after the mirror has answered, because the next answer in time shows that
+        // the leader is back.
         let mut asked = {
             let (leader, head, body) = (leader.clone(), self.head.clone(), self.body.clone());
             tokio::spawn(async move { leader.forward(term, &head, &body).await })
@@ -425,7 +431,7 @@ impl Call<'_> {
         }
     }
 
-    /// The parameter that is deleted, if it is one that the mirror has.
+    /// The parameter that is deleted, if the mirror has it.
     fn deletes(&self) -> Option<String> {
         let call = self.call.as_ref()?;
         let (caller, key) = (call.caller()?, call.text(1)?);
@@ -440,8 +446,8 @@ impl Call<'_> {
         there.then(|| names::resolve(key, caller))
     }
 
-    /// The mirror's answer to a read; none to any other call, and none if the mirror does not show yet what the
-    /// leader's answers have shown before: on one computer no read goes back.
+    /// The mirror's answer to a read. None to any other call, and none if the mirror does not yet
+    /// show what the leader's answers have shown: reads on one computer never go back in time.
     async fn by_mirror(&self) -> Option<HttpReply> {
         let read = self.call.as_ref().filter(|_| self.kind == Kind::Read)?;
         let (followed, told) = (*self.others.followed.borrow(), *self.others.told());
@@ -451,7 +457,7 @@ impl Call<'_> {
         }
     }
 
-    /// As [`Self::by_mirror`], when the mirror has caught up.
+    /// Like [`Self::by_mirror`], once the mirror has caught up.
     async fn by_mirror_when_fresh(&self) -> Option<HttpReply> {
         if self.kind != Kind::Read {
             return None;

@@ -1,4 +1,4 @@
-//! Replies over HTTP: the master's bytes, or our own.
+//! Replies over HTTP: the master's bytes, or rosrescue's own.
 
 use std::{
     convert::Infallible,
@@ -24,10 +24,10 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// What hyper sends.
+/// The reply that hyper sends.
 pub(crate) type HttpReply = Response<Content>;
 
-/// In the extensions of a reply: dropped when the reply has been written, or never will be.
+/// Carried in the extensions of a reply: dropped when the reply has been written, or never will be.
 #[derive(Clone)]
 pub(crate) struct UntilWritten(
     #[expect(dead_code, reason = "held, not read")] Arc<dyn Send + Sync>,
@@ -39,7 +39,7 @@ impl UntilWritten {
     }
 }
 
-/// `reply`, which is ready to be written.
+/// Returns `reply`, which is ready to be written.
 pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> HttpReply {
     if let Some(delivery) = delivery {
         delivery.ready();
@@ -51,9 +51,9 @@ pub(super) fn delivered(mut reply: HttpReply, delivery: Option<Delivery>) -> Htt
 /// The body of a reply.
 #[derive(Debug)]
 pub(crate) enum Content {
-    /// All of it is there.
+    /// The whole body.
     Whole(Full<Bytes>),
-    /// It is made as long as somebody reads it.
+    /// A stream that is produced as long as somebody reads it.
     Events(mpsc::Receiver<Bytes>),
 }
 
@@ -95,7 +95,8 @@ impl Body for Content {
     }
 }
 
-/// The mirror's reply, or the master's from a batch, with our address in place of the master's.
+/// The mirror's reply, or the master's from a batch, with rosrescue's address in place of the
+/// master's.
 pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpReply {
     match call.filter(|call| batch::asks_uri(call)) {
         Some(call) => xml(&batch::with_uri(call, reply.clone(), uri)),
@@ -103,7 +104,7 @@ pub(super) fn made(uri: &str, call: Option<&Request>, reply: &Reply) -> HttpRepl
     }
 }
 
-/// A master's reply, with our address in place of its own.
+/// A master's reply, with rosrescue's address in place of its own.
 pub(super) fn forwarded(uri: &str, call: Option<&Request>, raw: RawReply) -> HttpReply {
     if let Some(call) = call.filter(|call| batch::asks_uri(call))
         && let Ok(reply @ Reply::Value(_)) = xmlrpc::decode_reply(&raw.body)
@@ -131,7 +132,7 @@ pub(super) fn xml(reply: &Reply) -> HttpReply {
     encoded(xmlrpc::encode_reply(reply))
 }
 
-/// A reply of our own that is encoded already.
+/// A reply made by rosrescue that is already encoded.
 pub(super) fn encoded(reply: impl Into<Bytes>) -> HttpReply {
     let mut http = Response::new(Content::from(reply.into()));
     http.headers_mut()
@@ -153,7 +154,7 @@ pub(super) fn page(status: StatusCode, kind: &'static str, content: impl Into<By
     http
 }
 
-/// As [`page`], in plain text.
+/// Like [`page`], in plain text.
 pub(super) fn text(status: StatusCode, text: String) -> HttpReply {
     page(status, "text/plain; charset=utf-8", text)
 }

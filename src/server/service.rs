@@ -1,4 +1,4 @@
-//! One request from its head to its answer.
+//! Serves one request, from its head to its answer.
 
 use std::{
     net::SocketAddr,
@@ -31,12 +31,12 @@ use crate::{
     xmlrpc::Reply,
 };
 
-/// Sent to another computer whose body rosrescue cannot decode. The master may be able to, and the call may
-/// be a `shutdown`.
+/// Sent to another computer whose body rosrescue cannot decode. The master may be able to, and the
+/// call may be a `shutdown`.
 const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
                          computer only; send XML-RPC in UTF-8, without a document type";
 
-/// Other large answers wait, and this one cannot be made again.
+/// Other large answers are waiting, and this one cannot be made again.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
 /// How often an answer is made that is larger each time.
 const ATTEMPTS: u32 = 4;
@@ -54,7 +54,7 @@ pub(crate) async fn serve(
         Ok(()) => route(server, peer, grant, &deadlines, request).await,
         Err(refusal) => {
             let mut reply = keep_out(&server, peer, &refusal);
-            // Its connection is to leave room for others.
+            // The connection must close to make room for others.
             let close = HeaderValue::from_static("close");
             reply.headers_mut().insert(CONNECTION, close);
             Ok(reply)
@@ -122,7 +122,7 @@ async fn post(
     let read = async {
         let limit = server.max_body;
         let body = body::read(request.into_body(), limit, &mut room).await?;
-        // A packed body is left to the master: no ROS client packs.
+        // A compressed body is left to the master, because no ROS client compresses.
         let call = match &head.encoding {
             None => decode(body.clone(), &mut room).await?,
             Some(_) => None,
@@ -168,8 +168,8 @@ async fn post(
     answered
 }
 
-/// Answers a call. A large answer that finds no room is made again when there is some, so that few wait in
-/// memory.
+/// Answers a call. A large answer that finds no room is made again when there is some, so that few
+/// wait in memory.
 async fn answer(
     server: &Server,
     peer: SocketAddr,
@@ -201,7 +201,7 @@ async fn answer(
     Err(Closed("its answer keeps growing"))
 }
 
-/// A page, in the room for large answers if it is one.
+/// A page, in the room for large answers if it is large.
 async fn page(
     server: &Server,
     page: HttpReply,
@@ -220,7 +220,7 @@ fn refuse(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     text(refusal.status, format!("{}\n", refusal.reason))
 }
 
-/// As [`refuse`], but the log names an address once a minute: nodes call again and again.
+/// Like [`refuse`], but the log names an address once a minute, because nodes call again and again.
 fn keep_out(server: &Server, peer: SocketAddr, refusal: &Refusal) -> HttpReply {
     let mut said = server
         .refused

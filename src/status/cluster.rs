@@ -1,10 +1,10 @@
-//! What is known of the other computers.
+//! What this computer knows about the other computers of the robot.
 
 use std::time::{Duration, Instant};
 
 use crate::cluster::machine::Role;
 
-/// How this computer takes part, and what it knows of the others. Filled by `app::cluster`.
+/// This computer's role and what it knows about the others. `app::cluster` fills it.
 #[derive(Clone, Debug)]
 pub struct ClusterFacts {
     /// This computer's name.
@@ -12,57 +12,58 @@ pub struct ClusterFacts {
     pub role: Role,
     /// Since when it has this role.
     pub since: Instant,
-    /// Who leads, as far as is known; the last one while there is none.
+    /// The current leader as far as this computer knows, or the last one while there is none.
     pub leader: Option<LeaderFacts>,
-    /// Since when nobody leads, as far as is known: the last leader gave up, or is silent. None while somebody does.
+    /// Since when there is no leader, as far as this computer knows: the last one gave up or is
+    /// silent. None while there is a leader.
     pub leaderless: Option<Instant>,
-    /// The journal's last record that is known.
+    /// The last journal record that this computer knows of.
     pub seq: u64,
-    /// How many records of it this computer's mirror lacks.
+    /// Number of journal records that this computer's mirror lacks.
     pub behind: u64,
-    /// Writes that were made here and that etcd does not have yet.
+    /// Number of writes made here that etcd does not have yet.
     pub uncommitted: u64,
-    /// Why etcd does not answer, and since when; none if it does.
+    /// Since when etcd does not answer, and why; none while it answers.
     pub etcd: Option<(Instant, String)>,
-    /// All computers that have ever taken part, this one included.
+    /// All computers that have ever taken part, including this one.
     pub members: Vec<MemberFacts>,
-    /// Times that this computer has taken over.
+    /// Number of takeovers by this computer.
     pub takeovers: u64,
     pub last_takeover: Option<Takeover>,
-    /// Writes answered alone that did not hold, because others had changed the same meanwhile.
+    /// Number of writes answered while cut off that were lost, because others had changed the same.
     pub lost_writes: u64,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LeaderFacts {
     pub name: String,
-    /// Where nodes and other computers reach it.
+    /// Address at which nodes and other computers reach the leader.
     pub uri: String,
-    /// Of its rosrescue.
+    /// Version of the leader's rosrescue.
     pub version: String,
-    /// Grows with each leader.
+    /// The leader's term: a number that grows with each leader.
     pub term: u64,
-    /// Since when this computer knows of it.
+    /// When this computer learned of this leader.
     pub since: Instant,
 }
 
-/// A computer, as it said last.
+/// A computer of the robot, as it last described itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MemberFacts {
     pub name: String,
     pub uri: String,
     pub version: String,
     pub role: Role,
-    /// The journal's last record in its mirror.
+    /// The last journal record in its mirror.
     pub seq: u64,
-    /// When it was heard of last; none if not since this rosrescue started.
+    /// When this computer last heard from it; none if not since this rosrescue started.
     pub heard: Option<Instant>,
 }
 
 impl MemberFacts {
-    /// How often a computer says how it is.
+    /// How often a computer reports its state to the others.
     pub const SAYS_EVERY: Duration = Duration::from_secs(5);
-    /// A computer that has said nothing for this time is away.
+    /// A computer that has not reported for this long is away.
     pub const AWAY_AFTER: Duration = Duration::from_secs(15);
 
     pub(crate) fn is_away(&self) -> bool {
@@ -73,19 +74,19 @@ impl MemberFacts {
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Takeover {
-    /// When writes were answered here for the first time.
+    /// When this computer answered its first write as the leader.
     pub at: Instant,
-    /// From the last sign of the previous leader until then.
+    /// Time from the last sign of the previous leader to the first answered write.
     pub took: Duration,
-    /// Who led before; none if nobody did.
+    /// Name of the previous leader; none if there was none.
     pub from: Option<String>,
-    /// Whether the previous leader gave up leading by itself.
+    /// Whether the previous leader gave up in order, as in a handover.
     pub in_order: bool,
 }
 
 #[cfg(test)]
 impl ClusterFacts {
-    /// pc-2 as it follows pc-1, of which it was told a minute ago; pc-3 is away.
+    /// A view from pc-2, which follows pc-1; pc-3 is away.
     pub(crate) fn of_three() -> Self {
         let minute = Duration::from_secs(60);
         let before = Instant::now().checked_sub(minute).unwrap();

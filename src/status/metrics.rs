@@ -1,13 +1,14 @@
 //! The metrics, in Prometheus' text format.
 //!
-//! Written by hand: every value is one of a [`Status`], which a library would want in registers of its own.
+//! The format is written by hand, because every value is already in a [`Status`]; a metrics library
+//! would keep a second copy of each.
 
 use std::fmt::{Display, Write};
 
 use super::{computers::Computers, condition::Name, stats::Stats, summary::Status};
 use crate::cluster::machine::Role;
 
-/// What `/metrics` answers.
+/// The text that `/metrics` answers with.
 pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
     let mut text = String::new();
     for (name, help, value) in stats.list() {
@@ -107,7 +108,7 @@ fn add(text: &mut String, name: &str, help: &str, value: impl Display) {
     let _ = writeln!(text, "rosrescue_{name} {value}");
 }
 
-/// As in JSON.
+/// The role's name in JSON and in metrics.
 fn role_name(role: Role) -> &'static str {
     match role {
         Role::Joining => "joining",
@@ -118,7 +119,7 @@ fn role_name(role: Role) -> &'static str {
     }
 }
 
-/// 1 for the one of `names` that is so.
+/// Adds a gauge with one line per name: 1 for the name that applies, 0 for the others.
 fn add_one_of(text: &mut String, name: &str, help: &str, label: &str, names: &[(&str, bool)]) {
     head(text, name, help, "gauge");
     for (is, so) in names {

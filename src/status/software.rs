@@ -1,6 +1,7 @@
-//! What a master runs, and what follows from it.
+//! HTTP and Python versions of a master, and what follows from them.
 
-/// What a master speaks, for people: of HTTP by whether it keeps connections open, of Python by its `Server` header.
+/// Describes HTTP and Python of a master for people. The HTTP version follows from whether the
+/// master keeps connections open, the Python version from its `Server` header.
 pub(crate) fn speaks(keeps_alive: bool, server: Option<&str>) -> String {
     let http = match keeps_alive {
         true => "HTTP/1.1",
@@ -19,8 +20,9 @@ pub(crate) fn speaks(keeps_alive: bool, server: Option<&str>) -> String {
     }
 }
 
-/// Whether the rosmaster of this release keeps connections open on this kernel; none if one of the two cannot be read.
-/// Those before 1.14 never do. Since 1.14.11 and 1.15.10 they do from Linux 4.16 on.
+/// Whether the rosmaster of ros_comm `release` keeps connections open on this kernel; none if
+/// either version cannot be read. Releases before 1.14 never do. Releases since 1.14.11 and 1.15.10
+/// do from Linux 4.16 on.
 pub(crate) fn keeps_alive(release: &str, kernel: &str) -> Option<bool> {
     let (major, minor, patch) = numbers(release)?;
     Some(match (major, minor) {

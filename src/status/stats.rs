@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A number that only grows.
+/// A counter that only grows.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
@@ -20,17 +20,17 @@ impl Counter {
     }
 }
 
-/// A struct of counters that also lists them, with their names and meanings.
+/// Defines a struct of counters that also lists their names and meanings.
 macro_rules! counters {
     ($($name:ident = $meaning:literal,)*) => {
-        /// Counters since the start of this process.
+        /// Counters since this process started.
         #[derive(Debug, Default)]
         pub struct Stats {
             $(#[doc = $meaning] pub $name: Counter,)*
         }
 
         impl Stats {
-            /// Names, meanings and values, for pages.
+            /// Name, meaning and value of each counter.
             pub fn list(&self) -> Vec<(&'static str, &'static str, u64)> {
                 vec![$((stringify!($name), $meaning, self.$name.value()),)*]
             }

@@ -29,19 +29,19 @@ use crate::{
     xmlrpc::{self, Call, Reply},
 };
 
-/// Replies that take a millisecond to decode, in bytes.
+/// Size in bytes of replies that take about a millisecond to decode.
 const LONG: usize = 256 << 10;
 
-/// Sends and receives what hyper's handle is given.
+/// Sends and receives for hyper's handle.
 type Driver = http1::Connection<TokioIo<TcpStream>, Full<Bytes>>;
 
 /// A connection to the master, for one call at a time.
 ///
-/// The caller drives it, in its own task: another task would have to be woken twice for
-/// each call. So nobody notices its end between two calls; [`Self::is_closed`] looks.
+/// The caller's own task drives it, because another task would have to be woken twice for each
+/// call. So nobody notices its end between two calls; [`Self::is_closed`] checks for it.
 ///
-/// A server that closes its end after one answer, as one that speaks HTTP/1.0, gets a new connection for the
-/// next call. Another process may listen there by then.
+/// If the server closes its end after one answer, as HTTP/1.0 servers do, the next call gets a new
+/// connection. Another process may listen there by then.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,
@@ -51,12 +51,13 @@ pub struct Connection {
     instance: HeaderValue,
     max_reply: usize,
     silence: Option<Silence>,
-    /// What the last answer said.
+    /// Whether the last answer kept the connection alive.
     keeps_alive: Option<bool>,
     server: Option<HeaderValue>,
 }
 
-/// The caller's part of a connection; none if it has ended. With it ends the count of connections for writes.
+/// The connection that the caller drives; none if it has ended. Dropping it also ends the count of
+/// connections for writes.
 #[derive(Debug)]
 struct Drive(Option<(Box<Driver>, Option<Writer>)>);
 
@@ -69,7 +70,7 @@ impl Drive {
                 return Poll::Ready(done);
             }
             self.poll(context);
-            // What has arrived is seen at once.
+            // Data that has arrived is seen at once.
             work.as_mut().poll(context)
         })
         .await
@@ -79,15 +80,15 @@ impl Drive {
         if let Some((driver, _)) = &mut self.0
             && Pin::new(driver).poll(context).is_ready()
         {
-            // The call under way gets its error, if any.
+            // The call under way gets the error, if there is one.
             self.0 = None;
         }
     }
 }
 
 impl Connection {
-    /// A connection to the server at `address` over `stream`. Larger replies than `max_reply` bytes are
-    /// refused.
+    /// A connection to the server at `address` over `stream`. Replies larger than `max_reply` bytes
+    /// are refused.
     pub async fn over(
         stream: TcpStream,
         address: &MasterUri,
@@ -121,7 +122,7 @@ impl Connection {
         })
     }
 
-    /// The next connection to the same address.
+    /// Opens the next connection to the same address.
     async fn reopen(&mut self) -> io::Result<()> {
         let connecting = timeout(CONNECT_LIMIT, TcpStream::connect(self.peer));
         let (sender, driver) = handshake(connecting.await??, self.silence).await?;
@@ -135,12 +136,12 @@ impl Connection {
         self.sender.is_closed()
     }
 
-    /// Whether the other end answers more than one call on a connection. None before its first answer.
+    /// Whether the server answers more than one call on a connection. None before its first answer.
     pub fn keeps_alive(&self) -> Option<bool> {
         self.keeps_alive
     }
 
-    /// Whether the other end's dictionaries have an order, as its last answer shows.
+    /// Whether the server's dictionaries are ordered, as its last answer shows.
     pub fn keeps_order(&self) -> bool {
         keeps_order(self.server())
     }
@@ -155,8 +156,8 @@ impl Connection {
         self.exchange(head, body, None).await
     }
 
-    /// Sends a body of our own. The part of the reply that equals `predicted` is only compared and takes no
-    /// memory.
+    /// Sends a body made by rosrescue. The part of the reply that equals `predicted` is only
+    /// compared and takes no memory.
     pub async fn predicted(
         &mut self,
         body: Bytes,
@@ -175,12 +176,13 @@ impl Connection {
         if self.keeps_alive == Some(false) {
             self.reopen().await.map_err(CallError::NotConnected)?;
         }
-        // No Accept-Encoding: rosmaster would gzip replies, in Python.
+        // There is no Accept-Encoding, because rosmaster would compress replies in Python.
         let mut request = Request::post(head.path.as_str())
             .header(HOST, &self.host)
             .header(USER_AGENT, concat!("rosrescue/", env!("CARGO_PKG_VERSION")))
             .header(CONTENT_TYPE, "text/xml")
-            // Also for an empty body: without it rosmaster answers with a status 500 and no body.
+            // This is also needed for an empty body: without it rosmaster answers with status 500
+            // and no body.
             .header(CONTENT_LENGTH, body.len())
             .header(INSTANCE_HEADER, &self.instance);
         if let Some(encoding) = &head.encoding {
@@ -235,7 +237,7 @@ async fn handshake(
 ) -> io::Result<(SendRequest<Full<Bytes>>, Box<Driver>)> {
     stream.set_nodelay(true)?;
     if let Some(silence) = silence {
-        // Best effort: the connection works without it.
+        // Best effort: the connection also works without it.
         let _ = silence.bound(&stream);
     }
     let (sender, driver) = http1::Builder::new()
@@ -246,7 +248,7 @@ async fn handshake(
     Ok((sender, Box::new(driver)))
 }
 
-/// Whether a server that answers so takes another request on the connection.
+/// Whether a server that answers like this takes another request on the connection.
 fn keeps_alive(version: Version, headers: &HeaderMap) -> bool {
     let values = headers.get_all(CONNECTION).into_iter();
     let mut words = values.flat_map(|value| value.to_str().unwrap_or_default().split(','));
@@ -289,7 +291,7 @@ mod tests {
 
     use super::*;
 
-    /// A body that comes in these pieces.
+    /// A body that arrives in these pieces.
     struct Pieces(std::vec::IntoIter<&'static str>);
 
     impl Body for Pieces {

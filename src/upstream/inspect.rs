@@ -15,12 +15,12 @@ use crate::{
 pub(crate) enum InspectError {
     #[error(transparent)]
     Call(#[from] CallError),
-    /// The server is no master.
+    /// The server is not a master.
     #[error(transparent)]
     NotAMaster(#[from] NotAMaster),
 }
 
-/// The first request; without the parameters if the master cannot return one of them.
+/// Makes the first request; without the parameters if the master cannot return one of them.
 pub(crate) async fn first(
     connection: &mut Connection,
     token: &Token,
@@ -53,7 +53,7 @@ fn is_broken_document(error: &InspectError) -> bool {
     matches!(error, InspectError::Call(CallError::NotXmlRpc { status, .. }) if status.is_success())
 }
 
-/// The second request. Returns the state that the master holds.
+/// Makes the second request. Returns the state that the master holds.
 pub(crate) async fn second(
     first: Inspection,
     connection: &mut Connection,

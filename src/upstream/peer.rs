@@ -14,25 +14,26 @@ use crate::{master, ros_env::MasterUri, xmlrpc};
 
 /// Most idle connections that are kept.
 const IDLE_MOST: usize = 64;
-/// The path of calls that are for the leader of a term: this, and the term.
+/// Path of calls that are meant for the leader of a term: this prefix, and the term.
 const PATH: &str = "/cluster/";
-/// Its probes find out sooner whether it lives.
+/// Number of missed probes after which a connection ends. Probes by the cluster notice a dead
+/// computer sooner.
 const SILENT_PROBES: u32 = 3;
 
-/// The term, if a request with this path is for the leader of one.
+/// The term, if a request with this path is meant for the leader of one.
 pub(crate) fn term_of(path: &str) -> Option<u64> {
     path.strip_prefix(PATH)?.parse().ok()
 }
 
-/// The status of an answer by one that does not lead in the term.
+/// Status of an answer by a computer that does not lead in the term.
 pub(crate) const NOT_LEADING: StatusCode = StatusCode::MISDIRECTED_REQUEST;
 
-/// In a leader's answer: the number of the last record that was acknowledged then. Who has the answer may know of
-/// it, and must not be given an older state.
+/// Header in a leader's answer: the number of the last record that was acknowledged by then. The
+/// receiver may know of that record, so it must not be given an older state.
 pub(crate) const SEQ_HEADER: &str = "x-rosrescue-seq";
 
-/// In a leader's answer: its number. The leader is told when the caller has it, because nodes may be notified of
-/// something later only then.
+/// Header in a leader's answer: the answer's number. The leader is told when the caller has the
+/// answer, because some notifications must not be sent before that.
 pub(crate) const ANSWER_HEADER: &str = "x-rosrescue-answer";
 
 /// Why another computer has not answered.
@@ -70,7 +71,8 @@ impl Peer {
         self.late.store(late, Ordering::Relaxed);
     }
 
-    /// Sends a call to it as the leader of `term`. It may have been run even if there is no answer.
+    /// Sends it a call as the leader of `term`. The call may have been run even if there is no
+    /// answer.
     pub(crate) async fn forward(
         &self,
         term: u64,
@@ -114,7 +116,7 @@ impl Peer {
         Ok(reply)
     }
 
-    /// Whether it leads in `term`, as it says itself.
+    /// Whether it says that it leads in `term`.
     pub(crate) async fn leads(&self, term: u64) -> bool {
         let call = master::get_pid();
         let body = Bytes::from(xmlrpc::encode_call(&call));
@@ -122,7 +124,7 @@ impl Peer {
     }
 }
 
-/// Finds the rosrescue of the computer that leads now.
+/// Finds the rosrescue of the current leader.
 #[derive(Debug)]
 pub(crate) struct Peers {
     instance: HeaderValue,
@@ -131,7 +133,7 @@ pub(crate) struct Peers {
 }
 
 impl Peers {
-    /// `instance` identifies this process, see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
+    /// `instance` identifies this process; see [`INSTANCE_HEADER`](super::INSTANCE_HEADER).
     pub(crate) fn new(instance: HeaderValue, probe_timeout: std::time::Duration) -> Self {
         Self {
             instance,
@@ -140,7 +142,7 @@ impl Peers {
         }
     }
 
-    /// The one at `uri`. Connections to another one are dropped.
+    /// The rosrescue at `uri`. Connections to any other one are dropped.
     pub(crate) fn at(&self, uri: &MasterUri) -> Arc<Peer> {
         let mut present = self.present.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(peer) = present.as_ref().filter(|peer| peer.uri == *uri) {

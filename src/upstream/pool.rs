@@ -28,7 +28,7 @@ pub enum ReadError {
     Shut,
 }
 
-/// Connections for reads. Few: a Python master is slow with many.
+/// The pool. It is small, because a Python master is slow with many connections.
 pub struct Pool {
     upstream: Arc<Upstream>,
     ledger: Arc<Ledger>,
@@ -40,7 +40,7 @@ pub struct Pool {
     stalled: AtomicUsize,
 }
 
-/// See [`Pool::stalled`].
+/// Counts a read that has waited too long; see [`Pool::stalled`].
 pub struct Stalled<'a>(&'a Pool);
 
 impl Drop for Stalled<'_> {
@@ -50,7 +50,8 @@ impl Drop for Stalled<'_> {
 }
 
 impl Pool {
-    /// At most `size` connections to `upstream`, each verified to reach the incarnation of `ledger`.
+    /// Creates a pool of at most `size` connections to `upstream`, each verified to reach the
+    /// incarnation of `ledger`.
     pub fn new(size: usize, upstream: Arc<Upstream>, ledger: Arc<Ledger>, gate: gate::Rx) -> Self {
         Self {
             upstream,
@@ -86,8 +87,8 @@ impl Pool {
         }
     }
 
-    /// Sends a read to the master of `incarnation`. A read is sent once more if an idle connection turns out
-    /// to be closed.
+    /// Sends a read to the master of `incarnation`. The read is sent once more if an idle
+    /// connection turns out to be closed.
     pub async fn forward(
         &self,
         incarnation: u64,
@@ -95,7 +96,7 @@ impl Pool {
         body: &Bytes,
     ) -> Result<RawReply, ReadError> {
         let attempt = async {
-            // Never closed.
+            // The semaphore is never closed.
             let _permit = self.permits.acquire().await;
             if let Some(mut connection) = self.take_idle(incarnation)
                 && let Ok(reply) = connection.forward(head, body.clone()).await

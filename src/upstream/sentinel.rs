@@ -1,4 +1,5 @@
-//! The sentinel: a connection to the master on which nothing is ever sent. It ends with the master.
+//! The sentinel: a connection to the master on which nothing is ever sent. It ends when the master
+//! ends.
 
 use std::{io, mem::MaybeUninit, net::SocketAddr, sync::Arc, time::Duration};
 
@@ -7,11 +8,13 @@ use tokio::{net::TcpStream, sync::watch};
 
 use super::{ConnectError, Upstream, is_local};
 
-/// How often it is renewed where nothing else does so: before a master with the shortest sensible `-t` closes it.
+/// How often the sentinel is renewed if nothing else renews it: before a master with the shortest
+/// sensible `-t` closes it.
 const RENEWAL: Duration = Duration::from_secs(1);
 
-/// A connection on which nothing is ever sent. Also a master that closes each connection after one answer leaves
-/// it open. It is renewed from time to time, because a master may close idle connections.
+/// A connection on which nothing is ever sent. Even a master that closes each connection after one
+/// answer leaves it open. It is renewed from time to time, because a master may close idle
+/// connections.
 #[derive(Debug)]
 pub(crate) struct Sentinel {
     stream: watch::Sender<Arc<TcpStream>>,
@@ -28,28 +31,31 @@ impl Sentinel {
         })
     }
 
-    /// Whether the other end is on this computer, or seems to be: a tunnel's end is here too.
+    /// Whether the other end is, or seems to be, on this computer. The end of a tunnel is on this
+    /// computer, too.
     pub(crate) fn is_local(&self) -> bool {
         self.local
     }
 
-    /// The other end's address.
+    /// Address of the other end.
     pub(crate) fn peer(&self) -> SocketAddr {
         self.peer
     }
 
-    /// Whether the connection is open. Asks the kernel: the runtime may not have heard of its end yet.
+    /// Whether the connection is open. It asks the kernel, because the runtime may not have noticed
+    /// its end yet.
     pub(crate) fn is_open(&self) -> bool {
         let mut byte = [MaybeUninit::uninit()];
         let peeked = SockRef::from(&**self.stream.borrow()).peek(&mut byte);
         peeked.is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
     }
 
-    /// Replaces the connection by a new one to the same process. The kernel closes the descriptors of a dying
-    /// process one by one, mostly the newest first.
+    /// Replaces the connection by a new one to the same process. The kernel closes the descriptors
+    /// of a dying process one by one, mostly the newest first.
     pub(crate) async fn renew(&self, upstream: &Upstream) -> Result<(), ConnectError> {
         let (_, stream) = upstream.bounded_stream().await?;
-        // Open after the connect: no other process can have taken the new one.
+        // It is still open after the connect, so no other process can have taken the new
+        // connection.
         if self.is_open() {
             self.stream.send_replace(Arc::new(stream));
         }
@@ -61,7 +67,7 @@ impl Sentinel {
         let renewing = async {
             loop {
                 tokio::time::sleep(RENEWAL).await;
-                // If it fails, the end of the connection shows why.
+                // If this fails, the end of the connection shows why.
                 let _ = self.renew(upstream).await;
             }
         };
@@ -71,7 +77,8 @@ impl Sentinel {
         }
     }
 
-    /// Returns when the connection has ended, or when the other end says something unasked, as no master does.
+    /// Returns when the connection has ended, or when the other end sends something unasked, as no
+    /// master does.
     pub(crate) async fn ended(&self) {
         let mut renewed = self.stream.subscribe();
         loop {
@@ -137,7 +144,7 @@ mod tests {
         assert!(sentinel.is_open() && !ended.is_finished());
         drop(second);
         ended.await.unwrap();
-        // Its process is gone: one that another process takes is not believed.
+        // Its process is gone, so a connection to its successor is not trusted.
         sentinel.renew(&upstream).await.unwrap();
         assert!(!sentinel.is_open());
     }

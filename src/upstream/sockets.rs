@@ -29,34 +29,36 @@ const ESTABLISHED: u8 = 0x01;
 /// Whether the master at `master` may still be running a call of a connection that was closed on this side.
 pub(crate) fn may_run_a_call(master: SocketAddr) -> bool {
     ["tcp", "tcp6"].into_iter().any(|table| {
-        // Without the table nothing is known: treated as if nothing ran.
+        // Without the table nothing is known, which counts as if nothing ran.
         let table = fs::read_to_string(format!("/proc/self/net/{table}")).unwrap_or_default();
         is_in_table(&table, master)
     })
 }
 
-/// The addresses at which processes listen, in this network namespace. IPv4 ones are never mapped.
+/// The addresses at which processes listen in this network namespace. IPv4 addresses are never
+/// mapped.
 pub(crate) fn listening() -> HashSet<SocketAddr> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
-        // The kernel lists those that listen first. There may be ten thousands of others.
+        // The kernel lists listening sockets first. Tens of thousands of others may follow.
         let lines = BufReader::new(table).lines().skip(1);
         lines.map_while(|line| listens_at(&line.ok()?))
     });
     sockets.collect()
 }
 
-/// One end of a connection, in this network namespace.
+/// One end of a connection in this network namespace.
 #[derive(Clone, Debug)]
 pub(crate) struct Established {
     pub(crate) local: SocketAddr,
     pub(crate) remote: SocketAddr,
     pub(crate) user: u32,
-    /// Identifies the socket.
+    /// Inode of the socket, which identifies it.
     pub(crate) inode: u64,
 }
 
-/// The ends of all connections. IPv4 addresses are never mapped. Blocks for as long as the kernel makes up the table.
+/// The ends of all connections. IPv4 addresses are never mapped. Blocks for as long as the kernel
+/// needs to generate the table.
 pub(crate) fn established() -> Vec<Established> {
     let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(File::open);
     let sockets = tables.into_iter().flatten().flat_map(|table| {
@@ -66,7 +68,7 @@ pub(crate) fn established() -> Vec<Established> {
     sockets.collect()
 }
 
-/// The end of a connection in a table's line.
+/// The end of a connection in a line of the table.
 fn end_in(line: &str) -> Option<Established> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, remote, state) = (columns.next()?, columns.next()?, columns.next()?);
@@ -81,7 +83,7 @@ fn end_in(line: &str) -> Option<Established> {
     })
 }
 
-/// The address of a table's line, if its socket listens.
+/// The address in a line of the table, if its socket listens.
 fn listens_at(line: &str) -> Option<SocketAddr> {
     let mut columns = line.split_whitespace().skip(1);
     let (local, state) = (columns.next()?, columns.nth(1)?);
@@ -105,7 +107,7 @@ fn is_in_table(table: &str, master: SocketAddr) -> bool {
     })
 }
 
-/// An address as in the table: 32-bit words in this computer's byte order, and the port.
+/// Parses an address of the table: 32-bit words in this computer's byte order, and the port.
 fn address(text: &str) -> Option<SocketAddr> {
     let (ip, port) = text.split_once(':')?;
     let words: Vec<_> = (0..ip.len() / 8)
@@ -145,7 +147,7 @@ mod tests {
     fn a_call_may_run_until_the_master_closes_its_end() {
         for address in ["127.0.0.1:0", "[::1]:0"] {
             let Ok(listener) = TcpListener::bind(address) else {
-                // A computer without IPv6.
+                // This computer has no IPv6.
                 continue;
             };
             let master = listener.local_addr().unwrap();

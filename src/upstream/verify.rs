@@ -1,4 +1,4 @@
-//! That a call is answered by the served incarnation and by no other.
+//! Verifies that the served incarnation, and no other, answers a call.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use thiserror::Error;
 use super::{CallError, ConnectError, Connection, Head, RawReply, Upstream, sentinel::Sentinel};
 use crate::replay::Token;
 
-/// Why a connection, or a reply, is not known to be that of the served incarnation.
+/// Why a connection or a reply is not known to come from the served incarnation.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum VerifyError {
@@ -27,18 +27,22 @@ pub enum VerifyError {
 /// How calls are known to reach the served incarnation.
 #[derive(Clone, Debug)]
 pub(crate) enum Verification {
-    /// The master keeps connections open (HTTP/1.1): the token is looked up on each before its first call.
+    /// The master keeps connections open (HTTP/1.1): the token is looked up on each connection
+    /// before its first call.
     TokenFirst,
-    /// The master closes each connection after one answer (HTTP/1.0), and the sentinel leads to the process that
-    /// listens. While that is open, no other process can have taken a connection.
+    /// The master closes each connection after one answer (HTTP/1.0), and the sentinel is connected
+    /// to the process that listens. While the sentinel is open, no other process can have taken a
+    /// connection.
     Sentinel(Arc<Sentinel>),
-    /// As above, but the master runs elsewhere or cannot be seen: the token is looked up after each answer.
+    /// The master closes each connection after one answer, but runs elsewhere or cannot be seen:
+    /// the token is looked up after each answer.
     TokenAfterwards,
 }
 
 impl Verification {
-    /// How calls to a master are verified. `keeps_alive`: whether it answers more than one call on a connection.
-    /// `sees_master`: whether the sentinel leads to the master's own process and not to a tunnel.
+    /// Chooses how calls to a master are verified. `keeps_alive`: it answers more than one call on
+    /// a connection. `sees_master`: the sentinel is connected to the master's own process and not
+    /// to a tunnel.
     pub(crate) fn of(keeps_alive: bool, sees_master: bool, sentinel: &Arc<Sentinel>) -> Self {
         match (keeps_alive, sees_master) {
             (true, _) => Self::TokenFirst,
@@ -48,7 +52,7 @@ impl Verification {
     }
 }
 
-/// A connection that leads to the served incarnation, as far as that is known before a call.
+/// A connection to the served incarnation, as far as that is known before a call.
 #[derive(Debug)]
 pub(crate) struct Verified {
     pub(crate) connection: Connection,
@@ -56,13 +60,14 @@ pub(crate) struct Verified {
 }
 
 impl Verified {
-    /// A connection on which the token was found before.
+    /// Wraps a connection on which the token was found before.
     pub(crate) fn before(connection: Connection) -> Self {
         let by = Verification::TokenFirst;
         Self { connection, by }
     }
 
-    /// Sends `body` unchanged. Returns the reply unchanged, if it is that of the incarnation that bears `token`.
+    /// Sends `body` unchanged. Returns the reply unchanged, if it comes from the incarnation that
+    /// bears `token`.
     pub(crate) async fn forward(
         &mut self,
         upstream: &Upstream,
@@ -94,7 +99,7 @@ impl Verified {
     }
 }
 
-/// Verifies a new `connection`. The master may have been replaced unnoticed.
+/// Verifies a new `connection`, because the master may have been replaced unnoticed.
 pub(crate) async fn connection(
     mut connection: Connection,
     upstream: &Upstream,
@@ -103,14 +108,15 @@ pub(crate) async fn connection(
     let by = upstream.verification().ok_or(VerifyError::Ended)?;
     match &by {
         Verification::TokenFirst => look_up(&mut connection, token).await?,
-        // Open after the connect: the connection leads to the same process.
+        // The sentinel is open after the connect, so the connection leads to the same process.
         Verification::Sentinel(sentinel) => is_open(sentinel)?,
         Verification::TokenAfterwards => {}
     }
     Ok(Verified { connection, by })
 }
 
-/// Probes the master to which `sentinel` leads, and renews the sentinel if it bears `token`.
+/// Probes the master that `sentinel` is connected to, and renews the sentinel if the master bears
+/// `token`.
 pub(crate) async fn probe(
     upstream: &Upstream,
     token: &Token,

@@ -1,4 +1,4 @@
-//! Queued writes, how a batch becomes one request, and how its reply is unpacked.
+//! Queued writes: how a batch becomes one request, and how its reply is unpacked.
 
 use std::{collections::VecDeque, sync::Arc, time::Instant};
 
@@ -14,8 +14,8 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// Most calls in a batch. A compact multicall costs the master some 40 us a call, so a call waits for a few
-/// milliseconds at most.
+/// Most calls in a batch. A compact multicall costs the master some 40 µs per call, so a call waits
+/// for a few milliseconds at most.
 pub(super) const CALLS_MAX: usize = 100;
 /// Most bytes of bodies in a batch.
 pub(super) const BYTES_MAX: usize = 1 << 20;
@@ -24,39 +24,39 @@ pub(super) const BYTES_MAX: usize = 1 << 20;
 pub(crate) enum Answer {
     /// The master's reply as it came.
     Raw(RawReply),
-    /// A reply to encode: the mirror's, or one from a batch.
+    /// A reply that must be encoded: the mirror's, or one result of a batch.
     Made(Reply),
-    /// No answer: closes the connection, so that the client retries.
+    /// No answer: the connection is closed, so that the client retries.
     Close,
-    /// Another computer has the master, and is to be given the call.
+    /// Another computer has the master and must get the call.
     Elsewhere,
 }
 
 #[derive(Debug)]
 pub(crate) struct Item {
-    /// The client's bytes; none for a call of our own.
+    /// The client's bytes; none for a call made by rosrescue.
     pub raw: Option<(Head, Bytes)>,
     /// The call; none if the bytes could not be decoded.
     pub call: Option<Arc<Request>>,
     answer: oneshot::Sender<Answered>,
-    /// What it has to do with what nodes hear.
+    /// The call's relation to what nodes hear.
     concern: Concern,
-    /// Its answer, once it is on its way to the master, or answered by the mirror.
+    /// The call's answer, once the call is on its way to the master or the mirror has answered it.
     pub delivery: Option<Delivery>,
-    /// For a call of our own: when it is still right.
+    /// For a call made by rosrescue: the condition under which it is still right.
     pub condition: Option<Condition>,
-    /// Whether those whose ports it takes have been dealt with.
+    /// Whether the nodes whose ports it takes have been dealt with.
     pub way_made: bool,
     pub source: Source,
-    /// For writes of a computer that was alone.
+    /// For writes of a computer that was cut off.
     pub(super) merge: Option<Merge>,
 }
 
-/// An answer, and what is to be dropped when the caller has it.
+/// An answer, and what must be dropped when the caller has it.
 pub(crate) type Answered = (Answer, Option<Delivery>);
 
-/// A node and its last calls at the time of the decision to register or unregister something for it. The
-/// condition fails if the node does the opposite itself meanwhile.
+/// A node and its last calls when it was decided to register or unregister something for it. The
+/// condition fails if the node itself does the opposite meanwhile.
 #[derive(Clone, Debug)]
 pub struct Condition {
     pub node: String,
@@ -64,7 +64,7 @@ pub struct Condition {
 }
 
 impl Condition {
-    /// Whether it holds for a call of this kind, given the node's last calls `now`.
+    /// Whether the condition holds for a call of this kind, given the node's last calls `now`.
     pub fn holds(&self, kind: Kind, now: LastCalls) -> bool {
         match kind {
             Kind::Unregister => self.last_calls.registered == now.registered,
@@ -74,7 +74,8 @@ impl Condition {
 }
 
 impl Item {
-    /// A client's call, or one of our own if there is no `raw`, and where its answer comes.
+    /// Creates an item for a client's call, or for one made by rosrescue if there is no `raw`. Also
+    /// returns where its answer arrives.
     pub(crate) fn new(
         raw: Option<(Head, Bytes)>,
         call: Option<Arc<Request>>,
@@ -98,7 +99,7 @@ impl Item {
         &self.concern
     }
 
-    /// As if no node heard of anything.
+    /// Treats the call as if no node heard of anything.
     #[cfg(test)]
     pub(super) fn forget_concern(&mut self) {
         self.concern = Concern::default();
@@ -113,7 +114,8 @@ impl Item {
         self.answer.is_closed()
     }
 
-    /// Whether it stays behind all that was queued before it: it may do anything, or was decided on what was.
+    /// Whether it must stay behind everything that was queued before it: it may do anything, or its
+    /// decision was based on that.
     fn is_last(&self) -> bool {
         self.raw.is_none() || self.call.is_none()
     }
@@ -127,8 +129,8 @@ impl Item {
         format!("{:.100} of {caller_id:.200}", call.method().name())
     }
 
-    /// Whether it may share a batch. Only if its reply holds no parameter value: a value that the master
-    /// cannot return would spoil the whole reply.
+    /// Whether it may share a batch. It may not if its reply contains a parameter's value, because
+    /// a value that the master cannot return would spoil the whole reply.
     fn may_share(&self) -> bool {
         let shareable = |call: &Arc<Request>| {
             let shows = [Method::Multicall, Method::SubscribeParam].contains(call.method());
@@ -146,7 +148,7 @@ impl Item {
     }
 }
 
-/// The next batch.
+/// The next batch to send.
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
     pub(crate) items: Vec<Item>,
@@ -154,8 +156,8 @@ pub(crate) struct Batch {
     pub(crate) until: Option<Instant>,
 }
 
-/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over calls that have
-/// to [wait](Order::hold), and over later ones about the same subjects.
+/// Takes the next batch from `queue`: one call, or several that may share a batch. Passes over
+/// calls that have to [wait](Order::hold), and over later ones about the same subjects.
 pub(crate) fn pack(
     queue: &mut VecDeque<Item>,
     order: &mut Order,
@@ -204,7 +206,7 @@ pub(crate) fn pack(
     batch
 }
 
-/// The request for `items`: the client's own bytes if it is a single call.
+/// The request for `items`; for a single call, the client's own bytes.
 pub(crate) fn outbound(items: &[Item]) -> (Head, Bytes) {
     if let [
         Item {
@@ -237,13 +239,13 @@ pub(crate) fn unpack(reply: &Reply, count: usize) -> Option<Vec<Reply>> {
     (replies.len() == count).then_some(replies)
 }
 
-/// Whether the reply holds the master's address: `getUri`, alone or in a multicall.
+/// Whether the reply contains the master's address: `getUri`, alone or in a multicall.
 pub(crate) fn asks_uri(call: &Request) -> bool {
     let mut calls = call.calls().into_iter();
     calls.any(|call| *call.method() == Method::GetUri)
 }
 
-/// Replaces the master's address with our own in replies to `getUri`, alone or in a multicall.
+/// Replaces the master's address by rosrescue's in replies to `getUri`, alone or in a multicall.
 pub(crate) fn with_uri(call: &Request, mut reply: Reply, uri: &str) -> Reply {
     if let Reply::Value(value) = &mut reply {
         write_uri(call, value, uri);

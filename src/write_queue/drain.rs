@@ -1,4 +1,4 @@
-//! Drains the write queue, one batch at a time.
+//! Empties the write queue, one batch at a time.
 
 use std::{
     collections::VecDeque,
@@ -30,11 +30,12 @@ use crate::{
 
 /// Pause before an unsent batch is tried again while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed master
-/// closes its connections within milliseconds; one that only closed an idle connection answers.
+/// How long a batch may continue after the gate has shut, before the mirror answers it. A killed
+/// master closes its connections within milliseconds; a master that only closed an idle connection
+/// answers.
 const GRACE: Duration = Duration::from_millis(5);
 
-/// A batch on its way to the master. Without items: the master's state is being read.
+/// A batch on its way to the master. Without items, the master's state is being read.
 struct InFlight {
     incarnation: u64,
     /// The mirror's version when it was sent.
@@ -42,9 +43,9 @@ struct InFlight {
     items: Vec<Item>,
     /// Whether the mirror can answer these items.
     answerable: bool,
-    /// Whether it was reported as late.
+    /// Whether it has been reported as late.
     told_late: bool,
-    /// The mirror has answered them, and the master has not.
+    /// Whether the mirror has answered the items and the master has not.
     late: bool,
     sent: tokio::time::Instant,
     done: Pin<Box<dyn Future<Output = Done> + Send>>,
@@ -59,17 +60,17 @@ pub(crate) struct Drain {
     pub(super) queue: VecDeque<Item>,
     connection: Option<(u64, Connection)>,
     in_flight: Option<InFlight>,
-    /// How long the batch in flight may continue behind a shut gate.
+    /// Until when the batch in flight may continue behind a shut gate.
     grace: Option<tokio::time::Instant>,
-    /// A batch was lost, and the gate has not changed since.
+    /// Whether a batch was lost and the gate has not changed since.
     lost: bool,
     signals: Arc<Signals>,
-    /// When the batch in flight is late.
+    /// When the batch in flight becomes late.
     late_at: Option<tokio::time::Instant>,
-    /// The master, which was late, has answered. The gate follows.
+    /// Whether the late master has answered. The gate follows.
     late_over: bool,
     tell_sent: watch::Sender<Option<tokio::time::Instant>>,
-    /// The incarnation for which the gate was open last.
+    /// The incarnation for which the gate was last open.
     incarnation: u64,
     resync: ResyncSchedule,
     retry_at: Option<tokio::time::Instant>,
@@ -77,10 +78,10 @@ pub(crate) struct Drain {
     pub(super) held_until: Option<tokio::time::Instant>,
     order_changed: watch::Receiver<()>,
     lease: watch::Receiver<Option<Instant>>,
-    /// Calls with success that rosrescue does not understand. Their answers wait until the mirror has been
-    /// read from the master again and holds their effects.
+    /// Successful calls that rosrescue does not understand. Their answers wait until the mirror has
+    /// been read from the master again and includes their effects.
     opaque: Opaque,
-    /// Whether a node whose port another one registers is taken out.
+    /// Whether a node is unregistered when another node registers its port.
     pub(super) evicts: bool,
 }
 
@@ -148,7 +149,7 @@ impl Drain {
                 }
                 () = wait::until(self.retry_at) => self.retry_at = None,
                 () = wait::until(self.held_until) => {}
-                // The ledger lives as long.
+                // The ledger lives as long as this task.
                 _ = self.order_changed.changed() => {}
                 _ = self.lease.changed() => {}
                 () = wait::until(self.grace) => {}
@@ -168,7 +169,7 @@ impl Drain {
             while let Ok(item) = self.items.try_recv() {
                 self.queue.push_back(item);
             }
-            // Drops calls that are answered, or whose client has gone.
+            // Drops calls that are answered or whose client has gone.
             self.queue.retain(|item| !item.is_dropped());
             // Checked on every wake-up: once seen, a change is not notified again.
             let (state, unseen) = gate.look_changed();
@@ -190,8 +191,8 @@ impl Drain {
         }
     }
 
-    /// When the mirror is to answer for the master. It waits for the probes' verdict while it is in doubt itself,
-    /// and while something is under way that only a master can answer.
+    /// When the mirror must answer for the master. It waits for the probes' verdict while the
+    /// mirror is in doubt, and while something is under way that only a master can answer.
     fn late_at(&self, state: State) -> Option<tokio::time::Instant> {
         let batch = self
             .in_flight
@@ -205,7 +206,7 @@ impl Drain {
         Some(batch.sent + patience)
     }
 
-    /// Sends the next batch, if none is in flight and something is to be sent.
+    /// Sends the next batch, if none is in flight and there is something to send.
     fn send(&mut self, incarnation: u64) {
         self.grace = None;
         if let Some(batch) = self
@@ -297,7 +298,8 @@ impl Drain {
         self.link.ledger.settled_calls();
     }
 
-    /// The master has answered what the mirror has answered long ago, or will not.
+    /// Handles the end of a late batch: the master has answered what the mirror answered long ago,
+    /// or never will.
     fn late_done(&mut self, result: Result<(), RoundTripError>) {
         self.late_over = true;
         match result {
@@ -347,7 +349,7 @@ impl Drain {
                 _ => self.resync.failed(now),
             }
             if matches!(error, RoundTripError::Look(InspectError::NotAMaster(_))) {
-                // The master lives but cannot be read: clients need not wait for that.
+                // The master lives but cannot be read, and clients need not wait for that.
                 self.answer_opaque();
             }
             return;
@@ -355,7 +357,8 @@ impl Drain {
         self.take_back(items);
         if error.may_have_run() {
             self.link.ledger.abandon_batch();
-            // Whether it ran is known only when the master is back. Until then the mirror answers.
+            // Whether the master ran it is known only when the master is back. Until then the
+            // mirror answers.
             self.lost = true;
             self.signals.lost.notify_one();
         } else {
@@ -381,8 +384,9 @@ impl Drain {
                 opaque = item.call.is_none() && matches!(reply, Reply::Value(_));
                 vec![reply]
             }
-            // A call that cannot be decoded may change anything: the master's state must be read. That does
-            // not show parameter subscriptions: they are recorded as if they went as predicted.
+            // A call that cannot be decoded may change anything, so the master's state must be
+            // read. That does not show parameter subscriptions, which are recorded as if they went
+            // as predicted.
             ([item], None) if raw.status.is_success() => {
                 opaque = true;
                 let call = item.call.as_deref().filter(|call| subscribes_params(call));
@@ -411,7 +415,8 @@ impl Drain {
         };
         if opaque {
             self.link.ledger.doubt();
-            // Answers may be waiting already: after a failed read, calls are sent before the next one.
+            // Answers may be waiting already: after a failed read, calls are sent before the next
+            // one.
             self.opaque.incarnation = incarnation;
             self.opaque.mark = self.opaque.mark.max(recorded.mark);
             let answers = items
@@ -433,7 +438,7 @@ impl Drain {
         self.answer(recorded.mark, None, answers);
     }
 
-    /// A batch got one answer as a whole instead of its results.
+    /// Handles a batch whose reply is one answer instead of a result for each call.
     fn undeliverable(&mut self, items: Vec<Item>) {
         rarely!(
             warn,
@@ -447,8 +452,8 @@ impl Drain {
         }
     }
 
-    /// Answers the batch in flight, then the queue, from the mirror. Calls that only a master can answer
-    /// wait.
+    /// Answers the batch in flight, then the queue, from the mirror. Calls that only a master can
+    /// answer wait.
     fn stand_in(&mut self) {
         let now = tokio::time::Instant::now();
         if self.in_flight.is_some() && now < *self.grace.get_or_insert(now + GRACE) {
@@ -459,7 +464,8 @@ impl Drain {
         if was_in_flight {
             self.link.ledger.abandon_batch();
         }
-        // A master that comes back waits for this end: then it runs no call of this connection any more.
+        // A master that comes back is examined only when this connection has ended, because it then
+        // runs no call of it any more.
         self.connection = None;
         if let Some(batch) = self
             .in_flight
@@ -480,8 +486,8 @@ impl Drain {
         }
     }
 
-    /// Answers from the mirror what the master is late with, then the queue. The batch goes on: the master is
-    /// given the rest when it has answered it.
+    /// Answers from the mirror what the master is late with, then the queue. The batch continues;
+    /// when the master has answered it, it is given the rest.
     fn stand_in_for_late(&mut self) {
         self.grace = None;
         let ledger = self.link.ledger.clone();
@@ -490,7 +496,7 @@ impl Drain {
             Some(batch) => {
                 batch.late = true;
                 if batch.items.is_empty() {
-                    // A look, which is made again.
+                    // A look at the master was under way, and is repeated.
                     self.resync.request();
                 }
                 let mut answers = Answers::default();
@@ -540,7 +546,7 @@ impl Drain {
         self.answer(answers.mark, None, answers.made);
     }
 
-    /// Another computer has the master: all calls are to go there.
+    /// Redirects all calls to the other computer that has the master.
     fn send_elsewhere(&mut self) {
         (self.grace, self.connection) = (None, None);
         let in_flight = self.in_flight.take().map(|batch| batch.items);
@@ -555,8 +561,9 @@ impl Drain {
         }
     }
 
-    /// Sends answers once their effects are safe, see [`Ledger::durable`](crate::ledger::Ledger::durable), and this `version` of the mirror
-    /// is in a whole checkpoint.
+    /// Sends answers once their effects are safe (see
+    /// [`Ledger::durable`](crate::ledger::Ledger::durable)) and a whole checkpoint includes this
+    /// `version` of the mirror.
     fn answer(&self, mark: Mark, version: Option<u64>, answers: Vec<(Item, Answer)>) {
         let mark = self.link.ledger.to_await(mark);
         let send = move |is_safe: bool| {
@@ -584,16 +591,16 @@ impl Drain {
     }
 }
 
-/// Answers of the mirror.
+/// Answers from the mirror.
 #[derive(Default)]
 struct Answers {
     made: Vec<(Item, Answer)>,
-    /// Where the last record is.
+    /// Mark of the last record.
     mark: Mark,
 }
 
 impl Answers {
-    /// Answers `item`, or returns it if only a master can.
+    /// Answers `item`, or returns it if only a master can answer it.
     fn add(&mut self, ledger: &Arc<Ledger>, mut item: Item) -> Option<Item> {
         let call = item.call.as_deref().filter(|call| call.is_answerable());
         let answer = |call| ledger.stand_in_for(Instant::now(), call, item.concern(), &item.source);
@@ -611,7 +618,8 @@ impl Answers {
     }
 }
 
-/// Whether `call`, or an entry of it, subscribes a parameter. The reply holds the parameter's value.
+/// Whether `call`, or an entry of it, subscribes to a parameter. The reply contains the parameter's
+/// value.
 fn subscribes_params(call: &Request) -> bool {
     let mut calls = call.calls().into_iter();
     calls.any(|call| *call.method() == Method::SubscribeParam)

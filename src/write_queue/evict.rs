@@ -1,5 +1,5 @@
-//! With `--reap-dead-nodes`, a node whose port another node registers is taken out first.
-//! Nobody is asked: a node cannot answer before its registration is done.
+//! With `--reap-dead-nodes`, a node is unregistered when another node registers its port. No node
+//! is asked, because a node cannot answer before its registration is done.
 
 use std::{sync::Arc, time::Instant};
 
@@ -15,7 +15,8 @@ use crate::{
 };
 
 impl Drain {
-    /// The next batch. A call that takes a port is the first of its batch, and the eviction goes before it.
+    /// Takes the next batch. A call that takes a port is the first of its batch, and the eviction
+    /// precedes it.
     pub(super) fn pack(&mut self) -> Vec<Item> {
         let ledger = self.link.ledger.clone();
         let mut items = loop {
@@ -29,7 +30,7 @@ impl Drain {
                 .into_iter()
                 .filter_map(|item| merge::judged(&ledger, item))
                 .collect();
-            // Those that are answered leave room for others.
+            // The answered calls leave room for others.
             if !any || !items.is_empty() {
                 break items;
             }
@@ -62,12 +63,12 @@ impl Drain {
     }
 }
 
-/// What goes before `call`, if anything.
+/// The eviction that must precede `call`, if there is one.
 fn eviction(ledger: &Ledger, call: &Request) -> Option<Eviction> {
     ledger.with_mirror(|mirror| Eviction::before(mirror, call))
 }
 
-/// The same while the mirror stands in, which does it at once.
+/// Evicts while the mirror stands in, which happens at once.
 pub(super) fn while_standing_in(ledger: &Ledger, call: &Request) {
     if let Some(eviction) = eviction(ledger, call)
         && ledger.stand_in(Instant::now(), &eviction.call).is_some()

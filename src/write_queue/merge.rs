@@ -1,5 +1,5 @@
-//! Writes of a computer that was alone: what others have changed meanwhile is left out at the last moment, when
-//! nothing else is on its way to the master.
+//! Merges the writes of a computer that was cut off. Writes that conflict with changes by others
+//! are left out at the last moment, when nothing else is on its way to the master.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -17,7 +17,7 @@ use crate::{
     xmlrpc::{self, Reply, Value},
 };
 
-/// What becomes of the writes of an item, as it was judged last.
+/// The latest verdicts on the writes of an item.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Judged(Arc<Mutex<Option<Vec<Verdict>>>>);
 
@@ -26,7 +26,8 @@ impl Judged {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = verdicts;
     }
 
-    /// What is answered to who has asked, when the master has answered those that were made with `reply`.
+    /// The answer to the computer that sent the writes, given the master's `reply` to those that
+    /// were made.
     pub(super) fn answer(&self, reply: &Reply) -> wire::Answer {
         match &*self.0.lock().unwrap_or_else(PoisonError::into_inner) {
             Some(verdicts) => wire::Answer::of(verdicts, reply),
@@ -35,14 +36,14 @@ impl Judged {
     }
 }
 
-/// What is asked, and what was found.
+/// The writes to merge, and the verdicts on them.
 #[derive(Debug)]
 pub(crate) struct Merge {
     ask: Ask,
     judged: Judged,
 }
 
-/// An item for the queue, where its answer comes, and what is found.
+/// An item for the queue, where its answer arrives, and the verdicts on its writes.
 pub(super) fn item(ask: Ask) -> (Item, oneshot::Receiver<Answered>, Judged) {
     let judged = Judged::default();
     let (mut item, answered) = Item::new(None, Some(Arc::new(multicall(&ask.calls))));
@@ -66,7 +67,8 @@ fn set_call(item: &mut Item, call: Request) {
     item.call = Some(call);
 }
 
-/// Leaves out what others have changed meanwhile. None if nothing is left, and it is answered.
+/// Leaves out writes that conflict with changes by others. None if nothing is left and the item is
+/// answered.
 pub(super) fn judged(ledger: &Ledger, mut item: Item) -> Option<Item> {
     let Some(Merge { ask, judged }) = &item.merge else {
         return Some(item);

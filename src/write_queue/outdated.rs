@@ -1,4 +1,4 @@
-//! Calls of our own that other calls have made wrong.
+//! Recognises calls by rosrescue that other calls have made wrong.
 
 use super::batch::Item;
 use crate::{
@@ -6,8 +6,8 @@ use crate::{
     master::Master,
 };
 
-/// Whether a call of our own is no longer right: the node has come back at another address and would be shut
-/// down, or has done the opposite itself.
+/// Whether a call made by rosrescue is no longer right: the node has come back at another address
+/// and would be shut down, or it has done the opposite itself.
 pub(super) fn is_outdated(ledger: &Ledger, item: &Item) -> bool {
     let Some(call) = item.call.as_deref().filter(|_| item.raw.is_none()) else {
         return false;

@@ -1,4 +1,5 @@
-//! When the master's state is read again to compare it with the mirror. Pure: the time is an argument.
+//! Schedules when the master's state is read again to compare it with the mirror. Pure: the time is
+//! an argument.
 
 use std::time::Duration;
 
@@ -6,28 +7,29 @@ use tokio::time::Instant;
 
 /// Pause after an inspection that failed.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);
-/// Writes wait for an inspection, the longer the larger the state is. After each one they pass for this many
-/// times as long; calls that need an inspection meanwhile share the next one.
+/// Writes wait for an inspection, and a larger state takes longer. After each inspection writes
+/// pass for this many times its duration; calls that need an inspection meanwhile share the next
+/// one.
 const SPACING: u32 = 10;
-/// But not for longer: answers may wait for it.
+/// Longest pause between two inspections, because answers may wait for the next one.
 const SPACING_MOST: Duration = Duration::from_secs(30);
 
 /// The schedule of inspections.
 #[derive(Debug, Default)]
 pub(super) struct ResyncSchedule {
     due: bool,
-    /// When one that failed, or came too early, is due again.
+    /// When an inspection that failed or came too early is due again.
     retry_at: Option<Instant>,
     not_before: Option<Instant>,
 }
 
 impl ResyncSchedule {
-    /// An inspection is due as soon as possible.
+    /// Requests an inspection as soon as possible.
     pub(super) fn request(&mut self) {
         self.due = true;
     }
 
-    /// The mirror is in doubt: the same, unless a retry is scheduled.
+    /// Requests an inspection because the mirror is in doubt, unless a retry is scheduled.
     pub(super) fn doubted(&mut self) {
         self.due |= self.retry_at.is_none();
     }
@@ -41,7 +43,7 @@ impl ResyncSchedule {
         (self.due, self.retry_at) = (true, None);
     }
 
-    /// Another incarnation is served: what was requested concerned the previous one.
+    /// Forgets all requests, because they concerned the previous incarnation.
     pub(super) fn reset(&mut self) {
         (self.due, self.retry_at) = (false, None);
     }
@@ -56,12 +58,12 @@ impl ResyncSchedule {
         !self.due
     }
 
-    /// An inspection that took `time` has ended.
+    /// Notes the end of an inspection that took `time`.
     pub(super) fn ended(&mut self, now: Instant, time: Duration) {
         self.not_before = Some(now + (time * SPACING).min(SPACING_MOST));
     }
 
-    /// An inspection has failed.
+    /// Notes that an inspection has failed.
     pub(super) fn failed(&mut self, now: Instant) {
         self.retry_at = Some(now + RETRY_PAUSE);
     }
@@ -99,7 +101,7 @@ mod tests {
         schedule.request();
         assert!(schedule.begin(start));
         schedule.failed(start);
-        // Before each call that is sent.
+        // This happens before each call that is sent.
         schedule.doubted();
         assert!(!schedule.begin(start));
         assert_eq!(schedule.wake_at(), Some(start + RETRY_PAUSE));

@@ -49,8 +49,8 @@ impl RoundTripError {
     }
 }
 
-/// Sends `request`; without one, reads the master's state. The future owns what it needs, so that dropping it
-/// ends the connection.
+/// Sends `request`, or reads the master's state if there is none. The future owns what it needs, so
+/// dropping it ends the connection.
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,
@@ -98,7 +98,7 @@ async fn connect(link: &Link, token: &Token) -> Result<Verified, VerifyError> {
     verify::connection(connection, &link.upstream, token).await
 }
 
-/// The state of the master behind a connection.
+/// Reads the state of the master behind a connection.
 async fn held(link: &Link, token: &Token, verified: &mut Verified) -> Result<Master, InspectError> {
     let previous = link.ledger.with_mirror(Clone::clone);
     let mut first = inspect::first(&mut verified.connection, token).await?;

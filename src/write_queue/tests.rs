@@ -1,8 +1,10 @@
-//! The order of what nodes hear, played at random: the ledger, the packing of batches and the order of
-//! notifications are those of production. The master has notifier threads that are late at times, and dies.
-//! Nodes read answers and notifications in threads of their own, as rospy and roscpp do.
+//! Simulates at random the order in which nodes hear of changes. The ledger, the packing of batches
+//! and the order of notifications are those of production. The master has notifier threads that are
+//! sometimes late, and it dies. Nodes read answers and notifications in separate threads, as rospy
+//! and roscpp do.
 //!
-//! More schedules: `ROSRESCUE_SCHEDULES=1000000 cargo test --release --lib write_queue::tests`. A failure prints its seed.
+//! More schedules: `ROSRESCUE_SCHEDULES=1000000 cargo test --release --lib write_queue::tests`. A
+//! failure prints its seed.
 
 mod node;
 
@@ -38,16 +40,16 @@ const PARAMS: u64 = 3;
 const CALLS: u64 = 30;
 /// How long a batch may wait for the master, in microseconds.
 const PATIENCE: u64 = 100_000;
-/// When what a dead master may not have sent is sent, in microseconds.
+/// When notifications that a dead master may not have sent are sent, in microseconds.
 const OWED_AFTER: u64 = 50_000;
 
-/// What is left out of production's order, to show that the simulation notices.
+/// A part of production's order that is left out, to show that the simulation notices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mutant {
     None,
-    /// Nothing waits for anything: the order of sending before decision 31.
+    /// Nothing waits for anything, as before decision 31.
     NoOrder,
-    /// Nobody is told anything once more.
+    /// No notification is repeated.
     NoRepeats,
 }
 
@@ -55,7 +57,7 @@ enum Mutant {
 enum Event {
     /// The node's call reaches rosrescue.
     Arrives(usize, Request),
-    /// The master has run the batch, and its reply arrives; the number tells which master.
+    /// The master with this number has run the batch, and its reply arrives.
     Replied(u64, Vec<Reply>),
     /// The batch with this number has waited for the patience.
     Late(u64),
@@ -67,15 +69,15 @@ enum Event {
     Heard(usize, Thread),
     /// The master's first notification to this port arrives.
     MasterNotifies(u64, String),
-    /// The node has taken it.
+    /// The node has taken the master's notification.
     TakenFromMaster(u64, String),
-    /// The node has taken ours, with this number.
+    /// The node has taken rosrescue's notification with this number.
     Taken(String, u64),
     Dies,
     Revives,
-    /// What a master that is still away may not have sent is sent.
+    /// Sends what a master that is still away may not have sent.
     OwedInOutage,
-    /// The same after a recovery.
+    /// Sends it after a recovery.
     Owed,
     /// Something is due.
     Tick,
@@ -100,7 +102,7 @@ struct World {
     mutant: Mutant,
     dice: Dice,
     start: Instant,
-    /// In microseconds.
+    /// The time in microseconds.
     now: u64,
     events: BinaryHeap<Reverse<(u64, u64)>>,
     bodies: HashMap<u64, Event>,
@@ -110,25 +112,26 @@ struct World {
     waiting: Vec<Waiting>,
     unwritten: HashMap<u64, Unwritten>,
     in_flight: Option<Vec<Item>>,
-    /// The number of the last batch.
+    /// Number of the last batch.
     batch: u64,
-    /// The mirror has answered the one in flight.
+    /// Whether the mirror has answered the batch in flight.
     late: bool,
-    /// None while it is dead.
+    /// The master; none while it is dead.
     master: Option<Master>,
-    /// Which one it is.
+    /// Number of the master.
     life: u64,
     incarnation: u64,
     caught_up: u64,
-    /// The master's notifications, by port. The first one is on its way until the node has taken it.
+    /// The master's notifications, by port. The first one is on its way until the node has taken
+    /// it.
     notices: BTreeMap<String, VecDeque<Notice>>,
-    /// Ports that rosrescue notifies, and whether one is on its way.
+    /// Ports that rosrescue notifies, and whether a notification is on its way.
     ports: BTreeMap<String, bool>,
     nodes: Vec<Node>,
     calls_left: u64,
     answers: u64,
     value: i32,
-    /// Counts the values that parameters have had, and when each was set last.
+    /// Counts the values that parameters have had, and when each was last set.
     time: u64,
     values: HashMap<(String, Option<i32>), u64>,
 }
@@ -200,7 +203,7 @@ impl World {
         self.after(due + 1, Event::Tick);
     }
 
-    /// How long a thread of a process takes to run: mostly at once, at times when Python passes its lock on.
+    /// How long a thread takes to run: mostly at once, sometimes when Python passes its lock on.
     fn scheduled(&mut self) -> u64 {
         match self.dice.below(20) {
             0 => self.dice.below(15_000),
@@ -209,7 +212,7 @@ impl World {
         }
     }
 
-    /// The next call of a node whose last one has been answered.
+    /// Makes the next call of a node whose last call has been answered.
     fn call(&mut self, node: usize) {
         if self.calls_left == 0 {
             return;
@@ -319,7 +322,7 @@ impl World {
         self.in_flight = Some(batch.items);
         self.batch += 1;
         if self.dice.one_in(8) {
-            // It is stopped, or busy.
+            // The master is stopped, or busy.
             let time = self.dice.below(2 * PATIENCE);
             self.after(time, Event::RunsLate(self.life, calls));
             self.after(PATIENCE, Event::Late(self.batch));
@@ -331,7 +334,7 @@ impl World {
         self.after(time, Event::Replied(self.life, replies));
     }
 
-    /// The master runs `calls`, and notifies nodes.
+    /// Lets the master run `calls` and notify nodes.
     fn run(&mut self, calls: &[Arc<Request>]) -> Vec<Reply> {
         let Some(master) = &mut self.master else {
             return Vec::new();
@@ -367,7 +370,7 @@ impl World {
         self.after(time, Event::Replied(self.life, replies));
     }
 
-    /// The mirror answers the batch in flight, as `Drain::stand_in_for_late` does.
+    /// Lets the mirror answer the batch in flight, as `Drain::stand_in_for_late` does.
     fn stand_in_for_late(&mut self) {
         self.late = true;
         let mut tells = Vec::new();
@@ -381,7 +384,7 @@ impl World {
         self.ledger.fall_behind(tells);
     }
 
-    /// The master has answered late, and is given what it missed.
+    /// The late master has answered, and is given what it missed.
     fn catches_up(&mut self) {
         (self.in_flight, self.late) = (None, false);
         let now = self.instant();
@@ -397,7 +400,8 @@ impl World {
                 self.ledger.delivered();
                 self.caught_up += 1;
             }
-            // It is examined and injected, and goes on to tell what it had begun to tell.
+            // The master is examined and injected, and still sends the notifications that it had
+            // begun.
             None => return self.is_injected(),
         }
         self.incarnation = self.ledger.serve();
@@ -419,7 +423,7 @@ impl World {
         self.ledger.settled_calls();
     }
 
-    /// The mirror answers what is queued, as `Drain::stand_in` does.
+    /// Lets the mirror answer what is queued, as `Drain::stand_in` does.
     fn stand_in(&mut self) {
         for item in std::mem::take(&mut self.queue) {
             self.answer_item(item);
@@ -441,7 +445,7 @@ impl World {
         self.note_value(&call);
     }
 
-    /// A parameter has this value from now on.
+    /// Notes that a parameter has this value from now on.
     fn note_value(&mut self, call: &Request) {
         if let (Some(key), Some(value)) = (call.text(1), call.params().get(2)) {
             self.time += 1;
@@ -482,7 +486,7 @@ impl World {
         self.after(checked, Event::Owed);
     }
 
-    /// As `nodes::notify_owed`.
+    /// Sends owed notifications, as `nodes::notify_owed` does.
     fn owed(&mut self) {
         let now = self.instant();
         let owed = self
@@ -500,7 +504,7 @@ impl World {
         });
     }
 
-    /// Sends what is to be sent to nodes, as `notifications::deliver` does.
+    /// Sends the notifications that are due, as `notifications::deliver` does.
     fn notify(&mut self) {
         let now = self.instant();
         let idle = self.ledger.with_order(|order, _| {
@@ -519,7 +523,7 @@ impl World {
                 .with_order(|order, mirror| order.next(now, &port, mirror));
             match next {
                 Next::Send { call, number } => {
-                    // A network that is slow at times.
+                    // The network is sometimes slow.
                     let late = self.dice.one_in(20).then(|| self.dice.below(60_000));
                     let time = self.tell(&call, &port, late.unwrap_or(0)) + 50;
                     self.ports.insert(port.clone(), true);
@@ -632,8 +636,8 @@ impl World {
         self.notify();
     }
 
-    /// Plays until all is quiet. Returns what nodes believe and is not so, and how often a late master was given what
-    /// it missed, and no more.
+    /// Plays until all is quiet. Returns the nodes' false beliefs, and how often a late master was
+    /// given what it missed and nothing more.
     fn play(mut self) -> (Vec<String>, u64) {
         while let Some(Reverse((time, number))) = self.events.pop() {
             self.now = time;
@@ -652,7 +656,7 @@ impl World {
     }
 }
 
-/// The first seed from `from` on with which nodes believe what is not so, and what that is.
+/// The first seed from `from` on that leaves nodes with false beliefs, and these beliefs.
 fn mistake(mutant: Mutant, from: u64, schedules: u64) -> Option<(u64, Vec<String>)> {
     let stats: &'static Stats = Box::leak(Box::default());
     (from..from + schedules).find_map(|seed| {

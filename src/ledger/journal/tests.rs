@@ -108,7 +108,7 @@ fn what_a_silent_disk_was_not_given_is_in_the_next_whole_checkpoint() {
     assert_eq!(disk.reached(), 1);
     journal.append(entry(1));
     assert_eq!((journal.seq(), disk.reached()), (2, 2));
-    // It answers again: only the first record is written.
+    // The disk answers again: only the first record is written.
     journal.worker().work();
     assert_eq!(unprotected(&journal).as_deref(), Some(SILENT));
     rewrite(&mut journal, 0..2);
@@ -154,7 +154,7 @@ fn a_disk_that_is_given_too_much_is_given_up() {
     assert_eq!(disk.found(journal), state);
 }
 
-/// One thread runs all jobs; another one that comes meanwhile does not wait for the disk.
+/// One thread runs all jobs; another one that arrives meanwhile does not wait for the disk.
 #[test]
 fn a_thread_that_comes_meanwhile_leaves_its_job_to_the_first() {
     let disk = Disk::new();

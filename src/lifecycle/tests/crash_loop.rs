@@ -54,7 +54,7 @@ fn a_master_that_cannot_be_spawned_is_tried_again_with_growing_pauses() {
                 .feed(Input::SpawnFailed { pending: true }, &[])
                 .wake(Duration::from_millis(pause_ms), &[Action::Spawn]);
         }
-        // One that can be spawned ends the row.
+        // A master that can be spawned ends the series.
         script
             .feed(Input::Spawned, &[Action::Connect])
             .serve(true)
@@ -97,7 +97,7 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
             &[]
         };
         match death % 3 {
-            // The next one listens before anybody looks.
+            // The next master listens before the first look.
             0 => {
                 let actions = [Action::OpenGate].iter().chain(said).copied();
                 script
@@ -129,7 +129,7 @@ fn the_crash_loop_of_an_external_master_is_said_once() {
     script.feed(Input::Wake, &[Action::ReportCalm]);
 }
 
-/// How often a master is started within any minute, whatever it dies of and when.
+/// The number of starts within any minute is bounded, whatever the masters die of and when.
 #[test]
 fn the_rate_of_restarts_is_bounded() {
     const MOST: usize = 16;

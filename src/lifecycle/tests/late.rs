@@ -1,4 +1,4 @@
-//! A master that is late, starved, busy or slow to start.
+//! A master that is late, starved, busy, or slow to start.
 
 use super::super::evidence::Effort;
 use super::*;
@@ -12,7 +12,7 @@ enum Does {
 }
 
 impl Script {
-    /// Looks at our master if the machine wants to, then feeds `input`.
+    /// Samples our master if the machine wants to, then feeds `input`.
     fn feed_seen(&mut self, does: Does, input: Input, expected: &[Action]) -> &mut Self {
         if self.machine.needs_sample(self.now, input) {
             let ran = match does {
@@ -33,7 +33,7 @@ impl Script {
         self.feed(input, expected)
     }
 
-    /// Probes until the gate is shut, one each half second.
+    /// Misses a probe each half second until the gate is shut.
     fn miss_all(&mut self, does: Does, then: Action) -> &mut Self {
         for _ in 1..PROBING.count {
             self.now += Duration::from_millis(500);
@@ -61,14 +61,14 @@ fn a_late_master_is_stood_in_for_and_given_what_it_missed() {
             .feed(Input::Slow, &[])
             .feed(Input::CaughtUp, &[Action::OpenGate])
             .wake(PROBING.interval, &[Action::Probe])
-            // Not beside a probe that is under way.
+            // No probe is started while one is under way.
             .feed(Input::Late, &[Action::StandIn])
             .feed(Input::LateAnswered, &[Action::CatchUp])
             .feed(
                 Input::NotCaughtUp,
                 &[Action::ShutGate(Cause::Late), Action::Connect],
             )
-            // Of an earlier time.
+            // This answer belongs to an earlier time.
             .feed(Input::LateAnswered, &[])
             .feed(Input::CaughtUp, &[])
             .serve(false)
@@ -151,7 +151,7 @@ fn a_master_that_hangs_at_last_is_killed_at_last() {
         .miss_all(Does::Starve, STARVED)
         .wake(FIRST_PAUSE, &[Action::Connect])
         .feed(Input::Connected, &[Action::Examine]);
-    // The last sample before shows it starved still.
+    // The last sample before still shows it starved.
     script.now += Duration::from_secs(3);
     script
         .feed_seen(Does::Nothing, Input::Unreachable, &[STARVED])
@@ -203,7 +203,7 @@ fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
     let actions = refuse(&mut script, Does::Nothing, 2);
     assert_eq!(actions.first(), Some(&Action::Kill));
     script.feed(Input::Exited, &[Action::Spawn]);
-    // An endless loop is no start.
+    // An endless loop is not a slow start.
     script.feed(Input::Spawned, &[Action::Connect]);
     assert_eq!(refuse(&mut script, Does::Work, 300), []);
     let actions = refuse(&mut script, Does::Work, 40);

@@ -1,5 +1,5 @@
-//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now, they may be in the
-//! journal, and are no changes by others.
+//! Writes that were sent to a leader and are not answered yet. If this computer is cut off now,
+//! they may be in the journal, where they must not count as changes by others.
 
 use std::{
     collections::BTreeMap,
@@ -8,12 +8,13 @@ use std::{
 
 use crate::{cluster::merge::weight, master::Request};
 
-/// Most that are remembered,
+/// Most calls that are remembered.
 const MOST: usize = 1000;
-/// and the most bytes of one, about. One that is not remembered is reported as lost although it is there.
+/// Most bytes of one call, approximately. A call that is not remembered is reported as lost
+/// although it is there.
 const BYTES_MOST: usize = 1 << 20;
 
-/// See the [module](self).
+/// The calls that were sent; see the [module](self).
 #[derive(Debug, Default)]
 pub(crate) struct Forwarded(Mutex<Calls>);
 
@@ -28,7 +29,7 @@ impl Forwarded {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// `call` is sent from now on. It is answered, or nobody waits for it, when the result is dropped.
+    /// Remembers `call` until the result is dropped, when it is answered or nobody waits for it.
     pub(super) fn begin(self: &Arc<Self>, call: &Request) -> Option<Sent> {
         let bytes: usize = call.calls().into_iter().map(weight).sum();
         let mut calls = self.lock();
@@ -42,7 +43,7 @@ impl Forwarded {
         Some(Sent { of, number })
     }
 
-    /// The calls in them that write.
+    /// The writes among the calls that were sent.
     pub(crate) fn writes(&self) -> Vec<Request> {
         let calls = self.lock();
         let calls = calls.calls.values().flat_map(Request::calls);

@@ -1,4 +1,4 @@
-//! Calls to a computer that leads, follows, or knows nobody who leads.
+//! Calls to a computer that leads, follows, or knows no leader.
 
 use http_body_util::BodyExt;
 use hyper::{StatusCode, header::HeaderValue};
@@ -23,11 +23,11 @@ use crate::{
 const OWN: &str = "http://127.0.0.1:11311/";
 const TERM: u64 = 7;
 
-/// A computer that follows, and what its conductor holds.
+/// A computer that follows, and what the test controls of it.
 struct Computer {
     calls: Calls,
     way: watch::Sender<Way>,
-    /// How far its mirror holds the journal.
+    /// How far its mirror follows the journal.
     followed: watch::Sender<Place>,
     handovers: mpsc::Receiver<Handover>,
 }
@@ -130,7 +130,7 @@ fn made_by(call: &Request) -> Reply {
     model.apply(call).reply
 }
 
-/// A leader that says 421 to each call, or nothing at all.
+/// A leader that answers 421 to each call, or nothing at all.
 async fn leader(says: Option<StatusCode>) -> Way {
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -181,7 +181,7 @@ async fn a_read_falls_back_to_the_mirror_if_the_leader_is_silent_or_does_not_lea
         let computer = Computer::new(leader(says).await);
         let answer = computer.ask("/RPC2", &get()).await.unwrap();
         assert_eq!(reply(answer).await, made_by(&get()), "{says:?}");
-        // A write waits for what becomes of the leader.
+        // A write waits for the decision about the leader.
         let write = set(2);
         let waits = computer.ask("/RPC2", &write);
         assert!(
@@ -266,7 +266,7 @@ async fn a_handover_is_sent_once_to_a_leader_that_does_not_answer() {
     assert_eq!(answer[1], "the leader does not answer".into());
 }
 
-/// Tells when it is dropped.
+/// Reports when it is dropped.
 struct Told(mpsc::Sender<u64>, u64);
 
 impl Drop for Told {
@@ -293,7 +293,8 @@ fn an_answer_is_held_until_its_follower_has_passed_it_on_or_says_nothing() {
     assert!(told.try_recv().is_err());
 }
 
-/// A follower passes on to its caller what a leader answers, and tells the leader when the caller has it.
+/// A follower passes on to its caller what a leader answers, and tells the leader when the caller
+/// has it.
 #[tokio::test]
 async fn a_follower_tells_its_leader_when_the_caller_has_the_answer() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -347,7 +348,8 @@ async fn request_body(stream: &mut tokio::net::TcpStream) -> Option<String> {
     String::from_utf8(body).ok()
 }
 
-/// On one computer a caller sees what it was told of: a mirror that is behind does not answer, however long that takes.
+/// A caller on one computer keeps seeing what it has been told: a mirror that is behind does not
+/// answer, however long that takes.
 #[tokio::test(start_paused = true)]
 async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() {
     let computer = Computer::new(Way::Nobody { known: true });
@@ -357,7 +359,8 @@ async fn a_read_by_the_mirror_waits_for_what_the_leaders_answers_have_told_of() 
     let later = others.hold / 2;
     let get = get();
     told(TERM, 7);
-    // The last is of another leader: what the first one told of and did not commit is gone.
+    // The last one belongs to another leader: what the first leader announced and did not commit is
+    // gone.
     for (term, seq) in [(TERM, 7), (TERM + 1, 8)] {
         let start = Instant::now();
         let behind = async {

@@ -84,7 +84,7 @@ fn a_publisher_waits_for_the_answers_to_subscribers_and_nothing_else_does() {
     ];
     let mut queue: VecDeque<_> = calls.into_iter().map(item).collect();
     let first = next(&ledger, &mut queue);
-    // Who comes later about the same topic waits behind the publisher.
+    // Later calls about the same topic wait behind the publisher.
     let both = ["registerSubscriber of /a", "registerPublisher of /d"];
     assert_eq!(described(&first), both);
     assert!(next(&ledger, &mut queue).items.is_empty());

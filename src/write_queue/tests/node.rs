@@ -1,4 +1,4 @@
-//! Nodes: what they call, and what they believe by what they have heard.
+//! Simulated nodes: their calls, and what they believe after what they have heard.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -16,12 +16,12 @@ pub(super) enum Library {
     Roscpp,
 }
 
-/// Which thread of a node has read what.
+/// What a thread of a node has read.
 #[derive(Debug)]
 pub(super) enum Thread {
-    /// The one that has made a call reads the answer.
+    /// The thread that made a call reads the answer.
     Main(Request, Reply),
-    /// The one that serves XML-RPC reads a notification.
+    /// The thread that serves XML-RPC reads a notification.
     Server(Call),
 }
 
@@ -31,19 +31,19 @@ pub(super) struct Node {
     name: String,
     api: String,
     library: Library,
-    /// The publishers of subscribed topics, by what was heard last.
+    /// The publishers of subscribed topics, as last heard.
     topics: BTreeMap<String, Vec<String>>,
     /// Cached parameters.
     params: BTreeMap<String, Value>,
     published: BTreeSet<String>,
-    /// Parameters that it subscribes, and those that it has set.
+    /// Parameters that it subscribes to, and those that it has set.
     subscribed: BTreeSet<String>,
     set: BTreeSet<String>,
     /// A call of roscpp that holds the mutex which a publisherUpdate needs.
     subscribing: Option<String>,
-    /// What waits for the mutex.
+    /// Notifications that wait for the mutex.
     blocked: Vec<Call>,
-    /// When the value of each parameter that has arrived last was set, whoever sent it.
+    /// When the last value of each parameter to arrive was set, whoever sent it.
     arrived: BTreeMap<String, u64>,
     gone_back: Vec<String>,
 }
@@ -70,7 +70,7 @@ impl Node {
         port_of(&self.api)
     }
 
-    /// Its next call.
+    /// The node's next call.
     pub(super) fn call(&mut self, dice: &mut Dice, value: i32) -> Request {
         let topic = format!("/t{}", dice.below(TOPICS));
         let key = format!("/p{}", dice.below(PARAMS));
@@ -93,7 +93,7 @@ impl Node {
             6..8 if !self.set.contains(&key) && self.subscribed.insert(key.clone()) => {
                 Request::new(Method::SubscribeParam, [name, api, &key])
             }
-            // Who sets a parameter is not notified of it, whoever the master is.
+            // A node that sets a parameter is not notified of it by any master.
             _ if self.subscribed.contains(&key) => {
                 Request::new(Method::UnregisterService, [name, "/none", "rosrpc://n:1"])
             }
@@ -105,7 +105,7 @@ impl Node {
         }
     }
 
-    /// A notification arrives, in this order. `values`: when each parameter had each value.
+    /// A notification arrives, in this order. `values` tells when each parameter had each value.
     pub(super) fn arrives(&mut self, call: &Call, values: &HashMap<(String, Option<i32>), u64>) {
         let [_, subject, value] = call.params.as_slice() else {
             return;
@@ -120,7 +120,7 @@ impl Node {
         }
     }
 
-    /// One of its threads reads something. Returns the call that follows at once, if one does.
+    /// One of its threads reads something. Returns the call that follows at once, if there is one.
     pub(super) fn hears(&mut self, thread: Thread) -> Option<Request> {
         match thread {
             Thread::Server(call) => {
@@ -147,7 +147,7 @@ impl Node {
             return;
         }
         let key = subject.trim_end_matches('/').to_owned();
-        // rospy ignores what is not in its cache yet.
+        // rospy ignores parameters that are not in its cache yet.
         if self.library == Library::Roscpp || self.params.contains_key(&key) {
             self.params.insert(key, value.clone());
         }
@@ -176,7 +176,7 @@ impl Node {
                     Library::Rospy => {
                         self.params.insert(key.to_owned(), value.clone());
                     }
-                    // roscpp ignores this value and reads it anew.
+                    // roscpp ignores this value and reads the parameter again.
                     Library::Roscpp => {
                         return Some(Request::new(Method::GetParam, [&*self.name, key]));
                     }
@@ -191,7 +191,7 @@ impl Node {
         None
     }
 
-    /// What it believes and `state` does not say.
+    /// The node's beliefs that contradict `state`.
     pub(super) fn mistakes(&self, state: &Master) -> Vec<String> {
         let mut mistakes = self.gone_back.clone();
         for (topic, list) in &self.topics {
