@@ -1,4 +1,4 @@
-//! The checkpoint: its file format, its store on disk, and whether its session continues.
+//! The checkpoint: its format, its store on disk, and the decision whether its session continues.
 
 pub mod compare;
 pub(crate) mod folder;
