@@ -153,7 +153,11 @@ fn a_call_whose_reply_was_lost_is_answered_as_done() {
         }
         relay.swallow(method, 1);
         let answer = client.status(method, params).unwrap();
-        assert_eq!((relay.hunger(), answer.0), (0, 1), "{method}: {answer:?}");
+        assert_eq!(
+            (relay.to_swallow(), answer.0),
+            (0, 1),
+            "{method}: {answer:?}"
+        );
     }
     eventually("calls pass", || status(&client)["open"] == true);
     let state = State::read(&master.client());
@@ -179,7 +183,7 @@ fn an_injection_whose_reply_was_lost_is_a_recovery() {
     let master = Rosmaster::start_at(&scratch, port);
     eventually("the dead node is taken out", || {
         let known = master.client().ok("getSystemState", params!["/x"]);
-        relay.hunger() == 0 && !format!("{known:?}").contains("/dead")
+        relay.to_swallow() == 0 && !format!("{known:?}").contains("/dead")
     });
     assert_eq!(client.param("/swallowed"), Some(1.into()));
     let report = eventually_some("a report", || {

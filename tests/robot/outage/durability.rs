@@ -134,12 +134,12 @@ fn calls_that_cannot_be_read_wait_together_for_a_look_that_shows_what_they_did()
     let (master, relay, rescue) = Relay::between(&scratch);
     relay.swallow("getSystemState", 2);
     let first = send_unreadable(&rescue.client(), "/first");
-    eventually("a look is lost", || relay.hunger() == 1);
+    eventually("a look is lost", || relay.to_swallow() == 1);
     let second = send_unreadable(&rescue.client(), "/second");
     for call in [first, second] {
         assert_done(&call.join().unwrap());
     }
-    assert_eq!(relay.hunger(), 0);
+    assert_eq!(relay.to_swallow(), 0);
     assert_eq!(status(&rescue.client())["state"]["params"], 2);
     assert_eq!(master.client().param("/second"), Some(1.into()));
 }
