@@ -119,9 +119,10 @@ fn parameters_that_the_master_cannot_return_are_kept_as_known() {
     });
     let past = FakeNode::start("/past");
     past.publish(&master.client(), "/topic", "std_msgs/String");
-    rescue.wait_line("the log names the node that was read from the master", |line| {
-        line.contains("`/past`")
-    });
+    rescue.wait_line(
+        "the log names the node that was read from the master",
+        |line| line.contains("`/past`"),
+    );
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
     let after = master.client();

@@ -145,7 +145,7 @@ impl Master {
         self.inexact || self.params.is_cut()
     }
 
-    /// Says whether something is kept otherwise than rosmaster keeps it.
+    /// Sets whether something is kept differently than rosmaster keeps it, so that answers may differ.
     pub fn set_inexact(&mut self, inexact: bool) {
         self.inexact = inexact;
     }

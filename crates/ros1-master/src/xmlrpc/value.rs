@@ -59,7 +59,7 @@ impl FromIterator<(String, Value)> for Struct {
     }
 }
 
-/// For tests.
+/// A short form for tests and examples.
 impl From<&[(&str, Value)]> for Struct {
     fn from(members: &[(&str, Value)]) -> Self {
         let members = members.iter().cloned();
