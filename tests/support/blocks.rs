@@ -20,7 +20,7 @@ pub(crate) const NOT_RUN: [(&str, &str); 21] = [
     ("catkin_make", "needs a workspace: `tests/robot/service/catkin.rs`"),
     ("rosrun rosrescue", "needs a workspace: `tests/robot/service/catkin.rs`"),
     ("docker ", "no Docker in CI: `tests/robot/restart/guardian.rs` has a process namespace"),
-    ("robot_upstart", "not in Debian: nobody has run it, as `ROS_MASTER_URI.md` says"),
+    ("robot_upstart", "not in Debian: it was never run, as `ROS_MASTER_URI.md` says"),
     ("cargo ", "builds and tests: `tests/run.sh`"),
     ("tests/run.sh", "runs this very test: `tests/run.sh`"),
     ("ROSRESCUE_SCRIPT=failed.txt", "needs the output of a failure: `tests/differential/script.rs`"),

@@ -167,7 +167,7 @@ fn rosrescue_serves_calls_when_it_starts_on_a_hung_disk() {
     disk.begin(Trouble::Slow);
     rescue.start_again();
     let client = rescue.client();
-    eventually("it answers", || client.param("/before").is_some());
+    eventually("rosrescue answers", || client.param("/before").is_some());
     disk.begin(Trouble::Hangs);
     within(LATE, "a write", || client.set_param("/during", 1));
     disk.heal();

@@ -116,7 +116,7 @@ impl Robot {
     /// Panics if a master has called a node after it had `heard` so many calls, or if rosrescue has told a
     /// node anything but the present state, which has not changed.
     #[track_caller]
-    fn assert_nobody_disturbed(&self, heard: &[usize]) {
+    fn assert_no_node_disturbed(&self, heard: &[usize]) {
         for (node, heard) in self.nodes.iter().zip(heard) {
             let calls = node.calls();
             let (before, since) = calls.split_at(*heard);
@@ -246,7 +246,7 @@ fn a_record_that_kills_masters_causes_no_outage() {
         away(&robot.before);
         client.set_param("/while/it/dies", 1);
         client.ok("deleteParam", params!["/test", "/while"]);
-        robot.assert_nobody_disturbed(&heard);
+        robot.assert_no_node_disturbed(&heard);
         let after = match name {
             "/topic0" => {
                 robot.nodes[0].unpublish(&client, name);

@@ -75,7 +75,7 @@ fn a_divergence_is_logged_once_per_method_with_both_replies() {
     }
     let mut said = |method: &str| {
         let wanted = |line: &str| line.contains(&format!("method=\"{method}\""));
-        let line = robot.rescue.wait_line("what differs", wanted);
+        let line = robot.rescue.wait_line("the log says what differs", wanted);
         // Both rounds are over, so a repeated line would be there by now.
         let lines = robot.rescue.output();
         assert_eq!(lines.iter().filter(|line| wanted(line)).count(), 1);

@@ -232,7 +232,7 @@ fn a_master_whose_answers_are_not_http_counts_as_away() {
         }
         assert_eq!(status(&client)["open"], false, "case {number}");
         assert_eq!(real.param("/garbled"), None, "case {number}");
-        garbled.say(b"nobody says this", b"");
+        garbled.say(b"no call mentions this", b"");
         eventually("the gate is open", || status(&client)["open"] == true);
         let right = State::read(&well);
         right.assert_same(&State::read(&real), &format!("after case {number}"));
@@ -273,7 +273,7 @@ fn a_master_that_answers_only_faults_for_a_while_counts_as_away() {
     assert_eq!(garbled.real.client().param("/garbled"), None);
     assert_eq!(client.param("/kept"), Some(1.into()));
     assert_eq!(client.param("/garbled"), Some(1.into()));
-    garbled.say(b"nobody says this", b"");
+    garbled.say(b"no call mentions this", b"");
     eventually("the gate is open", is_open);
     for key in ["/kept", "/garbled"] {
         assert_eq!(garbled.real.client().param(key), Some(1.into()), "{key}");
@@ -347,7 +347,7 @@ fn a_server_that_is_not_a_master_is_reported_and_asked_seldom() {
             line.contains(&fake.port().to_string())
         });
         let client = rescue.client();
-        eventually("it listens", || client.connect().is_ok());
+        eventually("rosrescue listens", || client.connect().is_ok());
         assert!(client.ask("setParam", params!["/c", "/x", 1]).is_none());
         // rosrescue asks with pauses and does not busy-loop.
         assert!(

@@ -194,8 +194,8 @@ fn writes_that_bypassed_rosrescue_are_found_and_kept() {
     for key in ["/both", "/theirs", "/ours"] {
         client.set_param(key, 1);
     }
-    let nobody = free_port();
-    relay.turn_to(nobody);
+    let unused_port = free_port();
+    relay.turn_to(unused_port);
     client.set_param("/both", 2);
     client.set_param("/ours", 2);
     let past_us = FakeNode::start("/past_us");

@@ -338,7 +338,7 @@ in_both_modes!(tools_started_without_a_master_end_at_ctrl_c);
 
 fn tools_started_without_a_master_end_at_ctrl_c(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
-    let nobody = robot.settled_state().nodes;
+    let without_tools = robot.settled_state().nodes;
     robot.take_master_away();
     let client = robot.client();
     let runs: [(&[&str], &str); 5] = [
@@ -373,6 +373,6 @@ fn tools_started_without_a_master_end_at_ctrl_c(mode: Mode) {
         assert!(!log.contains("Unable to communicate"), "{log}");
     }
     eventually("no tool is registered any more", || {
-        State::read(&client).nodes == nobody
+        State::read(&client).nodes == without_tools
     });
 }

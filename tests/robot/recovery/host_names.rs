@@ -108,11 +108,11 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     let port = free_port();
     let rescue = core(&server, &scratch, port);
     let client = rescue.client();
-    let nobody: Vec<_> = (0..COUNT)
-        .map(|i| FakeNode::start(&format!("/nobody{i}")).at_host(&format!("nobody{i}.test")))
+    let unresolvable: Vec<_> = (0..COUNT)
+        .map(|i| FakeNode::start(&format!("/unresolvable{i}")).at_host(&format!("nobody{i}.test")))
         .collect();
     let living = FakeNode::start("/living");
-    for node in nobody.iter().chain([&living]) {
+    for node in unresolvable.iter().chain([&living]) {
         node.subscribe(&client, "/chatter", "std_msgs/String");
     }
     let dead = kill_master(&client);
@@ -132,7 +132,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     let report = report(&client, dead);
     assert_eq!(names(&report["removed"]), Vec::<String>::new());
-    let mut unreachable: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
+    let mut unreachable: Vec<_> = unresolvable.iter().map(|node| node.name.clone()).collect();
     unreachable.sort();
     assert_eq!(names(&report["unreachable"]), unreachable);
     assert_eq!(names(&status(&client)["unreachable"]), unreachable);
@@ -140,7 +140,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
     assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
 
     // When a name begins to exist, its node is told everything.
-    let found = &nobody[0];
+    let found = &unresolvable[0];
     assert!(found.calls().is_empty(), "{:?}", found.calls());
     server.set("nobody0.test", Ipv4Addr::LOCALHOST);
     eventually("the node is found", || {
@@ -150,7 +150,7 @@ fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node()
         let unreachable = names(&status(&client)["unreachable"]);
         unreachable.len() == COUNT - 1 && !unreachable.contains(&found.name)
     });
-    for node in nobody.iter().chain([&living]) {
+    for node in unresolvable.iter().chain([&living]) {
         assert_eq!(node.heard("shutdown").len(), 0);
     }
 }

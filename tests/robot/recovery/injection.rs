@@ -140,7 +140,7 @@ impl Nodes {
     /// present lists. This is checked for a while, because idle threads of a master look only every 100 ms
     /// whether there is anything to tell.
     #[track_caller]
-    fn assert_nobody_disturbed(&self) {
+    fn assert_no_node_disturbed(&self) {
         self.look();
         thread::sleep(Duration::from_millis(250));
         self.look();
@@ -197,7 +197,7 @@ fn a_new_master_may_die_at_every_call_of_the_injection() {
         let when = format!("after a death at call {number}");
         before.assert_same(&State::read(&proxied.bare()), &when);
         if number.is_multiple_of(10) {
-            nodes.assert_nobody_disturbed();
+            nodes.assert_no_node_disturbed();
         }
     }
     proxied.live();
@@ -208,7 +208,7 @@ fn a_new_master_may_die_at_every_call_of_the_injection() {
         "the injection had only {} calls",
         number - LOOK
     );
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
 #[test]
@@ -228,9 +228,9 @@ fn new_masters_may_die_in_the_injection_many_times_in_a_row() {
         pid = proxied.live();
         let when = format!("after {deaths} deaths about call {number}");
         before.assert_same(&State::read(&proxied.bare()), &when);
-        nodes.assert_nobody_disturbed();
+        nodes.assert_no_node_disturbed();
     }
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
 /// A crash loop of masters that rosrescue did not start is reported too.
@@ -256,7 +256,7 @@ fn a_crash_loop_of_masters_started_by_others_is_reported() {
         status(&client)["crash_loop"] == false
     });
     assert_eq!(status(&client)["open"], true);
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
 /// The state is small, because a core restarts its masters at once only for the first five deaths within a
@@ -292,7 +292,7 @@ fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
                 let open = status["open"] == true && now != pid && crate::support::alive(now);
                 open.then_some(!died)
             });
-            nodes.assert_nobody_disturbed();
+            nodes.assert_no_node_disturbed();
             if survived {
                 println!("{} calls in an injection", number - 1);
                 // Parameters, two registrations of each kind, what is read back, and the token.

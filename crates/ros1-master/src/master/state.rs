@@ -118,7 +118,7 @@ impl Master {
         &self.registry
     }
 
-    /// The type of each topic, in the order in which the master learnt of the topics.
+    /// The type of each topic, in the order in which the master first saw the topics.
     pub fn topic_types(&self) -> &IndexMap<String, String> {
         &self.topic_types
     }

@@ -77,7 +77,7 @@ pub(crate) fn notices(master: &mut Master, call: &Request) -> Vec<Notice> {
     master.apply(call).notices
 }
 
-/// The multicall with a malformed entry at its end.
+/// Adds a malformed entry at the end of a multicall.
 pub(crate) fn malformed(call: Request) -> Request {
     let mut entries = call.into_entries();
     entries.push(Entry::Malformed("malformed".into()));
