@@ -1,4 +1,4 @@
-//! What was measured, as Markdown.
+//! Prints the results as Markdown.
 
 use crate::{
     Measured, Small,
@@ -10,7 +10,7 @@ use crate::{
     shared::numbers::{short, spread},
 };
 
-/// All tables.
+/// All tables with their explanations.
 pub(crate) fn markdown(measured: &Measured) -> String {
     let mut parts = vec![format!(
         "{}; {} s for each number, in {} turns.",

@@ -1,9 +1,9 @@
-//! How long those who use the master wait when it dies: `cargo bench --bench pauses`.
+//! Measures how long clients wait when the master dies: `cargo bench --bench pauses`.
 //!
-//! A client that reads a parameter all the time, one that sets a parameter all the time, and one that
-//! subscribes a parameter that is not set all the time, as loggers do; with many SIGKILLs of the master, and
-//! with a master that stays away; under `rosrescue core`, behind `rosrescue proxy` with a rosmaster that is
-//! started again at once, and with such a rosmaster alone. What is measured how is said below the tables.
+//! One client reads a parameter all the time, one sets a parameter, and one subscribes to a parameter that is
+//! not set, as loggers do. The master is killed many times, and once stays away. This is done under
+//! `rosrescue core`, behind `rosrescue proxy` with a rosmaster that is restarted at once, and with such a
+//! rosmaster alone. The text below the tables explains the measurements.
 
 #![allow(
     clippy::unwrap_used,
@@ -25,13 +25,14 @@ use crate::{
     subject::{Kind, Subject, Window},
 };
 
-/// A sixth death of its own master within a minute counts as a crash loop for rosrescue, which then pauses.
+/// Number of kills per rosrescue. It treats a sixth death of its master within a minute as a crash loop and
+/// then pauses.
 const KILLS_A_LIFE: usize = 5;
 
 /// Measures the pauses that clients see when the master dies.
 #[derive(Debug, Args)]
 struct Options {
-    /// Kills for each line of the table
+    /// Number of kills for each line of the table
     #[arg(
         long,
         env = "ROSRESCUE_KILLS",
@@ -39,10 +40,10 @@ struct Options {
         default_value_t = 100
     )]
     kills: usize,
-    /// Nodes that are registered, with seven registrations each
+    /// Number of registered nodes, with seven registrations each
     #[arg(long, value_name = "COUNT", default_value_t = 80)]
     nodes: usize,
-    /// For how long a master stays away; 0 for not at all
+    /// How long a master stays away, in seconds; 0 skips this part
     #[arg(
         long,
         env = "ROSRESCUE_AWAY_SECONDS",
@@ -109,7 +110,7 @@ Milliseconds, median (largest) over the kills; without a master the largest.
 * *nobody killed*: the same in as many spans of half a second without a kill.
 ";
 
-/// Median and largest.
+/// Median and maximum, as a table cell.
 fn cell(times: impl IntoIterator<Item = f64>) -> String {
     let mut times: Vec<_> = times.into_iter().collect();
     times.sort_by(f64::total_cmp);
@@ -119,7 +120,7 @@ fn cell(times: impl IntoIterator<Item = f64>) -> String {
     }
 }
 
-/// Two lines of the first table: with kills, and without.
+/// Measures two lines of the first table: with kills and without.
 fn kills(kind: Kind, options: &Options) -> String {
     let (mut quiet, mut kills, mut injections) = (Vec::new(), Vec::new(), Vec::new());
     while kills.len() < options.kills {
@@ -127,7 +128,7 @@ fn kills(kind: Kind, options: &Options) -> String {
         let life = match kind {
             Kind::Core => KILLS_A_LIFE,
             Kind::Proxy => usize::MAX,
-            // Its nodes are unknown after one.
+            // A bare rosmaster has forgotten its nodes after one kill.
             Kind::Bare => 1,
         };
         for _ in 0..life.min(options.kills - kills.len()) {
@@ -167,7 +168,7 @@ fn all(window: &Window) -> [&Seen; 3] {
     [&window.read, &window.write, &window.idle]
 }
 
-/// A line of the second table.
+/// Measures a line of the second table.
 fn outage(kind: Kind, options: &Options) -> String {
     let mut subject = Subject::start(kind, options.nodes);
     let (window, notified) = subject.outage(Duration::from_secs(options.away));
@@ -186,7 +187,7 @@ fn outage(kind: Kind, options: &Options) -> String {
     )
 }
 
-/// A line of the third table; none if nobody starts rosrescue again.
+/// Measures a line of the third table. `None` if nothing restarts rosrescue.
 fn deaths(kind: Kind, options: &Options) -> Option<String> {
     let mut subject = Subject::start(kind, options.nodes);
     let windows: Vec<_> = (0..KILLS_A_LIFE)

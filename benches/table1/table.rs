@@ -1,4 +1,4 @@
-//! What was measured, as Markdown.
+//! Prints the results as Markdown.
 
 use crate::{
     limit::Limit,
@@ -6,10 +6,10 @@ use crate::{
     shared::machine,
 };
 
-/// The paper's Table 1, recovery alone: nodes and milliseconds.
+/// The paper's Table 1, recovery alone: number of nodes and milliseconds.
 const PAPER: [(usize, u32); 6] = [(1, 5), (5, 59), (10, 112), (20, 218), (40, 436), (80, 900)];
 
-/// What was measured with a number of nodes.
+/// The results for one number of nodes.
 #[derive(Debug)]
 pub(crate) struct Row {
     nodes: usize,
