@@ -12,7 +12,7 @@ quick:
 test:
     tests/run.sh
 
-# Print the tables of docs/benchmarks.md
+# Print the tables of benches/results.md
 bench:
     cargo bench --bench pauses
     cargo bench --bench table1

@@ -51,7 +51,7 @@ pub(crate) const REPEAT_AFTER: Duration = Duration::from_millis(300);
 /// How long a master may take for one notification while many wait. Python passes its lock on every 5 ms.
 const MASTER_TAKES: Duration = Duration::from_millis(5);
 /// The longest backlog of the master's notifications for which ours wait.
-const BACKLOG_MOST: Duration = Duration::from_secs(10);
+const BACKLOG_MAX: Duration = Duration::from_secs(10);
 /// How long a client that does not read its answer can delay the writes of others.
 pub(crate) const ANSWER_LIMIT: Duration = Duration::from_secs(1);
 /// How long a node that does not take a notification can delay writes about the subject. With thirty runnable
@@ -325,7 +325,7 @@ impl Told {
         self.forget(now);
         let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
         let busy = self.busy.map_or(now, |busy| busy.max(now));
-        let busy = (busy + takes.min(BACKLOG_MOST)).min(now + BACKLOG_MOST);
+        let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MOST);
         self.busy = Some(busy);
         let until = busy + REPEAT_AFTER;
         if let Some(before) = self.ends.set(subject.clone(), until) {

@@ -91,7 +91,7 @@ struct Options {
     /// Cargo's target folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write the tables of all parts and the picture into docs/
+    /// Also write the tables of all parts into benches/results.md, and the picture into docs/
     #[arg(long, conflicts_with = "parts")]
     write_docs: bool,
 }

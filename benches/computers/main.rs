@@ -90,7 +90,7 @@ struct Options {
     /// File for all numbers as JSON [default: computers.json in Cargo's target folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write the tables of all parts into docs/
+    /// Also write the tables of all parts into benches/results.md
     #[arg(long, conflicts_with = "parts")]
     write_docs: bool,
 }

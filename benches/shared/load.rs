@@ -25,7 +25,7 @@ pub(crate) const NUMBER: i32 = 17_171_717;
 const FIRST: usize = 20_000_000;
 const NUMBERS: usize = 70_000_000;
 /// Maximum number of calls in one turn, over all connections.
-const CALLS_MOST: usize = 1_000_000;
+const CALLS_MAX: usize = 1_000_000;
 /// The errors by which a closed connection shows.
 const CLOSED: [ErrorKind; 3] = [
     ErrorKind::UnexpectedEof,
@@ -113,7 +113,7 @@ impl Load {
         callers
             .iter_mut()
             .for_each(|caller| caller.reconnections = 0);
-        let most = CALLS_MOST / callers.len().max(1);
+        let most = CALLS_MAX / callers.len().max(1);
         let barrier = Arc::new(Barrier::new(callers.len()));
         let call = |mut caller: Caller| {
             let barrier = Arc::clone(&barrier);

@@ -35,7 +35,7 @@ pub(crate) fn write(path: &Path, text: &str) {
     eprintln!("written: {}", path.display());
 }
 
-/// Writes `text` into `docs/benchmarks.md`, between the marks of this bench.
+/// Writes `text` into `benches/results.md`, between the marks of this bench.
 pub(crate) fn write_document(bench: &str, text: &str) {
     let document = fs::read_to_string(DOCUMENT).expect("the document");
     let document = between_marks(&document, bench, text).expect("marks for the tables");

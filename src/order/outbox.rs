@@ -11,7 +11,7 @@ use crate::{health::port_of, master::Master, xmlrpc::Call};
 
 /// When more notifications than this wait for a node, it is told each subject only once, as it is at the time
 /// of sending.
-const QUEUE_MOST: usize = 256;
+const QUEUE_MAX: usize = 256;
 
 /// The next thing to do for a node.
 #[derive(Clone, Debug, PartialEq)]
@@ -77,7 +77,7 @@ impl Outbox {
             return;
         }
         queue.push_back(notification);
-        if queue.len() > QUEUE_MOST {
+        if queue.len() > QUEUE_MAX {
             renew(queue, |_| true);
         }
     }

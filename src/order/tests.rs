@@ -260,7 +260,7 @@ fn a_parameter_that_is_set_again_and_again_takes_no_more_memory() {
     assert_eq!(order.told.until.about(&param("/k/")).count(), 1);
     assert_eq!(order.told.ends.queue.len(), 1);
     let until = order.told.until(now, &param("/")).unwrap();
-    assert!(until < now + Duration::from_secs(1) + BACKLOG_MOST + 2 * REPEAT_AFTER);
+    assert!(until < now + Duration::from_secs(1) + BACKLOG_MAX + 2 * REPEAT_AFTER);
     assert_eq!(order.told.until(until, &param("/")), None);
 }
 

@@ -6,7 +6,7 @@ use crate::master::Master;
 use crate::xmlrpc::{Struct, Value};
 
 /// Maximum number of sentences.
-const MOST: usize = 20;
+const SENTENCES_MAX: usize = 20;
 
 /// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if
 /// the two are equal. The sentences name keys, nodes and addresses, but never the value of a parameter.
@@ -76,7 +76,7 @@ struct Words(Vec<String>);
 
 impl Words {
     fn say(&mut self, sentence: impl FnOnce() -> String) {
-        if self.0.len() < MOST {
+        if self.0.len() < SENTENCES_MAX {
             self.0.push(sentence());
         }
     }

@@ -11,7 +11,7 @@ use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable}
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
 /// Maximum number of mismatches in an error.
-const MOST_MISMATCHES: usize = 20;
+const MISMATCHES_MAX: usize = 20;
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
 ///
@@ -302,7 +302,7 @@ impl Plan {
                 !is_alike(result, predicted) && (ordered || !in_any_order())
             })
             .map(|(_, call)| mismatch(call))
-            .take(MOST_MISMATCHES)
+            .take(MISMATCHES_MAX)
             .collect();
         if mismatches.is_empty() {
             Ok(())

@@ -12,9 +12,9 @@ use crate::checkpoint::format::{self, Checkpoint};
 use crate::xmlrpc::Value;
 
 /// Maximum number of earlier sessions that are kept.
-const SESSIONS_MOST: usize = 5;
+const SESSIONS_MAX: usize = 5;
 /// Maximum number of rescues that are kept.
-const RESCUES_MOST: usize = 20;
+const RESCUES_MAX: usize = 20;
 
 /// The names of nodes and parameters of `rosrescue drill` start with this. The process id follows.
 pub(crate) const DRILLS: &str = "/rosrescue_drill_";
@@ -124,8 +124,8 @@ pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
     let all = kept(path)?;
     let (mut sessions, mut rescues): (Vec<_>, Vec<_>) =
         all.into_iter().partition(|kept| kept.kind == Kind::Session);
-    let mut surplus = sessions.split_off(SESSIONS_MOST.min(sessions.len()));
-    surplus.extend(rescues.split_off(RESCUES_MOST.min(rescues.len())));
+    let mut surplus = sessions.split_off(SESSIONS_MAX.min(sessions.len()));
+    surplus.extend(rescues.split_off(RESCUES_MAX.min(rescues.len())));
     // By age: the last one of each kind, the last but one of each kind, and so on.
     let mut ranked: Vec<_> = sessions.into_iter().enumerate().collect();
     ranked.extend(rescues.into_iter().enumerate());
