@@ -98,16 +98,16 @@ fn main() {
 }
 
 const EXPLANATION: &str = "
-Milliseconds, median (largest) over the kills; without a master the largest.
+Milliseconds: median (largest) over the kills; without a master, the largest.
 
-* *read*, *write*, *write that changes nothing*: the longest time between two answers that a client got which calls `getParam`, `setParam` with
-  a new value, or `subscribeParam` of a parameter that is not set all the time, a millisecond after each answer, and again a millisecond
-  after each failure. Any answer counts, a wrong one too.
-* *bare injection*: one multicall that brings the same state to another rosmaster of the same kind, before each kill.
-* *calls without an answer*: refused or cut off. rospy's and roscpp's `getParam` fail then.
-* *a subscriber is notified*: from a `registerPublisher`, one a second, until a subscriber of the topic has its `publisherUpdate`: median (largest).
-* The rosmaster of `proxy` and the bare one are started again at once by the bench, and `core` does so itself.
-* *nobody killed*: the same in as many spans of half a second without a kill.
+* *read*, *write*, *write that changes nothing*: the longest time between two answers to a client that calls `getParam`, `setParam` with a new
+  value, or `subscribeParam` of a parameter that is not set. It calls all the time, a millisecond after each answer, and again a
+  millisecond after each failure. Every answer counts, even a wrong one.
+* *bare injection*: one multicall that gives the same state to another rosmaster of the same kind, before each kill.
+* *calls without an answer*: refused or cut off. rospy's and roscpp's `getParam` fail in this case.
+* *a subscriber is notified*: the time from a `registerPublisher`, one per second, until a subscriber of the topic has its `publisherUpdate`: median (largest).
+* The bench itself restarts the rosmaster of `proxy` and the bare one at once; `core` restarts its own.
+* *no kills*: the same in as many spans of half a second without a kill.
 ";
 
 /// Median and maximum, as a table cell.
@@ -161,7 +161,7 @@ fn kills(kind: Kind, options: &Options) -> String {
             count(|seen| seen.refused),
         )
     };
-    line("", &kills, &injections) + &line(", nobody killed", &quiet, &[])
+    line("", &kills, &injections) + &line(", no kills", &quiet, &[])
 }
 
 fn all(window: &Window) -> [&Seen; 3] {

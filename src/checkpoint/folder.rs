@@ -27,7 +27,7 @@ impl Access {
         })
     }
 
-    /// Who else than the user `own` may create files in the folder. `None` if nobody may.
+    /// Who else than the user `own` may create files in the folder. `None` if no other user may.
     fn others(self, own: u32) -> Option<&'static str> {
         // Many distributions give each user a group with the same number and no other members.
         let is_private = self.group == self.user || self.group == 0;

@@ -1,4 +1,4 @@
-//! Decides whether the session of a checkpoint continues, or the robot was switched on anew.
+//! Decides whether the session of a checkpoint continues, or the robot has been switched on again.
 //!
 //! A robot that is switched on in the morning must not start with the parameters of yesterday.
 

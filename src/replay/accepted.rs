@@ -305,7 +305,7 @@ mod tests {
         assert!(!found.certain);
     }
 
-    /// The model must not be made anew for each inner multicall: that would take hours.
+    /// The model must not be built again for each inner multicall: that would take hours.
     #[test]
     fn many_failing_multicalls_inside_a_long_one_are_judged_quickly() {
         let count = 20_000;

@@ -164,7 +164,7 @@ pub(crate) struct Framed<'a> {
     pub(crate) lines: Vec<Line<'a>>,
     pub(crate) torn: Option<Range<usize>>,
     pub(crate) damaged: Vec<Damage>,
-    /// Whether damage follows the last whole line, so that records may be missing that nobody knows of.
+    /// Whether damage follows the last whole line, so that an unknown number of records may be missing.
     pub(crate) end_lost: bool,
 }
 
