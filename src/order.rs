@@ -325,7 +325,7 @@ impl Told {
         self.forget(now);
         let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
         let busy = self.busy.map_or(now, |busy| busy.max(now));
-        let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MOST);
+        let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MAX);
         self.busy = Some(busy);
         let until = busy + REPEAT_AFTER;
         if let Some(before) = self.ends.set(subject.clone(), until) {
