@@ -1,7 +1,7 @@
-//! What `rosrescue --version` says: the version, and in a release build the commit and its date.
+//! Provides what `rosrescue --version` prints: the version, and in a release build the commit and its date.
 //!
-//! `ROSRESCUE_COMMIT` and `SOURCE_DATE_EPOCH` go before git, for builds from a tarball. A debug build does not ask
-//! git: every commit would have it compiled anew.
+//! `ROSRESCUE_COMMIT` and `SOURCE_DATE_EPOCH` take precedence over git, for builds from a tarball. A debug
+//! build does not ask git, because then every commit would trigger a new build.
 
 use std::{env, path::Path, process::Command};
 
@@ -32,14 +32,14 @@ fn given(variable: &str) -> Option<String> {
     env::var(variable).ok().filter(|value| !value.is_empty())
 }
 
-/// Short hash and date of the commit that is checked out here; none outside of a git repository of our own.
+/// Short hash and date of the commit that is checked out. `None` outside of rosrescue's own git repository.
 fn head() -> Option<(String, String)> {
     let top = git(&["rev-parse", "--show-toplevel"])?;
     let here = env::var("CARGO_MANIFEST_DIR").ok()?;
     if Path::new(&top).canonicalize().ok()? != Path::new(&here).canonicalize().ok()? {
         return None;
     }
-    // A commit changes this log, a change of branch, too.
+    // Changes with every commit, and when another branch is checked out.
     for file in ["HEAD", "logs/HEAD"] {
         if let Some(path) = git(&["rev-parse", "--git-path", file])
             && Path::new(&path).exists()
@@ -60,7 +60,7 @@ fn git(arguments: &[&str]) -> Option<String> {
     output.status.success().then(|| text.trim().to_owned())
 }
 
-/// The day of a time in seconds since 1970, by `date` of GNU, busybox or toybox.
+/// The date of a time in seconds since 1970, from the `date` of GNU, busybox or toybox.
 fn date(seconds: &str) -> Option<String> {
     let output = Command::new("date")
         .args(["-u", "-d", &format!("@{seconds}"), "+%Y-%m-%d"])

@@ -1,24 +1,24 @@
-# The few commands, for those who have `just`. Nothing needs it: each is a line to type.
+# The usual commands, for users of `just`. They can all be typed as well.
 
 # Release build
 build:
     cargo build --release --locked
 
-# Checks without ROS, some two minutes
+# Run the checks that need no ROS (about two minutes)
 quick:
     tests/quick.sh
 
-# Every check; installs what is missing of ROS 1 (needs root)
+# Run all checks; installs missing parts of ROS 1 (needs root)
 test:
     tests/run.sh
 
-# The tables of docs/benchmarks.md
+# Print the tables of benches/results.md
 bench:
     cargo bench --bench pauses
     cargo bench --bench table1
     cargo bench --bench compare
     . tests/install_etcd.sh && cargo bench --bench computers
 
-# A rescue to look at, with a real rosmaster and nodes
+# Show a rescue with a real rosmaster and nodes
 quickstart:
     examples/quickstart.sh

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# What a robot loses when nothing but `respawn` looks after its master: a bare rosmaster in a loop, as systemd's
-# Restart=always with RestartSec=0.1 has it. Shows it, kills the master, looks at what is left, and cleans up.
+# What a robot loses when its master is only restarted: a bare rosmaster in a loop, as with systemd's Restart=always and
+# RestartSec=0.1. Starts it, kills the master, shows what is left, and cleans up.
 
 cd "$(dirname "$0")/.." || exit
 . examples/common.sh
@@ -18,12 +18,12 @@ has_heard() { [ "$(heard "$1")" -ge "$2" ]; }
 late_is_up() { rosnode list | grep -qx /late; }
 count() { "$@" 2>/dev/null | grep -c . || true; }
 
-step "A rosmaster that is started again 0.1 s after its end"
+step "Start a rosmaster that is restarted 0.1 s after its end"
 start master bash -c "while :; do rosmaster --core -p $master_port; sleep 0.1; done"
 within 60 master_pid >/dev/null || give_up "the rosmaster did not start"
 took "ROS_MASTER_URI=$ROS_MASTER_URI"
 
-step "rosout, which is roscpp; a rospy talker and a rospy listener; a parameter and a /run_id"
+step "Start rosout (roscpp), a rospy talker and a rospy listener; set a parameter and /run_id"
 rosparam set /run_id "$(cat /proc/sys/kernel/random/uuid)"
 rosparam set /robot/wheels 4
 for rosout in /opt/ros/*/lib/rosout/rosout /usr/lib/rosout/rosout; do
@@ -41,33 +41,33 @@ killed=$EPOCHREALTIME
 kill -KILL "$master"
 is_back() { [ "$(master_pid)" != "$master" ] && [ -n "$(master_pid)" ]; }
 within 60 is_back || give_up "the rosmaster did not come back"
-say "after $(seconds "$killed" "$EPOCHREALTIME") s a new one, process $(master_pid), answers"
+say "after $(seconds "$killed" "$EPOCHREALTIME") s a new rosmaster answers, process $(master_pid)"
 
-step "What it knows, five seconds later"
+step "See what it knows five seconds later"
 sleep 5
 say "$(count rosnode list) nodes, $(count rostopic list) topics, $(count rosservice list) services, $(count rosparam list) parameters"
 before=$(heard listener)
-within 10 has_heard listener $((before + 50)) || wrong "the listener, which was connected, hears nothing more"
-say "the listener, which was connected, goes on: $(heard listener) messages"
+within 10 has_heard listener $((before + 50)) || wrong "the connected listener receives nothing more"
+say "the connected listener still receives messages: $(heard listener) so far"
 rosparam get /robot/wheels >"$scratch/wheels.log" 2>&1 || true
 say "rosparam get /robot/wheels: $(tail -n 1 "$scratch/wheels.log")"
 
 step "A new listener asks the new rosmaster for the talker"
 start_node late examples/nodes/listener.py __name:=late
-within 60 late_is_up || give_up "the new listener does not come up"
+within 60 late_is_up || give_up "the new listener did not start"
 if within 5 has_heard late 1; then
-    wrong "it hears something, against expectation"
+    wrong "it has received something, which was not expected"
 else
-    say "five seconds later it has heard nothing; nodes: $(rosnode list | paste -sd ' ')"
+    say "five seconds later it has received nothing; nodes: $(rosnode list | paste -sd ' ')"
 fi
 
 step "roslaunch --wait examples/robot.launch"
 start_node roslaunch roslaunch --wait examples/robot.launch
-within 60 grep -q 'master has started' "$scratch/roslaunch.log" || give_up "roslaunch finds no master"
+within 60 grep -q 'master has started' "$scratch/roslaunch.log" || give_up "roslaunch found no master"
 if within 5 grep -q 'started with pid' "$scratch/roslaunch.log"; then
-    wrong "it starts nodes, against expectation"
+    wrong "it has started nodes, which was not expected"
 else
-    say "five seconds later it has started nothing: it waits for a /run_id"
+    say "five seconds later it has started nothing, because it waits for a /run_id"
 fi
 
-[ "$failed" = 0 ] || give_up "it is not as docs/comparison.md says"
+[ "$failed" = 0 ] || give_up "the result is not what docs/comparison.md says"

@@ -1,14 +1,14 @@
 # shellcheck shell=bash
-# What the examples share: ROS, the rosrescue to use, a scratch folder, and an end that leaves
-# nothing behind. To be sourced from the repository's root by a bash script:
+# Functions for all examples: they provide ROS, the rosrescue to use, and a scratch folder, and clean up at the end. To
+# be sourced from the root of the repository by a bash script:
 #
 #     . examples/common.sh
 #
-# Everything that an example starts bears its scratch folder in its environment (ROS_HOME), which is
-# how it is found and ended again, whatever has become of its parent.
+# Every process that an example starts has the scratch folder in its environment (ROS_HOME). That is how all of them are
+# found and ended, even if their parents are gone.
 
 set -euo pipefail
-# $EPOCHREALTIME is to have a point, whatever the language here.
+# Makes $EPOCHREALTIME contain a point in any language.
 export LC_ALL=C.UTF-8
 failed=0
 scratch=
@@ -20,7 +20,7 @@ if [ -t 1 ] && [ -z "${NO_COLOR:-}" ]; then
     bold=$'\e[1m' red=$'\e[31;1m' plain=$'\e[0m'
 fi
 
-# Begins a step.
+# Begins a step and prints its title.
 step() {
     step_number=$((${step_number:-0} + 1))
     step_began=$EPOCHREALTIME
@@ -29,26 +29,26 @@ step() {
 
 say() { printf '   %s\n' "$@"; }
 
-# Says how long the step took.
+# Prints a line with the time that the step took.
 took() { say "$1 ($(seconds "$step_began" "$EPOCHREALTIME") s)"; }
 
 seconds() { awk -v a="$1" -v b="$2" 'BEGIN { printf "%.1f", b - a }'; }
 milliseconds() { awk -v a="$1" -v b="$2" 'BEGIN { printf "%.1f", (b - a) * 1000 }'; }
 
-# Something that should have held did not.
+# Reports a check that failed, and goes on.
 wrong() {
     failed=1
     printf '   %sWRONG: %s%s\n' "$red" "$*" "$plain"
 }
 
-# Something without which there is no going on.
+# Reports an error after which the example cannot go on.
 give_up() {
     failed=1
     printf '\n%s%s: %s%s\n' "$red" "${0##*/}" "$*" "$plain" >&2
     exit 1
 }
 
-# Waits until a command succeeds, for at most so many seconds.
+# Waits until a command succeeds. Fails after SECONDS.
 within() { # SECONDS COMMAND...
     local end=$((SECONDS + $1))
     shift
@@ -58,7 +58,7 @@ within() { # SECONDS COMMAND...
     done
 }
 
-# Makes ROS known to this shell, and installs what is missing of it.
+# Sets up ROS for this shell, and installs missing parts of it.
 need_ros() {
     . tests/install_ros.sh
 }
@@ -70,15 +70,14 @@ need_rosrescue() {
     fi
     command -v cargo >/dev/null || PATH="$PATH:$HOME/.cargo/bin"
     command -v cargo >/dev/null ||
-        give_up "there is no cargo; install a Rust toolchain first: https://rustup.rs"
+        give_up "cargo is not installed; install a Rust toolchain first: https://rustup.rs"
     cargo build --release --locked ||
-        give_up "cargo could not build it. Should it be too old: Rust $(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml) or later is needed, https://rustup.rs"
+        give_up "cargo could not build rosrescue. It needs Rust $(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml) or later: https://rustup.rs"
     ROSRESCUE=$(cargo metadata --format-version 1 --no-deps --offline |
         /usr/bin/python3 -c 'import json, sys; print(json.load(sys.stdin)["target_directory"])')/release/rosrescue
 }
 
-# A folder for everything, which goes away at the end; and an environment that knows nothing of any
-# other ROS on this computer.
+# Makes a folder for all files, which is removed at the end, and an environment without any other ROS on this computer.
 need_scratch() {
     trap clean_up EXIT
     trap 'exit 129' HUP
@@ -99,14 +98,14 @@ free_port() {
     /usr/bin/python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
 }
 
-# Starts a program in a session of its own, so that Ctrl-C here is for this script alone. What it
-# writes goes to NAME.log in the scratch folder. Its process id is $! then.
+# Starts a program in a new session, so that Ctrl-C reaches only this script. Its output goes to NAME.log in the scratch
+# folder. Its process id is then in $!.
 start() { # NAME COMMAND...
     local name=$1
     shift
     : >"$scratch/$name.log"
     setsid "$@" </dev/null >"$scratch/$name.log" 2>&1 &
-    # Its end is nothing to report here.
+    # The shell must not report its end.
     disown
 }
 
@@ -115,7 +114,7 @@ start_node() { # NAME COMMAND...
     node_pids+=($!)
 }
 
-# Starts rosrescue and waits until it says that it serves. Sets rosrescue_pid and ROS_MASTER_URI.
+# Starts rosrescue and waits until it reports that it serves. Sets rosrescue_pid and ROS_MASTER_URI.
 start_rosrescue() { # ARGUMENTS...
     start rosrescue "$ROSRESCUE" "$@"
     rosrescue_pid=$!
@@ -130,18 +129,18 @@ rosrescue_has_decided() {
         ! kill -0 "$rosrescue_pid" 2>/dev/null
 }
 
-# Starts `rosrescue core` on a port that is free. Somebody else may take it meanwhile: once more then.
+# Starts `rosrescue core` on a free port. Tries again if another program takes that port in the meantime.
 start_core() {
     local attempt
     for attempt in 1 2 3 4 5; do
         start_rosrescue core -p "$(free_port)" && return
         grep -q 'is in use' "$scratch/rosrescue.log" || break
-        [ "$attempt" = 5 ] || say "the port was taken by somebody else; trying another one"
+        [ "$attempt" = 5 ] || say "another program has taken the port; trying another one"
     done
     give_up "rosrescue did not start: $(tail -n 3 "$scratch/rosrescue.log")"
 }
 
-# Fields of the status page, such as `open` or `last_recovery.phases.total_ms`, one after the other.
+# Prints fields of the status page, such as `open` or `last_recovery.phases.total_ms`, one after another.
 status() { # FIELD...
     /usr/bin/python3 - "$ROS_MASTER_URI" "$@" 2>>"$scratch/status.log" <<'PY'
 import http.client, json, sys, urllib.parse
@@ -158,14 +157,14 @@ print()
 PY
 }
 
-# Whether so many masters have been brought to the state, and calls pass.
+# Whether COUNT masters have been given the state, and calls pass.
 recovered() { # COUNT
     local recoveries open
     read -r recoveries open < <(status recoveries open) || return 1
     [ "$open" = True ] && [ "$recoveries" -ge "$1" ]
 }
 
-# What a person would ask a robot: nodes, topics with who is at them, services, parameters.
+# Prints what a user can ask about a robot: nodes, topics with their nodes, services, parameters.
 robot_state() {
     rosnode list
     rostopic list -v
@@ -173,7 +172,7 @@ robot_state() {
     rosparam dump
 }
 
-# Kills the master, waits until its successor knows everything, and compares.
+# Kills the master, waits until its successor has the state, and compares.
 kill_master() {
     local before after recoveries master total
     before=$(robot_state 2>&1)
@@ -182,22 +181,22 @@ kill_master() {
     kill -KILL "$master"
     within 60 recovered $((recoveries + 1)) || give_up "the master did not come back"
     read -r master total < <(status last_recovery.{master_pid,phases.total_ms})
-    took "rosmaster is process $master now; calls had to wait for ${total%.*} ms"
+    took "rosmaster is now process $master; it had the whole state after ${total%.*} ms"
     after=$(robot_state 2>&1)
     if [ "$before" = "$after" ]; then
-        say "nodes, topics, services and parameters are what they were"
+        say "nodes, topics, services and parameters are the same as before"
     else
         wrong "the state differs:"
         diff <(echo "$before") <(echo "$after") || true
     fi
 }
 
-# The process ids of all that this example started and that still runs.
+# Prints the ids of all processes that this example has started and that still run.
 ours() {
     env -u ROS_HOME grep -lsF "ROS_HOME=$scratch/" /proc/[0-9]*/environ | cut -d / -f 3
 }
 
-# Sends a signal to one of them, and waits until it has ended, for some seconds.
+# Sends a signal to one of them, and waits up to five seconds for its end.
 end() { # SIGNAL PID
     local tick
     for tick in {1..100}; do
@@ -208,13 +207,13 @@ end() { # SIGNAL PID
     return 1
 }
 
-# Ends everything in order: the nodes, which say goodbye to the master; then rosrescue, which ends
-# rosmaster and rosout; then whatever is left.
+# Ends everything cleanly: first the nodes, which unregister from the master; then rosrescue, which ends rosmaster and
+# rosout; then everything that is left.
 clean_up() {
     local code=$? pid
     trap '' HUP INT TERM
     trap - EXIT
-    # Processes come and go while `ours` looks at all of them.
+    # Processes start and end while `ours` examines all of them, so errors are normal.
     set +e +o pipefail
     [ -n "$scratch" ] || exit "$code"
     [ "$code" -lt 128 ] || printf '\ncleaning up\n'
@@ -227,7 +226,7 @@ clean_up() {
     for pid in "${node_pids[@]}" $rosrescue_pid; do
         end TERM "$pid"
     done
-    # Twice: a loop that starts masters may just have started another one.
+    # Twice, because a loop that starts masters may just have started another one.
     for _ in 1 2; do
         for pid in $(ours); do
             end KILL "$pid"

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Watch a ROS 1 robot survive the death of its master.
 #
-#     examples/quickstart.sh          shows it and cleans up
-#     examples/quickstart.sh --keep   shows it and leaves it running, to play with
+#     examples/quickstart.sh          runs the demonstration and cleans up
+#     examples/quickstart.sh --keep   leaves everything running afterwards, for you to try
 #
-# On a Debian or Ubuntu with a Rust toolchain it installs what is missing of ROS 1 (as root or with
-# sudo) and builds rosrescue. It uses free ports and a scratch folder, and touches no other ROS.
-# ROSRESCUE=/path/to/rosrescue takes a binary that is there already.
-# Exit status: 0 if all held, 1 if anything did not, 2 for a wrong argument.
+# On a Debian or Ubuntu with a Rust toolchain, it installs missing parts of ROS 1 (as root or with sudo) and builds
+# rosrescue. It uses free ports and a scratch folder, and does not touch any other ROS.
+# ROSRESCUE=/path/to/rosrescue uses a program that is already built.
+# Exit status: 0 if everything worked, 1 if anything failed, 2 for a wrong argument.
 
 keep=0
 case "$#${1:-}" in
@@ -25,11 +25,11 @@ esac
 cd "$(dirname "$0")/.." || exit
 . examples/common.sh
 
-# How many messages the listener NAME has written down.
+# Prints how many messages the listener NAME has received.
 heard() { grep -cE '^[0-9.]+ [0-9]+$' "$scratch/$1.log" || true; }
 has_heard() { [ "$(heard "$1")" -ge "$2" ] 2>/dev/null; }
 
-# Checks that the listener NAME has heard every number from its first to its last, once, in order.
+# Checks that the listener NAME has received every number from its first to its last, once and in order.
 check_stream() { # NAME
     local first last count broken
     read -r first last count broken < <(awk '
@@ -41,7 +41,7 @@ check_stream() { # NAME
     if [ "$count" -gt 0 ] && [ "$broken" = 0 ] && [ "$count" = $((last - first + 1)) ]; then
         say "$1: $first to $last, $count messages: none lost, none twice"
     else
-        wrong "$1: $first to $last, $count messages, $broken breaks in the row"
+        wrong "$1: $first to $last, $count messages, $broken gaps or repeats"
     fi
 }
 
@@ -65,8 +65,8 @@ step "Start a rospy talker and a rospy listener, and set a parameter"
 start_node talker examples/nodes/talker.py
 start_node listener examples/nodes/listener.py
 rosparam set /robot/wheels 4
-within 60 has_heard listener 100 || give_up "the listener hears nothing"
-# What rosrescue itself sets comes when `rosversion` has been asked.
+within 60 has_heard listener 100 || give_up "the listener receives nothing"
+# rosrescue sets its own parameters after it has run `rosversion`.
 within 60 rosparam get /rosdistro >/dev/null 2>&1 || give_up "rosrescue did not set /rosdistro"
 before=$(nodes)
 took "$(heard listener) messages so far; nodes: $before"
@@ -92,13 +92,13 @@ say "after $detected ms it was noticed" \
     "after $listening ms a new rosmaster, process $pid, was listening" \
     "after $open ms it knew everything again, and calls passed: $restored nodes" \
     "meanwhile the listener heard $during messages$([ "$during" = 0 ] || echo ": $first to $last")"
-[ "$pid" != "$master" ] || wrong "the rosmaster is the old one"
+[ "$pid" != "$master" ] || wrong "it is still the old rosmaster"
 
 step "A new listener asks the new rosmaster for the talker"
 start_node late examples/nodes/listener.py __name:=late
-within 60 has_heard late 1 || give_up "the new listener hears nothing"
+within 60 has_heard late 1 || give_up "the new listener receives nothing"
 took "it hears message $(awk '{ print $2; exit }' "$scratch/late.log")"
-within 60 has_heard late 100 || give_up "the new listener hears nothing more"
+within 60 has_heard late 100 || give_up "the new listener receives nothing more"
 
 step "Compare"
 check_stream listener
@@ -115,14 +115,14 @@ if [ "$wheels" = 4 ]; then
 else
     wrong "rosparam get /robot/wheels: $wheels"
 fi
-[ "$failed" = 0 ] || give_up "not everything held"
+[ "$failed" = 0 ] || give_up "something failed, see above"
 
 if [ "$keep" = 0 ]; then
-    printf '\nAll of it held. Run it with --keep to play with it.\n'
+    printf '\nEverything worked. Run it with --keep to try more.\n'
     exit
 fi
 
-# A way back for the person, without this script: what clean_up does.
+# A script with which the user can clean up later.
 {
     printf '#!/usr/bin/env bash\n# Ends what examples/quickstart.sh --keep left running, and removes this folder.\n'
     declare -p scratch failed node_pids rosrescue_pid
@@ -139,24 +139,24 @@ END
 trap - EXIT
 cat <<END
 
-It goes on running. In another terminal:
+It is still running. In another terminal:
 
     . $scratch/env
     rosnode list
     rostopic echo /count
 
-Kill the master as often as you like, and see what nodes feel of it:
+Kill the master as often as you like, and see what nodes notice:
 
     $(realpath "$ROSRESCUE") drill
 
-How it is: $ROS_MASTER_URI in a browser, or
+Status: $ROS_MASTER_URI in a browser, or
 
     curl $ROS_MASTER_URI
 
-What it remembers: $ROS_LOG_DIR/latest-chkpt.yaml
-What it says:      $scratch/rosrescue.log
+Checkpoint: $ROS_LOG_DIR/latest-chkpt.yaml
+Log:        $scratch/rosrescue.log
 
-And to end it all:
+To end everything:
 
     bash $scratch/stop
 END

@@ -1,4 +1,4 @@
-"""Draws the lines that come on stdin, each lighting up when it came, as an SVG on stdout."""
+"""Reads lines from standard input and draws them as an SVG, in which each line lights up at the time it was read."""
 
 import datetime
 import html
@@ -37,12 +37,12 @@ def kind(line):
         return "quiet"
     if re.match(r"\d+\. ", line):
         return "step"
-    if "knew everything" in line or "none lost" in line or "All of it held" in line:
+    if "knew everything" in line or "none lost" in line or "Everything worked" in line:
         return "good"
     return "text"
 
 
-# Installing and building are no part of the rescue: it begins with rosrescue.
+# The recording begins when rosrescue starts. Installing and building are not part of the rescue.
 lines, began = [], None
 for line in sys.stdin:
     line = line.rstrip("\n")
@@ -53,7 +53,7 @@ for line in sys.stdin:
     if began is not None and line:
         lines.append((time.monotonic() - began, line))
 if not lines:
-    sys.exit("record.py: no rescue came")
+    sys.exit("record.py: the input has no rescue")
 
 title = f"examples/quickstart.sh in real time, {os.cpu_count()} cores, {datetime.date.today()}"
 height = TOP + ROW * len(lines)

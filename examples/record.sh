@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Records a rescue: runs examples/quickstart.sh, and draws what it says, when it says it.
+# Records a rescue: runs examples/quickstart.sh and draws its output with the real times.
 #
 #     examples/record.sh >rescue.svg
 #
-# It needs Python 3 and what the quickstart needs. The picture needs nothing but itself, in light and in dark: its
-# lines light up in real time, once, where an SVG may move.
-# ROSRESCUE=/path/to/rosrescue takes a binary that is there already.
+# It needs Python 3 and everything that the quickstart needs. The picture works in light and dark mode and refers to no
+# other file. Where an SVG may be animated, its lines light up once, in real time.
+# ROSRESCUE=/path/to/rosrescue uses a program that is already built.
 
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# A supervised set-up: `rosrescue core` in the place of roscore, and a robot that is brought up by
-# roslaunch. Shows it, kills the master three times, and cleans up.
+# `rosrescue core` in place of roscore, and a robot that roslaunch starts. Starts both, kills the master three times, and
+# cleans up.
 #
-# It uses free ports and a scratch folder. On a robot there is nothing of that; it is just
+# This script uses free ports and a scratch folder. On a robot you need only
 #
 #     rosrescue core
 #     roslaunch --wait my_robot.launch
 #
-# ROSRESCUE=/path/to/rosrescue takes a binary that is there already.
+# ROSRESCUE=/path/to/rosrescue uses a program that is already built.
 
 cd "$(dirname "$0")/.." || exit
 . examples/common.sh
@@ -15,17 +15,17 @@ need_ros
 need_rosrescue
 need_scratch
 
-step "rosrescue core, where roscore was"
+step "rosrescue core, in place of roscore"
 start_core
 took "ROS_MASTER_URI=$ROS_MASTER_URI"
 
-# --wait: without a master roslaunch would start one of its own, on rosrescue's port.
+# --wait, because without a master roslaunch would start its own on rosrescue's port.
 step "roslaunch --wait examples/robot.launch"
 start_node robot roslaunch --wait examples/robot.launch
 all_up() {
     grep -qE '^[0-9.]+ [0-9]+$' "$scratch/robot.log" && rosparam get /rosdistro >/dev/null 2>&1
 }
-within 60 all_up || give_up "the robot does not come up"
+within 60 all_up || give_up "the robot did not start"
 took "nodes: $(rosnode list | paste -sd ' ')"
 
 for _ in 1 2 3; do
@@ -39,5 +39,5 @@ else
     wrong "it failed: $(tail -n 1 "$scratch/rosservice.log")"
 fi
 
-[ "$failed" = 0 ] || give_up "not everything held"
-printf '\nAll of it held.\n'
+[ "$failed" = 0 ] || give_up "something failed, see above"
+printf '\nEverything worked.\n'

@@ -1,4 +1,4 @@
-//! The checkpoint: its text and its session are in [`rescue_core::checkpoint`], its file in [`checkpoint_store`].
+//! The checkpoint: its format, its store on disk, and the decision whether its session continues.
 
 pub use checkpoint_store as store;
 pub(crate) use checkpoint_store::folder;

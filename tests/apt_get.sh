@@ -1,6 +1,6 @@
-# apt-get for the scripts that install something; to be sourced.
+# A function that runs apt-get, for scripts that install packages. To be sourced.
 
-# How long to wait for a package manager that another program is using, in seconds.
+# How long to wait while another program uses the package manager, in seconds.
 apt_patience=600
 
 # Runs apt-get as root. Waits while another program holds one of the package manager's locks. apt's own option
@@ -11,7 +11,7 @@ apt_get() { # ARGUMENTS...
     elif command -v sudo >/dev/null; then
         as_root=sudo
     else
-        echo "neither root nor sudo to run apt-get $1" >&2
+        echo "apt-get $1 needs root or sudo" >&2
         return 1
     fi
     apt_errors=$(mktemp)
@@ -23,7 +23,7 @@ apt_get() { # ARGUMENTS...
             break
         fi
         if [ "$apt_waited" -ge "$apt_patience" ]; then
-            echo "another program has used the package manager for $apt_patience s; try again later" >&2
+            echo "another program has been using the package manager for $apt_patience s; try again later" >&2
             break
         fi
         if [ "$apt_waited" = 0 ]; then

@@ -1,9 +1,9 @@
 #!/bin/sh
-# Runs rosrescue with what is in the field, and writes the results into docs/compatibility.md:
+# Tests rosrescue with other systems and software, and writes the results into docs/compatibility.md:
 #
-#     tests/field.sh                      everything; some hours
+#     tests/field.sh                      everything; takes some hours
 #     tests/field.sh releases             every release of Debian and Ubuntu that carries ROS 1, with its own ROS
-#     tests/field.sh releases debian-13   that one; the rows of others stay
+#     tests/field.sh releases debian-13   this release only; the rows of others stay
 #     tests/field.sh clients              other client libraries
 #     tests/field.sh robots               several robots side by side
 #
@@ -23,12 +23,12 @@ for known in releases clients robots; do
     if [ -x "$program" ]; then
         "$program" "$@" || status=1
     elif [ "$part" = "$known" ]; then
-        echo "tests/field.sh: there is no part $known" >&2
+        echo "tests/field.sh: unknown part $known" >&2
         exit 1
     fi
 done
 case $part in
     all | releases | clients | robots) exit "$status" ;;
 esac
-echo "tests/field.sh: no part $part: releases, clients or robots" >&2
+echo "tests/field.sh: unknown part $part: use releases, clients or robots" >&2
 exit 1

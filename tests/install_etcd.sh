@@ -1,8 +1,8 @@
-# Unpacks Debian's etcd for the tests, where there is none, and makes it known to this shell:
+# Unpacks Debian's etcd for the tests if it is missing, and adds it to the PATH of this shell:
 #
 #     . tests/install_etcd.sh
 #
-# Not by installing it: that would start an etcd as a service of this computer.
+# It does not install the package, because that would start etcd as a service on this computer.
 
 . tests/apt_get.sh
 
@@ -20,9 +20,9 @@ etcd_folder="${CARGO_TARGET_DIR:-$PWD/target}/etcd"
 PATH="$etcd_folder/usr/bin:$PATH"
 if ! etcd_works; then
     mkdir -p "$etcd_folder"
-    # The lists may be missing, old, or in the middle of somebody else's update.
+    # The package lists may be missing or old, or another program may be updating them.
     if ! { unpack_etcd || { apt_get update -qq && unpack_etcd; }; } || ! etcd_works; then
-        echo "there is no etcd 3.4 or later here, and apt-get cannot download one (etcd-server and etcd-client of Debian 12)" >&2
+        echo "etcd 3.4 or later is not installed, and apt-get cannot download it (etcd-server and etcd-client of Debian 12)" >&2
         exit 1
     fi
 fi

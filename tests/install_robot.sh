@@ -1,4 +1,4 @@
-# Installs what is missing for the example robot (examples/robot), and its test; to be sourced after
+# Installs missing packages for the example robot (examples/robot) and its test. To be sourced after
 # tests/install_ros.sh.
 
 robot_missing() {
@@ -8,7 +8,7 @@ robot_missing() {
         done
         return 1
     }
-    # What roslaunch and pluginlib find packages by.
+    # roslaunch and pluginlib find packages by this file.
     has_package() { # PACKAGE
         for package in /usr/share/"$1"/package.xml /opt/ros/*/share/"$1"/package.xml; do
             [ ! -r "$package" ] || return 0
@@ -50,5 +50,5 @@ robot_missing() {
     need libstd-srvs-dev pkg-config --exists std_srvs
 }
 
-# shellcheck disable=SC2046 # words are what is wanted
+# shellcheck disable=SC2046 # splitting is intended
 install_missing $(robot_missing)

@@ -1,14 +1,14 @@
-# Installs what is missing of ROS 1 for the tests and the examples, and makes it known to this shell:
+# Installs missing parts of ROS 1 for the tests and examples, and sets up ROS for this shell:
 #
 #     . tests/install_ros.sh
 #
-# Debian and Ubuntu carry ROS 1 themselves. A ROS in /opt/ros is used as it is.
+# Debian and Ubuntu contain ROS 1. A ROS in /opt/ros is used unchanged.
 
 . tests/apt_get.sh
 
 for ros_setup in /opt/ros/*/setup.sh; do
     if [ -r "$ros_setup" ] && [ -z "${ROS_DISTRO:-}" ]; then
-        set +u # not written for it
+        set +u # the set-up script of ROS uses unset variables
         . "$ros_setup"
         set -u
     fi
@@ -28,7 +28,7 @@ has_libfaketime() {
     return 1
 }
 
-# PACKAGES, unless CHECK succeeds.
+# Prints PACKAGES unless CHECK succeeds.
 need() { # PACKAGES CHECK...
     packages=$1
     shift
@@ -42,7 +42,7 @@ has_pam_systemd() {
     return 1
 }
 
-# The packages of what does not work here. `python3` may be another one than ROS was made for.
+# Prints the packages of everything that does not work here. `python3` may not be the one for which ROS was built.
 ros_missing() {
     for tool in rosmaster roslaunch rosnode rostopic rosservice rosparam; do
         need "python3-$tool" command -v "$tool"
@@ -76,21 +76,21 @@ ros_missing() {
 install_missing() { # PACKAGES...
     [ $# -gt 0 ] || return 0
     if ! command -v apt-get >/dev/null; then
-        echo "ROS 1 is not complete here and there is no apt-get to install: $*" >&2
+        echo "parts of ROS 1 are missing, and there is no apt-get to install: $*" >&2
         exit 1
     fi
     echo "installing: $*"
     if ! apt_get update -qq; then
-        echo "the lists of packages cannot be updated; to install: $*" >&2
+        echo "cannot update the package lists; packages to install: $*" >&2
         exit 1
     fi
     if ! apt_get install -y -qq --no-install-recommends "$@"; then
-        echo "apt-get cannot install all of: $*" >&2
-        echo "This needs a Debian or Ubuntu that carries ROS 1, as Debian 12 does, or a ROS Noetic in" >&2
+        echo "apt-get cannot install some of: $*" >&2
+        echo "You need a Debian or Ubuntu that contains ROS 1, such as Debian 12, or a ROS Noetic in" >&2
         echo "/opt/ros." >&2
         exit 1
     fi
 }
 
-# shellcheck disable=SC2046 # words are what is wanted
+# shellcheck disable=SC2046 # splitting is intended
 install_missing $(ros_missing)

@@ -1,7 +1,7 @@
 #!/bin/sh
-# The checks that need no ROS, in less than two minutes after the build: formatting, clippy, and the tests of
-# the pure core, the codec, the checkpoint and the documents. Needs a Rust toolchain, and Python with PyYAML
-# (Debian's python3-yaml), which the codec and the checkpoint are compared with. `tests/run.sh` runs everything.
+# Runs the checks that need no ROS, in less than two minutes after the build: formatting, clippy, and the tests of the
+# pure core, the codec, the checkpoint and the documents. Needs a Rust toolchain, and Python with PyYAML (Debian's
+# python3-yaml), with which the codec and the checkpoint are compared. `tests/run.sh` runs everything.
 set -eu
 cd "$(dirname "$0")/.."
 

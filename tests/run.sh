@@ -1,7 +1,7 @@
 #!/bin/sh
-# Runs every check of rosrescue on a bare Debian or Ubuntu: installs what is missing of ROS 1, then
-# formatting, clippy, the documentation, the dependencies (if cargo-deny is installed), the fuzz targets
-# (whether they compile), and unit, integration and documentation tests. Needs a Rust toolchain.
+# Runs every check of rosrescue on a bare Debian or Ubuntu: installs missing parts of ROS 1, then checks formatting,
+# clippy, the documentation, the dependencies (if cargo-deny is installed) and whether the fuzz targets compile, and runs
+# unit, integration and documentation tests. Needs a Rust toolchain.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -9,7 +9,7 @@ if ! command -v cargo >/dev/null; then
     PATH="$PATH:$HOME/.cargo/bin"
 fi
 if ! command -v cargo >/dev/null; then
-    echo "tests/run.sh: there is no cargo; install a Rust toolchain first: https://rustup.rs" >&2
+    echo "tests/run.sh: cargo is not installed; install a Rust toolchain first: https://rustup.rs" >&2
     exit 1
 fi
 
@@ -30,13 +30,13 @@ if command -v cargo-deny >/dev/null; then
         fi
     done
 else
-    echo "tests/run.sh: no cargo-deny: dependencies are not checked (cargo install --locked cargo-deny)" >&2
+    echo "tests/run.sh: cargo-deny is not installed, so dependencies are not checked (cargo install --locked cargo-deny)" >&2
 fi
 cargo check --locked --manifest-path fuzz/Cargo.toml --target-dir "${CARGO_TARGET_DIR:-target}"
 
-# All test programs run, even if one of them fails.
+# All test programs run, even if one fails.
 #
-# Tests with real ROS wait for processes most of the time: twice as many at once as there are cores. Those
-# that measure times (tests/timing) run one at a time in any case.
+# Tests with real ROS mostly wait for processes, so twice as many as there are cores run at once. Tests that measure
+# times (tests/timing) always run one at a time.
 threads=${RUST_TEST_THREADS:-$((2 * $(nproc)))}
 RUST_TEST_THREADS=$threads cargo test --locked --workspace --no-fail-fast

@@ -1,4 +1,4 @@
-//! One kind of call at a time, by few and many connections, every party in its turn.
+//! Measures one kind of call at a time, over few and many connections, with the parties taking turns.
 
 use std::{io, time::Duration};
 
@@ -18,26 +18,27 @@ use crate::{
 const SMALL: &str = "/compare/small";
 const TEXT: &str = "/compare/text";
 const MANY: &str = "/compare/many";
-/// Calls in the multicall, without the last.
+/// Number of `setParam` calls in the multicall, before its last call.
 const LAUNCH: usize = 100;
 
-/// What is called.
+/// The kind of call to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Call {
     GetPid,
     GetParam,
-    /// A text of so many KB, such as a `robot_description`.
+    /// Reads a text of this many KB, such as a `robot_description`.
     GetText(usize),
-    /// 10,000 parameters.
+    /// Reads 10,000 parameters.
     GetAll,
     SetParam,
-    /// `registerPublisher` and `unregisterPublisher` in turn.
+    /// Calls `registerPublisher` and `unregisterPublisher` in turn.
     Register,
-    /// The multicall with which `roslaunch` sets parameters.
+    /// Makes the multicall with which `roslaunch` sets parameters.
     Launch,
 }
 
-/// What is measured, with which numbers of connections. Left out is what takes seconds a call.
+/// The calls to measure, with their numbers of connections. Combinations that take seconds per call are left
+/// out.
 pub(crate) const WHOLE: &[(Call, &[usize])] = &[
     (Call::GetPid, &[1, 8, 64, 512]),
     (Call::GetParam, &[1, 8, 64, 512]),
@@ -49,7 +50,7 @@ pub(crate) const WHOLE: &[(Call, &[usize])] = &[
     (Call::Launch, &[1, 8]),
 ];
 
-/// For a small computer.
+/// The calls to measure on a small computer.
 pub(crate) const SMALLER: &[(Call, &[usize])] = &[
     (Call::GetPid, &[1, 8]),
     (Call::GetParam, &[1, 8, 64]),
@@ -82,7 +83,7 @@ impl Serialize for Call {
 }
 
 impl Call {
-    /// Makes what it reads.
+    /// Sets the parameters that the call reads.
     fn prepare(self, client: &Client) {
         match self {
             Self::GetParam => client.set_param(SMALL, 1),
@@ -92,7 +93,7 @@ impl Call {
         }
     }
 
-    /// Removes what is large: it is for no other call.
+    /// Deletes large parameters, which no other call needs.
     fn clean(self, client: &Client) {
         let large = match self {
             Self::GetText(_) => TEXT,
@@ -102,7 +103,7 @@ impl Call {
         client.ok("deleteParam", params!["/compare", large]);
     }
 
-    /// What client `number` calls.
+    /// The calls that client `number` makes.
     pub(crate) fn script(self, number: usize) -> Script {
         let node = format!("/compare/node_{number}");
         let name = node.as_str();
@@ -143,7 +144,7 @@ impl Call {
     }
 }
 
-/// As a robot's description, with as many characters that are escaped.
+/// A text like a robot's description, with as many characters that must be escaped.
 fn text(bytes: usize) -> String {
     let mut text = String::new();
     // Each line is six bytes longer in XML.
@@ -156,7 +157,7 @@ fn text(bytes: usize) -> String {
     text
 }
 
-/// Sets so many parameters below `key`, of the usual types, in groups of at most a hundred.
+/// Sets `count` parameters below `key`, of the usual types, in groups of at most a hundred.
 pub(crate) fn many(client: &Client, key: &str, count: usize) {
     const GROUP: usize = 100;
     for group in 0..count.div_ceil(GROUP) {
@@ -173,7 +174,7 @@ pub(crate) fn many(client: &Client, key: &str, count: usize) {
     }
 }
 
-/// What one party did in one turn.
+/// The results of one party in one turn.
 #[derive(Clone, Debug, Serialize)]
 struct Turn {
     calls: usize,
@@ -185,7 +186,7 @@ struct Turn {
     reconnections: usize,
 }
 
-/// What one party did in all its turns.
+/// The results of one party in all its turns.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Seen {
     pub(crate) party: Kind,
@@ -193,9 +194,9 @@ pub(crate) struct Seen {
     pub(crate) p99_ms: f64,
     pub(crate) largest_ms: f64,
     pub(crate) calls_per_second: f64,
-    /// Processor time a call of what is before the master.
+    /// Processor time per call of everything in front of the master, in µs.
     pub(crate) own_cpu_us: f64,
-    /// Processor time a call of the master.
+    /// Processor time per call of the master, in µs.
     pub(crate) master_cpu_us: f64,
     turns: Vec<Turn>,
 }
@@ -214,7 +215,7 @@ impl Cell {
     }
 }
 
-/// Measures every cell of `plan`, `seconds` for each party in `turns` turns.
+/// Measures every combination in `plan`, with `seconds` for each party, divided among `turns` turns.
 pub(crate) fn measure(
     parties: &[Party],
     plan: &[(Call, &[usize])],
@@ -241,7 +242,7 @@ fn cell(parties: &[Party], call: Call, connections: usize, seconds: f64, turns: 
     let time = Duration::from_secs_f64(seconds / turns as f64);
     let mut seen: Vec<_> = parties.iter().map(|_| (Vec::new(), Vec::new())).collect();
     for turn in 0..turns {
-        // Each begins in its turn.
+        // In each turn another party begins.
         for place in 0..parties.len() {
             let place = (place + turn) % parties.len();
             let (times, turns) = &mut seen[place];
@@ -270,12 +271,12 @@ fn one_turn(
 ) -> io::Result<(Vec<Duration>, Turn)> {
     let scripts = (0..connections).map(|number| call.script(number)).collect();
     let mut load = Load::connect(party.client.port(), scripts)?;
-    // Whoever pools connections makes those that so many callers need.
+    // Parties that pool connections open as many as so many callers need.
     load.run(time / 5)?;
     let (own, master) = (party.own(), [party.master_pid]);
     let before = (Cpu::read(&own), Cpu::read(&master));
     let done = load.run(time)?;
-    // While all are connected: the master has a thread for each connection.
+    // Read while all are connected, because the master has a thread for each connection.
     let after = (Cpu::read(&own), Cpu::read(&master));
     drop(load);
     let mut sorted = done.calls.clone();

@@ -1,8 +1,9 @@
-//! rosrescue side by side with a bare rosmaster, HAProxy and nginx, all in one run: `cargo bench --bench compare`.
+//! Compares rosrescue with a bare rosmaster, HAProxy and nginx in one run: `cargo bench --bench compare`.
 //!
-//! Five parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
-//! writes that notify nodes; what grows with the state; and the first again on a stand-in for a small computer. Prints tables as Markdown,
-//! draws a picture, and writes every number as JSON. What a number means is said below each table.
+//! There are five parts: single kinds of calls over few and many connections; real clients (many nodes that
+//! start at once, and `roslaunch`); writes that notify nodes; how times grow with the state; and the first
+//! part again on a simulated small computer. It prints tables as Markdown, draws a picture, and writes all
+//! numbers as JSON. The text below each table explains its numbers.
 
 #![allow(
     clippy::unwrap_used,
@@ -42,20 +43,20 @@ use crate::{
 
 const PICTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/compare.svg");
 
-/// For each turn of the writes that notify.
+/// Length of each turn of the writes that notify, in seconds.
 const NOTIFY_SECONDS: f64 = 5.0;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Part {
-    /// One kind of call at a time, by 1 to 512 connections.
+    /// One kind of call at a time, over 1 to 512 connections
     Calls,
-    /// A storm of 100 nodes, and `roslaunch`.
+    /// 100 nodes that start at once, and `roslaunch`
     Robots,
-    /// Writes that notify nodes, and rospy nodes that start together.
+    /// Writes that notify nodes, and rospy nodes that start together
     Notify,
-    /// What grows with the state.
+    /// How times grow with the state
     Scale,
-    /// The calls on one core at a quarter of its speed.
+    /// The calls on one core at a quarter of its speed
     Small,
 }
 
@@ -66,7 +67,7 @@ struct Options {
     #[arg(long, value_name = "PART,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Part::Calls, Part::Robots, Part::Notify, Part::Scale, Part::Small])]
     parts: Vec<Part>,
-    /// Length of each measurement of one party in seconds; there are some 200
+    /// Length of each of some 200 measurements of one party, in seconds
     #[arg(
         long,
         env = "ROSRESCUE_BENCH_SECONDS",
@@ -74,23 +75,23 @@ struct Options {
         default_value_t = 0.8
     )]
     seconds: f64,
-    /// Turns among which that time is divided, the parties alternating
+    /// Number of turns among which that time is divided; the parties alternate
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     turns: usize,
-    /// Storms of 100 nodes for each party
+    /// Number of starts of 100 nodes for each party
     #[arg(long, value_name = "COUNT", default_value_t = 5)]
     storms: usize,
-    /// Launches of 40 nodes for each party
+    /// Number of launches of 40 nodes for each party
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     launches: usize,
-    /// Turns of the writes that notify, and starts of rospy nodes, for each party
+    /// Number of turns of the writes that notify, and of starts of rospy nodes, for each party
     #[arg(long, value_name = "COUNT", default_value_t = 5)]
     notifies: usize,
-    /// Where all numbers go as JSON, and the picture beside it as SVG [default: compare.json in Cargo's target
-    /// folder]
+    /// File for all numbers as JSON; the picture is written beside it as SVG [default: compare.json in
+    /// Cargo's target folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also put the tables of all parts and the picture into docs/
+    /// Also write the tables of all parts into benches/results.md, and the picture into docs/
     #[arg(long, conflicts_with = "parts")]
     write_docs: bool,
 }
@@ -110,9 +111,9 @@ struct Measured {
 
 #[derive(Debug, Serialize)]
 enum Small {
-    /// The share of a core that there really was.
+    /// The share of a core that was really available, and the results.
     Measured(f64, Vec<calls::Cell>),
-    /// Why nothing was measured.
+    /// The reason why nothing was measured.
     Impossible(String),
 }
 
@@ -124,7 +125,7 @@ fn main() -> ExitCode {
     let missing = relays::missing();
     if (needs(Part::Calls) || needs(Part::Small)) && !missing.is_empty() {
         eprintln!(
-            "compare: not everything to compare with is installed; apt-get install {}",
+            "compare: some programs are not installed; run: apt-get install {}",
             missing.join(" ")
         );
         return ExitCode::FAILURE;

@@ -1,4 +1,5 @@
-//! Writes that notify nodes. What notifies is rosmaster's threads, under the same lock of Python as its answers.
+//! Measures writes that notify nodes. rosmaster's threads do the notifying, under the same Python lock as its
+//! answers.
 
 use std::{thread, time::Duration};
 
@@ -10,11 +11,11 @@ use crate::shared::support::{
     writers::{SUBSCRIBERS, Subscriber, WRITERS, write},
 };
 
-/// Between two calls of a writer at most.
+/// Maximum pause between two calls of a writer.
 const PAUSE: Duration = Duration::from_millis(4);
 
-/// What is measured, with further arguments: of rosmaster, which has 3 threads that notify, or of rosrescue, whose
-/// rosmaster has 32.
+/// The master to measure. The number is that of the threads that notify: 3 in a usual rosmaster, 32 in that
+/// of rosrescue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Subject {
     Bare(&'static [&'static str]),
@@ -30,32 +31,32 @@ const SUBJECTS: [Subject; 5] = [
     Subject::Proxy,
 ];
 
-/// One of them.
+/// The results of one subject.
 #[derive(Debug, Serialize)]
 pub(crate) struct Writes {
     pub(crate) name: String,
-    /// Of each call in each turn, sorted, in milliseconds.
+    /// The time of each call in all turns, sorted, in milliseconds.
     pub(crate) calls_ms: Vec<f64>,
     pub(crate) calls_per_second: f64,
-    /// Notifications that had come when the last call was answered.
+    /// Number of notifications that had arrived when the last call was answered.
     pub(crate) notifications: usize,
 }
 
-/// What rospy nodes took until all had registered, in milliseconds.
+/// How long rospy nodes took until all had registered, in milliseconds.
 #[derive(Debug, Serialize)]
 pub(crate) struct Starts {
     pub(crate) name: String,
     pub(crate) ms: Vec<f64>,
 }
 
-/// Both.
+/// The results of both measurements.
 #[derive(Debug, Serialize)]
 pub(crate) struct Notify {
     pub(crate) writes: Vec<Writes>,
     pub(crate) starts: Vec<Starts>,
 }
 
-/// Measures each subject for `seconds` in each of `turns`, and so many starts of rospy nodes.
+/// Measures each subject for `seconds` in each of `turns` turns, and as many starts of rospy nodes.
 pub(crate) fn measure(seconds: f64, turns: usize) -> Notify {
     let time = Duration::from_secs_f64(seconds);
     let mut writes: Vec<_> = SUBJECTS
@@ -125,7 +126,8 @@ impl Subject {
         }
     }
 
-    /// The calls that six writers make in that time, and how many notifications have come then.
+    /// Runs six writers for `time`. Returns the times of their calls, and how many notifications had arrived
+    /// then.
     fn write(self, time: Duration) -> (Vec<Duration>, usize) {
         let scratch = Scratch::new();
         let port = free_port();
@@ -159,7 +161,7 @@ impl Subject {
 }
 
 impl Writes {
-    /// The share of all notifications that had come.
+    /// The share of all notifications that had arrived.
     pub(crate) fn told(&self) -> f64 {
         self.notifications as f64 / (SUBSCRIBERS * self.calls_ms.len()) as f64
     }

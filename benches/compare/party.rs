@@ -1,4 +1,4 @@
-//! Who is compared: each with a rosmaster of its own, all started alike.
+//! The parties to compare, each with its own rosmaster, all started in the same way.
 
 use std::fmt;
 
@@ -15,7 +15,7 @@ use crate::{
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// A rosmaster, nothing before it.
+    /// A rosmaster without anything in front of it.
     Bare,
     /// `rosrescue core`.
     Core,
@@ -33,7 +33,7 @@ impl Kind {
         Self::Haproxy,
         Self::Nginx,
     ];
-    /// Those that are compared by real clients.
+    /// The parties that are compared by real clients.
     pub(crate) const OURS: [Self; 3] = [Self::Bare, Self::Core, Self::Proxy];
 }
 
@@ -62,14 +62,14 @@ enum Before {
     Relay(Process),
 }
 
-/// A rosmaster, and what is before it.
+/// A rosmaster, and the program in front of it.
 #[derive(Debug)]
 pub(crate) struct Party {
     pub(crate) kind: Kind,
-    /// What nodes use.
+    /// A client of the port that nodes use.
     pub(crate) client: Client,
     pub(crate) master_pid: u32,
-    // In the order of the drops.
+    // Fields are dropped in this order.
     before: Before,
     _master: Option<SecondMaster>,
     _scratch: Scratch,
@@ -81,12 +81,14 @@ impl Party {
         let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
         let rescue = setup.guarded().start();
         let client = rescue.client();
-        eventually("`rosversion` has been asked", || {
+        eventually("roscore's parameters are set", || {
             client.param("/rosdistro").is_some()
         });
         Self {
             kind: Kind::Core,
-            master_pid: client.master_pid().expect("the master's process id"),
+            master_pid: client
+                .master_pid()
+                .expect("the master does not report its process id"),
             client,
             before: Before::Rescue(Box::new(rescue)),
             _master: None,
@@ -94,7 +96,7 @@ impl Party {
         }
     }
 
-    /// One whose master is started as the one with process id `like` was.
+    /// Starts a party whose master is started like the one with process id `like`.
     fn start(kind: Kind, like: u32) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
@@ -102,7 +104,9 @@ impl Party {
         let master = SecondMaster::spawn(&mut command);
         let client = Client::new(master_port);
         eventually("the master answers", || client.master_pid().is_some());
-        let master_pid = client.master_pid().expect("the master's process id");
+        let master_pid = client
+            .master_pid()
+            .expect("the master does not report its process id");
         let (client, before) = match kind {
             Kind::Core => panic!("`core` starts its own master"),
             Kind::Bare => (client, Before::Nothing),
@@ -117,7 +121,7 @@ impl Party {
             }
         };
         eventually("calls pass", || client.master_pid() == Some(master_pid));
-        // As roscore does: roslaunch waits for it.
+        // As roscore does, because roslaunch waits for it.
         client.set_param("/run_id", "3b1f2f3e-c77e-11f0-8b0e-000000000000");
         Self {
             kind,
@@ -139,7 +143,7 @@ impl Party {
     }
 }
 
-/// One of each of `kinds`, in that order; `core` must be one of them.
+/// Starts one party of each of `kinds`, in that order. `core` must be one of them.
 pub(crate) fn start(kinds: &[Kind]) -> Vec<Party> {
     let core = Party::core();
     let like = core.master_pid;

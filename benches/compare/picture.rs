@@ -1,4 +1,4 @@
-//! The picture: bars to the right are better than the bare rosmaster, bars to the left worse.
+//! Draws the picture: bars to the right are better than the bare rosmaster, bars to the left are worse.
 
 use std::fmt::Write;
 
@@ -7,7 +7,7 @@ use crate::{
     party::Kind,
 };
 
-/// In the order of the bars, and their colours.
+/// The parties in the order of their bars, and their colours.
 const BARS: [(Kind, &str); 4] = [
     (Kind::Core, "#c2410c"),
     (Kind::Proxy, "#fb923c"),
@@ -17,12 +17,12 @@ const BARS: [(Kind, &str); 4] = [
 const BAR: f64 = 9.0;
 const GROUP: f64 = BAR * BARS.len() as f64 + 14.0;
 const LABEL: f64 = 190.0;
-/// Width of a panel, and of a doubling in it.
+/// Width of a panel, and of a factor of two in it, in pixels.
 const PANEL: f64 = 400.0;
 const DOUBLING: f64 = 40.0;
 const TOP: f64 = 78.0;
 
-/// A panel: its title, and how many times better than the bare rosmaster a party is.
+/// A panel: its title, and how to compute how many times better than the bare rosmaster a party is.
 struct Panel {
     title: &'static str,
     connections: usize,
@@ -42,7 +42,7 @@ const PANELS: [Panel; 2] = [
     },
 ];
 
-/// Two panels of bars, for one caller and for 64.
+/// Draws two panels of bars, for one caller and for 64.
 pub(crate) fn svg(cells: &[Cell]) -> String {
     let groups = |panel: &Panel| {
         let wanted = panel.connections;
@@ -79,7 +79,7 @@ pub(crate) fn svg(cells: &[Cell]) -> String {
     text + "</svg>\n"
 }
 
-/// Where a ratio is: the bare rosmaster at a third of the width, a logarithmic axis.
+/// The position of a ratio on the logarithmic axis, where the bare rosmaster is at a third of the width.
 fn place(left: f64, ratio: f64) -> f64 {
     let zero = left + PANEL / 3.0;
     (zero + ratio.log2() * DOUBLING).clamp(left, left + PANEL)

@@ -1,4 +1,4 @@
-//! HAProxy and nginx as plain child processes in the foreground, before a rosmaster.
+//! HAProxy and nginx as plain child processes in front of a rosmaster.
 
 use std::{
     fs,
@@ -11,7 +11,7 @@ use crate::{
     shared::support::{Process, Scratch},
 };
 
-/// What a relay is run by, and the Debian package that has it.
+/// The name of a relay's program, and of the Debian package that contains it.
 fn program(kind: Kind) -> Option<(&'static str, &'static str)> {
     match kind {
         Kind::Haproxy => Some(("haproxy", "haproxy")),
@@ -20,7 +20,7 @@ fn program(kind: Kind) -> Option<(&'static str, &'static str)> {
     }
 }
 
-/// The program on the PATH, or where Debian has it, which is not on everybody's PATH.
+/// Finds a program in the PATH, or where Debian installs it, which is not in every user's PATH.
 fn find(name: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let mut folders: Vec<_> = std::env::split_paths(&path).collect();
@@ -29,19 +29,19 @@ fn find(name: &str) -> Option<PathBuf> {
     programs.find(|program| program.is_file())
 }
 
-/// The packages that are not installed.
+/// The Debian packages that are not installed.
 pub(crate) fn missing() -> Vec<&'static str> {
     let programs = [Kind::Haproxy, Kind::Nginx].into_iter().filter_map(program);
     let missing = programs.filter(|(name, _)| find(name).is_none());
     missing.map(|(_, package)| package).collect()
 }
 
-/// The relay of this kind at `port`, before the master at `master`.
+/// Starts a relay at `port` in front of the master at `master`.
 pub(crate) fn start(kind: Kind, scratch: &Scratch, port: u16, master: u16) -> Process {
     let (name, _) = program(kind).expect("a relay");
     let folder = scratch.path("");
     let file = scratch.path(format!("{name}.conf"));
-    let mut command = Command::new(find(name).expect("an installed program"));
+    let mut command = Command::new(find(name).expect("the program of the relay is not installed"));
     scratch.prepare(&mut command);
     let text = if kind == Kind::Haproxy {
         command.args(["-db", "-f"]).arg(&file);
@@ -50,12 +50,13 @@ pub(crate) fn start(kind: Kind, scratch: &Scratch, port: u16, master: u16) -> Pr
         command.arg("-p").arg(&folder).arg("-c").arg(&file);
         nginx(port, master, &folder)
     };
-    fs::write(&file, text).expect("a file in the scratch folder");
+    fs::write(&file, text).expect("cannot write to the scratch folder");
     Process::start(name, &mut command)
 }
 
-/// A client's connection keeps its own to the master. A shared pool would hold some that the rosmaster is just closing,
-/// as it does with those that are idle for its socket timeout, 5 s.
+/// The configuration of HAProxy. Each client connection has its own connection to the master. A shared pool
+/// would contain some that rosmaster is just closing, because it closes idle ones after its socket timeout of
+/// 5 s.
 fn haproxy(port: u16, master: u16) -> String {
     format!(
         "global
@@ -77,7 +78,7 @@ backend master
     )
 }
 
-/// Kept-alive connections end before a rosmaster closes them.
+/// The configuration of nginx. Kept connections are closed before rosmaster closes them.
 fn nginx(port: u16, master: u16, folder: &Path) -> String {
     let kinds = ["client_body", "proxy", "fastcgi", "uwsgi", "scgi"];
     let folder = folder.display();

@@ -1,4 +1,4 @@
-//! What was measured, as Markdown.
+//! Prints the results as Markdown.
 
 use crate::{
     Measured, Small,
@@ -10,7 +10,7 @@ use crate::{
     shared::numbers::{short, spread},
 };
 
-/// All tables.
+/// All tables with their explanations.
 pub(crate) fn markdown(measured: &Measured) -> String {
     let mut parts = vec![format!(
         "{}; {} s for each number, in {} turns.",
@@ -44,37 +44,37 @@ pub(crate) fn markdown(measured: &Measured) -> String {
 }
 
 const CALLS: &str = "
-* Each party has a rosmaster of its own, started in the same way, and the parties take turns. Each connection is kept alive and calls as soon as it is answered; one thread
-  makes all the load, on the same cores. A connection that was closed is made anew and the call repeated, as Python's client does; the JSON counts that.
+* Each party has its own rosmaster, started in the same way, and the parties take turns. Each connection is kept alive and makes its next call as soon as it has its answer.
+  One thread makes all calls, on the same cores. If a connection was closed, the call is repeated on a new one, as Python's client does; the JSON has their number.
   HAProxy runs in http mode with one thread, nginx with one worker and kept-alive connections to its master.
-* *Times*: from just before a call is sent until its whole answer is there.
+* *Times*: from just before a call is sent until its whole answer has arrived.
 * *Calls a second*: of all connections together.
-* *Processor time*: user and system time of what is before the master (guardian and worker of rosrescue) + that of its master, over the calls.
-* *registerPublisher*: and `unregisterPublisher`, in turn. *multicall of 101*: 100 times `setParam` and a `deleteParam`, as `roslaunch` does. *KB*, *MB*: of the answer. Writes
-  change something: each sets another value.
-* Left out is what takes seconds a call: 5 MB, 10,000 parameters and multicalls by 64 or 512 connections.
+* *Processor time*: user and system time per call of everything in front of the master (guardian and worker of rosrescue) + that of its master.
+* *registerPublisher*: in turn with `unregisterPublisher`. *multicall of 101*: 100 times `setParam` and one `deleteParam`, as from `roslaunch`. *KB*, *MB*: size of the answer. Each write
+  sets another value.
+* Combinations that take seconds per call are left out: 5 MB, 10,000 parameters and multicalls over 64 or 512 connections.
 ";
 
 const ROBOTS: &str = "
-* *A storm of 100 nodes*: all connect at once and make 15 calls each, one after the other, as a node does that starts: publishers, subscribers, services, parameters. Until
+* *A storm of 100 nodes*: all connect at once and make 15 calls each, one after another, like a starting node: publishers, subscribers, services, parameters. Time until
   the last answer, median (largest).
-* *`roslaunch`*: 30 rospy and 10 roscpp nodes and 500 parameters, from its start until the last has registered. Most of it is Python's start.
+* *`roslaunch`*: 30 rospy and 10 roscpp nodes and 500 parameters. Time from its start until the last node has registered. Most of it is the start of Python programs.
 ";
 
 const NOTIFY: &str = "
-* *Calls a second*: by six writers for 5 s in each turn, each with a parameter and a publisher of its own that comes and goes, and random pauses of up to 4 ms between two calls.
-  Four nodes subscribe to all of them, and answer after 1 ms. *Notified by then*: of all notifications, how many had come when the last call was answered; the rest are queued.
-* *Twelve rospy nodes*: started together, with 20 publishers and 60 subscribers each; until the last has registered.
-* A rosmaster as people start it notifies by 3 threads, that of `core` by 32.
+* *Calls a second*: six writers for 5 s in each turn. Each has its own parameter and its own publisher, which comes and goes, with random pauses of up to 4 ms between calls.
+  Four nodes subscribe to all of them, and answer after 1 ms. *Notified by then*: the share of notifications that had arrived when the last call was answered; the rest are queued.
+* *Twelve rospy nodes*: started together, with 20 publishers and 60 subscribers each. Time until the last has registered.
+* A usual rosmaster notifies nodes with 3 threads, the one of `core` with 32.
 ";
 
 const SCALE: &str = "
 * *A write*, *a read*: `setParam` and `getParam` of one parameter by one client, medians. A node has ten registrations.
-* *Compaction*: while one client sets a value of 8 KB and another one reads, without pause; from the first sight of the new file until it is the checkpoint.
-  *Longest call*: read, write; from 200 ms before that on, and in brackets all the rest of the time.
-* *Restart*: guardian and worker are killed and started again; from the start to the first answer to a read. *Recovery*: the master is killed; from the shut gate to the open
-  one, the start of a rosmaster included. *Recovery alone*: from the new rosmaster's open port on.
-* *Memory*: resident, guardian and worker together; at first, and after all that.
+* *Compaction*: while one client sets a value of 8 KB and another one reads, without pause. Time from the first sight of the new file until it is the checkpoint.
+  *Longest call*: read, write, from 200 ms before the compaction on; in brackets, during the rest of the time.
+* *Restart*: guardian and worker are killed and started again. Time from the start to the first answer to a read. *Recovery*: the master is killed. Time from the shut gate to the open
+  one, including the start of a rosmaster. *Recovery alone*: from the open port of the new rosmaster on.
+* *Memory*: resident memory of guardian and worker together, at first and at the end.
 ";
 
 fn calls(cells: &[Cell]) -> String {

@@ -1,4 +1,4 @@
-//! Real clients: a storm of nodes that start at once, and `roslaunch` of rospy and roscpp nodes.
+//! Measures real clients: many nodes that start at once, and `roslaunch` of rospy and roscpp nodes.
 
 use std::{
     fmt::Write,
@@ -22,12 +22,12 @@ const STORM: usize = 100;
 const ROSPY: usize = 30;
 const ROSCPP: usize = 10;
 const PARAMS: usize = 500;
-/// Between two looks at who has registered.
+/// Pause between two checks of which nodes have registered.
 const LOOK: Duration = Duration::from_millis(50);
-/// How long a launch may take.
+/// Maximum time of a launch.
 const PATIENCE: Duration = Duration::from_secs(180);
 
-/// Milliseconds of each turn.
+/// The times of all turns, in milliseconds.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Times {
     pub(crate) party: Kind,
@@ -35,7 +35,7 @@ pub(crate) struct Times {
     pub(crate) launch_ms: Vec<f64>,
 }
 
-/// Each turn has parties that were just started: all begin with the same state.
+/// Measures both. Each turn uses newly started parties, so that all begin with the same state.
 pub(crate) fn measure(storms: usize, launches: usize) -> Vec<Times> {
     let storm_ms = turns("storm", storms, storm);
     let launch_ms = turns("launch", launches, launch);
@@ -61,8 +61,8 @@ fn turns(what: &str, count: usize, measure: fn(&Party) -> f64) -> [Vec<f64>; Kin
     times
 }
 
-/// What a node with two publishers, two subscribers and a few parameters calls when it starts: 15 calls on one
-/// connection.
+/// The calls that a node with two publishers, two subscribers and a few parameters makes when it starts: 15
+/// calls on one connection.
 fn start_of(node: &FakeNode, number: usize) -> Script {
     let (name, api) = (node.name.as_str(), node.api.as_str());
     let service_api = node.service_api();
@@ -118,12 +118,12 @@ fn storm(party: &Party) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
-/// From the start of `roslaunch` until its last node and parameter is there.
+/// The time from the start of `roslaunch` until its last node and parameter is there, in milliseconds.
 fn launch(party: &Party) -> f64 {
-    // Of its own: what is in it ends with this turn.
+    // A scratch folder for this turn, so that everything started here ends with it.
     let scratch = Scratch::new();
     let file = scratch.path("compare.launch");
-    fs::write(&file, launch_file()).expect("a launch file");
+    fs::write(&file, launch_file()).expect("cannot write the launch file");
     let program = find_program("roslaunch");
     let mut command = ros_command(&scratch, program, party.client.port());
     command.arg("--wait").arg(&file);
@@ -160,7 +160,7 @@ fn launch_file() -> String {
     text + "</launch>\n"
 }
 
-/// How many nodes publish this topic.
+/// Number of nodes that publish this topic.
 fn publishers(party: &Party, topic: &str) -> usize {
     let state = party.client.ok("getSystemState", params!["/compare"]);
     let tables = state.as_array().expect("three tables");

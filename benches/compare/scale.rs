@@ -1,4 +1,4 @@
-//! What grows with the state of `rosrescue core`, and what does not.
+//! Measures which times of `rosrescue core` grow with its state.
 
 use std::{
     fs,
@@ -25,7 +25,7 @@ use crate::{
     },
 };
 
-/// Parameters and nodes. A node has ten registrations.
+/// Numbers of parameters and nodes. Each node has ten registrations.
 pub(crate) const STATES: [(usize, usize); 5] = [
     (10, 1),
     (1_000, 1),
@@ -33,20 +33,20 @@ pub(crate) const STATES: [(usize, usize); 5] = [
     (10, 1_000),
     (10_000, 1_000),
 ];
-/// Compactions that are watched.
+/// Number of compactions to observe.
 const COMPACTIONS: usize = 3;
-/// How large the value is that is set all the time until the journal is compacted.
+/// Size in bytes of the value that is set again and again until the journal is compacted.
 const VALUE: usize = 8 << 10;
-/// Between two looks at the checkpoint.
+/// Pause between two checks of the checkpoint.
 const LOOK: Duration = Duration::from_micros(200);
-/// The mirror is copied before the first sign of a compaction in the folder.
+/// How long before the first sign of a compaction in the folder rosrescue may begin to copy the mirror.
 const LEAD: Duration = Duration::from_millis(200);
-/// How long the compactions may take together.
+/// Maximum time for all compactions together.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Kills of rosrescue, and of the master.
+/// Number of kills of rosrescue, and of the master.
 const KILLS: usize = 3;
 
-/// Milliseconds, but for the memory. Medians, the longest calls aside.
+/// The results for one state. Times are medians in milliseconds, except for the longest calls.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Row {
     pub(crate) params: usize,
@@ -54,17 +54,17 @@ pub(crate) struct Row {
     pub(crate) write_ms: f64,
     pub(crate) read_ms: f64,
     pub(crate) compactions_ms: Vec<f64>,
-    /// The longest read and write during a compaction.
+    /// The longest read and the longest write during a compaction.
     pub(crate) longest_ms: [f64; 2],
-    /// The same while there was none.
+    /// The longest read and the longest write without a compaction.
     pub(crate) otherwise_ms: [f64; 2],
     pub(crate) restarts_ms: Vec<f64>,
-    /// From the shut gate to the open one.
+    /// Times from the shut gate to the open one.
     pub(crate) recoveries_ms: Vec<f64>,
-    /// Of each of these, what was not waiting for the new master.
+    /// The part of each of these times that was not spent waiting for the new master.
     pub(crate) injections_ms: Vec<f64>,
     pub(crate) memory_kib: u64,
-    /// After restarts and recoveries.
+    /// Memory use after restarts and recoveries.
     pub(crate) memory_after_kib: u64,
 }
 
@@ -114,7 +114,7 @@ fn row(count: usize, nodes: usize, seconds: f64) -> Row {
     row
 }
 
-/// So many nodes that answer, with ten registrations each.
+/// Registers `count` nodes that answer, with ten registrations each.
 fn register(client: &Client, count: usize) -> Vec<FakeNode> {
     let start = |number: usize| {
         let name = format!("/scale_{number}");
@@ -136,7 +136,7 @@ fn register(client: &Client, count: usize) -> Vec<FakeNode> {
 /// When a call began, and how long it took.
 type Timed = (Instant, Duration);
 
-/// How long compactions of the journal take, the longest read and write during them, and otherwise.
+/// The times of compactions of the journal, and the longest read and write during them and otherwise.
 fn compactions(client: &Client, checkpoint: &Path) -> (Vec<f64>, [f64; 2], [f64; 2]) {
     let over = AtomicBool::new(false);
     let read = encode_call("getParam", params!["/compare", "/compare/small"]);
@@ -185,7 +185,7 @@ fn call_until(client: &Client, request: &[u8], over: &AtomicBool) -> Vec<Timed> 
     calls
 }
 
-/// From the first sight of a new generation's file until it is the checkpoint.
+/// Measures compactions: from the first sight of a new generation's file until it has become the checkpoint.
 fn watch(checkpoint: &Path) -> Vec<(Instant, Instant)> {
     let begin = Instant::now();
     let inode = || fs::metadata(checkpoint).map_or(0, |found| found.ino());
@@ -199,7 +199,7 @@ fn watch(checkpoint: &Path) -> Vec<(Instant, Instant)> {
     while spans.len() < COMPACTIONS && begin.elapsed() < PATIENCE {
         let now = inode();
         if now != last {
-            // One that was too quick to be seen took less than a look.
+            // A compaction that was too quick to be seen took less than one pause.
             let to = Instant::now();
             spans.push((from.take().unwrap_or(to - LOOK), to));
             last = now;
@@ -211,11 +211,11 @@ fn watch(checkpoint: &Path) -> Vec<(Instant, Instant)> {
     spans
 }
 
-/// Both processes of rosrescue are killed, and it is started again: from there to its first answer to a read.
-/// The master lives.
+/// Kills both processes of rosrescue and starts it again. Returns the time from the start to its first answer
+/// to a read, in milliseconds. The master lives on.
 fn restart(rescue: &mut Rescue) -> f64 {
     let family = family(rescue.pid());
-    // The guardian first: it would start another worker.
+    // The guardian first, because it would start another worker.
     for pid in &family {
         signal(*pid, Signal::KILL);
     }
@@ -238,7 +238,7 @@ fn restart(rescue: &mut Rescue) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
-/// As `eventually_some`, with shorter pauses.
+/// Like `eventually_some`, with shorter pauses.
 fn eventually_soon<T>(mut look: impl FnMut() -> Option<T>) -> T {
     let begin = Instant::now();
     loop {
@@ -250,13 +250,13 @@ fn eventually_soon<T>(mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// SIGKILL to the master: from the shut gate to the open one, and of that from the new master's open port on, as
-/// rosrescue says.
+/// Kills the master. Returns the time from the shut gate to the open one, and the part of it after the new
+/// master's port was open, as reported by rosrescue.
 fn recovery(client: &Client) -> (f64, f64) {
     let recoveries = status(client)["recoveries"].as_u64();
     let master = client.master_pid().expect("a process id");
     signal(master, Signal::KILL);
-    let status = eventually_some("the recovery has been reported", || {
+    let status = eventually_some("the recovery has a report", || {
         Some(status(client)).filter(|status| status["recoveries"].as_u64() > recoveries)
     });
     let phases = &status["last_recovery"]["phases"];

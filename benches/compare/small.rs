@@ -1,4 +1,5 @@
-//! A small computer: one core, and a quarter of its time, by the kernel's bandwidth control for groups.
+//! Simulates a small computer: one core and a quarter of its time, by the kernel's bandwidth control for
+//! cgroups.
 
 use std::{
     fs,
@@ -10,16 +11,16 @@ use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
 use crate::shared::cpu::Cpu;
 
-/// Of the core's time.
+/// The share of the core's time.
 const SHARE: f64 = 0.25;
-/// In which the group gets its share, in microseconds. The default of 100 ms would make pauses of 75 ms, as no
-/// slow processor has them.
+/// The period in which the group gets its share, in microseconds. The default of 100 ms would cause pauses of
+/// 75 ms, which no slow processor has.
 const PERIOD: u32 = 10_000;
-/// For how long the share is measured.
+/// For how long the real share is measured.
 const SPIN: Duration = Duration::from_secs(1);
 
-/// This process and all that it starts, in a group with a quota on one core. Dropped, this process leaves it; what
-/// else is in it must have ended.
+/// This process and everything that it starts, in a cgroup with a quota on one core. When this is dropped,
+/// the process leaves the group; all other processes in it must have ended.
 #[derive(Debug)]
 pub(crate) struct SmallComputer {
     group: PathBuf,
@@ -28,7 +29,7 @@ pub(crate) struct SmallComputer {
 }
 
 impl SmallComputer {
-    /// Why there is none, if not: neither version of cgroups can be written.
+    /// Enters such a group. The error says why that is impossible: neither version of cgroups is writable.
     pub(crate) fn enter() -> Result<Self, String> {
         let (parent, own, version) = mount()?;
         let group = parent.join(format!("rosrescue-compare-{}", std::process::id()));
@@ -77,8 +78,8 @@ impl Drop for SmallComputer {
     }
 }
 
-/// Where a group can be made in the hierarchy that controls processor time, the group of this process, and the
-/// version of cgroups.
+/// Where a group can be created in the hierarchy that controls processor time, the present group of this
+/// process, and the version of cgroups.
 fn mount() -> Result<(PathBuf, PathBuf, u8), String> {
     let read = |path: &str| fs::read_to_string(path).map_err(|error| format!("{path}: {error}"));
     let (mounts, groups) = (read("/proc/self/mounts")?, read("/proc/self/cgroup")?);
@@ -107,7 +108,7 @@ fn mount() -> Result<(PathBuf, PathBuf, u8), String> {
         let controls = place.join("cgroup.subtree_control");
         let controls = fs::read_to_string(controls).unwrap_or_default();
         if *kind == "cgroup2" && has_cpu(controls.trim(), ' ') {
-            // A group with processes of its own can have none below it, but for the root.
+            // A group that contains processes cannot have groups below it, except for the root.
             return Ok((place.to_owned(), below(own("")), 2));
         }
     }

@@ -1,4 +1,4 @@
-//! Three computers on loopback: an etcd and a `rosrescue core` each.
+//! Three computers on loopback, each with an etcd and a `rosrescue core`.
 
 use std::{
     fmt,
@@ -30,16 +30,16 @@ pub(crate) const COUNT: usize = 3;
 pub(crate) const TIME_TO_LIVE: Duration = Duration::from_secs(2);
 /// A file system in memory.
 const MEMORY: &str = "/dev/shm";
-/// After a change of who leads every node is asked for a sign of life.
+/// Time to wait after a change of the leader, because every node is then asked whether it is alive.
 const SETTLE: Duration = Duration::from_secs(1);
 
-/// Where etcd has its data.
+/// Where etcd stores its data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Data {
-    /// In Cargo's target folder.
+    /// In Cargo's target folder
     Disk,
-    /// In `/dev/shm`.
+    /// In `/dev/shm`
     Memory,
 }
 
@@ -52,7 +52,7 @@ impl fmt::Display for Data {
     }
 }
 
-/// `--cluster-sync`.
+/// The value of `--cluster-sync`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Sync {
@@ -69,7 +69,7 @@ impl fmt::Display for Sync {
     }
 }
 
-/// After which silence of its leader etcd elects another one.
+/// How long etcd's leader must be silent before etcd elects another one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Election {
@@ -118,12 +118,12 @@ impl Engine {
         }
     }
 
-    /// The member that leads etcd.
+    /// The number of the member that leads etcd.
     fn leader(&self) -> usize {
         self.runtime.block_on(self.servers.leader())
     }
 
-    /// Has member `index` lead etcd.
+    /// Makes member `index` lead etcd.
     fn let_lead(&self, index: usize) {
         let leads = self.leader();
         if leads == index {
@@ -150,14 +150,14 @@ impl Engine {
 }
 
 struct Computer {
-    // In the order of the drops: the scratch folder last, which ends what is left.
+    // Fields are dropped in this order. The scratch folder comes last and ends everything that is left.
     rescue: Rescue,
     scratch: Scratch,
 }
 
-/// The computers, and nodes that are on none of them.
+/// The computers, and nodes that run on none of them.
 pub(crate) struct Cluster {
-    // In the order of the drops.
+    // Fields are dropped in this order.
     computers: Vec<Computer>,
     nodes: Vec<FakeNode>,
     engine: Engine,
@@ -203,14 +203,14 @@ impl Cluster {
         self.computers[index].rescue.checkpoint()
     }
 
-    /// Who leads.
+    /// The number of the leading computer.
     pub(crate) fn leader(&self) -> usize {
         eventually_some("a computer leads", || {
             (0..COUNT).find(|index| self.role(*index).as_deref() == Some("leading"))
         })
     }
 
-    /// Those that do not lead, in a fixed order.
+    /// The numbers of the other computers, in a fixed order.
     pub(crate) fn followers(leader: usize) -> [usize; COUNT - 1] {
         [(leader + 1) % COUNT, (leader + 2) % COUNT]
     }
@@ -221,20 +221,20 @@ impl Cluster {
     }
 
     fn cluster_status(&self, index: usize) -> Option<Json> {
-        // It may not listen yet.
+        // rosrescue may not listen yet.
         self.client(index).connect().ok()?;
         Some(status(&self.client(index))["cluster"].clone())
     }
 
-    /// Waits until one leads, has a master, and the others follow it, and for a moment more.
+    /// Waits until one computer leads and has a master, the others follow it, and all nodes were asked.
     pub(crate) fn settle(&self) {
-        eventually("etcd is whole", || self.engine.is_whole());
+        eventually("all members of etcd are up", || self.engine.is_whole());
         let leader = self.leader();
         eventually("the leader has a master", || {
             let client = self.client(leader);
             status(&client)["open"] == true && client.param("/rosdistro").is_some()
         });
-        eventually("the others follow", || {
+        eventually("the other computers follow", || {
             let mut followers = Self::followers(leader).into_iter();
             followers.all(|index| {
                 let status = self.cluster_status(index).unwrap_or_default();
@@ -249,7 +249,7 @@ impl Cluster {
         sleep(SETTLE);
     }
 
-    /// Has etcd led by the leading computer's member, or by another one.
+    /// Makes the leading computer's member lead etcd, or another member.
     pub(crate) fn place_leader_of_etcd(&self, with_leader: bool) {
         let leader = self.leader();
         let index = match with_leader {
@@ -259,7 +259,7 @@ impl Cluster {
         self.engine.let_lead(index);
     }
 
-    /// SIGKILL to everything that runs on this computer. Returns when it began.
+    /// Sends SIGKILL to everything that runs on this computer. Returns when that began.
     pub(crate) fn kill(&mut self, index: usize) -> Instant {
         let processes = self.computers[index].scratch.survivors();
         let begin = Instant::now();
@@ -270,7 +270,7 @@ impl Cluster {
         begin
     }
 
-    /// Switches it on again.
+    /// Starts the computer again.
     pub(crate) fn start_again(&mut self, index: usize) {
         self.engine.servers.start(index);
         let rescue = &mut self.computers[index].rescue;
@@ -278,13 +278,13 @@ impl Cluster {
         rescue.start_again();
     }
 
-    /// How often this computer has said that it is cut off.
+    /// How often this computer has logged that it is cut off.
     pub(crate) fn times_alone(&self, index: usize) -> usize {
         let lines = self.computers[index].rescue.output().into_iter();
         lines.filter(|line| line.contains("ALONE:")).count()
     }
 
-    /// How many seconds the last takeover took, as the computer that leads says.
+    /// The time of the last takeover in seconds, as reported by the leading computer.
     pub(crate) fn said(&self) -> f64 {
         let status = self.cluster_status(self.leader()).unwrap_or_default();
         let seconds = status["last_takeover"]["seconds"].as_f64();

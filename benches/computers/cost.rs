@@ -1,4 +1,4 @@
-//! What a call costs, through the leader and through a follower, next to one computer.
+//! Measures the time of a call through the leader and through a follower, compared with a single computer.
 
 use std::{fmt, time::Duration};
 
@@ -18,7 +18,7 @@ pub(crate) const CONNECTIONS: [usize; 2] = [1, 64];
 
 /// A `rosrescue core` without `--cluster`.
 pub(crate) struct Single {
-    // In the order of the drops.
+    // Fields are dropped in this order.
     rescue: Rescue,
     _scratch: Scratch,
 }
@@ -28,7 +28,7 @@ impl Single {
         let scratch = Scratch::new();
         let rescue = Setup::core(&scratch, free_port()).guarded().start();
         let client = rescue.client();
-        eventually("`rosversion` has been asked", || {
+        eventually("roscore's parameters are set", || {
             client.param("/rosdistro").is_some()
         });
         Self {
@@ -38,7 +38,7 @@ impl Single {
     }
 }
 
-/// Whom the clients call.
+/// The computer to which clients make their calls.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Through {
@@ -68,7 +68,7 @@ impl fmt::Display for Call {
     }
 }
 
-/// What so many clients saw, in milliseconds.
+/// The results for a number of clients, in milliseconds.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Cost {
     pub(crate) sync: Sync,
@@ -82,7 +82,7 @@ pub(crate) struct Cost {
     pub(crate) calls_per_second: f64,
 }
 
-/// What client `number` calls.
+/// The calls that client `number` makes.
 pub(crate) fn script(call: Call, number: usize) -> Script {
     let name = format!("/computers/node_{number}");
     let name = name.as_str();
@@ -111,7 +111,7 @@ pub(crate) fn measure(single: &Single, cluster: &Cluster, seconds: f64, turns: u
             let mut seen = Through::ALL.map(|_| (Vec::new(), 0.0));
             let time = Duration::from_secs_f64(seconds / turns as f64);
             for turn in 0..turns {
-                // Each begins in its turn.
+                // In each turn another party begins.
                 for place in 0..parties.len() {
                     let place = (place + turn) % parties.len();
                     let (times, length) = &mut seen[place];
@@ -152,7 +152,7 @@ fn one_turn(
         .map(|number| script(call, number))
         .collect();
     let mut load = Load::connect(client.port(), scripts).expect("connections");
-    // Whoever pools connections makes those that so many callers need.
+    // Parties that pool connections open as many as so many callers need.
     load.run(time / 5).expect("answers");
     let done = load.run(time).expect("answers");
     (done.calls, done.time)

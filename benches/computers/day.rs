@@ -1,7 +1,8 @@
-//! What etcd needs after a day of a robot's writes, played as fast as it goes.
+//! Measures what etcd needs after a day of a robot's writes, played as fast as possible.
 //!
-//! Nothing of rosrescue runs here: its leader has etcd forget by the clock, which would not come into play. The
-//! requests are those of a leader and two followers, at the same places of the day.
+//! No rosrescue runs here, because its leader makes etcd discard old data by the clock, which would not
+//! happen during such a short run. The requests are those of a leader and two followers, at the same moments
+//! of the day.
 
 use std::{
     fs,
@@ -39,44 +40,45 @@ use crate::{
     },
 };
 
-/// Requests under way at a time.
+/// Number of requests under way at a time.
 const AT_ONCE: u32 = 16;
-/// Parameters that are written in turn.
+/// Number of parameters that are written in turn.
 const PARAMS: u32 = 50;
-/// As `SNAPSHOT_ENTRIES` of the journal, one record each.
+/// The same as `SNAPSHOT_ENTRIES` of the journal, with one record each.
 const SNAPSHOT_EVERY: u32 = 1_000;
-/// As `FORGET` of the leader, in seconds.
+/// The same as `FORGET` of the leader, in seconds.
 const FORGET_EVERY: u32 = 300;
-/// As `SAYS_EVERY` of every computer, in seconds.
+/// The same as `SAYS_EVERY` of every computer, in seconds.
 const SAY_EVERY: u32 = 5;
-/// Of the lease for what a computer says: as few are there at a time as etcd lets be.
+/// Time to live of the lease for a computer's status, in seconds: the shortest that etcd allows, so that few
+/// exist at a time.
 const LEASE: &str = "2";
-/// Of a robot's seconds, between two lines of progress.
+/// Time of the robot between two lines of progress, in seconds.
 const PROGRESS: u32 = 7_200;
 
-/// What the member of etcd that needs most takes.
+/// The resources of the etcd member that needs most, in bytes.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub(crate) struct Need {
-    /// The database, and what of it is in use.
+    /// Size of the database, and of the part in use.
     pub(crate) database: u64,
     pub(crate) in_use: u64,
-    /// Its whole folder, with the log of what was written last.
+    /// Size of its whole folder, including the log of recent writes.
     pub(crate) folder: u64,
     /// Resident memory.
     pub(crate) memory: u64,
 }
 
-/// In bytes.
+/// The results of a day. Sizes are in bytes.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct Day {
     pub(crate) hours: u32,
     pub(crate) data: Data,
     pub(crate) transactions: u64,
-    /// What it took to play it.
+    /// How long playing the day took.
     pub(crate) seconds: f64,
     pub(crate) before: Need,
     pub(crate) after: Need,
-    /// The most that was resident on the way.
+    /// The maximum resident memory on the way.
     pub(crate) peak_memory: u64,
 }
 
@@ -84,13 +86,13 @@ struct Robot<'a> {
     keys: Keys,
     servers: &'a Servers,
     term: u64,
-    /// The value of the key that says that the leader is alive.
+    /// The value of the key that shows that the leader is alive.
     alive: Vec<u8>,
     snapshot: Checkpoint,
-    /// The next second to be played.
+    /// The next second to play.
     next: AtomicU32,
     transactions: AtomicU64,
-    /// The revision that etcd is to forget next.
+    /// The revision up to which etcd is to discard data next time.
     old: Mutex<u64>,
 }
 
@@ -157,10 +159,10 @@ impl Robot<'_> {
         let found = replica.client.range(&self.keys.small(), LIMIT).await;
         let found = found.expect("all keys").kvs.into_iter();
         let mut alive = found.filter(|kv| kv.key == self.keys.alive());
-        self.alive = alive.next().expect("the key that was written").value;
+        self.alive = alive.next().expect("the key must exist").value;
     }
 
-    /// Plays seconds of the day until `end`.
+    /// Plays the seconds of the day until `end`.
     fn play(&self, end: u32) {
         let authority = self.servers.endpoints(0)[0].clone();
         let port = authority
@@ -175,7 +177,7 @@ impl Robot<'_> {
                 return;
             }
             let seq = u64::from(second) + 1;
-            // A write is a sign of life, too. The next one is due half a second later.
+            // A write is a sign of life as well. The next one is due half a second later.
             let revision = self.beat(&mut wire, Some(&record(seq)));
             self.beat(&mut wire, None);
             if second.is_multiple_of(SAY_EVERY) {
@@ -194,8 +196,8 @@ impl Robot<'_> {
         }
     }
 
-    /// A transaction of the leader. Returns its revision. The comparison with the last sign of life is of the same
-    /// form, but holds for all that are under way at a time.
+    /// Makes a transaction of the leader and returns its revision. Its comparison with the last sign of life
+    /// has the same form as the leader's, but holds for all transactions that are under way at the same time.
     fn beat(&self, wire: &mut Wire, record: Option<&Record>) -> u64 {
         let (leader, alive) = (self.keys.leader(), self.keys.alive());
         let mut puts = Vec::new();
@@ -222,7 +224,7 @@ impl Robot<'_> {
         revision.parse().expect("a number")
     }
 
-    /// How a computer is.
+    /// Writes the status of a computer.
     fn say(&self, wire: &mut Wire, number: usize, seq: u64) {
         let lease = self.post(wire, "lease/grant", &json!({ "TTL": LEASE }));
         let name = format!("pc-{number}");
@@ -250,10 +252,13 @@ impl Robot<'_> {
         let written = runtime
             .expect("a runtime")
             .block_on(replica.write_snapshot(self.term, &checkpoint));
-        assert!(written.expect("a snapshot").is_some(), "it does not lead");
+        assert!(
+            written.expect("a snapshot").is_some(),
+            "the robot does not lead"
+        );
     }
 
-    /// Has etcd forget what is older than the last time.
+    /// Makes etcd discard what is older than at the previous time.
     fn forget(&self, wire: &mut Wire, revision: u64) {
         let mut old = self.old.lock().expect("the revision");
         if *old > 0 {
@@ -263,7 +268,7 @@ impl Robot<'_> {
                 &json!({ "revision": old.to_string() }),
             );
         }
-        // Those that are under way at a time come in no order.
+        // Requests that are under way at the same time arrive in any order.
         *old = revision.max(*old);
     }
 
@@ -286,7 +291,7 @@ fn put(key: &str, value: &[u8]) -> Json {
     json!({ "request_put": { "key": text(key), "value": BASE64_STANDARD.encode(value) } })
 }
 
-/// A node sets a parameter.
+/// The record of a node that sets a parameter.
 fn record(seq: u64) -> Record {
     let key = format!("/robot/part_{}/state", seq % u64::from(PARAMS));
     let params = params!["/robot_state", key, seq as f64 * 0.1];
@@ -296,7 +301,7 @@ fn record(seq: u64) -> Record {
     }
 }
 
-/// The state of a robot with so many nodes, with seven registrations each.
+/// The state of a robot with this many nodes, with seven registrations each.
 fn state(nodes: usize) -> Checkpoint {
     let mut master = Master::default();
     let mut apply = |method: &'static str, params: Vec<Value>| {
@@ -353,12 +358,12 @@ fn need(servers: &Servers) -> Need {
     most
 }
 
-/// What a folder takes on its disk.
+/// The space that a folder takes on its disk, in bytes.
 fn allocated(folder: &Path) -> u64 {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let sizes = entries.map(|entry| match entry.metadata() {
         Ok(metadata) if metadata.is_dir() => allocated(&entry.path()),
-        // One that was removed meanwhile takes nothing.
+        // A file that was removed in the meantime takes no space.
         metadata => metadata.map_or(0, |metadata| metadata.blocks() * 512),
     });
     sizes.sum()

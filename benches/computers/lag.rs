@@ -1,7 +1,7 @@
-//! How long after the answer to a write the followers' mirrors hold it.
+//! Measures how long after the answer to a write the mirrors of the followers have it.
 //!
-//! A follower forwards reads, so none of them shows its mirror. But it appends a record to its checkpoint under
-//! the lock under which it applies it: what is looked at is the length of that file.
+//! A follower forwards reads, so no read shows its mirror. But it appends a record to its checkpoint under
+//! the same lock under which it applies it to the mirror, so this bench watches the length of that file.
 
 use std::{
     fs::{self, File},
@@ -24,31 +24,31 @@ use crate::{
     },
 };
 
-/// How exactly it is known when a mirror holds a write.
+/// Pause between two checks, which is the accuracy of the results.
 const LOOK: Duration = Duration::from_micros(50);
-/// Between two writes.
+/// Pause between two writes.
 const PAUSE: Duration = Duration::from_millis(10);
-/// So many; with `interval` each takes 200 ms.
+/// Number of writes. With `interval` each takes 200 ms, so there are fewer.
 const WRITES: u32 = 200;
 const WRITES_AT_INTERVALS: u32 = 40;
-/// Clients that write meanwhile.
+/// Number of other clients that write at the same time.
 const OTHERS: usize = 64;
-/// A follower that lacks a write after this time does not follow.
+/// Maximum time for a follower to have a write.
 const LIMIT: Duration = Duration::from_secs(10);
 
-/// In milliseconds; nothing if a mirror had it before the answer.
+/// The results in milliseconds. 0 if a mirror had the write before it was answered.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct Lag {
     pub(crate) sync: Sync,
     pub(crate) data: Data,
-    /// Clients that write meanwhile.
+    /// Number of other clients that write at the same time.
     pub(crate) others: usize,
     pub(crate) median: f64,
     pub(crate) p99: f64,
     pub(crate) largest: f64,
 }
 
-/// Without other clients, and with some.
+/// Measures without other clients and with some.
 pub(crate) fn measure(cluster: &Cluster, seconds: f64) -> [Lag; 2] {
     [0, OTHERS].map(|others| {
         let done = AtomicBool::new(false);
@@ -65,7 +65,7 @@ pub(crate) fn measure(cluster: &Cluster, seconds: f64) -> [Lag; 2] {
             });
             let lags = writes(cluster);
             done.store(true, Ordering::Relaxed);
-            load.join().expect("the other clients");
+            load.join().expect("the other clients failed");
             lags
         });
         lags.sort();
@@ -82,7 +82,7 @@ pub(crate) fn measure(cluster: &Cluster, seconds: f64) -> [Lag; 2] {
     })
 }
 
-/// Of each write, at each follower.
+/// The time of each write at each follower.
 fn writes(cluster: &Cluster) -> Vec<Duration> {
     let leader = cluster.leader();
     let files = Cluster::followers(leader).map(|index| cluster.checkpoint(index));
@@ -118,14 +118,14 @@ fn answer(wire: &mut Wire, call: &[u8]) -> Instant {
     Instant::now()
 }
 
-/// When `file` has `mark` somewhere after `from`.
+/// The moment at which `file` contains `mark` somewhere after `from`.
 fn seen_at(file: &Path, mut from: u64, mark: &str) -> Instant {
     let begin = Instant::now();
     let mut known = from;
     while begin.elapsed() < LIMIT {
         let (now, is) = (Instant::now(), length(file));
         if is < known {
-            // It was compacted, and holds the value or does not.
+            // The file was compacted, so the mark may be anywhere in it.
             from = 0;
         }
         if is != known {
@@ -153,7 +153,7 @@ fn rest(file: &Path, from: u64) -> String {
     String::from_utf8_lossy(&bytes).into_owned()
 }
 
-/// Another one each time: a mark must not be found in what an earlier measurement wrote.
+/// A new number each time, so that a mark is never found in what an earlier measurement has written.
 fn lags_id() -> u64 {
     use std::sync::atomic::AtomicU64;
     static NEXT: AtomicU64 = AtomicU64::new(0);

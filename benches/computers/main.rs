@@ -1,8 +1,8 @@
-//! Several computers: what a takeover, a handover and a write take, with three real etcd servers and three
-//! `rosrescue core` on loopback: `cargo bench --bench computers`.
+//! Several computers: measures the times of a takeover, a handover and a write, with three real etcd servers
+//! and three `rosrescue core` on loopback: `cargo bench --bench computers`.
 //!
-//! Prints tables as Markdown, and writes every number as JSON. What a number means is said below the tables.
-//! `tests/install_etcd.sh` unpacks an etcd.
+//! Prints tables as Markdown and writes all numbers as JSON. The text below the tables explains the numbers.
+//! `tests/install_etcd.sh` provides an etcd.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,7 +17,7 @@ mod day;
 mod lag;
 mod report;
 mod rounds;
-#[expect(dead_code, reason = "not all of it is needed here")]
+#[expect(dead_code, reason = "only a part is used here")]
 #[path = "../../tests/cluster/servers.rs"]
 mod servers;
 #[path = "../shared/mod.rs"]
@@ -40,13 +40,13 @@ use crate::{
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Part {
-    /// The leading computer dies.
+    /// The leading computer dies
     Takeover,
-    /// The leading computer gives up leading.
+    /// The leading computer hands over
     Handover,
-    /// A write, a read, and how far the followers are behind.
+    /// The time of a write and a read, and how far followers are behind
     Cost,
-    /// What etcd needs after a day.
+    /// What etcd needs after a day
     Day,
 }
 
@@ -57,7 +57,8 @@ struct Options {
     #[arg(long, value_name = "PART,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Part::Takeover, Part::Handover, Part::Cost, Part::Day])]
     parts: Vec<Part>,
-    /// Deaths of the leading computer, and handovers; half as many deaths more with a quicker election of etcd
+    /// Number of deaths of the leading computer, and of handovers; half as many additional deaths with a
+    /// quicker election of etcd
     #[arg(
         long,
         env = "ROSRESCUE_KILLS",
@@ -65,11 +66,10 @@ struct Options {
         default_value_t = 20
     )]
     kills: usize,
-    /// Nodes that are registered, with seven registrations each
+    /// Number of registered nodes, with seven registrations each
     #[arg(long, value_name = "COUNT", default_value_t = 80)]
     nodes: usize,
-    /// Length of each measurement of a call in seconds; there are 24 for each place of
-    /// etcd's data
+    /// Length of each measurement of a call, in seconds; there are 24 for each place of etcd's data
     #[arg(
         long,
         env = "ROSRESCUE_BENCH_SECONDS",
@@ -77,20 +77,20 @@ struct Options {
         default_value_t = 0.8
     )]
     seconds: f64,
-    /// Turns among which that time is divided, the parties alternating
+    /// Number of turns among which that time is divided; the parties alternate
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     turns: usize,
-    /// Hours of a robot's life that are played
+    /// Number of hours of a robot's life to play
     #[arg(long, value_name = "COUNT", default_value_t = 24)]
     hours: u32,
-    /// Where etcd has its data; all but the cost of calls is measured with the first
+    /// Where etcd stores its data; everything but the time of calls is measured with the first one only
     #[arg(long, value_name = "DATA,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Data::Disk, Data::Memory])]
     data: Vec<Data>,
-    /// Where all numbers go as JSON [default: computers.json in Cargo's target folder]
+    /// File for all numbers as JSON [default: computers.json in Cargo's target folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also put the tables of all parts into docs/
+    /// Also write the tables of all parts into benches/results.md
     #[arg(long, conflicts_with = "parts")]
     write_docs: bool,
 }

@@ -1,4 +1,4 @@
-//! What was measured, as Markdown.
+//! Prints the results as Markdown.
 
 use crate::{
     Measured,
@@ -10,7 +10,7 @@ use crate::{
     shared::numbers::{short, spread},
 };
 
-/// All tables.
+/// All tables with their explanations.
 pub(crate) fn markdown(measured: &Measured) -> String {
     let mut parts = vec![format!(
         "{}, {} nodes; three etcd and three `rosrescue core` on this one computer, `--cluster-ttl {}`.",
@@ -30,24 +30,24 @@ pub(crate) fn markdown(measured: &Measured) -> String {
 }
 
 const CHANGES: &str = "
-* *First write*: from just before the SIGKILL of everything on the leading computer (guardian, worker, rosmaster, rosout and its member of etcd), or before the call of `rosrescue/handover`, to the
-  answer to the first write that a client began after it. *Longest write*, *longest read*: the longest call that was answered since, one that was under way at that moment included. One client sets a
-  parameter through one of the others, one reads through each of them, a millisecond after each answer.
-* *Its status page*: `last_takeover.seconds` of the next leader, from the last sign of the one before.
-* In every other round the member of etcd that dies leads etcd, which then elects another one after a silence of 1 s to 2 s, its default, or of 0.5 s to 1 s with `--heartbeat-interval 50 --election-timeout 500`;
-  where the first vote is split, after once more that time.
-* *Alone meanwhile*: rounds in which etcd had no leader for so long that a survivor was cut off from the majority and stood in for itself (`--alone serve`), until etcd answered.
-* *Calls without an answer*, *refused*: of all these clients in all rounds. After each round every write that was answered is there, and all nodes are registered.
+* *First write*: the time until the first write that began after the change is answered. The change begins just before the SIGKILL of everything on the leading computer (guardian, worker, rosmaster, rosout and
+  its etcd member), or before the call of `rosrescue/handover`. *Longest write*, *longest read*: the longest call that was answered since then, including one that was under way. One client sets a
+  parameter through one of the other computers, and one reads through each of them, a millisecond after each answer.
+* *Its status page*: `last_takeover.seconds` of the next leader, from the last sign of life of the previous one.
+* In every other round the etcd member that dies leads etcd, which then elects another one after a silence of 1 s to 2 s (its default), or of 0.5 s to 1 s with `--heartbeat-interval 50 --election-timeout 500`.
+  If the first vote is split, it takes that time once more.
+* *Alone meanwhile*: rounds in which etcd had no leader for so long that a survivor was cut off from the majority and answered alone (`--alone serve`) until etcd answered.
+* *Calls without an answer*, *refused*: of all clients in all rounds. After each round every answered write is there, and all nodes are registered.
 ";
 
 const COSTS: &str = "
-* *Single*: a `rosrescue core` without `--cluster`, beside, in turns with the others. Each client has a connection that is kept alive, and calls as soon as it is answered. In brackets the ratio of the
-  median to *single*. All of etcd's members, all of rosrescue and the load share the same cores.
+* *Single*: a `rosrescue core` without `--cluster` that runs beside the others and takes turns with them. Each client has a connection that is kept alive, and calls as soon as it has its answer. In brackets the ratio of
+  the median to *single*. All members of etcd, all rosrescue processes and the clients share the same cores.
 ";
 
 const LAGS: &str = "
-* From the answer to a write at the leader until the mirror of a follower holds it, of both followers; 0 if it did before. A follower appends a record to its checkpoint under the lock
-  under which it applies it: it is the length of that file that was looked at, every 0.1 ms. Each write is made 10 ms after both followers have the one before; `interval` commits every 200 ms.
+* The time from the answer to a write at the leader until the mirror of a follower has it, for both followers; 0 if it had it before. A follower appends a record to its checkpoint under the same lock
+  under which it applies it, so the length of that file is checked, every 0.1 ms. Each write is made 10 ms after both followers have the previous one. `interval` commits every 200 ms.
 ";
 
 fn changes(measured: &Measured) -> String {

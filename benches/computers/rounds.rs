@@ -1,4 +1,4 @@
-//! Who leads changes, under calls through the computers that survive.
+//! Changes the leader while clients make calls through the computers that survive.
 
 use std::{
     thread::sleep,
@@ -16,24 +16,24 @@ use crate::{
     },
 };
 
-/// What the readers read.
+/// The parameter that the readers read.
 const READ: &str = "/computers/value";
-/// What the writer sets.
+/// The parameter that the writer sets.
 const WRITTEN: &str = "/computers/count";
-/// How long calls are watched at least.
+/// Minimum time for which calls are observed.
 const SPAN: Duration = Duration::from_millis(500);
 
-/// What was seen of one change, in milliseconds.
+/// What the clients saw of one change of the leader, in milliseconds.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct Round {
     /// From the beginning of the change to the answer to the first write that was made after it.
     pub(crate) first_write: f64,
-    /// The longest time of a write, and between the answers to two.
+    /// The longest time of a write, or between the answers to two writes.
     pub(crate) write: f64,
     pub(crate) pause: f64,
     /// The longest time of a read.
     pub(crate) read: f64,
-    /// Calls without an answer, and answers that were no success.
+    /// Number of calls without an answer, and of answers that report no success.
     pub(crate) failed: usize,
     pub(crate) refused: usize,
 }
@@ -41,16 +41,18 @@ pub(crate) struct Round {
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct Takeover {
     pub(crate) election: Election,
-    /// The member of etcd that died with the computer led etcd.
+    /// Whether the etcd member that died with the computer was leading etcd.
     pub(crate) led_etcd: bool,
-    /// A survivor was cut off meanwhile, and answered for itself: etcd took longer for its own election.
+    /// Whether a survivor was cut off in the meantime and answered alone, because etcd's own election took
+    /// longer.
     pub(crate) alone: bool,
     pub(crate) round: Round,
-    /// What the status page of the next leader says, in milliseconds: from the last sign of the one before.
+    /// The time on the status page of the next leader, in milliseconds: from the last sign of life of the
+    /// previous one.
     pub(crate) said: f64,
 }
 
-/// The clients: a writer through one follower, and a reader through each of them.
+/// The clients: one writer through one follower, and one reader through each.
 struct Callers {
     writer: Caller,
     readers: [Caller; 2],
@@ -71,16 +73,16 @@ impl Callers {
         callers
     }
 
-    /// Until calls of all of them that began after this moment are answered.
+    /// Waits until each client has an answer to a call that began after this moment.
     fn wait(&self) {
         let now = Instant::now();
-        eventually("all clients are answered", || {
+        eventually("all clients have been answered", || {
             let mut all = self.readers.iter().chain([&self.writer]);
             all.all(|caller| caller.answered_since(now))
         });
     }
 
-    /// What they saw of the change that began at `begin`; every write that was answered must be there.
+    /// What the clients saw of the change that began at `begin`. Every answered write must be there.
     fn end(self, cluster: &Cluster, begin: Instant) -> Round {
         self.wait();
         sleep(SPAN);
@@ -88,8 +90,8 @@ impl Callers {
         let reads = self.readers.each_ref().map(|of| of.seen_since(begin));
         let last = self.writer.last();
         drop(self);
-        // What was answered by one that was cut off comes to the leader a little later.
-        eventually("every write that was answered is there", || {
+        // Writes that a computer has answered while it was cut off reach the leader a little later.
+        eventually("every answered write is there", || {
             let held = cluster.client(cluster.leader()).param(WRITTEN);
             held.and_then(|value| value.as_int()) >= last
         });
@@ -105,7 +107,7 @@ impl Callers {
     }
 }
 
-/// The leading computer dies, with the member that leads etcd or with another one.
+/// Kills the leading computer, together with the member that leads etcd or with another member.
 pub(crate) fn takeover(cluster: &mut Cluster, number: usize, led_etcd: bool) -> Takeover {
     cluster.place_leader_of_etcd(led_etcd);
     let leader = cluster.leader();
@@ -134,7 +136,7 @@ pub(crate) fn takeover(cluster: &mut Cluster, number: usize, led_etcd: bool) -> 
     }
 }
 
-/// The leading computer gives up leading, as `rosrescue handover` has it.
+/// Makes the leading computer hand over, like `rosrescue handover`.
 pub(crate) fn handover(cluster: &Cluster, number: usize) -> Round {
     let leader = cluster.leader();
     let callers = Callers::start(cluster, leader);

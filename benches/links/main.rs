@@ -1,9 +1,10 @@
-//! Whether every start of many nodes makes every link: `cargo bench --bench links`.
+//! Counts the links that are not made when many nodes start at once: `cargo bench --bench links`.
 //!
-//! Nodes of rospy or roscpp start at the same moment. When all are ready, and some seconds later at most, each
-//! subscriber has to be connected to exactly the publishers of the master's state. Of rospy nodes it is also counted
-//! how often the answer of `registerSubscriber` was overtaken by a newer `publisherUpdate`. A failure is printed with
-//! the node, the topic, and what each was told when. With `--profile dev` nothing is built anew after `cargo build`.
+//! rospy or roscpp nodes start at the same moment. When all are ready, and a few seconds later at most, each
+//! subscriber must be connected to exactly the publishers in the master's state. For rospy nodes it also
+//! counts how often an answer to `registerSubscriber` was overtaken by a newer `publisherUpdate`. A failure
+//! is printed with the node, the topic, and what each node was told when. With `--profile dev` nothing is
+//! rebuilt after `cargo build`.
 
 #![allow(
     clippy::unwrap_used,
@@ -29,7 +30,7 @@ use crate::shared::{
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Mode {
-    /// A rosmaster, nothing before it
+    /// A rosmaster without rosrescue
     Bare,
     /// `rosrescue core`
     Core,
@@ -37,7 +38,7 @@ enum Mode {
     Proxy,
     /// `rosrescue proxy` whose master is dead while the nodes start
     StandingIn,
-    /// `rosrescue core`: master and worker are killed while the nodes start
+    /// `rosrescue core` whose master and worker are killed while the nodes start
     Kills,
     /// The follower of two `rosrescue core --cluster` (needs etcd: `. tests/install_etcd.sh`)
     Follower,
@@ -65,7 +66,7 @@ enum Nodes {
 /// Counts the links that starts of many nodes do not make.
 #[derive(Debug, Args)]
 struct Options {
-    /// Where the nodes start; the modes take turns
+    /// The masters at which nodes start; the modes take turns
     #[arg(
         long = "mode",
         value_name = "MODE,…",
@@ -74,39 +75,40 @@ struct Options {
     )]
     #[arg(default_values_t = [Mode::Bare, Mode::Core, Mode::Proxy, Mode::StandingIn])]
     modes: Vec<Mode>,
-    /// Starts in each mode
+    /// Number of starts in each mode
     #[arg(long, value_name = "COUNT", default_value_t = 5)]
     starts: u64,
-    /// Nodes that start together
+    /// Number of nodes that start together
     #[arg(long, value_name = "COUNT", default_value_t = 12)]
     nodes: usize,
-    /// Links: each topic has one publisher and three subscribers
+    /// Number of links; each topic has one publisher and three subscribers
     #[arg(long, value_name = "COUNT", default_value_t = 720)]
     links: usize,
-    /// The nodes' client library
+    /// The client library of the nodes
     #[arg(long, value_enum, default_value_t = Nodes::Rospy)]
     library: Nodes,
-    /// Each node registers in an order of its own, not topic by topic
+    /// Each node registers in a random order of its own instead of topic by topic
     #[arg(long)]
     shuffled: bool,
-    /// Busy processes beside the nodes
+    /// Number of busy processes beside the nodes
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
     load: usize,
-    /// How long after the last node was ready a link may take, in seconds; with load a quarter more for each process
+    /// How long a link may take after the last node was ready, in seconds; a quarter more for each busy
+    /// process
     #[arg(long, value_name = "SECONDS", default_value_t = 6.0)]
     wait: f64,
-    /// End at the first start that misses something
+    /// Stop at the first start that misses a link
     #[arg(long)]
     stop: bool,
-    /// The first start's seed; the others follow it [default: the process id]
+    /// Seed of the first start; later starts use the next numbers [default: the process id]
     #[arg(long, value_name = "NUMBER")]
     seed: Option<u64>,
-    /// The rosrescue to test [default: this build's]
+    /// The rosrescue to test [default: the one that was just built]
     #[arg(long, value_name = "FILE")]
     rosrescue: Option<PathBuf>,
 }
 
-/// What the starts in one mode were.
+/// The results of all starts in one mode.
 #[derive(Debug, Default)]
 struct Row {
     starts: usize,
@@ -124,7 +126,7 @@ fn main() -> ExitCode {
     };
     if let Some(program) = &options.rosrescue {
         let program = program.canonicalize().expect("--rosrescue: no such file");
-        PROGRAM.set(program).expect("nothing was started before");
+        PROGRAM.set(program).expect("rosrescue was already started");
     }
     let plan = Plan {
         library: match options.library {
@@ -166,12 +168,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// One start. Whether nothing was missed.
+/// Runs one start. Returns whether nothing was missed.
 fn one(mode: Mode, plan: &Plan, seed: u64, row: &mut Row) -> bool {
     let start = links::start(mode.place(), plan, seed);
     let found = [
         ("never made", &start.never_made, &mut row.never_made),
-        ("not of the state", &start.wrong, &mut row.wrong),
+        ("links that the state lacks", &start.wrong, &mut row.wrong),
         ("overtaken", &start.overtaken, &mut row.overtaken),
         ("went back", &start.went_back, &mut row.went_back),
     ];

@@ -1,9 +1,9 @@
-//! How long those who use the master wait when it dies: `cargo bench --bench pauses`.
+//! Measures how long clients wait when the master dies: `cargo bench --bench pauses`.
 //!
-//! A client that reads a parameter all the time, one that sets a parameter all the time, and one that
-//! subscribes a parameter that is not set all the time, as loggers do; with many SIGKILLs of the master, and
-//! with a master that stays away; under `rosrescue core`, behind `rosrescue proxy` with a rosmaster that is
-//! started again at once, and with such a rosmaster alone. What is measured how is said below the tables.
+//! One client reads a parameter all the time, one sets a parameter, and one subscribes to a parameter that is
+//! not set, as loggers do. The master is killed many times, and once stays away. This is done under
+//! `rosrescue core`, behind `rosrescue proxy` with a rosmaster that is restarted at once, and with such a
+//! rosmaster alone. The text below the tables explains the measurements.
 
 #![allow(
     clippy::unwrap_used,
@@ -25,13 +25,14 @@ use crate::{
     subject::{Kind, Subject, Window},
 };
 
-/// A sixth death of its own master within a minute counts as a crash loop for rosrescue, which then pauses.
+/// Number of kills per rosrescue. It treats a sixth death of its master within a minute as a crash loop and
+/// then pauses.
 const KILLS_A_LIFE: usize = 5;
 
 /// Measures the pauses that clients see when the master dies.
 #[derive(Debug, Args)]
 struct Options {
-    /// Kills for each line of the table
+    /// Number of kills for each line of the table
     #[arg(
         long,
         env = "ROSRESCUE_KILLS",
@@ -39,10 +40,10 @@ struct Options {
         default_value_t = 100
     )]
     kills: usize,
-    /// Nodes that are registered, with seven registrations each
+    /// Number of registered nodes, with seven registrations each
     #[arg(long, value_name = "COUNT", default_value_t = 80)]
     nodes: usize,
-    /// For how long a master stays away; 0 for not at all
+    /// How long a master stays away, in seconds; 0 skips this part
     #[arg(
         long,
         env = "ROSRESCUE_AWAY_SECONDS",
@@ -97,19 +98,19 @@ fn main() {
 }
 
 const EXPLANATION: &str = "
-Milliseconds, median (largest) over the kills; without a master the largest.
+Milliseconds: median (largest) over the kills; without a master, the largest.
 
-* *read*, *write*, *write that changes nothing*: the longest time between two answers that a client got which calls `getParam`, `setParam` with
-  a new value, or `subscribeParam` of a parameter that is not set all the time, a millisecond after each answer, and again a millisecond
-  after each failure. Any answer counts, a wrong one too.
-* *bare injection*: one multicall that brings the same state to another rosmaster of the same kind, before each kill.
-* *calls without an answer*: refused or cut off. rospy's and roscpp's `getParam` fail then.
-* *a subscriber is notified*: from a `registerPublisher`, one a second, until a subscriber of the topic has its `publisherUpdate`: median (largest).
-* The rosmaster of `proxy` and the bare one are started again at once by the bench, and `core` does so itself.
-* *nobody killed*: the same in as many spans of half a second without a kill.
+* *read*, *write*, *write that changes nothing*: the longest time between two answers to a client that calls `getParam`, `setParam` with a new
+  value, or `subscribeParam` of a parameter that is not set. It calls all the time, a millisecond after each answer, and again a
+  millisecond after each failure. Every answer counts, even a wrong one.
+* *bare injection*: one multicall that gives the same state to another rosmaster of the same kind, before each kill.
+* *calls without an answer*: refused or cut off. rospy's and roscpp's `getParam` fail in this case.
+* *a subscriber is notified*: the time from a `registerPublisher`, one per second, until a subscriber of the topic has its `publisherUpdate`: median (largest).
+* The bench itself restarts the rosmaster of `proxy` and the bare one at once; `core` restarts its own.
+* *no kills*: the same in as many spans of half a second without a kill.
 ";
 
-/// Median and largest.
+/// Median and maximum, as a table cell.
 fn cell(times: impl IntoIterator<Item = f64>) -> String {
     let mut times: Vec<_> = times.into_iter().collect();
     times.sort_by(f64::total_cmp);
@@ -119,7 +120,7 @@ fn cell(times: impl IntoIterator<Item = f64>) -> String {
     }
 }
 
-/// Two lines of the first table: with kills, and without.
+/// Measures two lines of the first table: with kills and without.
 fn kills(kind: Kind, options: &Options) -> String {
     let (mut quiet, mut kills, mut injections) = (Vec::new(), Vec::new(), Vec::new());
     while kills.len() < options.kills {
@@ -127,7 +128,7 @@ fn kills(kind: Kind, options: &Options) -> String {
         let life = match kind {
             Kind::Core => KILLS_A_LIFE,
             Kind::Proxy => usize::MAX,
-            // Its nodes are unknown after one.
+            // A bare rosmaster has forgotten its nodes after one kill.
             Kind::Bare => 1,
         };
         for _ in 0..life.min(options.kills - kills.len()) {
@@ -160,14 +161,14 @@ fn kills(kind: Kind, options: &Options) -> String {
             count(|seen| seen.refused),
         )
     };
-    line("", &kills, &injections) + &line(", nobody killed", &quiet, &[])
+    line("", &kills, &injections) + &line(", no kills", &quiet, &[])
 }
 
 fn all(window: &Window) -> [&Seen; 3] {
     [&window.read, &window.write, &window.idle]
 }
 
-/// A line of the second table.
+/// Measures a line of the second table.
 fn outage(kind: Kind, options: &Options) -> String {
     let mut subject = Subject::start(kind, options.nodes);
     let (window, notified) = subject.outage(Duration::from_secs(options.away));
@@ -186,7 +187,7 @@ fn outage(kind: Kind, options: &Options) -> String {
     )
 }
 
-/// A line of the third table; none if nobody starts rosrescue again.
+/// Measures a line of the third table. `None` if nothing restarts rosrescue.
 fn deaths(kind: Kind, options: &Options) -> Option<String> {
     let mut subject = Subject::start(kind, options.nodes);
     let windows: Vec<_> = (0..KILLS_A_LIFE)

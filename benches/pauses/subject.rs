@@ -1,4 +1,4 @@
-//! A master with nodes and clients, and what they see of its death.
+//! A master with nodes and clients, and what the clients notice of its death.
 
 use std::{
     fmt, fs,
@@ -20,27 +20,27 @@ use crate::shared::{
     },
 };
 
-/// A span in which pauses are looked for: longer than any recovery, which is waited for in any case.
+/// The time in which pauses are observed. It is longer than any recovery, which is waited for in any case.
 const SPAN: Duration = Duration::from_millis(500);
-/// What the reader reads.
+/// The parameter that the reader reads.
 const READ: &str = "/pauses/value";
-/// What the writer sets.
+/// The parameter that the writer sets.
 const WRITTEN: &str = "/pauses/count";
-/// What a logger subscribes again and again: it is not set.
+/// The parameter to which the logger subscribes again and again. It is not set.
 const UNSET: &str = "/rosout_disable_topics_generation";
-/// A publisher registers so often while there is no master.
+/// Pause between two registrations of a publisher while there is no master.
 const REGISTRATIONS: Duration = Duration::from_secs(1);
-/// How exactly it is known when a subscriber was notified.
+/// Pause between two checks whether a subscriber was notified, which is the accuracy of that result.
 const LOOK: Duration = Duration::from_micros(200);
 
-/// Who is in charge of the master.
+/// Which program restarts the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Kind {
     /// `rosrescue core`.
     Core,
     /// `rosrescue proxy`.
     Proxy,
-    /// Nobody but whoever starts it again.
+    /// A loop in this bench
     Bare,
 }
 
@@ -54,12 +54,12 @@ impl fmt::Display for Kind {
     }
 }
 
-/// What was seen in one span, by each client.
+/// What each client saw in one span of time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Window {
     pub(crate) read: Seen,
     pub(crate) write: Seen,
-    /// A write that changes nothing.
+    /// The client whose writes change nothing.
     pub(crate) idle: Seen,
 }
 
@@ -83,7 +83,7 @@ impl Master {
         }
     }
 
-    /// What the nodes use.
+    /// A client of the port that nodes use.
     fn client(&self) -> Client {
         match self {
             Self::Guarded(robot) => robot.client(),
@@ -94,11 +94,11 @@ impl Master {
     fn robot(&mut self) -> &mut Robot {
         match self {
             Self::Guarded(robot) => robot,
-            Self::Bare(..) => panic!("there is no rosrescue"),
+            Self::Bare(..) => panic!("a bare master has no rosrescue"),
         }
     }
 
-    /// SIGKILL, and another one at once.
+    /// Kills the master with SIGKILL. Another one is started at once.
     fn kill(&mut self) {
         match self {
             Self::Guarded(robot) => {
@@ -120,7 +120,7 @@ impl Master {
 /// A master in use.
 #[derive(Debug)]
 pub(crate) struct Subject {
-    // In the order of the drops.
+    // Fields are dropped in this order.
     reader: Caller,
     writer: Caller,
     logger: Caller,
@@ -130,7 +130,7 @@ pub(crate) struct Subject {
 }
 
 impl Subject {
-    /// Starts one with so many nodes.
+    /// Starts a master with `count` nodes.
     pub(crate) fn start(kind: Kind, count: usize) -> Self {
         let master = Master::start(kind);
         let client = master.client();
@@ -160,12 +160,12 @@ impl Subject {
         self.master.kill();
     }
 
-    /// What the clients see while `event` takes place and for as long as it has consequences.
+    /// What the clients see while `event` takes place and as long as it has consequences.
     pub(crate) fn window(&mut self, event: impl FnOnce(&mut Self)) -> Window {
         let begin = Instant::now();
         event(self);
         let after = Instant::now();
-        eventually("all clients are answered", || {
+        eventually("all clients have been answered", || {
             [&self.reader, &self.writer, &self.logger]
                 .iter()
                 .all(|caller| caller.answered_since(after))
@@ -178,15 +178,15 @@ impl Subject {
         }
     }
 
-    /// Sets the parameter again where that is nobody else's duty.
+    /// Sets the parameter again if rosrescue does not restore it.
     pub(crate) fn repair(&mut self) {
         if self.kind == Kind::Bare {
             self.master.client().set_param(READ, 1);
         }
     }
 
-    /// How long one compact multicall takes, in milliseconds, that brings the master's state to another
-    /// rosmaster, started in the same way. Nothing is looked at or compared.
+    /// The time in milliseconds of one compact multicall that gives the master's state to another rosmaster,
+    /// started in the same way. Nothing is read back or compared.
     pub(crate) fn bare_injection(&mut self) -> f64 {
         let robot = self.master.robot();
         let request = http_request(&injection(&robot.state()));
@@ -205,8 +205,8 @@ impl Subject {
         ms(begin.elapsed())
     }
 
-    /// What the clients see while there is no master for `away`, and how many milliseconds after its
-    /// registration each publisher that registers meanwhile is known to a subscriber.
+    /// What the clients see while there is no master for `away`. Also the time in milliseconds from the
+    /// registration of each publisher in the meantime until a subscriber knows it.
     pub(crate) fn outage(&mut self, away: Duration) -> (Window, Vec<f64>) {
         let client = self.master.client();
         let subscriber = FakeNode::start("/pauses_subscriber");
@@ -244,8 +244,8 @@ impl Subject {
         (window, notified)
     }
 
-    /// SIGKILL to the process of rosrescue that answers calls, if another one keeps its sockets: none
-    /// if there is no such process.
+    /// Kills the process of rosrescue that answers calls with SIGKILL, if another one keeps its sockets open.
+    /// `None` if there is no such process.
     pub(crate) fn kill_rosrescue(&mut self) -> Option<Window> {
         let guardian = self.master.robot().rescue.pid();
         let worker = worker_of(guardian)?;
@@ -253,7 +253,7 @@ impl Subject {
     }
 }
 
-/// The child of `guardian` that is the same program.
+/// The child of `guardian` that runs the same program.
 fn worker_of(guardian: u32) -> Option<u32> {
     let program = |pid: u32| fs::read_link(format!("/proc/{pid}/exe")).ok();
     let children = fs::read_to_string(format!("/proc/{guardian}/task/{guardian}/children")).ok()?;

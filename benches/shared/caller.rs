@@ -1,4 +1,4 @@
-//! A client that calls all the time.
+//! A client that makes calls all the time.
 
 use std::{
     sync::{
@@ -13,18 +13,18 @@ use rosrescue::xmlrpc::{Reply, Value};
 
 use super::support::{Client, Wire, http_request};
 
-/// Between an answer, or a failure, and the next call.
+/// Pause between an answer, or a failure, and the next call.
 const PAUSE: Duration = Duration::from_millis(1);
 
 #[derive(Clone, Copy, Debug)]
 struct Answer {
-    /// When it was asked for, and when it came.
+    /// When the call was made, and when the answer arrived.
     asked: Instant,
     at: Instant,
     success: bool,
 }
 
-/// When the answers came, and what they were.
+/// All answers, and when they arrived.
 #[derive(Debug, Default)]
 struct Log {
     answers: Vec<Answer>,
@@ -40,15 +40,15 @@ pub(crate) struct Seen {
     pub(crate) pause: f64,
     /// The longest time of a call that was answered, in milliseconds.
     pub(crate) longest: f64,
-    /// Until the first call that began in that span was answered with success, in milliseconds.
+    /// The time until the first call that began in the span succeeded, in milliseconds.
     pub(crate) first: f64,
-    /// Calls without an answer.
+    /// Number of calls without an answer.
     pub(crate) failed: usize,
-    /// Answers that were no success.
+    /// Number of answers that report no success.
     pub(crate) refused: usize,
 }
 
-/// The client, in a thread of its own.
+/// A client in a thread of its own.
 #[derive(Debug)]
 pub(crate) struct Caller {
     log: Arc<Mutex<Log>>,
@@ -57,8 +57,8 @@ pub(crate) struct Caller {
 }
 
 impl Caller {
-    /// Starts one that sends to `master` what `call` makes of the number of the call, on one connection for
-    /// as long as it lasts.
+    /// Starts a client that calls `master` with what `call` returns for the number of the call. It uses one
+    /// connection as long as that lasts.
     pub(crate) fn start(master: Client, call: impl Fn(i32) -> Vec<u8> + Send + 'static) -> Self {
         let log = Arc::new(Mutex::new(Log::default()));
         let done = Arc::new(AtomicBool::new(false));
@@ -108,7 +108,7 @@ impl Caller {
         self.log.lock().expect("the log").last
     }
 
-    /// What it saw since `begin`.
+    /// What the client has seen since `begin`.
     pub(crate) fn seen_since(&self, begin: Instant) -> Seen {
         let ms = |time: Option<Duration>| time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3);
         let log = self.log.lock().expect("the log");
@@ -135,7 +135,7 @@ impl Drop for Caller {
     }
 }
 
-/// Whether the call was a success; nothing if it got no answer.
+/// Makes a call. Returns whether it succeeded, or `None` if there was no answer.
 fn exchange(master: &Client, wire: &mut Option<Wire>, request: &[u8]) -> Option<bool> {
     if wire.is_none() {
         *wire = master.connect().ok();

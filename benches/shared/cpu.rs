@@ -2,8 +2,8 @@
 
 use std::{collections::HashMap, fs, path::Path, time::Duration};
 
-/// The process and those of its descendants that run the same program: guardian and worker, or nginx's
-/// master and worker.
+/// A process and those of its descendants that run the same program, such as guardian and worker of
+/// rosrescue, or master and worker of nginx.
 pub(crate) fn family(root: u32) -> Vec<u32> {
     let name = |pid: u32| fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
     let mut family = vec![root];
@@ -25,7 +25,7 @@ pub(crate) fn resident_kib(pids: &[u32]) -> u64 {
     pids.iter().filter_map(|pid| kib(*pid, "VmRSS:")).sum()
 }
 
-/// The most that was resident of this process in KiB.
+/// Maximum resident memory of a process so far, in KiB.
 pub(crate) fn peak_kib(pid: u32) -> u64 {
     kib(pid, "VmHWM:").unwrap_or_default()
 }
@@ -36,8 +36,8 @@ fn kib(pid: u32, name: &str) -> Option<u64> {
     line.split_whitespace().nth(1)?.parse().ok()
 }
 
-/// Processor time of each thread so far, user and system, in nanoseconds: `utime` and `stime` count hundredths
-/// of a second, which is coarse for what takes a few microseconds.
+/// Processor time of each thread so far, user and system, in nanoseconds. `utime` and `stime` would count
+/// hundredths of a second, which is too coarse for work of a few microseconds.
 #[derive(Debug)]
 pub(crate) struct Cpu(HashMap<(u32, u32), u64>);
 
@@ -50,7 +50,7 @@ impl Cpu {
                 let path = Path::new(&tasks).join(thread.to_string());
                 let text = fs::read_to_string(path.join("schedstat")).unwrap_or_default();
                 let time = text.split_whitespace().next();
-                // A thread may end meanwhile.
+                // A thread may end in the meantime.
                 if let Some(Ok(time)) = time.map(str::parse) {
                     times.insert((pid, thread), time);
                 }
@@ -59,7 +59,8 @@ impl Cpu {
         Self(times)
     }
 
-    /// What was used from `before` until this reading. A thread that has ended in between is not counted.
+    /// Processor time used between `before` and this reading. A thread that has ended in between is not
+    /// counted.
     pub(crate) fn since(&self, before: &Self) -> Duration {
         let used = self.0.iter().map(|(thread, now)| {
             let then = before.0.get(thread).copied().unwrap_or_default();
@@ -69,7 +70,7 @@ impl Cpu {
     }
 }
 
-/// The numbers that are names in a folder of `/proc`.
+/// The numeric names in a folder of `/proc`.
 fn entries(folder: &str) -> Vec<u32> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name());

@@ -1,10 +1,10 @@
-//! What brings a state to an empty rosmaster, in as few bytes and calls as can be.
+//! Gives a state to an empty rosmaster in as few bytes and calls as possible.
 
 use rosrescue::xmlrpc::{self, Call};
 
 use super::support::{State, params};
 
-/// One multicall that makes `state` of an empty master's, in the order that disturbs nobody.
+/// Encodes one multicall that gives `state` to an empty master, in an order in which no node is notified.
 pub(crate) fn injection(state: &State) -> Vec<u8> {
     let text = |pairs: &[(String, String)], key: &str| {
         let found = pairs.iter().find(|(name, _)| name == key);

@@ -1,5 +1,5 @@
-//! The load generator: one thread, any number of keep-alive connections, each of which calls as soon as it is
-//! answered.
+//! The load generator: one thread with any number of keep-alive connections, each of which makes its next
+//! call as soon as it has its answer.
 
 use std::{
     io::{self, ErrorKind},
@@ -19,32 +19,32 @@ use tokio::{
 
 use super::support::http_request;
 
-/// Stands in a request for a number that is another in each call.
+/// A placeholder in a request for a number that differs in each call.
 pub(crate) const NUMBER: i32 = 17_171_717;
-/// The least such number: each has as many digits as [`NUMBER`].
+/// The smallest such number. All of them have as many digits as [`NUMBER`].
 const FIRST: usize = 20_000_000;
 const NUMBERS: usize = 70_000_000;
-/// Calls in one turn, over all connections.
-const CALLS_MOST: usize = 1_000_000;
-/// What is seen of a connection that the other side has closed.
+/// Maximum number of calls in one turn, over all connections.
+const CALLS_MAX: usize = 1_000_000;
+/// The errors by which a closed connection shows.
 const CLOSED: [ErrorKind; 3] = [
     ErrorKind::UnexpectedEof,
     ErrorKind::ConnectionReset,
     ErrorKind::BrokenPipe,
 ];
-/// Room for an answer; grows with the first large one.
+/// Initial capacity for an answer. It grows with the first large one.
 const ROOM: usize = 64 << 10;
 
-/// What one client calls again and again.
+/// The calls that one client repeats.
 #[derive(Debug)]
 pub(crate) struct Script {
-    /// Requests, and where in each the number goes.
+    /// The requests, and the places of the number in each.
     requests: Vec<(Vec<u8>, Vec<usize>)>,
     sent: usize,
 }
 
 impl Script {
-    /// Of the bodies of calls.
+    /// Makes a script of the bodies of calls.
     pub(crate) fn new(bodies: impl IntoIterator<Item = Vec<u8>>) -> Self {
         let number = NUMBER.to_string();
         let request = |body: Vec<u8>| {
@@ -72,14 +72,14 @@ impl Script {
     }
 }
 
-/// Connected clients that have been answered once.
+/// Connected clients that have each been answered once.
 #[derive(Debug)]
 pub(crate) struct Load {
     runtime: Runtime,
     callers: Vec<Caller>,
 }
 
-/// How long each call took, and all of them together.
+/// The time of each call, and of all of them together.
 #[derive(Debug)]
 pub(crate) struct Turn {
     pub(crate) calls: Vec<Duration>,
@@ -88,8 +88,8 @@ pub(crate) struct Turn {
 }
 
 impl Load {
-    /// Connects one client for each script, one after the other: a rosmaster accepts few at once. Each call of
-    /// a script must succeed.
+    /// Connects one client per script, one after another, because a rosmaster accepts only few at once. Each
+    /// call of a script must succeed.
     pub(crate) fn connect(port: u16, scripts: Vec<Script>) -> io::Result<Self> {
         let runtime = runtime()?;
         let mut callers = Vec::new();
@@ -106,13 +106,14 @@ impl Load {
         Ok(Self { runtime, callers })
     }
 
-    /// All call until `time` is over, at least once; what was sent by then is counted. They stay connected.
+    /// Makes all clients call for `time`, at least once each. Calls that were sent by then are counted. The
+    /// clients stay connected.
     pub(crate) fn run(&mut self, time: Duration) -> io::Result<Turn> {
         let mut callers = std::mem::take(&mut self.callers);
         callers
             .iter_mut()
             .for_each(|caller| caller.reconnections = 0);
-        let most = CALLS_MOST / callers.len().max(1);
+        let most = CALLS_MAX / callers.len().max(1);
         let barrier = Arc::new(Barrier::new(callers.len()));
         let call = |mut caller: Caller| {
             let barrier = Arc::clone(&barrier);
@@ -153,7 +154,7 @@ impl Load {
     }
 }
 
-/// How long it takes until clients that connect all at once have been answered every call of their scripts.
+/// The time until clients that all connect at once have been answered every call of their scripts.
 pub(crate) fn once(port: u16, scripts: Vec<Script>) -> io::Result<Duration> {
     let client = |script: Script| async move {
         let count = script.requests.len();
@@ -183,7 +184,8 @@ struct Caller {
     stream: TcpStream,
     /// How often the connection was found closed.
     reconnections: usize,
-    /// The last answer was one of HTTP/1.0: the next call needs a new connection, which is part of its time.
+    /// Whether the last answer was HTTP/1.0, so that the next call needs a new connection, which counts as
+    /// part of its time.
     spent: bool,
     script: Script,
     /// The last answer, head and body.
@@ -204,8 +206,8 @@ impl Caller {
         })
     }
 
-    /// Calls and waits for the whole answer. On a connection that was closed it calls once more on a new one, as
-    /// Python's client does: a rosmaster closes connections that are idle for 5 s.
+    /// Makes a call and waits for the whole answer. If the connection was closed, it repeats the call once on
+    /// a new one, as Python's client does: a rosmaster closes connections that are idle for 5 s.
     async fn call(&mut self) -> io::Result<()> {
         let request = self.script.next().to_vec();
         if self.spent {
@@ -246,7 +248,7 @@ impl Caller {
         }
     }
 
-    /// Panics unless the last answer was a success, or a list of them.
+    /// Panics unless the last answer reports success, or is a list of such answers.
     fn assert_success(&self) {
         let reply = xmlrpc::decode_reply(&self.answer[self.body.clone()]).expect("an answer");
         let is_success = |value: &Value| matches!(value, Value::Array(fields) if fields.first() == Some(&Value::Int(1)));
@@ -267,7 +269,8 @@ async fn connect(port: u16) -> io::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Where the body of an answer that begins so is; none before the end of its head.
+/// The position of the body in an answer, of which this much has been read. `None` before the end of the
+/// head.
 fn body_of(answer: &[u8]) -> io::Result<Option<std::ops::Range<usize>>> {
     const END: &[u8] = b"\r\n\r\n";
     let Some(end) = answer.windows(END.len()).position(|found| found == END) else {

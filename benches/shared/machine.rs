@@ -1,4 +1,4 @@
-//! What the numbers were measured on.
+//! Describes the computer on which the numbers were measured.
 
 use std::{fs, process::Command, thread::available_parallelism};
 
@@ -22,7 +22,7 @@ pub(crate) fn describe() -> String {
 
 fn processor() -> String {
     let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    // ARM has no names of models there.
+    // On ARM the file has no model names.
     let name = text.lines().find_map(|line| {
         let (key, value) = line.split_once(':')?;
         (key.trim() == "model name").then(|| value.trim().to_owned())

@@ -1,4 +1,4 @@
-//! What the benches share.
+//! Code that the benches share.
 
 #[allow(dead_code, reason = "not every bench calls all the time")]
 pub(crate) mod caller;
@@ -21,17 +21,17 @@ pub(crate) mod support;
 
 use clap::{Args, Parser};
 
-/// The options of a bench, and what Cargo adds to them.
+/// The options of a bench, and the one that Cargo adds.
 #[derive(Debug, Parser)]
 struct Arguments<T: Args> {
     #[command(flatten)]
     options: T,
-    /// What `cargo bench` passes
+    /// Passed by `cargo bench`
     #[arg(long, hide = true)]
     bench: bool,
 }
 
-/// What `bench` is to measure; nothing if it runs as a test.
+/// Parses the options of `bench`. `None` if it runs as a test, in which nothing is measured.
 pub(crate) fn options<T: Args>(bench: &str) -> Option<T> {
     let arguments = Arguments::<T>::parse();
     if !arguments.bench {

@@ -1,14 +1,14 @@
-//! Nodes that do nothing but be there.
+//! Nodes that do nothing but answer.
 
 use super::support::{Client, FakeNode};
 
-/// Topics of node `number` of `count`, two that it publishes and two of its neighbour.
+/// The topics of node `number` of `count`: two that it publishes, and two of its neighbour.
 pub(crate) fn topics(number: usize, count: usize) -> [[String; 2]; 2] {
     let of = |number: usize| [1, 2].map(|topic| format!("/node_{number:03}/topic_{topic}"));
     [of(number), of((number + 1) % count)]
 }
 
-/// So many nodes that are registered, and answer for it. Seven registrations each.
+/// Starts `count` nodes, with seven registrations each, that answer the questions of the health check.
 pub(crate) fn synthetic(client: &Client, count: usize) -> Vec<FakeNode> {
     let start = |number| {
         let name = format!("/node_{number:03}");

@@ -1,4 +1,5 @@
-//! A second rosmaster, started just as rosrescue started its own: what differs is not the master.
+//! A second rosmaster, started exactly as rosrescue has started its own, so that no difference is due to the
+//! master.
 
 use std::{
     fs,
@@ -11,8 +12,8 @@ use std::{
 pub(crate) struct SecondMaster(Child);
 
 impl SecondMaster {
-    /// The command line and environment of the rosmaster with this process id, but for the port and
-    /// the folder of the log.
+    /// The command line and environment of the rosmaster with process id `of`, except for the port and the
+    /// folder of its log.
     pub(crate) fn command(of: u32, port: u16, log: &Path) -> Command {
         let read = |file: &str| {
             let text =
@@ -22,7 +23,7 @@ impl SecondMaster {
         };
         let (mut arguments, environment) = (read("cmdline"), read("environ"));
         if arguments[1] == "-c" {
-            // It was a spare: interpreter, program text, and only then the rosmaster.
+            // The rosmaster was a spare: its command line starts with interpreter and program text.
             arguments.drain(..3);
         }
         let place = arguments.iter().position(|word| word == "-p");
@@ -42,7 +43,7 @@ impl SecondMaster {
         command
     }
 
-    /// Starts it and waits for nothing.
+    /// Starts it without waiting.
     pub(crate) fn spawn(command: &mut Command) -> Self {
         Self(command.spawn().expect("a second rosmaster"))
     }

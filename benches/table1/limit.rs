@@ -1,5 +1,5 @@
-//! The best that anybody could do: the same rosmaster started by somebody who knows everything before,
-//! and brought to the state by a single call.
+//! The best possible recovery: the same rosmaster, started by a program that knows everything in advance and
+//! gives it the state in a single call.
 
 use std::{
     thread::sleep,
@@ -17,29 +17,30 @@ use crate::{
     },
 };
 
-/// Pause between two looks at whether the port is open. A shorter one slows down what is waited for.
+/// Pause between two checks whether the port is open. A shorter pause would slow down what is measured.
 const PAUSE: Duration = Duration::from_millis(1);
-/// How long a rosmaster may take to listen.
+/// Maximum time for a rosmaster to listen.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// In milliseconds.
+/// The times of the best possible recovery, in milliseconds.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limit {
     /// From the start of the process to its open port.
     pub(crate) start: f64,
-    /// From there to the reply to one compact multicall that brings the whole state.
+    /// From the open port to the reply to one compact multicall with the whole state.
     pub(crate) injection: f64,
 }
 
 impl Limit {
-    /// From nothing to the whole state.
+    /// From the start of the process to the whole state.
     pub(crate) fn total(self) -> f64 {
         self.start + self.injection
     }
 }
 
-/// Starts a second rosmaster just as rosrescue started the robot's and brings it to the same state.
-/// Nothing is looked at or compared. No node notices: in this order no master calls any.
+/// Starts a second rosmaster exactly as rosrescue has started the robot's, and gives it the same state.
+/// Nothing is read back or compared. No node notices, because a master notifies no node when calls come in
+/// this order.
 pub(crate) fn measure(robot: &Robot) -> Limit {
     let request = http_request(&injection(&robot.state()));
     let port = free_port();
@@ -51,7 +52,10 @@ pub(crate) fn measure(robot: &Robot) -> Limit {
     let mut wire = loop {
         match Wire::connect("127.0.0.1", port) {
             Ok(wire) => break wire,
-            Err(error) => assert!(begin.elapsed() < PATIENCE, "no rosmaster: {error}"),
+            Err(error) => assert!(
+                begin.elapsed() < PATIENCE,
+                "rosmaster does not listen: {error}"
+            ),
         }
         sleep(PAUSE);
     };

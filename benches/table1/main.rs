@@ -1,11 +1,12 @@
-//! The paper's Table 1: how long a recovery of the master takes, against the limit of this machine.
+//! Measures the paper's Table 1: how long a recovery of the master takes, compared with the best possible
+//! time on this computer.
 //!
 //! `cargo bench --bench table1` prints it as Markdown. The real rosmaster is killed with SIGKILL under
-//! `rosrescue core`, with synthetic and with real rospy nodes: two publishers and two subscribers each,
-//! which makes seven registrations a node with those that every node has.
+//! `rosrescue core`, with synthetic and with real rospy nodes. Each has two publishers and two subscribers,
+//! which makes seven registrations together with those that every node has.
 //!
-//! Between any two kills the same machine shows what the best possible recovery takes at that moment
-//! ([`limit`]). What a column means is said below the tables ([`table::print`]).
+//! Between any two kills, the same computer measures the best possible recovery at that moment ([`limit`]).
+//! The text below the tables explains the columns ([`table::print`]).
 
 #![allow(
     clippy::unwrap_used,
@@ -27,7 +28,8 @@ use crate::{
     table::Row,
 };
 
-/// A sixth death of the master within a minute counts as a crash loop and is answered with a pause.
+/// Number of kills per rosrescue. It treats a sixth death of its master within a minute as a crash loop and
+/// then pauses.
 const KILLS_A_LIFE: usize = 5;
 
 /// Measures the paper's Table 1 with the real rosmaster.
@@ -37,13 +39,13 @@ struct Options {
     #[arg(long, value_name = "COUNT,…", value_delimiter = ',')]
     #[arg(default_values_t = [1, 5, 10, 20, 40, 80])]
     nodes: Vec<usize>,
-    /// Kills for each number of synthetic nodes; 0 for none
+    /// Number of kills for each number of synthetic nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 10)]
     synthetic: usize,
-    /// Kills for each number of real rospy nodes; 0 for none
+    /// Number of kills for each number of real rospy nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     real: usize,
-    /// With a spare rosmaster
+    /// Use a spare rosmaster
     #[arg(long)]
     spare: bool,
 }
@@ -70,7 +72,7 @@ fn main() {
     table::print(&tables);
 }
 
-/// Kills the master of a robot with so many nodes again and again.
+/// Kills the master of a robot with this many nodes again and again.
 fn row(kind: Kind, nodes: usize, kills: usize, spare: bool) -> Row {
     let mut row = Row::new(nodes);
     while row.kills() < kills {

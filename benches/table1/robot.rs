@@ -23,20 +23,20 @@ use crate::shared::{
     },
 };
 
-/// After a recovery every node is asked for a sign of life. That delays no call, but it would be in
-/// the way of what is measured next on the same processor cores. Longer than the second between two
-/// probes: a robot at rest has been probed since its master last called a node.
+/// Time to wait after a recovery. Every node is then asked whether it is alive, which delays no call but
+/// would disturb the next measurement on the same cores. It is longer than the second between two probes, so
+/// that, as on a robot at rest, the master has been probed since it last called a node.
 const SETTLE: Duration = Duration::from_millis(1500);
 
-/// A parameter that is set already.
+/// A parameter that is already set.
 const PARAM: &str = "/table1";
 
-/// What the nodes are.
+/// The kind of nodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// Registrations, and a server that answers for the node; nothing else happens on the machine.
+    /// Registrations, and a server that answers for the nodes; nothing else happens on the computer.
     Synthetic,
-    /// rospy processes with live connections, each publishing 20 messages a second.
+    /// rospy processes with live connections, each of which publishes 20 messages per second.
     Real,
 }
 
@@ -49,22 +49,22 @@ impl fmt::Display for Kind {
     }
 }
 
-/// When things happened, in milliseconds since the SIGKILL.
+/// The times of events in milliseconds since the SIGKILL.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Recovery {
-    /// rosrescue noticed.
+    /// rosrescue noticed the death.
     pub(crate) detected: f64,
     /// The new master's port was open.
     pub(crate) port_open: f64,
-    /// The new master held the whole state, read back and compared.
+    /// The new master had the whole state, read back and compared.
     pub(crate) gate_open: f64,
-    /// A node that had called when the master died got its answer from the new one.
+    /// A node whose call was under way when the master died got its answer from the new one.
     pub(crate) answered: f64,
 }
 
-/// Nodes, ended when they are dropped.
+/// Nodes, which end when this is dropped.
 #[derive(Debug)]
-#[expect(dead_code, reason = "held, not looked at")]
+#[expect(dead_code, reason = "kept only so that they are dropped later")]
 enum Nodes {
     Synthetic(Vec<FakeNode>),
     Real(Vec<Process>),
@@ -73,7 +73,7 @@ enum Nodes {
 /// A robot.
 #[derive(Debug)]
 pub(crate) struct Robot {
-    // In the order of the drops: the scratch folder last, which ends what is left.
+    // Fields are dropped in this order. The scratch folder comes last and ends everything that is left.
     _nodes: Nodes,
     rescue: Rescue,
     pub(crate) master: Client,
@@ -81,7 +81,7 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// Starts rosrescue and its nodes, and waits until all of it is there.
+    /// Starts rosrescue and its nodes, and waits until everything has registered.
     pub(crate) fn start(kind: Kind, count: usize, spare: bool) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
@@ -89,7 +89,7 @@ impl Robot {
             .args(spare.then_some("--spare-master"))
             .start();
         let client = rescue.client();
-        eventually("`rosversion` has been asked", || {
+        eventually("roscore's parameters are set", || {
             client.param("/rosdistro").is_some()
         });
         client.set_param(PARAM, 1);
@@ -102,14 +102,14 @@ impl Robot {
             master: Client::new(master_port),
             scratch,
         };
-        // rosout has one of each, and both services that every node has.
+        // rosout has one publisher and one subscriber, and both services that every node has.
         let wanted = [
             ("nodes", count + 1),
             ("publishers", 3 * count + 1),
             ("subscribers", 2 * count + 1),
             ("services", 2 * count + 2),
         ];
-        eventually("every registration has come", || {
+        eventually("every registration is there", || {
             let state = &robot.status()["state"];
             let is = |what: &str| {
                 state[what]
@@ -128,8 +128,8 @@ impl Robot {
         serde_json::from_slice(&page.body).expect("JSON")
     }
 
-    /// Makes the master tell every subscriber of its publishers again, as in a life of hours: it keeps
-    /// a connection to each node that it has called, and closes them all when it dies.
+    /// Makes the master notify every subscriber again, as it does in a life of hours: it keeps a connection
+    /// to each node that it has called, and closes all of them when it dies.
     pub(crate) fn let_live(&self) {
         let (client, state) = (self.rescue.client(), self.state());
         let of = |table: &[(String, String)], key: &str| {
@@ -146,27 +146,29 @@ impl Robot {
         }
     }
 
-    /// Waits until nothing of what was started or killed before is still at work.
+    /// Waits until nothing that was started or killed before is still busy.
     pub(crate) fn settle(&self) {
         sleep(SETTLE);
     }
 
-    /// What the real master holds.
+    /// The state of the real master.
     pub(crate) fn state(&self) -> State {
         State::read(&self.master)
     }
 
     /// The process id of the real master.
     pub(crate) fn master_pid(&self) -> u32 {
-        self.master.master_pid().expect("the master's process id")
+        self.master
+            .master_pid()
+            .expect("the master does not report its process id")
     }
 
-    /// SIGKILL to the master, while a node calls it. Panics if anything of its state is lost.
+    /// Kills the master with SIGKILL while a node calls it. Panics if any of its state is lost.
     pub(crate) fn kill_master(&mut self) -> Recovery {
         let (before, pid) = (self.state(), self.master_pid());
         let recoveries = self.status()["recoveries"].as_u64().unwrap();
         let mut node = self.rescue.client().connect().expect("a connection");
-        // The same value as before: the state is to be the same.
+        // The value is the same as before, so that the state stays the same.
         let call = encode_call("setParam", params!["/node", PARAM, 1]);
 
         let (start, wall) = (Instant::now(), clock::wall_time());
@@ -179,7 +181,7 @@ impl Robot {
             panic!("{answer:?}");
         };
         assert_eq!(fields[0], Value::Int(1), "{answer:?}");
-        let status = eventually_some("the recovery has been reported", || {
+        let status = eventually_some("the recovery has a report", || {
             Some(self.status()).filter(|status| status["recoveries"].as_u64() > Some(recoveries))
         });
         before.assert_same(&self.state(), "after the recovery");
@@ -199,12 +201,12 @@ fn number(json: &Json) -> f64 {
     json.as_f64().expect("a number")
 }
 
-/// Starts so many at a time that each gets on: a rospy node takes half a second of a core.
+/// Starts rospy nodes, so many at a time that all make progress: each takes half a second of a core.
 fn real(scratch: &Scratch, port: u16, count: usize) -> Vec<Process> {
     let at_once = 2 * available_parallelism().map_or(2, usize::from);
     let mut nodes: Vec<Process> = Vec::new();
     for number in 0..count {
-        eventually("the nodes before are ready", || {
+        eventually("the previous nodes are ready", || {
             let not_ready = nodes.iter().filter(|node| node.stdout().is_empty());
             not_ready.count() < at_once
         });

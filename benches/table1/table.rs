@@ -1,4 +1,4 @@
-//! What was measured, as Markdown.
+//! Prints the results as Markdown.
 
 use crate::{
     limit::Limit,
@@ -6,10 +6,10 @@ use crate::{
     shared::machine,
 };
 
-/// The paper's Table 1, recovery alone: nodes and milliseconds.
+/// The paper's Table 1, recovery alone: number of nodes and milliseconds.
 const PAPER: [(usize, u32); 6] = [(1, 5), (5, 59), (10, 112), (20, 218), (40, 436), (80, 900)];
 
-/// What was measured with a number of nodes.
+/// The results for one number of nodes.
 #[derive(Debug)]
 pub(crate) struct Row {
     nodes: usize,
@@ -85,14 +85,14 @@ pub(crate) fn print(tables: &[(Kind, Vec<Row>)]) {
         "\n\
          * *detection*: from just before the SIGKILL to the shut gate. *New port open*: from the SIGKILL \
          to rosrescue's connection to the new master.\n\
-         * *recovery alone*: from the open port to the open gate; the state has been brought in, read \
+         * *recovery alone*: from the open port to the open gate; the state has been restored, read \
          back and compared. *Its limit*: from the open port of a second rosmaster, started in the same \
          way between two kills, to its reply to a single multicall with the same registrations; nothing \
-         looked at or read back.\n\
+         read back or compared.\n\
          * *whole state*: from the SIGKILL to the open gate. *Its limit*: from the start of the second \
          rosmaster's process to that reply.\n\
-         * *answer*: from the SIGKILL to the answer to a call that a node made at that moment.\n\
-         * *the paper*: its recovery alone, on its own machine.\n\
+         * *answer*: from the SIGKILL to the answer to a call that a node made at the moment of the SIGKILL.\n\
+         * *the paper*: recovery alone in the paper, on another computer.\n\
          <!-- table1:end -->"
     );
 }

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Writes down what it hears on `count`: a line "TIME NUMBER" a message, TIME in seconds since 1970."""
+"""Prints each message on `count` as a line "TIME NUMBER", with TIME in seconds since 1970."""
 
 import time
 

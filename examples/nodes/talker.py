@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Counts aloud: publishes 1, 2, 3, … on `count`, 50 times a second."""
+"""Publishes 1, 2, 3, … on `count`, 50 times a second."""
 
 import rospy
 from std_msgs.msg import UInt64

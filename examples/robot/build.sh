@@ -1,9 +1,9 @@
 #!/bin/sh
-# Compiles the robot's C++ nodes into a folder, which becomes the ROS package `robot_example_cpp`:
+# Compiles the robot's C++ nodes into a folder, and makes that the ROS package `robot_example_cpp`:
 #
 #     build.sh FOLDER
 #
-# Debian has no catkin that would do it. What is newer than its source is not compiled again.
+# It replaces catkin, which Debian lacks. A program that is newer than its source is not compiled again.
 set -eu
 cd "$(dirname "$0")/cpp"
 folder=$1
@@ -14,8 +14,8 @@ compile() { # SOURCE TARGET FLAGS...
     target=$folder/$2
     shift 2
     if [ ! -e "$target" ] || [ "$source" -nt "$target" ]; then
-        # What is half written has another name.
-        # shellcheck disable=SC2046 # words are what is wanted
+        # An unfinished file has another name.
+        # shellcheck disable=SC2046 # splitting is intended
         g++ -O1 -Wall -o "$target.half" "$source" "$@" $(pkg-config --cflags --libs roscpp std_msgs)
         mv "$target.half" "$target"
     fi

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# A whole robot (README.md) under `rosrescue core`, until Ctrl-C: run.sh [PORT]
+# Runs a whole robot (README.md) with `rosrescue core` until Ctrl-C: run.sh [PORT]
 #
-# It uses a free port and a scratch folder. ROSRESCUE=/path/to/rosrescue takes a binary that is there already.
+# It uses a free port and a scratch folder. ROSRESCUE=/path/to/rosrescue uses a program that is already built.
 
 cd "$(dirname "$0")/../.." || exit
 . examples/common.sh
@@ -19,7 +19,7 @@ else
 fi
 took "the page: $ROS_MASTER_URI"
 
-# Kept, so that it is there the next time.
+# This folder is kept for the next time.
 built=${CARGO_TARGET_DIR:-$PWD/target}/example-robot
 step "compile the robot's C++ nodes, where that has not been done"
 examples/robot/build.sh "$built/robot_example_cpp" || give_up "they cannot be compiled"
@@ -27,7 +27,7 @@ took "in $built"
 
 step "the robot: examples/robot/launch.sh"
 start_node robot examples/robot/launch.sh "$built" bag:="$scratch/robot.bag"
-within 120 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot does not come up"
+within 120 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot did not start"
 took "$(rosnode list | wc -l) nodes; it has reached the first place"
 
 step "the master is yours to kill:"

@@ -1,4 +1,4 @@
-//! What holds of any bytes that are found as a checkpoint.
+//! Checks that must hold for any bytes found as a checkpoint.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -11,13 +11,14 @@ use rosrescue::checkpoint::store::{FileId, FileStatus, Loaded, Storage, Store};
 use rosrescue::master::Master;
 use rosrescue::xmlrpc::Call;
 
-/// Parts the present file from its previous generation, which may follow it.
+/// Separates the present file from its previous generation, which may follow it.
 const PREVIOUS: &[u8] = b"=== previous generation ===\n";
 
 const MAGIC: &str = "# rosrescue checkpoint v1 ";
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Loads the bytes as they are, and with all check sums put right, as a fuzzer could never do it.
+/// Loads the bytes as they are, and again with all check sums corrected, which a fuzzer could never do by
+/// itself.
 pub(crate) fn check(bytes: &[u8]) {
     let at = position(bytes, PREVIOUS);
     let (present, previous) = match at {
@@ -32,7 +33,7 @@ fn position(bytes: &[u8], what: &[u8]) -> Option<usize> {
     bytes.windows(what.len()).position(|window| window == what)
 }
 
-/// The file with a first line and with records whose check sums hold.
+/// The file with a first line and records whose check sums are right.
 fn sealed(bytes: &[u8]) -> Vec<u8> {
     let Some(end) = bytes.iter().position(|&byte| byte == b'\n') else {
         return bytes.to_vec();
@@ -74,7 +75,7 @@ fn sealed(bytes: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Panics if loading does, or if what was loaded is not what comes back when it is written.
+/// Panics if loading panics, or if the loaded state is not read back after it was written.
 fn load(present: &[u8], previous: Option<&[u8]>) {
     if let Ok(decoded) = format::decode(present) {
         decoded.records.iter().for_each(check_record);
@@ -88,7 +89,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
     let Ok((mut store, Some(loaded))) = Store::open_on(memory.clone(), path) else {
         return;
     };
-    // Nobody counts so far; what follows could not be read again.
+    // No store ever counts this far. A state written after it could not be read again.
     const END: u64 = u64::MAX / 2 - 2;
     if store.seq() > END || store.generation() > END {
         return;
@@ -117,7 +118,7 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
     };
     store
         .begin(&expected)
-        .expect("what was loaded can be written");
+        .expect("cannot write what was loaded");
     let call = Call::new("deleteParam", vec!["/n".into(), "/p".into()]);
     let entries = [
         Entry::Call {
@@ -126,11 +127,11 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
         },
         Entry::Session(expected.session.clone()),
     ];
-    store.append(&entries).expect("records can follow it");
+    store.append(&entries).expect("cannot append records to it");
     drop(store);
 
-    let (store, loaded) = Store::open_on(memory, path).expect("our own file can be opened");
-    let loaded = loaded.expect("our own file is there");
+    let (store, loaded) = Store::open_on(memory, path).expect("cannot open our own file");
+    let loaded = loaded.expect("our own file is missing");
     assert!(loaded.exact && loaded.torn.is_none(), "{loaded:?}");
     assert_eq!(loaded.damage, Vec::<String>::new());
     assert_eq!(store.seq(), expected.seq + 2);
@@ -140,9 +141,10 @@ fn load(present: &[u8], previous: Option<&[u8]>) {
 }
 
 fn check_record(record: &Record) {
-    let fresh = format::encode_checkpoint(&Checkpoint::default(), 1).expect("an empty state");
-    let line = format::encode_record(record, fresh.stamp).expect("what was read can be written");
-    let again = format::decode(&[fresh.bytes, line].concat()).expect("our own file");
+    let fresh =
+        format::encode_checkpoint(&Checkpoint::default(), 1).expect("cannot encode an empty state");
+    let line = format::encode_record(record, fresh.stamp).expect("cannot encode what was read");
+    let again = format::decode(&[fresh.bytes, line].concat()).expect("cannot read our own file");
     assert_eq!(again.records.as_slice(), std::slice::from_ref(record));
 }
 
@@ -153,7 +155,7 @@ fn id(file: &File) -> FileId {
     FileId { device, inode }
 }
 
-/// A disk that never fails and forgets nothing.
+/// A disk that never fails and loses nothing.
 #[derive(Clone, Default)]
 struct Memory(Arc<Mutex<BTreeMap<PathBuf, File>>>);
 

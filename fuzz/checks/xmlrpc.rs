@@ -1,14 +1,15 @@
-//! What holds of any bytes that come as XML-RPC.
+//! Checks that must hold for any bytes that are received as XML-RPC.
 
 use rosrescue::master::{Master, Request};
 use rosrescue::replay;
 use rosrescue::xmlrpc::{Call, Reply, Value, decode_call, decode_reply, encode_call, encode_reply};
 
-/// Panics if decoding does, or if what was decoded is not what comes out of its own encoding.
+/// Panics if decoding panics, or if a decoded document is not the same after it was encoded and decoded
+/// again.
 pub(crate) fn check(bytes: &[u8]) {
     if let Ok(call) = decode_call(bytes) {
         assert_eq!(decode_call(&encode_call(&call)), Ok(call.clone()));
-        // Whatever it is, the mirror has an answer to it, and the answer can be sent.
+        // Whatever it is, the mirror has an answer, and the answer can be sent.
         let request = Request::from(call);
         request.kind();
         request.is_answerable();
@@ -31,7 +32,7 @@ fn check_reply(reply: &Reply) {
     match reply {
         Reply::Fault { .. } => assert_eq!(again.as_ref(), Ok(reply)),
         Reply::Value(value) => {
-            // As a parameter it is written in our own form, which keeps everything.
+            // As a parameter it is encoded in our own form, which keeps everything.
             let call = Call::new("m", vec![value.clone()]);
             assert_eq!(decode_call(&encode_call(&call)), Ok(call));
             match form(value, 1) {
@@ -43,21 +44,21 @@ fn check_reply(reply: &Reply) {
     }
 }
 
-/// What becomes of a value in a reply, which is written as CPython writes it; the later the worse.
+/// What happens to a value in a reply, which is encoded as by CPython. Later variants are worse.
 #[derive(PartialEq, Eq, PartialOrd, Ord)]
 enum Form {
-    /// It arrives as it is.
+    /// It is decoded unchanged.
     Kept,
-    /// A date that holds markup: CPython does not escape it.
+    /// It is a date with markup, which CPython does not escape.
     Spoiled,
-    /// CPython does not write it.
+    /// CPython does not encode it.
     Refused,
 }
 
 fn form(value: &Value, level: usize) -> Form {
     match value {
         Value::Nil | Value::BigInt(_) => Form::Refused,
-        // From here on CPython is near its recursion limit, and may or may not write it.
+        // From here on CPython is close to its recursion limit, so it may or may not encode the value.
         _ if level > 480 => Form::Spoiled,
         Value::DateTime(text) if text.contains(['&', '<', '>']) => Form::Spoiled,
         Value::Array(elements) => elements

@@ -1,4 +1,4 @@
-//! Any bytes as a checkpoint, and the same with its check sums put right.
+//! Loads any bytes as a checkpoint, and again with corrected check sums.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! Any bytes as a call and as a reply.
+//! Decodes any bytes as a call and as a reply.
 
 #![no_main]
 

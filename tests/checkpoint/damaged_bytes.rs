@@ -1,4 +1,4 @@
-//! What is left of a damaged checkpoint is what was written, or nothing; never something else.
+//! What is read from a damaged checkpoint is what was written or nothing, never something else.
 
 use std::path::Path;
 
@@ -47,7 +47,7 @@ fn record(seq: u64) -> Record {
     }
 }
 
-/// A checkpoint as of record 7 followed by `count` records, where each line starts, and its stamp.
+/// A checkpoint as of record 7, followed by `count` records; also where each line starts, and the stamp.
 fn file(count: u64, generation: u64) -> (Vec<u8>, Vec<usize>, Stamp) {
     let encoded = encode_checkpoint(&checkpoint(7), generation).unwrap();
     let mut bytes = encoded.bytes;
@@ -59,7 +59,8 @@ fn file(count: u64, generation: u64) -> (Vec<u8>, Vec<usize>, Stamp) {
     (bytes, starts, encoded.stamp)
 }
 
-/// Everything that came back was written; says whether all of it did and nothing was noticed.
+/// Checks that everything that was read had been written. Returns whether all of it was read and no damage
+/// was found.
 fn is_untouched(decoded: &Decoded, count: u64) -> bool {
     if let Ok(found) = &decoded.checkpoint {
         assert_eq!(*found, checkpoint(7));
@@ -76,7 +77,7 @@ fn is_untouched(decoded: &Decoded, count: u64) -> bool {
 }
 
 #[test]
-fn an_untouched_file_is_whole() {
+fn an_undamaged_file_is_read_completely() {
     let (bytes, _, _) = file(3, 2);
     let decoded = decode(&bytes).unwrap();
     assert!(is_untouched(&decoded, 3));
@@ -93,9 +94,9 @@ fn every_flipped_bit_is_noticed() {
             let decoded = decode(&flipped).unwrap_or_else(|error| panic!("byte {at}: {error}"));
             assert!(
                 !is_untouched(&decoded, 6),
-                "bit {bit} of byte {at} went unnoticed"
+                "the flip of bit {bit} in byte {at} went unnoticed"
             );
-            // One bit costs the snapshot or one record, or two if they are joined.
+            // One bit costs the snapshot, or one record, or two if they become one line.
             if at < starts[0] {
                 assert!(decoded.checkpoint.is_err(), "bit {bit} of byte {at}");
                 assert_eq!(decoded.records.len(), 6, "bit {bit} of byte {at}");
@@ -110,7 +111,7 @@ fn every_flipped_bit_is_noticed() {
 }
 
 #[test]
-fn a_zeroed_sector_costs_what_was_in_it() {
+fn a_zeroed_sector_costs_only_the_records_in_it() {
     let (bytes, starts, _) = file(200, 2);
     for sector in (0..bytes.len()).step_by(512) {
         let end = bytes.len().min(sector + 512);
@@ -123,7 +124,7 @@ fn a_zeroed_sector_costs_what_was_in_it() {
             .filter(|line| line[0] < end && sector < line[1])
             .count();
         assert_eq!(decoded.records.len(), 200 - hit, "sector at {sector}");
-        // The end of the file is a torn write; anything else is damage.
+        // At the end of the file this is an incomplete append; anywhere else it is damage.
         if sector >= starts[0] {
             assert_eq!(
                 decoded.torn.is_some(),
@@ -140,24 +141,24 @@ fn a_zeroed_sector_costs_what_was_in_it() {
 }
 
 #[test]
-fn records_of_another_life_of_the_file_do_not_count() {
+fn records_of_an_earlier_file_are_ignored() {
     let (mut bytes, starts, stamp) = file(3, 2);
     let (old, old_starts, _) = file(9, 1);
     let whole = bytes.len();
-    // Old whole records with the very numbers that would come next.
+    // Whole records of an older file, with just the numbers that would come next.
     bytes.extend_from_slice(&old[old_starts[3]..]);
     let decoded = decode(&bytes).unwrap();
     assert_eq!(decoded.records.len(), 3);
     assert_eq!(decoded.torn, Some(whole..bytes.len()));
     assert!(decoded.damaged.is_empty());
 
-    // The same in the middle is damage.
+    // The same records in the middle of the file are damage.
     bytes.extend(encode_record(&record(11), stamp).unwrap());
     let decoded = decode(&bytes).unwrap();
     assert_eq!(decoded.records.len(), 4);
     assert_eq!(decoded.damaged.len(), 6);
 
-    // A record twice, or one that the snapshot contains.
+    // A record that is there twice, or is already in the snapshot.
     for seq in [8, 7] {
         let mut bytes = bytes[..starts[1]].to_vec();
         bytes.extend(encode_record(&record(seq), stamp).unwrap());
@@ -180,7 +181,7 @@ fn any_bytes_are_read_without_a_panic() {
 }
 
 #[test]
-fn what_is_not_ours_is_told_apart() {
+fn files_of_other_programs_are_recognised() {
     for foreign in [
         "use_sim_time: true\n",
         "# my parameters\nrate: 10\n",
@@ -191,7 +192,7 @@ fn what_is_not_ours_is_told_apart() {
         let error = decode(foreign.as_bytes()).unwrap_err();
         assert_eq!(error, DecodeError::NotACheckpoint, "{foreign}");
     }
-    // What a crash of the machine makes of a file is not foreign.
+    // Files as a crash of the machine may leave them count as ours.
     for ours in [&b""[..], &[0; 4096], b"# rosrescue check"] {
         assert_eq!(
             decode(ours).unwrap().checkpoint.unwrap_err(),
@@ -201,7 +202,7 @@ fn what_is_not_ours_is_told_apart() {
 }
 
 #[test]
-fn a_later_format_is_told_apart() {
+fn a_newer_format_is_recognised() {
     let line = b"# rosrescue checkpoint v2 whatever=this says header=";
     let mut bytes = line.to_vec();
     bytes.extend(format!("{:08x}\n- newer: true\n", crc32c::crc32c(line)).bytes());
@@ -209,7 +210,7 @@ fn a_later_format_is_told_apart() {
         decode(&bytes).unwrap_err(),
         DecodeError::NewerVersion { version: 2 }
     );
-    // Without its check sum it is a damaged one of ours.
+    // With a wrong check sum it counts as a damaged file of ours.
     bytes[line.len()] ^= 1;
     assert_eq!(
         decode(&bytes).unwrap().checkpoint.unwrap_err(),
@@ -217,7 +218,7 @@ fn a_later_format_is_told_apart() {
     );
 }
 
-/// A file whose session and writes know more: what has not reached the master yet.
+/// A file whose session and records also tell which writes have not reached the master yet.
 fn file_with_pending_writes() -> Vec<u8> {
     let mut checkpoint = checkpoint(7);
     checkpoint.session.incarnation = 2;
@@ -245,9 +246,9 @@ fn file_with_pending_writes() -> Vec<u8> {
     bytes
 }
 
-/// Files of earlier releases stay readable, and today's are written as they were.
+/// Files of earlier versions stay readable, and files are still written exactly like those.
 #[test]
-fn golden_files() {
+fn golden_files_are_read_and_written_unchanged() {
     let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let files = [
         ("checkpoint-v1.yaml", file(2, 1).0, 2),

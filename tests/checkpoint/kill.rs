@@ -1,4 +1,4 @@
-//! SIGKILL at any moment of a process that records on a real disk.
+//! SIGKILL, at any moment, to a process that records on a real disk.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -11,8 +11,8 @@ use rosrescue::xmlrpc::{Call, Value};
 
 const FILE: &str = "ROSRESCUE_TEST_CHECKPOINT";
 
-/// The process that is killed: records without end, with syncs and compactions in between, and says
-/// the number of each record once it is recorded. Sets the parameter `n` to the record's number.
+/// The process to kill: records without end, with syncs and compactions in between, and prints the number of
+/// each record once it has been recorded. Record `n` sets the parameter `n`.
 fn write_until_killed(path: &Path) -> ! {
     let (mut store, _) = Store::open(path).unwrap();
     let checkpoint = |seq: u64| {
@@ -56,8 +56,8 @@ fn write_until_killed(path: &Path) -> ! {
 }
 
 #[test]
-fn what_was_said_to_be_recorded_survives_a_kill() {
-    // The test starts itself as the process that is killed.
+fn acknowledged_records_survive_a_kill() {
+    // The test starts itself again as the process to kill.
     if let Some(path) = std::env::var_os(FILE) {
         write_until_killed(path.as_ref());
     }
@@ -69,7 +69,7 @@ fn what_was_said_to_be_recorded_survives_a_kill() {
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args([
                 "--exact",
-                "kill::what_was_said_to_be_recorded_survives_a_kill",
+                "kill::acknowledged_records_survive_a_kill",
                 "--nocapture",
                 "--test-threads=1",
             ])
@@ -79,12 +79,12 @@ fn what_was_said_to_be_recorded_survives_a_kill() {
             .spawn()
             .unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
-        // Once it records, at a time that differs from round to round.
+        // Kill it while it records, at a time that differs from round to round.
         let first = lines.next().unwrap().unwrap();
         std::thread::sleep(Duration::from_micros(round * 997 % 20_000));
         child.kill().unwrap();
         child.wait().unwrap();
-        // The last line may be cut.
+        // The last line may be incomplete.
         let said = std::iter::once(first).chain(lines.map_while(Result::ok));
         let last = said
             .filter_map(|line| line.strip_prefix("recorded ")?.parse::<u64>().ok())
@@ -105,10 +105,10 @@ fn what_was_said_to_be_recorded_survives_a_kill() {
         assert_eq!(state, Value::from(store.seq() as i32));
         assert!(
             store.seq() >= least,
-            "round {round}: {} of {least}",
+            "round {round}: found {} of at least {least} records",
             store.seq()
         );
-        // Every other round the next process starts from the file as the kill left it.
+        // In every other round the next process starts from the file as the kill has left it.
         if round % 2 == 0 {
             let mut checkpoint = Checkpoint {
                 seq: store.seq(),

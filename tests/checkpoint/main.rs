@@ -1,4 +1,4 @@
-//! The checkpoint, without ROS: its bytes, its YAML, and the store on a real disk.
+//! The checkpoint without ROS: its bytes, its YAML, and the store on a real disk.
 
 #![allow(
     clippy::unwrap_used,
@@ -7,11 +7,11 @@
     reason = "a test"
 )]
 
-/// Any damage to the bytes of a file.
+/// Damage of any kind to the bytes of a file.
 mod damaged_bytes;
 /// SIGKILL to a process that records.
 mod kill;
 /// The store on a disk: locks, generations, compaction.
 mod store;
-/// What Python reads in it.
+/// How Python reads a checkpoint.
 mod yaml;

@@ -12,7 +12,7 @@ use rosrescue::checkpoint::store::{OpenError, Store, StoreError};
 use rosrescue::xmlrpc::{Call, Value};
 use tempfile::TempDir;
 
-/// A folder of a test's own, and a checkpoint in it.
+/// A new folder, and a path for a checkpoint in it.
 fn place() -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("c.yaml");
@@ -43,7 +43,7 @@ fn checkpoint(seq: u64) -> Checkpoint {
     checkpoint
 }
 
-/// A store at `path`, begun and with records up to number `seq`.
+/// A store at `path` that has begun, with records up to number `seq`.
 fn started(path: &Path, seq: i32) -> Store {
     let (mut store, loaded) = Store::open(path).unwrap();
     assert!(loaded.is_none());
@@ -64,7 +64,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn what_was_appended_is_there_after_a_crash() {
+fn appended_records_are_there_after_a_crash() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("deep/er/latest-chkpt.yaml");
     let store = started(&path, 3);
@@ -87,7 +87,7 @@ fn what_was_appended_is_there_after_a_crash() {
 }
 
 #[test]
-fn a_second_one_is_refused_by_name() {
+fn a_second_store_is_refused_with_the_process_id_of_the_first() {
     let (folder, path) = place();
     let _store = started(&path, 0);
     let link = folder.path().join("other.yaml");
@@ -108,7 +108,7 @@ fn a_second_one_is_refused_by_name() {
 }
 
 #[test]
-fn files_are_for_their_owner_only() {
+fn files_are_accessible_to_their_owner_only() {
     let (folder, path) = place();
     let mut store = started(&path, 1);
     store.begin(&checkpoint(1)).unwrap();
@@ -126,7 +126,7 @@ fn files_are_for_their_owner_only() {
 }
 
 #[test]
-fn a_link_is_followed_and_stays() {
+fn a_symbolic_link_is_followed_and_kept() {
     let folder = tempfile::tempdir().unwrap();
     let (link, real) = (
         folder.path().join("link.yaml"),
@@ -143,7 +143,7 @@ fn a_link_is_followed_and_stays() {
 }
 
 #[test]
-fn what_is_recorded_during_a_compaction_is_in_both_files() {
+fn records_made_during_a_compaction_are_in_both_files() {
     let (folder, path) = place();
     let mut store = started(&path, 2);
     let job = store.begin_compaction(checkpoint(2)).unwrap();
@@ -190,7 +190,7 @@ fn compaction_is_wanted_when_the_journal_outgrows_the_snapshot() {
 }
 
 #[test]
-fn a_session_set_aside_has_no_part_in_the_next() {
+fn a_session_that_was_set_aside_does_not_affect_the_next() {
     let (folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
@@ -202,7 +202,7 @@ fn a_session_set_aside_has_no_part_in_the_next() {
         store.append(&[entry(nth)]).unwrap();
         store.begin(&checkpoint(store.seq())).unwrap();
     }
-    // The last ten are kept.
+    // Only the last ten are kept.
     let kept = names(folder.path())
         .iter()
         .filter(|name| name.contains("session-"))
@@ -215,7 +215,7 @@ fn a_session_set_aside_has_no_part_in_the_next() {
 }
 
 #[test]
-fn a_session_set_aside_is_no_fallback_of_the_next() {
+fn a_session_that_was_set_aside_is_no_fallback_for_the_next() {
     let (_folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
@@ -230,7 +230,7 @@ fn a_session_set_aside_is_no_fallback_of_the_next() {
 }
 
 #[test]
-fn a_file_that_was_removed_to_start_afresh_stays_removed() {
+fn the_state_of_a_file_that_the_operator_removed_is_not_restored() {
     let (folder, path) = place();
     let mut store = started(&path, 2);
     store.begin(&checkpoint(2)).unwrap();
@@ -249,7 +249,7 @@ fn a_file_that_was_removed_to_start_afresh_stays_removed() {
 }
 
 #[test]
-fn an_orderly_stop_is_in_the_file() {
+fn a_clean_stop_is_recorded_in_the_file() {
     let (_folder, path) = place();
     let mut store = started(&path, 1);
     let session = Session {
@@ -269,7 +269,7 @@ fn an_orderly_stop_is_in_the_file() {
 }
 
 #[test]
-fn synced_records_are_counted() {
+fn the_store_knows_the_last_synced_record() {
     let folder = tempfile::tempdir().unwrap();
     let mut store = started(&folder.path().join("c.yaml"), 2);
     assert_eq!(store.synced_seq(), 0);

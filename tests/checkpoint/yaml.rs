@@ -1,6 +1,6 @@
-//! A checkpoint is YAML that means the same to us, to PyYAML and to rosparam.
+//! A checkpoint is YAML that rosrescue, PyYAML and rosparam read alike.
 
-// The lints know `#[test]` functions only, not their helpers.
+// The lints exempt only `#[test]` functions, not their helpers.
 mod catalogue;
 mod python;
 
@@ -26,7 +26,7 @@ fn in_struct(value: Value) -> Value {
     Value::Struct(Struct::from([("k".to_owned(), value)]))
 }
 
-/// A state with `value` as a parameter, which one that waits for the master has set.
+/// A state that has `value` as a parameter, set by a pending write.
 fn with_value(value: &Value) -> Checkpoint {
     Checkpoint {
         pending: vec![set_param(value), Call::new("deleteParam", vec![])],
@@ -104,7 +104,7 @@ fn with_params(params: Struct) -> Checkpoint {
     }
 }
 
-/// One file that holds `value` as a parameter and in a record, and both still to be delivered.
+/// A file that holds `value` as a parameter and in a record, both still to be delivered to the master.
 fn file_with(value: &Value) -> Result<Vec<u8>, EncodeError> {
     let checkpoint = with_value(value);
     let encoded = encode_checkpoint(&checkpoint, 3)?;
@@ -143,11 +143,11 @@ fn assert_round_trip(value: &Value) {
     else {
         panic!("{:?}\n{text}", decoded.damaged);
     };
-    assert!(call.params[2] == *value, "another value came back:\n{text}");
+    assert!(call.params[2] == *value, "the value has changed:\n{text}");
 }
 
 #[test]
-fn every_kind_of_value_comes_back() {
+fn every_kind_of_value_is_read_back_unchanged() {
     for value in catalogue() {
         assert_round_trip(&value);
     }
@@ -155,7 +155,7 @@ fn every_kind_of_value_comes_back() {
 }
 
 #[test]
-fn every_character_comes_back() {
+fn every_character_is_read_back_unchanged() {
     let all: Vec<char> = (0..=0x10_ffff).filter_map(char::from_u32).collect();
     for some in all.chunks(100_000) {
         assert_round_trip(&Value::String(some.iter().collect()));
@@ -176,7 +176,7 @@ fn a_write_that_the_master_has_run_is_not_pending() {
 }
 
 #[test]
-fn a_session_record_comes_back() {
+fn a_session_record_is_read_back_unchanged() {
     let encoded = encode_checkpoint(&Checkpoint::default(), 1).unwrap();
     let session = Session {
         id: "x".to_owned(),
@@ -197,8 +197,8 @@ fn a_session_record_comes_back() {
 }
 
 #[test]
-fn what_is_written_is_never_too_deep_to_read() {
-    // The key `p` is a level of its own.
+fn nothing_is_written_that_is_too_deep_to_read() {
+    // The key `p` takes one level.
     for wrap in [in_array, in_struct] {
         assert_round_trip(&nested(DEPTH_MAX - 1, wrap));
         let error = file_with(&nested(DEPTH_MAX + 1, wrap)).unwrap_err();
@@ -210,7 +210,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(2_000))]
 
     #[test]
-    fn any_value_comes_back(value in values()) {
+    fn any_value_is_read_back_unchanged(value in values()) {
         assert_round_trip(&value);
     }
 }

@@ -1,4 +1,4 @@
-//! Users, passwords and certificates.
+//! Access to etcd with users, passwords and certificates.
 
 use std::{path::Path, process::Command, time::Duration};
 
@@ -11,7 +11,7 @@ use crate::{
 };
 
 #[tokio::test]
-async fn a_user_has_a_password_and_a_token_that_expires() {
+async fn a_user_needs_its_password_and_an_expired_token_is_renewed() {
     let expires = ["--auth-token-ttl", "2"];
     let servers = Servers::with(Scratch::new(), 1, "http", &expires).await;
     for (path, body) in [
@@ -51,7 +51,7 @@ async fn a_user_has_a_password_and_a_token_that_expires() {
     let client = servers.client_of(0, with_user("root", "secret"));
     client.view(&keys, LIMIT).await.unwrap();
     let mut watch = client.watch(keys.small(), 0, Duration::from_secs(1));
-    // Tokens go after 2 s without a use, and with their member's end.
+    // Tokens expire after 2 s without use, and when their member ends.
     let start = std::time::Instant::now();
     while start.elapsed() < Duration::from_secs(4) {
         let _ = tokio::time::timeout(Duration::from_secs(4), watch.next()).await;
@@ -60,7 +60,7 @@ async fn a_user_has_a_password_and_a_token_that_expires() {
     assert!(!format!("{:?}", with_user("root", "secret")).contains("secret"));
 }
 
-/// etcd's gateway is a client of its own server.
+/// The gateway of etcd is a client of its own server, so a certificate for servers alone is not enough.
 async fn for_servers_alone(access: Access, folder: &Path) {
     std::fs::write(folder.join("usage"), "extendedKeyUsage=serverAuth\n").unwrap();
     certificate(folder, "half", "ca", 9);
@@ -91,7 +91,7 @@ fn openssl(folder: &Path, arguments: &str) {
         .current_dir(folder)
         .args(arguments.split(' '))
         .output();
-    let output = output.expect("there is no openssl");
+    let output = output.expect("openssl is not installed");
     assert!(
         output.status.success(),
         "{}",
@@ -99,7 +99,7 @@ fn openssl(folder: &Path, arguments: &str) {
     );
 }
 
-/// A certificate `name` that is valid for so many days from now on, signed with that of `ca`.
+/// Makes a certificate `name`, valid for `days` from now on, signed with the certificate of `ca`.
 fn certificate(folder: &Path, name: &str, ca: &str, days: i32) {
     let new = "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
     openssl(
@@ -184,7 +184,7 @@ async fn certificates_are_checked_on_both_sides() {
             "{error}"
         );
     }
-    // One that has expired is replaced while rosrescue runs.
+    // An expired certificate is replaced while rosrescue runs.
     let renewed = client(access("ca", Some("expired")));
     assert!(renewed.view(&keys(), limit).await.is_err());
     certificate(&folder, "expired", "ca", 9);

@@ -1,4 +1,4 @@
-//! What several computers stand on, with real etcd servers on loopback.
+//! The base of running on several computers, with real etcd servers on loopback.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,13 +12,13 @@ mod support;
 
 mod servers;
 
-/// Users, passwords and certificates.
+/// Access with users, passwords and certificates.
 mod access;
-/// The robot's state in etcd, from one computer to the other.
+/// The robot's state in etcd, read by another computer.
 mod replica;
-/// Requests, when members die, hang, are full, or are no majority.
+/// Requests while members die, hang, are full, or are no majority.
 mod requests;
-/// Two machines on a real etcd: who leads when one dies.
+/// Two state machines on a real etcd: which one leads when the other dies.
 mod takeover;
-/// Changes, when members die, and when they are forgotten.
+/// Watches while members die, and when etcd has discarded what was watched.
 mod watches;

@@ -1,4 +1,4 @@
-//! The robot's state in etcd, from one computer to the other.
+//! The robot's state in etcd, written by one computer and read by another.
 
 use std::time::Instant;
 
@@ -30,7 +30,7 @@ fn record(seq: u64, bytes: usize) -> Record {
     Record { seq, entry }
 }
 
-/// A leader, as simple as it can be.
+/// A leader, as simple as possible.
 struct Leader {
     replica: Replica,
     guard: Guard,
@@ -63,7 +63,7 @@ impl Leader {
         }
     }
 
-    /// Commits all, in as many beats as it takes.
+    /// Commits all records, in as many heartbeats as it takes.
     async fn commit(&mut self, records: &[Record]) {
         for record in records {
             let parts = journal::parts(&self.replica.keys, record).unwrap();
@@ -94,7 +94,7 @@ impl Leader {
 }
 
 #[tokio::test]
-async fn a_follower_reads_what_the_leader_has_committed_a_map_of_20_mb_too() {
+async fn a_follower_reads_everything_that_the_leader_commits_even_a_map_of_20_mb() {
     let servers = Servers::new(3).await;
     let mut leader = Leader::new(&servers).await;
     let sizes = [10, 100, 300 << 10, 5, 20 << 20, 1];
@@ -112,7 +112,7 @@ async fn a_follower_reads_what_the_leader_has_committed_a_map_of_20_mb_too() {
     let loaded = follower.load(Progress::default()).await.unwrap();
     assert!(loaded.records == records && loaded.checkpoint.is_none());
     assert_eq!(loaded.view.guard(), leader.guard);
-    // The same, as it came.
+    // The same records, as they arrive.
     let (mut progress, mut seen) = (Progress::default(), Vec::new());
     while seen.len() < records.len() {
         for change in watch.next().await.unwrap() {
@@ -124,14 +124,14 @@ async fn a_follower_reads_what_the_leader_has_committed_a_map_of_20_mb_too() {
         }
     }
     assert!(seen == records);
-    // A little more is little to read.
+    // After one more record there is little to read.
     leader.commit(&[record(7, 1)]).await;
     let more = follower.load(loaded.progress).await.unwrap();
     assert_eq!(more.records, [record(7, 1)]);
 }
 
 #[tokio::test]
-async fn a_snapshot_takes_the_place_of_the_journal() {
+async fn a_snapshot_replaces_the_journal_before_it() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     let records: Vec<_> = (1..=50).map(|seq| record(seq, 30 << 10)).collect();
@@ -170,12 +170,12 @@ async fn a_snapshot_takes_the_place_of_the_journal() {
     assert!(joined.checkpoint == Some(state));
     assert_eq!(joined.records, [record(52, 10)]);
     assert!(!joined.progress.wants_snapshot());
-    // Who had followed to the snapshot goes on from what it has.
+    // A follower that has read up to the snapshot continues from there.
     let mut known = Progress::default();
     known.seq = 51;
     let on = follower.load(known).await.unwrap();
     assert!(on.checkpoint.is_none() && on.records == [record(52, 10)]);
-    // Nothing old is left.
+    // Nothing is left of the old journal.
     let all = format!("{}a", keys().prefix())..format!("{}z", keys().prefix());
     let all = follower.client.range(&all, LIMIT).await.unwrap();
     let sizes: usize = all.kvs.iter().map(|kv| kv.value.len()).sum();
@@ -183,7 +183,7 @@ async fn a_snapshot_takes_the_place_of_the_journal() {
 }
 
 #[tokio::test]
-async fn a_journal_with_a_hole_is_not_taken_for_whole() {
+async fn a_journal_with_a_gap_is_refused() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     for seq in 1..=4 {
@@ -221,7 +221,7 @@ async fn a_journal_with_a_hole_is_not_taken_for_whole() {
 }
 
 #[tokio::test]
-async fn a_state_can_replace_the_one_before_in_the_middle_of_the_journal() {
+async fn a_whole_state_can_be_replaced_in_the_middle_of_the_journal() {
     let servers = Servers::new(1).await;
     let mut leader = Leader::new(&servers).await;
     leader.commit(&[record(1, 10), record(2, 10)]).await;
@@ -246,7 +246,7 @@ async fn a_state_can_replace_the_one_before_in_the_middle_of_the_journal() {
     };
     let answer = replica.run(&settings("a"), &beat, Some(&entry)).await;
     let Answer::Applied { revision, seq: 3 } = answer.unwrap() else {
-        panic!("the state is in no journal");
+        panic!("no journal holds the state");
     };
     leader.guard.alive = revision;
     leader.commit(&[record(4, 10)]).await;

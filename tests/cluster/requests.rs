@@ -1,4 +1,4 @@
-//! Requests, when members die, hang, are full, or are no majority.
+//! Requests to etcd while members die, hang, are full, or are no majority.
 
 use std::time::{Duration, Instant};
 
@@ -29,7 +29,7 @@ fn beat(guard: Guard, beat: u64, seq: u64) -> Op {
 }
 
 #[tokio::test]
-async fn one_claims_and_what_is_sent_twice_is_made_once() {
+async fn only_one_claim_succeeds_and_a_repeated_request_has_one_effect() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let claim = |claim| Op::Claim {
@@ -47,7 +47,7 @@ async fn one_claims_and_what_is_sent_twice_is_made_once() {
     else {
         panic!("{first:?}");
     };
-    // The other one is told who leads.
+    // The second claim is answered with the present leader.
     let second = client
         .run(&keys, &settings("b"), &claim(1), None, LIMIT)
         .await
@@ -64,7 +64,7 @@ async fn one_claims_and_what_is_sent_twice_is_made_once() {
         (leader.uri.as_str(), leader.version.as_str()),
         ("http://a:11311", "0.1.0")
     );
-    // A beat, and the same once more.
+    // A heartbeat, and the same one again.
     let op = beat(view.guard(), 1, 7);
     let made = client
         .run(&keys, &a, &op, Some(&entry(7)), LIMIT)
@@ -86,7 +86,7 @@ async fn one_claims_and_what_is_sent_twice_is_made_once() {
         client.run(&keys, &a, &Op::Read, None, LIMIT).await.unwrap(),
         Answer::Is(view.clone())
     );
-    // Parts and deletions are for the leader alone.
+    // Only the leader may write parts and delete.
     assert!(client.put(&keys, term, &[entry(3)], LIMIT).await.unwrap());
     assert!(
         !client
@@ -125,10 +125,10 @@ async fn one_claims_and_what_is_sent_twice_is_made_once() {
 }
 
 #[tokio::test]
-async fn a_range_is_read_in_pages_of_one_moment() {
+async fn a_range_is_read_in_pages_of_the_same_revision() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
-    // Nobody leads: the term is 0.
+    // Nobody leads, so the term is 0.
     let puts: Vec<_> = (1..=100).map(entry).collect();
     assert!(client.put(&keys, 0, &puts, LIMIT).await.unwrap());
     let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
@@ -144,7 +144,7 @@ async fn a_range_is_read_in_pages_of_one_moment() {
 }
 
 #[tokio::test]
-async fn a_member_that_dies_or_hangs_is_passed_over() {
+async fn a_member_that_dies_or_hangs_is_skipped() {
     let mut servers = Servers::new(3).await;
     let (client, keys) = (servers.client(), keys());
     let mut seq = 0;
@@ -176,7 +176,7 @@ async fn a_member_that_dies_or_hangs_is_passed_over() {
 }
 
 #[tokio::test]
-async fn without_a_majority_nothing_is_answered_and_it_is_said_why() {
+async fn without_a_majority_requests_fail_with_a_clear_error() {
     let mut servers = Servers::new(3).await;
     let (client, keys) = (servers.client(), keys());
     servers.kill(1);
@@ -221,7 +221,7 @@ async fn a_key_goes_with_its_lease() {
 }
 
 #[tokio::test]
-async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
+async fn a_full_etcd_reports_it_can_still_be_read_and_later_accepts_writes_again() {
     let quota = ["--quota-backend-bytes", "8388608"];
     let servers = Servers::with(crate::support::Scratch::new(), 1, "http", &quota).await;
     let (client, keys) = (servers.client(), keys());
@@ -232,7 +232,7 @@ async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
     let mut seq = 0;
     let error = loop {
         seq += 1;
-        assert!(seq < 20, "it is never full");
+        assert!(seq < 20, "etcd never becomes full");
         if let Err(error) = client.put(&keys, 0, &[large(seq)], LIMIT).await {
             break error;
         }
@@ -244,7 +244,7 @@ async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
     );
     let found = client.range(&keys.journal_after(0), LIMIT).await.unwrap();
     assert!(!found.kvs.is_empty());
-    // What can be done from here: less is kept. The rest is for a person.
+    // rosrescue can only delete entries. The rest is up to the operator.
     assert!(
         client
             .delete(&keys, 0, &keys.behind(seq), LIMIT)
@@ -252,7 +252,7 @@ async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
             .unwrap()
     );
     client.compact(found.revision + 1, LIMIT).await.unwrap();
-    // Twice is no error.
+    // Compacting twice is not an error.
     client.compact(found.revision + 1, LIMIT).await.unwrap();
     servers.post("maintenance/defragment", &json!({}));
     let alarms = servers.post("maintenance/alarm", &json!({ "action": "GET" }));
@@ -263,7 +263,7 @@ async fn a_full_etcd_says_so_can_still_be_read_and_takes_writes_again() {
 }
 
 #[tokio::test]
-async fn a_request_that_is_too_large_is_told_from_others() {
+async fn a_request_that_is_too_large_has_an_error_of_its_own() {
     let servers = Servers::new(1).await;
     let large = Put {
         key: keys().journal(1),
@@ -278,7 +278,7 @@ async fn a_request_that_is_too_large_is_told_from_others() {
 }
 
 #[tokio::test]
-async fn each_endpoint_is_tried_on_its_own_and_a_wrong_one_is_told_from_the_others() {
+async fn each_endpoint_is_tried_separately_and_a_wrong_one_is_named() {
     let servers = Servers::new(1).await;
     let endpoints = |port| vec![servers.endpoints(0)[0].clone(), port];
     let unknown = "http://nobody.invalid:2379".to_owned();
@@ -309,7 +309,7 @@ async fn each_endpoint_is_tried_on_its_own_and_a_wrong_one_is_told_from_the_othe
 }
 
 #[tokio::test]
-async fn the_robots_in_etcd_are_found_without_the_keys_of_others() {
+async fn the_robots_in_etcd_are_listed_without_keys_of_other_programs() {
     let servers = Servers::new(1).await;
     let client = servers.client();
     assert_eq!(client.robots(LIMIT).await.unwrap(), [""; 0]);

@@ -1,4 +1,4 @@
-//! What the clients of a cluster of etcd are given.
+//! Settings for clients of a cluster of etcd servers.
 
 use std::time::Duration;
 

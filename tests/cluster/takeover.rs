@@ -1,4 +1,5 @@
-//! Two machines on a real etcd, each with the simplest shell: who leads when one dies.
+//! Two state machines on a real etcd, each with the simplest possible driver: which one leads when the other
+//! dies.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +14,7 @@ use tokio::{
 
 use crate::servers::{LIMIT, Servers, keys, settings};
 
-/// What a shell says of itself.
+/// A change of role that a driver reports.
 #[derive(Debug)]
 struct Became {
     name: &'static str,
@@ -21,7 +22,7 @@ struct Became {
     at: Instant,
 }
 
-/// Runs a machine. It has no journal: it is always where the others are.
+/// Drives a state machine. It has no journal, so it always counts as up to date.
 fn run(
     client: Etcd,
     name: &'static str,
@@ -31,7 +32,7 @@ fn run(
     let inward = inputs.clone();
     let task = tokio::spawn(async move {
         let (keys, settings) = (keys(), settings(name));
-        // They end with it.
+        // The requests end together with the driver.
         let mut requests = JoinSet::new();
         let mut machine = Machine::new(settings.clone());
         let mut view = client.view(&keys, LIMIT).await.unwrap();
@@ -87,7 +88,7 @@ async fn until(heard: &mut mpsc::Receiver<Became>, role: Role) -> Became {
     loop {
         let became = tokio::time::timeout(LIMIT, heard.recv()).await;
         let became = became
-            .unwrap_or_else(|_| panic!("nobody becomes {role:?}"))
+            .unwrap_or_else(|_| panic!("neither computer becomes {role:?}"))
             .unwrap();
         if became.role == role {
             return became;
@@ -96,7 +97,7 @@ async fn until(heard: &mut mpsc::Receiver<Became>, role: Role) -> Became {
 }
 
 #[tokio::test]
-async fn who_dies_or_gives_up_is_succeeded_also_when_the_leader_of_etcd_dies_with_it() {
+async fn the_other_computer_takes_over_even_if_the_leader_of_etcd_dies_too() {
     let mut servers = Servers::new(3).await;
     let (tell, mut heard) = mpsc::channel(1000);
     let start = |servers: &Servers, name, first| {
@@ -134,7 +135,7 @@ async fn who_dies_or_gives_up_is_succeeded_also_when_the_leader_of_etcd_dies_wit
             next.at - began
         );
         assert_eq!(next.name, other);
-        // 2 s, and what a busy computer adds. By a lease of etcd it would be 4.4 to 6.1 s.
+        // It takes 2 s, and some more on a busy computer. With an etcd lease it would take 4.4 to 6.1 s.
         assert!(next.at - began < Duration::from_secs(4));
         if round.contains("etcd") {
             servers.start(member);
@@ -143,7 +144,7 @@ async fn who_dies_or_gives_up_is_succeeded_also_when_the_leader_of_etcd_dies_wit
             shells[at] = (leads, start(&servers, leads, at));
             assert_eq!(until(&mut heard, Role::Following).await.name, leads);
         }
-        // For the next round: who leads is told again.
+        // The next round expects to be told who leads.
         let leader = Became {
             name: other,
             role: Role::Leading,

@@ -1,4 +1,4 @@
-//! Changes, when members die, and when they are forgotten.
+//! Watches while members die, and when etcd has discarded what was watched.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use rosrescue::cluster::{
 
 use crate::servers::{LIMIT, Servers, keys};
 
-/// Longer than a write takes, shorter than a test.
+/// Longer than a write takes, and shorter than a test may take.
 const QUIET: Duration = Duration::from_secs(2);
 
 fn entry(seq: u64) -> Put {
@@ -19,20 +19,20 @@ fn entry(seq: u64) -> Put {
     }
 }
 
-/// The numbers of the journal's entries as they come, until `last`, each once.
+/// Follows the journal's entries until `last`. Repeated entries are allowed, gaps are not.
 async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
     while *seen < last {
         let end = Instant::now() + LIMIT;
         let changes = loop {
-            // As the shell does, which has other things to wait for.
+            // The real driver stops waiting again and again too, because it has other events to wait for.
             if let Ok(changes) = tokio::time::timeout(QUIET / 20, watch.next()).await {
                 break changes;
             }
-            assert!(Instant::now() < end, "it is silent");
+            assert!(Instant::now() < end, "the watch is silent");
         };
         for change in changes.unwrap() {
             let seq = keys().seq_of(&change.key).unwrap();
-            // Twice is allowed, a gap is not.
+            // A repeated entry is allowed, a gap is not.
             assert!(seq <= *seen + 1, "{seq} after {seen}");
             *seen = seq.max(*seen);
         }
@@ -40,7 +40,7 @@ async fn follow(watch: &mut Watch, seen: &mut u64, last: u64) {
 }
 
 #[tokio::test]
-async fn a_watch_goes_on_at_another_member_and_misses_nothing() {
+async fn a_watch_continues_at_another_member_and_misses_nothing() {
     let mut servers = Servers::new(3).await;
     let (writer, keys) = (servers.client_of(1, Access::default()), keys());
     let mut watch = servers.client().watch(keys.small(), 0, QUIET);
@@ -71,7 +71,7 @@ async fn a_watch_goes_on_at_another_member_and_misses_nothing() {
 }
 
 #[tokio::test]
-async fn what_is_forgotten_is_told() {
+async fn a_watch_reports_that_etcd_has_discarded_older_changes() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let puts: Vec<_> = (1..=10).map(entry).collect();
@@ -81,7 +81,7 @@ async fn what_is_forgotten_is_told() {
     let mut watch = client.watch(keys.small(), 1, QUIET);
     let end = watch.next().await.unwrap_err();
     assert!(matches!(end, WatchEnd::Compacted), "{end:?}");
-    // From what was read it goes on.
+    // A watch that starts at what has been read goes on.
     let mut watch = client.watch(keys.small(), found.revision, QUIET);
     assert!(client.put(&keys, 0, &[entry(11)], LIMIT).await.unwrap());
     let mut seen = 10;
@@ -89,7 +89,7 @@ async fn what_is_forgotten_is_told() {
 }
 
 #[tokio::test]
-async fn parts_of_values_are_not_watched_and_long_messages_come_whole() {
+async fn long_values_arrive_complete_and_their_parts_are_not_watched() {
     let servers = Servers::new(1).await;
     let (client, keys) = (servers.client(), keys());
     let value = vec![b'x'; 1 << 20];

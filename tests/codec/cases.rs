@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{Struct, Value};
 
-/// Text with what XML and XML-RPC libraries stumble over.
+/// Text that XML and XML-RPC libraries tend to mishandle.
 pub(crate) fn text() -> impl Strategy<Value = String> {
     prop_oneof![
         "[a-z/_ ]{0,12}",
@@ -75,7 +75,7 @@ pub(crate) fn values(more: BoxedStrategy<Value>) -> impl Strategy<Value = Value>
     })
 }
 
-/// A piece of a document, mostly well-formed, seldom sensible.
+/// A piece of a document that is mostly well-formed and seldom makes sense.
 pub(crate) fn mess() -> impl Strategy<Value = String> {
     let text = proptest::sample::select(vec![
         "",

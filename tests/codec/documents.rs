@@ -1,6 +1,6 @@
-//! Documents written by hand.
+//! Documents that were written by hand.
 
-/// What is inside one `<value>`.
+/// Contents of a `<value>`.
 #[rustfmt::skip]
 const VALUES: &[&str] = &[
     // Untyped and typed text.
@@ -26,7 +26,7 @@ const VALUES: &[&str] = &[
     "<a><b></a></b>", "<a:b>x</a:c>", "\u{1}", "\u{b}", "\u{1f}", "\u{fffe}", "\u{ffff}",
     "<!-- \u{1} -->", "<!-- \u{ffff} -->", "<?pi \u{2}?>", "<string a='\u{3}'/>",
     "<string a='\u{fffe}'/>", "<![CDATA[\u{0}]]>", "<![CDATA[\u{ffff}]]>", "\0",
-    // Where quick-xml alone is more lenient than XML, or might be.
+    // Where quick-xml alone is, or might be, more lenient than XML.
     "<!---> -->", "<!--->-->", "<!-->-->", "<!-- - -->", "<!--- -->", "<!-x-->", "<??>", "<?>",
     "<?>?>", "<?? ?>", "<![CDATA[]>]]>", "<![CDATA[>]]>", "<![CDATA[]]]>", "<![CDATA[]]]]>",
     "<![ CDATA[]]>", "<![]]>", "<a'>'>x</a'>'>", "<string><a/b></a/b></string>",
@@ -64,7 +64,7 @@ const VALUES: &[&str] = &[
     "<double>4.9e-324</double>", "<double>2e-324</double>",
     "<double>1.7976931348623159e308</double>", "<double>9007199254740993</double>",
     "<double>0.1e1e1</double>", "<float>2.5</float>", "<double>nan(1)</double>",
-    // Truth, nothing, dates, bytes.
+    // Booleans, nil, dates, binary data.
     "<boolean>0</boolean>", "<boolean>1</boolean>", "<boolean> 1 </boolean>",
     "<boolean>true</boolean>", "<boolean></boolean>", "<boolean>01</boolean>",
     "<boolean>2</boolean>", "<nil/>", "<nil></nil>", "<nil>x</nil>", "<ex:nil/>",
@@ -79,7 +79,7 @@ const VALUES: &[&str] = &[
     "<base64>Q===</base64>", "<base64>QU=J=D=</base64>", "<base64>QUI=QUI=</base64>",
     "<base64>QUJD*-_!</base64>", "<base64>é</base64>", "<base64>QUJDQ</base64>",
     "<base64>QUJDQ=</base64>",
-    // Arrays and structs, and what is neither.
+    // Arrays and structs, well-formed or not.
     "<array/>", "<array><data/></array>", "<array><data></data></array>",
     "<array><value>a</value></array>", "<array> a <data> b <value>c</value> d </data> e </array>",
     "<array><int>1</int><string>x</string></array>",
@@ -107,7 +107,7 @@ const VALUES: &[&str] = &[
     "<bigdecimal>x</bigdecimal>", "<methodName>other</methodName>", "<fault/>",
 ];
 
-/// What is inside `<params>`.
+/// Contents of `<params>`.
 #[rustfmt::skip]
 const PARAMS: &[&str] = &[
     "", "<param/>", "<param><value/></param><param><value><int>1</int></value></param>",
@@ -203,18 +203,18 @@ const DOCUMENTS: &[&str] = &[
     "<methodName>m</methodName", "<a><methodName>m</methodName>",
 ];
 
-/// A request with this inside `<params>`.
+/// A call with `inside` between `<params>` and `</params>`.
 pub(crate) fn params(inside: &str) -> Vec<u8> {
     format!("<?xml version='1.0'?><methodCall><methodName>m</methodName><params>{inside}</params></methodCall>")
         .into_bytes()
 }
 
-/// A request with one parameter, this inside `<value>`.
+/// A call with one parameter, which has `inside` between `<value>` and `</value>`.
 pub(crate) fn value(inside: &str) -> Vec<u8> {
     params(&format!("<param><value>{inside}</value></param>"))
 }
 
-/// Documents on which both must agree.
+/// Documents that CPython and our decoder must treat alike.
 pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     let mut documents = Vec::new();
     for inside in VALUES {
@@ -269,7 +269,7 @@ pub(crate) fn odd_documents() -> Vec<Vec<u8>> {
     documents
 }
 
-/// Everything that CPython takes and the codec refuses, so that the bytes are only forwarded.
+/// Documents that CPython accepts and our decoder refuses, so that they are only forwarded.
 pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
     let utf16 = |mark: bool| {
         let text = "<?xml version='1.0'?><methodName>m</methodName>".encode_utf16();
@@ -291,39 +291,39 @@ pub(crate) fn refused_documents() -> Vec<(&'static str, Vec<u8>)> {
         ),
         ("UTF-16", utf16(true)),
         ("UTF-16", utf16(false)),
-        ("an encoding with 8 bits", declared("windows-1252")),
-        ("an encoding with 8 bits", declared("latin-1")),
-        ("an encoding with 8 bits", declared("utf8")),
+        ("an 8-bit encoding", declared("windows-1252")),
+        ("an 8-bit encoding", declared("latin-1")),
+        ("an 8-bit encoding", declared("utf8")),
         (
-            "a mark, yet another encoding",
+            "a byte order mark with another encoding",
             [b"\xef\xbb\xbf".to_vec(), declared("ISO-8859-1")].concat(),
         ),
         (
-            "a mark, yet another encoding",
+            "a byte order mark with another encoding",
             [b"\xef\xbb\xbf".to_vec(), declared("US-ASCII")].concat(),
         ),
-        ("a name beyond ASCII", params("<é/>")),
-        ("a name beyond ASCII", params("<aé/>")),
-        ("a name beyond ASCII", params("<a é='1'/>")),
-        ("a name beyond ASCII", params("<?é x?>")),
-        ("a number beyond ASCII", value("<int>٣</int>")),
-        ("a number beyond ASCII", value("<int>5\u{a0}</int>")),
-        ("a number beyond ASCII", value("<double>٣.٥</double>")),
+        ("a non-ASCII name", params("<é/>")),
+        ("a non-ASCII name", params("<aé/>")),
+        ("a non-ASCII name", params("<a é='1'/>")),
+        ("a non-ASCII name", params("<?é x?>")),
+        ("a non-ASCII number", value("<int>٣</int>")),
+        ("a non-ASCII number", value("<int>5\u{a0}</int>")),
+        ("a non-ASCII number", value("<double>٣.٥</double>")),
         ("a bigdecimal", value("<bigdecimal>1.5</bigdecimal>")),
         (
-            "a name that is no string",
+            "a name that is not a string",
             value("<struct><int>1</int><value>x</value></struct>"),
         ),
         (
-            "a name that is no string",
+            "a name that is not a string",
             value("<struct><nil/><value>x</value></struct>"),
         ),
         (
-            "deeper than 512",
+            "more than 512 levels",
             value(&("<array>".repeat(513) + &"</array>".repeat(513))),
         ),
         (
-            "deeper than 2048 elements",
+            "more than 2048 open elements",
             params(&("<x>".repeat(2050) + &"</x>".repeat(2050))),
         ),
     ]

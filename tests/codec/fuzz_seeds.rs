@@ -1,5 +1,5 @@
-//! What the fuzz targets check of any bytes holds of their seeds, among which is every input that
-//! ever failed. `fuzz/README.md` says how to look for more.
+//! Runs the checks of the fuzz targets on their seeds, which include every input that ever failed.
+//! `fuzz/README.md` says how to search for more.
 
 #[path = "../../fuzz/checks/checkpoint.rs"]
 mod checkpoint;
@@ -19,15 +19,15 @@ fn each_seed(target: &str, check: fn(&[u8])) {
         check(&fs::read(&path).unwrap());
         count += 1;
     }
-    assert!(count > 10, "the seeds of {target} are not where they were");
+    assert!(count > 10, "only {count} seeds of {target} were found");
 }
 
 #[test]
-fn seeds_of_the_xmlrpc_target_hold() {
+fn the_seeds_of_the_xmlrpc_fuzz_target_pass() {
     each_seed("xmlrpc", xmlrpc::check);
 }
 
 #[test]
-fn seeds_of_the_checkpoint_target_hold() {
+fn the_seeds_of_the_checkpoint_fuzz_target_pass() {
     each_seed("checkpoint", checkpoint::check);
 }

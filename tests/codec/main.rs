@@ -1,4 +1,4 @@
-//! The codec against CPython's: the same verdict and value for every document, the same bytes for
+//! Compares the codec with CPython's: the same result and value for every document, and the same bytes for
 //! every answer.
 
 #![allow(
@@ -24,7 +24,7 @@ use cases::{any_value, double, mess, returnable, text};
 use documents::{odd_documents, params, refused_documents};
 use peer::{Peer, hex};
 
-/// A value in the notation of the peer.
+/// A value in the notation of `peer.py`.
 fn notation(value: &Value) -> String {
     match value {
         Value::Nil => "nil".to_owned(),
@@ -52,7 +52,7 @@ fn notation(value: &Value) -> String {
     }
 }
 
-/// Our verdict, in the words of the peer.
+/// The result of our decoder in the notation of `peer.py`.
 fn verdict(verb: &str, document: &[u8]) -> Result<String, DecodeError> {
     if verb == "call" {
         let call = decode_call(document)?;
@@ -72,16 +72,16 @@ fn verdict(verb: &str, document: &[u8]) -> Result<String, DecodeError> {
     })
 }
 
-/// The document without what is read otherwise in a reply: carriage returns and dates, which CPython
-/// does not escape.
+/// The document without carriage returns and dates, which are read differently in a reply because CPython
+/// does not escape them.
 fn plain(document: &[u8]) -> Vec<u8> {
     let text = String::from_utf8_lossy(document);
     let text = text.replace('\r', "").replace("dateTime.iso8601", "date");
     text.into_bytes()
 }
 
-/// The same verdict on both sides, or a refusal of the kinds that we allow ourselves. Where a fault is foretold, it
-/// is the same, too.
+/// Checks that both decoders give the same result, or that ours refuses for one of the permitted reasons. If
+/// our decoder predicts the fault, it must be the same too.
 fn compare(peer: &mut Peer, verb: &str, document: &[u8]) -> Result<(), String> {
     let theirs = peer.ask(verb, document);
     let shown = String::from_utf8_lossy(document);
@@ -109,7 +109,7 @@ fn compare(peer: &mut Peer, verb: &str, document: &[u8]) -> Result<(), String> {
 }
 
 #[test]
-fn odd_calls_are_taken_as_cpython_takes_them() {
+fn odd_calls_are_decoded_as_cpython_decodes_them() {
     let mut peer = Peer::start();
     let mut failures = String::new();
     for document in odd_documents() {
@@ -129,9 +129,9 @@ fn odd_calls_are_taken_as_cpython_takes_them() {
     assert!(failures.is_empty(), "{failures}");
 }
 
-/// The mirror answers so while there is no master.
+/// The mirror answers with these faults while there is no master.
 #[test]
-fn faults_to_what_cannot_be_decoded_are_in_cpythons_words() {
+fn faults_for_undecodable_calls_are_in_cpythons_words() {
     let mut peer = Peer::start();
     let mut known = 0;
     let mut failures = String::new();
@@ -154,18 +154,18 @@ fn faults_to_what_cannot_be_decoded_are_in_cpythons_words() {
 }
 
 #[test]
-fn the_list_of_what_is_refused_here_and_taken_there_is_true() {
+fn the_documents_that_only_cpython_accepts_are_listed_correctly() {
     let mut peer = Peer::start();
     for (why, document) in refused_documents() {
         let theirs = peer.ask("call", &document);
         assert!(theirs.starts_with("ok "), "{why}: CPython says {theirs}");
         let ours = verdict("call", &document);
-        assert!(ours.is_err(), "{why}: is taken as {ours:?}");
+        assert!(ours.is_err(), "{why}: our decoder accepts it as {ours:?}");
     }
 }
 
 #[test]
-fn odd_replies_are_taken_as_a_python_client_takes_them() {
+fn odd_replies_are_decoded_as_a_python_client_decodes_them() {
     let fault = |members: &str| {
         format!(
             "<methodResponse><fault><value><struct>{members}</struct></value></fault></methodResponse>"
@@ -207,25 +207,25 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_call_comes_back(method in text(), params in proptest::collection::vec(any_value(), 0..4)) {
+    fn an_encoded_call_decodes_to_the_same_call(method in text(), params in proptest::collection::vec(any_value(), 0..4)) {
         let call = Call::new(method, params);
         prop_assert_eq!(decode_call(&encode_call(&call)).unwrap(), call);
     }
 
     #[test]
-    fn a_reply_comes_back(value in returnable()) {
+    fn an_encoded_reply_decodes_to_the_same_reply(value in returnable()) {
         let reply = decode_reply(&encode_reply(&Reply::Value(value.clone()))).unwrap();
         prop_assert_eq!(reply, Reply::Value(value));
     }
 
     #[test]
-    fn a_fault_comes_back(code in any::<i32>(), text in "[ -~\n]{0,40}") {
+    fn an_encoded_fault_decodes_to_the_same_fault(code in any::<i32>(), text in "[ -~\n]{0,40}") {
         let fault = Reply::Fault { code, text };
         prop_assert_eq!(decode_reply(&encode_reply(&fault)).unwrap(), fault);
     }
 }
 
-/// Runs a property with one peer for all of its cases.
+/// Runs a property test with one peer for all cases.
 fn with_peer<S: Strategy>(
     cases: &S,
     property: impl Fn(&mut Peer, S::Value) -> Result<(), TestCaseError>,
@@ -266,7 +266,7 @@ fn doubles_are_written_as_python_writes_them() {
 }
 
 #[test]
-fn senseless_documents_are_taken_as_cpython_takes_them() {
+fn random_documents_are_decoded_as_cpython_decodes_them() {
     with_peer(&proptest::collection::vec(mess(), 1..4), |peer, inside| {
         let document = params(&inside.concat());
         for verb in ["call", "reply"] {
@@ -281,7 +281,7 @@ fn senseless_documents_are_taken_as_cpython_takes_them() {
     });
 }
 
-/// What is put into a document to damage it.
+/// Texts that are inserted into a document to damage it.
 #[rustfmt::skip]
 const DAMAGE: &[&str] = &[
     "", "<", ">", "/", "&", ";", "'", "=", " ", "\n", "]]>", "<!--", "-->", "--", "<?", "?>", "<![CDATA[", "x",
@@ -290,7 +290,7 @@ const DAMAGE: &[&str] = &[
 ];
 
 #[test]
-fn damaged_documents_are_taken_as_cpython_takes_them() {
+fn damaged_documents_are_decoded_as_cpython_decodes_them() {
     let damage = (
         any::<proptest::sample::Index>(),
         0..4_usize,
@@ -319,9 +319,9 @@ fn damaged_documents_are_taken_as_cpython_takes_them() {
     });
 }
 
-/// Of several things that cannot be marshalled, the first one decides.
+/// If a reply holds several values that cannot be encoded, the first one decides about the fault.
 #[test]
-fn the_first_refusal_decides() {
+fn the_first_unencodable_value_decides_the_fault() {
     let mut peer = Peer::start();
     for value in [
         Value::Array(vec![Value::Nil, Value::BigInt("2147483648".to_owned())]),
@@ -336,9 +336,9 @@ fn the_first_refusal_decides() {
     }
 }
 
-/// A body that is nothing but depth must neither overflow the stack nor take long.
+/// A body that consists of nothing but nesting must neither overflow the stack nor take long.
 #[test]
-fn a_tower_is_refused() {
+fn an_extremely_deep_document_is_refused_quickly() {
     for tag in ["array", "struct", "value", "x"] {
         let document = params(&format!("<{tag}>").repeat(1_000_000));
         assert!(matches!(

@@ -1,4 +1,4 @@
-"""CPython's side of the comparison: one request a line, one answer a line.
+"""CPython's side of the comparison. Reads one request per line, and prints one answer per line.
 
     call HEX    what rosmaster makes of a request: `ok METHOD VALUES`, or `raise WHY`
     reply HEX   what a Python client makes of an answer: `ok VALUE`, `fault CODE TEXT`, `raise WHY`
@@ -16,7 +16,7 @@ defusedxml.xmlrpc.monkey_patch()
 
 
 def text(value):
-    """A value in the notation that the Rust side writes too. Without recursion: values are deep."""
+    """A value in the same notation as on the Rust side. Without recursion, because values are deep."""
     out, todo = [], [value]
     while todo:
         v = todo.pop()

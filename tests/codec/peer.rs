@@ -1,4 +1,4 @@
-//! A CPython beside the test.
+//! A CPython process that runs beside the test.
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
@@ -6,7 +6,7 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use rosrescue::xmlrpc::{Call, Value, encode_call};
 
-/// A `/usr/bin/python3` that does with documents what rosmaster does.
+/// A `/usr/bin/python3` that treats documents as rosmaster does.
 pub(crate) struct Peer {
     child: Child,
     stdin: Option<ChildStdin>,
@@ -39,11 +39,11 @@ impl Peer {
             .unwrap();
         let mut answer = String::new();
         self.stdout.read_line(&mut answer).unwrap();
-        assert!(answer.ends_with('\n'), "the peer has ended");
+        assert!(answer.ends_with('\n'), "the CPython process has ended");
         answer.trim_end().to_owned()
     }
 
-    /// What CPython answers to a call of a method that returns this value.
+    /// CPython's answer to a call of a method that returns this value.
     pub(crate) fn echo(&mut self, value: &Value) -> Vec<u8> {
         let answer = self.ask(
             "echo",
@@ -55,7 +55,7 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        // The end of its input ends it.
+        // The process ends at the end of its input.
         self.stdin = None;
         self.child.wait().unwrap();
     }

@@ -1,11 +1,11 @@
-/* A disk that misbehaves: whatever rosrescue itself does with a file whose path contains DISK_PATH. How it does is the
- * first letter in the file DISK_STATE; without that file all is well.
- *   h  hangs until the file says otherwise
- *   o  hangs whoever opens a file
- *   y  hangs whoever forces a file to it
- *   s  slow: each operation takes 0.2 s
- *   f  full: what is written is taken in part, or not at all
- *   r  read-only */
+/* A disk that misbehaves, for all operations of rosrescue on files whose path contains DISK_PATH. The first letter in
+ * the file DISK_STATE says how; without that file all operations work.
+ *   h  every operation hangs until the letter changes
+ *   o  opening a file hangs
+ *   y  syncing a file hangs
+ *   s  each operation takes 0.2 s
+ *   f  the disk is full: writes are done in part or not at all
+ *   r  the disk is read-only */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
@@ -42,7 +42,7 @@ static char state(void)
     return letter;
 }
 
-/* Zero, or why an operation of this kind fails. */
+/* The error with which an operation of this kind fails, or zero. */
 static int meets(const char *path, enum kind kind)
 {
     const char *part = getenv("DISK_PATH");

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""The time of a call to a rosmaster that speaks HTTP/1.0 and holds 80 nodes: bare, and through rosrescue.
+"""Measures the time of a call to a rosmaster that speaks HTTP/1.0 and has 80 nodes: bare, and through rosrescue.
 
     tests/field/calls.py ROSRESCUE [TURNS]      prints a table as Markdown
 
@@ -23,14 +23,14 @@ turns = int(sys.argv[2]) if len(sys.argv) > 2 else 20
 
 
 def free_port():
-    """A port that nothing listens at."""
+    """A port at which no program listens."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return listener.getsockname()[1]
 
 
 def exchange(port, body):
-    """One call on a connection of its own."""
+    """Makes one call on a new connection."""
     head = "POST /RPC2 HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n" % len(body)
     with socket.create_connection(("127.0.0.1", port)) as stream:
         stream.sendall(head.encode() + body)
@@ -43,7 +43,7 @@ def exchange(port, body):
 
 
 class Party:
-    """A master, perhaps with rosrescue before it."""
+    """A master, with or without rosrescue in front of it."""
 
     def __init__(self, name, scratch):
         self.name, self.port, self.processes = name, free_port(), []
@@ -60,14 +60,14 @@ class Party:
         self.fill()
 
     def start(self, *command):
-        """rosmaster sees a kernel before 4.16."""
+        """Runs rosmaster so that it sees a kernel before 4.16."""
         command = ["setarch", os.uname().machine, "--uname-2.6", *command]
         self.processes.append(
             subprocess.Popen(command, env=self.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         )
 
     def fill(self):
-        """Seven registrations a node, once the master answers."""
+        """Waits until the master answers, and makes seven registrations per node."""
         master = xmlrpc.client.ServerProxy("http://127.0.0.1:%d" % self.port)
         deadline = time.monotonic() + 60
         while True:

@@ -1,9 +1,9 @@
 #!/bin/sh
-# release.sh make NAME FOLDER: makes FOLDER a release of Debian or Ubuntu with its own ROS 1, a compiler and what the
-# test nodes need. FOLDER is made whole or not at all. Takes two to four minutes and 0.7 to 1.5 GB.
+# release.sh make NAME FOLDER: installs a release of Debian or Ubuntu into FOLDER, with its own ROS 1, a compiler and
+# everything that the test nodes need. FOLDER is complete or does not exist. Takes two to four minutes and 0.7 to 1.5 GB.
 #
-# release.sh run FOLDER COMMAND...: runs COMMAND in it, as root, with this checkout and Rust's toolchain at their own
-# places. Mounts are private and end with COMMAND.
+# release.sh run FOLDER COMMAND...: runs COMMAND in it as root, with this checkout and the Rust toolchain at the same
+# paths as outside. Mounts are private and end with COMMAND.
 #
 # Releases come from the public archives, or from ROSRESCUE_TEST_UBUNTU and ROSRESCUE_TEST_DEBIAN. Needs root and
 # debootstrap.
@@ -43,7 +43,7 @@ components() { # NAME
     esac
 }
 
-# Releases name the Python packages differently.
+# The names of Python packages depend on the release.
 packages() { # NAME
     case $1 in
         ubuntu-16.04 | ubuntu-18.04) python=python messages="python-roscpp-msgs python-genpy python-roslib python-rosgraph-msgs" ;;
@@ -62,9 +62,9 @@ make() { # NAME FOLDER
     rm -rf "$2.new"
     keyring=/usr/share/keyrings/${1%%-*}-archive-keyring.gpg
     check=--keyring=$keyring
-    # Debian has no package of Ubuntu's keyring. What is made here runs tests, and nothing else.
+    # Debian has no package with Ubuntu's keyring. The result is used for tests only.
     if [ ! -r "$keyring" ]; then
-        echo "release.sh: there is no $keyring: the signature of $1 is not checked" >&2
+        echo "release.sh: $keyring is missing, so the signature of $1 is not checked" >&2
         check=--no-check-gpg
     fi
     debootstrap --variant=minbase "$check" --components="$(components "$1")" "$suite" "$2.new" \
@@ -72,17 +72,17 @@ make() { # NAME FOLDER
         tail -n 3 "$2.log" >&2
         fail "debootstrap cannot make $1"
     }
-    # shellcheck disable=SC2046 # words are what is wanted
+    # shellcheck disable=SC2046 # splitting is intended
     in_root "$2.new" apt-get install -y --no-install-recommends $(packages "$1") >>"$2.log" 2>&1 || {
         tail -n 3 "$2.log" >&2
         fail "the ROS of $1 cannot be installed"
     }
     rm -rf "$2.new"/var/cache/apt/archives/*.deb
-    # The test nodes name the Python that they run with.
+    # The test nodes name the Python with which they run.
     case $1 in
         ubuntu-16.04 | ubuntu-18.04) ln -sf python2.7 "$2.new/usr/bin/python3" ;;
     esac
-    # Its compiler takes C++ of 1998 for granted, and its packages name libraries as its linker does not take them.
+    # Its compiler defaults to C++98, and its packages name libraries in a form that its linker does not accept.
     if [ "$1" = ubuntu-16.04 ]; then
         cat >"$2.new/usr/local/bin/g++" <<'END'
 #!/bin/sh
@@ -111,7 +111,7 @@ in_root() { # FOLDER COMMAND...
             mkdir -p "$root$folder"
             mount --bind "$folder" "$root$folder"
         done
-        # The roscpp nodes are compiled by the compiler of the release.
+        # The compiler of the release compiles the roscpp nodes.
         mkdir -p "$root/nodes" "$checkout/target/field/build/ros-nodes"
         mount --bind "$root/nodes" "$root$checkout/target/field/build/ros-nodes"
         exec env DEBIAN_FRONTEND=noninteractive LC_ALL=C.UTF-8 PATH="$HOME/.cargo/bin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \

@@ -1,10 +1,11 @@
 #!/bin/sh
-# releases.sh [NAME…]: runs the paper's four cases, deaths of master, worker and both, an outage of a minute, hangs and
-# the differential test in each release, with its own rosmaster, rospy and roscpp, and writes a row for each into
-# docs/compatibility.md. NAME is one of the releases below, with `+http1.0` for one that is forced to speak HTTP/1.0.
-# Some 8 minutes each, and as long again to install it the first time.
+# releases.sh [NAME…]: in each release, with its own rosmaster, rospy and roscpp, runs the paper's four cases, deaths of
+# master, worker and both, an outage of a minute, hangs and the differential test, and writes a row into
+# docs/compatibility.md. NAME is one of the releases below, with `+http1.0` to force HTTP/1.0. Each takes some 8 minutes,
+# and as long again for the installation the first time.
 #
-# rosrescue and the tests are compiled once, in the oldest release: what is linked with its C library runs in all.
+# rosrescue and the tests are compiled once, in the oldest release, because programs linked with its C library run in all
+# later ones.
 set -eu
 cd "$(dirname "$0")/../.."
 checkout=$PWD
@@ -23,12 +24,12 @@ run() { # RELEASE COMMAND...
     tests/field/release.sh run "$root" "$@"
 }
 
-# The name of the test program that cargo has compiled last.
+# Prints the name of the test program that cargo has compiled last.
 program() { # NAME
     find "$build/deps" -name "$1-*" ! -name '*.*' -printf '%T@ %p\n' | sort -n | tail -n 1 | cut -d ' ' -f 2
 }
 
-# "12 of 12", or that and what failed.
+# Prints "12 of 12", and which tests failed if any did.
 count() { # LOG PATTERN
     awk -v pattern="^test ($2)" '
         $0 ~ pattern { name = $2; sub(/^test [^ ]+ \.\.\. /, "") }
@@ -36,7 +37,7 @@ count() { # LOG PATTERN
         END { printf "%d of %d", good, all; if (bad) printf ", failed:%s", bad }' "$1"
 }
 
-# How many numbered messages the tests have followed, each talker counted at its last word.
+# Prints how many numbered messages the tests have checked, from the last line about each talker.
 messages() { # LOG
     awk '
         function add(name) { for (name in last) sum += last[name]; delete last }
@@ -52,7 +53,7 @@ differences() { # LOG
         END { printf "%d in %d sequences, %d calls", bad, n, calls }' "$1"
 }
 
-# What the master speaks, as `rosrescue check` says after it has asked one.
+# Prints which HTTP the master speaks, according to `rosrescue check`.
 speaks() { # RELEASE SETARCH...
     release=$1
     shift
@@ -90,17 +91,17 @@ for name; do
         ubuntu-16.04 | ubuntu-18.04) unordered=ROSRESCUE_UNORDERED=1 ;;
     esac
     begin=$(date +%s)
-    # shellcheck disable=SC2086 # words are what is wanted
+    # shellcheck disable=SC2086 # splitting is intended
     run "$release" $force env $unordered ROSRESCUE_AWAY_SECONDS=60 \
         "$(program robot)" --test-threads 2 --show-output paper:: outage::long master::hung recovery::spare_master \
         >"$log" 2>&1 || status=1
-    # shellcheck disable=SC2086 # words are what is wanted
+    # shellcheck disable=SC2086 # splitting is intended
     run "$release" $force env $unordered \
         ROSRESCUE_SEQUENCES=12 ROSRESCUE_CRASH_SEQUENCES=12 ROSRESCUE_CALLS=150 \
         "$(program differential)" --test-threads 2 --show-output --exact \
         a_bare_rosmaster_answers_as_the_model_does through_rosrescue_no_crash_of_the_master_can_be_told \
         >"$log.differential" 2>&1 || status=1
-    # shellcheck disable=SC2086 # words are what is wanted
+    # shellcheck disable=SC2086 # splitting is intended
     said=$(speaks "$release" $force)
     version=$(echo "$said" | sed -n '1s/rosmaster, \([^,]*\).*/\1/p')
     http=$(echo "$said" | sed -n '2s/ .*//p; 2s/,.*//p' | head -n 1)

@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Writes a row of a table between two markers of a document: row.py FILE SECTION CELL...
 
-The row that begins with the first cell is replaced, or it comes last. The table's head is there already.
+Replaces the row that starts with the first cell, or adds a row at the end. The head of the table must be there.
 """
 
 import sys

@@ -1,4 +1,4 @@
-// Calls the service `who` again and again, each time looking it up anew. Usage: client [HZ]
+// Calls the service `who` again and again, with a new lookup each time. Usage: client [HZ]
 #include <cstdlib>
 #include <ros/ros.h>
 #include <roscpp/GetLoggers.h>
@@ -15,7 +15,7 @@ int main(int argc, char** argv)
   ros::Rate rate(hz);
   while (ros::ok())
   {
-    // Not ros::service::call: one such call in some 40,000 fails, at a bare rosmaster, too, because the server closes
+    // Not ros::service::call: one such call in some 40,000 fails even with a bare rosmaster, because the server closes
     // the connection before roscpp has read the reply (ros_comm issue 1976). A persistent connection stays open.
     ros::ServiceClient client = node.serviceClient<roscpp::GetLoggers>("who", true);
     roscpp::GetLoggers call;

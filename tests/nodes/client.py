@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Calls the service `who` again and again, each time looking it up anew. Usage: client.py [HZ]"""
+"""Calls the service `who` again and again, with a new lookup each time. Usage: client.py [HZ]"""
 
 import rospy
 from roscpp.srv import GetLoggers

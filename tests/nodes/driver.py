@@ -1,10 +1,10 @@
 #!/usr/bin/python3
-"""A driver as robots have them: at 50 Hz it publishes, at 10 Hz it reads a parameter and logs, and it runs
-`diagnostic_updater`, which asks for its period at 4 Hz. It says each fifth of a second how long its longest pass took
-in milliseconds since it last said so.
+"""A typical robot driver. It publishes at 50 Hz, reads a parameter and logs at 10 Hz, and runs `diagnostic_updater`,
+which reads its period at 4 Hz. Five times a second it prints the time of its longest pass since the last such line, in
+milliseconds.
 
-Neither `~diagnostic_period` nor `/rosout_disable_topics_generation` is set, as on most robots: rospy's
-`get_param_cached` then calls `subscribeParam` each time.
+As on most robots, neither `~diagnostic_period` nor `/rosout_disable_topics_generation` is set, so rospy's
+`get_param_cached` calls `subscribeParam` each time.
 """
 
 import time

@@ -1,9 +1,9 @@
 #!/usr/bin/python3
-"""A real rosmaster that dies between changing its state and telling nodes of the change.
+"""A real rosmaster that dies between changing its state and notifying nodes of the change.
 
-`$ROS_HOME/die-at` says where, as `TASK N`: TASK is publisherUpdate (of the topic /chatter) or
-paramUpdate (of the key /gain). With N = 0 it dies before any callback of the next change is queued, else
-as the Nth callback is about to be sent. The file is removed then, so the next master lives.
+The file `$ROS_HOME/die-at` says when, as `TASK N`: TASK is publisherUpdate (for the topic /chatter) or paramUpdate (for
+the key /gain). With N = 0 it dies before any callback of the next change is queued, otherwise when the Nth callback is
+about to be sent. It removes the file then, so the next master lives.
 """
 
 import os
@@ -17,7 +17,7 @@ _sent = {"publisherUpdate": 0, "paramUpdate": 0}
 
 
 def maybe_die(task, point):
-    """Dies if this is where it should. `point` is None for the next callback."""
+    """Dies if this is the right moment. `point` is None for the next callback."""
     path = os.path.join(os.environ["ROS_HOME"], "die-at")
     with _lock:
         try:

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""A real rosmaster that speaks HTTP/1.0, as on a kernel before 4.16. Like waiting_rosmaster.py, it begins only
-when the file `away` in `ROS_HOME` is not there (any more)."""
+"""A real rosmaster that speaks HTTP/1.0, as on a kernel before 4.16. Like waiting_rosmaster.py, it starts only when
+there is no file `away` in `ROS_HOME`."""
 
 import os
 import platform

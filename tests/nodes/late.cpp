@@ -1,5 +1,5 @@
-// At SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into
-// its cache, all at the same time, and says when each is done. roscpp itself tries again what fails.
+// On SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into its
+// cache, all at the same time, and prints when each is done. roscpp itself repeats calls that fail.
 #include <atomic>
 #include <csignal>
 #include <functional>

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""At SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into
-its cache, all at the same time, and says when each is done. It says `again` when a call fails that its user has to make again.
+"""On SIGUSR1 it publishes, subscribes, offers a service, sets a parameter and reads `/gain`, which is 7, into its cache,
+all at the same time, and prints when each is done. It prints `again` when a call fails that its user must repeat.
 """
 
 import signal
@@ -17,7 +17,7 @@ kept = []
 
 
 def insist(call):
-    """rospy tells the user of these calls of a failure, and does not try again itself."""
+    """Repeats a call whose failure rospy reports to the user instead of trying again itself."""
     while not rospy.is_shutdown():
         try:
             return call()
@@ -27,7 +27,7 @@ def insist(call):
 
 
 def read_gain():
-    """Fails unless it reads what is set."""
+    """Fails unless it reads the value that is set."""
     if rospy.get_param_cached("/gain", None) != 7:
         say("failed", "it got its default")
 
@@ -42,7 +42,7 @@ STEPS = {
 
 
 def step(name):
-    """Does one of the steps."""
+    """Runs one of the steps."""
     try:
         STEPS[name]()
         say("done", name)
@@ -51,7 +51,7 @@ def step(name):
 
 
 def start(_signal, _frame):
-    """Does all of them."""
+    """Runs all steps."""
     for name in STEPS:
         threading.Thread(target=step, args=(name,), daemon=True).start()
 

@@ -1,4 +1,4 @@
-// One line per event on standard output, flushed at once. What the lines mean stands in lines.py.
+// Prints one line per event on standard output, flushed at once. lines.py explains the lines.
 #ifndef ROSRESCUE_LINES_H
 #define ROSRESCUE_LINES_H
 

@@ -1,8 +1,8 @@
 // One of many nodes that start at the same moment and register as fast as they can.
 // Usage: links GO NAME pub:TOPIC|sub:TOPIC...
 //
-// It says `loaded`, begins when somebody opens the FIFO GO for writing, and says `ready NAME URI BEGIN END` when it has
-// registered, with the times of the computer's monotonic clock.
+// It prints `loaded`, begins when the FIFO GO is opened for writing, and prints `ready NAME URI BEGIN END` when it has
+// registered, with times of the computer's monotonic clock.
 #include <ctime>
 #include <fcntl.h>
 #include <unistd.h>

@@ -1,13 +1,14 @@
 #!/usr/bin/python3
 """Many nodes that start at the same moment and register as fast as they can. Usage: links.py FOLDER
 
-`FOLDER/plan.json` has the nodes: {NAME: [["pub"|"sub", TOPIC]...]}. This process imports rospy once and makes a process
-of its own for each node; it says `loaded` when they are there. They begin when somebody opens the FIFO `FOLDER/go` for
-writing, and each says `ready NAME URI BEGIN END`. When `FOLDER/end` is opened for writing, each writes `FOLDER/NAME.json`
-and says `written NAME`: what it asked and was told of each topic, and when, on the computer's monotonic clock.
+`FOLDER/plan.json` lists the nodes: {NAME: [["pub"|"sub", TOPIC]...]}. This process imports rospy once, starts a process
+for each node, and prints `loaded` when all exist. They begin when the FIFO `FOLDER/go` is opened for writing, and each
+one prints `ready NAME URI BEGIN END`. When `FOLDER/end` is opened for writing, each one writes `FOLDER/NAME.json` and
+prints `written NAME`. The file has what the node asked and was told about each topic, and when, on the computer's
+monotonic clock.
 
-rospy has two places that hand lists of publishers to the thread that connects: the answer of registerSubscriber and
-publisherUpdate. This wraps both, so the order of the events of one topic is that in which the lists are handed on.
+In rospy, lists of publishers reach the connecting thread from two places: the answer of registerSubscriber, and
+publisherUpdate. This program wraps both, so the events of a topic are in the order in which the lists are passed on.
 """
 
 import gc
@@ -29,17 +30,17 @@ _thread = threading.local()
 
 
 def say(*words):
-    """One line, in one piece: the processes share the pipe."""
+    """Prints one line in one piece, because the processes share the pipe."""
     os.write(1, (" ".join(str(word) for word in words) + "\n").encode())
 
 
 def note(what, topic, uris=()):
-    """Remembers an event of a topic."""
+    """Records an event of a topic."""
     events.append((time.monotonic(), what, topic, list(uris)))
 
 
 def watch():
-    """Notes the events. To be called before the node's server starts."""
+    """Records all events. Must be called before the node's server starts."""
     manager, handler = rospy.impl.registration.RegManager, rospy.impl.masterslave.ROSHandler
     subscriber = rospy.topics._SubscriberImpl
     hand_over, told = manager.publisher_update, handler.publisherUpdate
@@ -47,7 +48,7 @@ def watch():
 
     def publisher_update(self, topic, uris):
         with _lock:
-            # rospy hands the list of an update over once for each publisher in it.
+            # rospy passes on the list of an update once for each publisher in it.
             note(getattr(_thread, "source", "answer"), topic, uris)
             return hand_over(self, topic, uris)
 
@@ -72,7 +73,7 @@ def watch():
 
 
 def run(folder, name, ends):
-    """One node."""
+    """Runs one node."""
     watch()
     open(os.path.join(folder, "go")).close()
     begin = time.monotonic()

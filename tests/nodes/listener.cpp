@@ -1,7 +1,7 @@
-// Subscribes to `chatter` and says each message, each change of its links and each publisherUpdate.
+// Subscribes to `chatter` and prints each message, each change of its links and each publisherUpdate.
 // Usage: listener [EVERY]
 //
-// With EVERY it says each EVERYth message of a publisher, the first one, and every gap between two.
+// With EVERY it prints only each EVERYth message of a publisher, the first one, and every gap between two messages.
 #include <algorithm>
 #include <cstdlib>
 #include <map>
@@ -16,8 +16,8 @@
 
 static ros::Subscriber subscriber;
 
-// roscpp tells nobody of a publisherUpdate. The node's server is asked to hand the call to this
-// function, which passes it on to where it went before (private: hence -fno-access-control).
+// roscpp has no callback for a publisherUpdate. So the node's server passes the call to this function, which passes it
+// on to roscpp's own function (that one is private: hence -fno-access-control).
 static void on_update(XmlRpc::XmlRpcValue& params, XmlRpc::XmlRpcValue& result)
 {
   std::string line = "update " + std::string(params[1]);
@@ -37,7 +37,7 @@ struct Last
 static unsigned long every = 0;
 static std::map<std::string, Last> lasts;
 
-// Says of the messages what matters, where there are too many to say them all.
+// Prints only some of the messages, and every gap, when there are too many to print.
 static void summarise(const std::string& name, unsigned long number)
 {
   const ros::WallTime now = ros::WallTime::now();

@@ -1,10 +1,10 @@
 #!/usr/bin/python3
-"""Subscribes to `chatter` and says each message, each change of its links and each publisherUpdate.
+"""Subscribes to `chatter` and prints each message, each change of its links and each publisherUpdate.
 Usage: listener.py [EVERY]
 
-With EVERY it says each EVERYth message of a publisher, the first one, and every gap between two.
+With EVERY it prints only each EVERYth message of a publisher, the first one, and every gap between two messages.
 
-rospy has no call-back for links of a subscriber, so this wraps the places where it makes and ends them.
+rospy has no callback for the links of a subscriber, so this wraps the places where rospy makes and ends them.
 """
 
 import threading
@@ -18,7 +18,7 @@ from lines import now, say
 
 
 class Summary:
-    """Says of the messages what matters, where there are too many to say them all."""
+    """Prints only some of the messages, and every gap, when there are too many to print."""
 
     def __init__(self, every):
         self.every = every
@@ -39,7 +39,7 @@ class Summary:
 
 
 def watch_updates():
-    """Says every publisherUpdate. To be called before the node's server starts."""
+    """Prints every publisherUpdate. Must be called before the node's server starts."""
     original = rospy.impl.masterslave.ROSHandler.publisherUpdate
 
     def publisher_update(self, caller_id, topic, publishers):
@@ -50,7 +50,7 @@ def watch_updates():
 
 
 def watch_reconnects():
-    """rospy mends a broken link under the same connection object: that is a lost link all the same."""
+    """Counts a broken link as lost, although rospy repairs it under the same connection object."""
     original = rospy.impl.tcpros_base.TCPROSTransport._reconnect
 
     def reconnect(self):
@@ -61,15 +61,15 @@ def watch_reconnects():
 
 
 def watch_links(subscriber):
-    """Says how many publishers are connected whenever that changes."""
+    """Prints how many publishers are connected whenever that changes."""
     impl = subscriber.impl
     saying = threading.Lock()
 
     def watched(original):
         def method(connection):
             answer = original(connection)
-            # Two threads at once would say their numbers in any order. Without rospy's own lock: rospy may
-            # hold it while it removes a connection, and would wait for ours for ever.
+            # Without a lock, two threads would print their numbers in any order. It is not rospy's own lock: rospy
+            # may hold that while it removes a connection, and would wait for ours forever.
             with saying:
                 say("links", len(impl.connections or ()))
             return answer

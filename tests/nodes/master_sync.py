@@ -1,13 +1,13 @@
 #!/usr/bin/python3
-"""The calls of multimaster_fkie's master_discovery and master_sync, in one direction, without ROS's own part of it.
+"""Makes the calls of multimaster_fkie's master_discovery and master_sync, in one direction, without their ROS nodes.
 
     master_sync.py OWN REMOTE NAMESPACE IGNORED...
 
-Every fifth of a second it reads the state of the master at REMOTE, as master_discovery does, and registers the nodes
-below NAMESPACE with the master at OWN, under their own names and addresses, as master_sync does. What the remote
-master has no more is unregistered. Topics in IGNORED are left out, as by `_ignore_topics`. A subscriber that has been
-registered is told of the publishers at both masters. Says `synced JSON` after each pass that changed something:
-what is registered now.
+Five times a second it reads the state of the master at REMOTE, as master_discovery does, and registers the nodes below
+NAMESPACE with the master at OWN, under their own names and addresses, as master_sync does. It unregisters whatever the
+remote master no longer has. Topics in IGNORED are left out, as by `_ignore_topics`. A subscriber that it has registered
+is told of the publishers at both masters. After each pass that changed something it prints `synced JSON` with all
+present registrations.
 """
 
 import json
@@ -19,7 +19,7 @@ NAME = "/master_sync"
 
 
 def ask(master, calls):
-    """The values of many questions at once; None for what failed."""
+    """The values of many calls, made in one multicall. None for each call that failed."""
     multi = xmlrpc.client.MultiCall(master)
     for method, *params in calls:
         getattr(multi, method)(NAME, *params)
@@ -27,7 +27,7 @@ def ask(master, calls):
 
 
 def remote_state(remote, namespace, ignored):
-    """What is to be registered: (kind, node, topic or service, type or address, node's address)."""
+    """The registrations to make: (kind, node, topic or service, type or address, node's address)."""
     (publishers, subscribers, services), types = ask(remote, [("getSystemState",), ("getTopicTypes",)])
     types = dict(types)
     found = [
@@ -63,7 +63,7 @@ def register(kind, node, name, what, uri):
 
 
 def apply(own, remote, known, wanted):
-    """Brings the own master from `known` to `wanted`."""
+    """Brings the master at OWN from `known` to `wanted`."""
     gone, new = sorted(known - wanted), sorted(wanted - known)
     multi = xmlrpc.client.MultiCall(own)
     for make, entries in ((unregister, gone), (register, new)):
@@ -92,7 +92,7 @@ def main():
                 known = wanted
                 print("synced", json.dumps(sorted(known)), flush=True)
         except (OSError, xmlrpc.client.Error) as error:
-            # A master that is away for a moment.
+            # One of the masters is away for a moment.
             print("again", error, flush=True)
         time.sleep(0.2)
 

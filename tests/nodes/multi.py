@@ -1,7 +1,8 @@
 #!/usr/bin/python3
-"""A node with as many ends as wanted. Usage: multi.py [pub:TOPIC|sub:TOPIC|srv:SERVICE|param:KEY]...
+"""A node with any number of publishers, subscribers, services and parameter subscriptions.
+Usage: multi.py [pub:TOPIC|sub:TOPIC|srv:SERVICE|param:KEY]...
 
-Publishers send ten messages a second each; `got` lines are not said, there may be too many.
+Each publisher sends ten messages a second. The node prints no `got` lines, because there could be too many.
 """
 
 import rospy

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""A real rosmaster that refuses and notifies as 1.14.3 and before. Like waiting_rosmaster.py, it begins only when the
-file `away` in `ROS_HOME` is not there (any more)."""
+"""A real rosmaster that refuses and notifies like 1.14.3 and before. Like waiting_rosmaster.py, it starts only when
+there is no file `away` in `ROS_HOME`."""
 
 import os
 import time

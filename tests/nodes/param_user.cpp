@@ -1,6 +1,6 @@
-// Says what `getCached` holds for a parameter, whenever it changes. Usage: param_user KEY
+// Prints the value of `getCached` for a parameter whenever it changes. Usage: param_user KEY
 //
-// After the first look only a paramUpdate of the master changes the cache.
+// After the first read, only a paramUpdate of the master changes the cache.
 #include <ros/ros.h>
 
 #include "lines.h"

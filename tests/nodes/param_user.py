@@ -1,7 +1,7 @@
 #!/usr/bin/python3
-"""Says what `get_param_cached` holds for a parameter, whenever it changes. Usage: param_user.py KEY
+"""Prints the value of `get_param_cached` for a parameter whenever it changes. Usage: param_user.py KEY
 
-After the first look only a paramUpdate of the master changes the cache. rospy before 1.14.4 has none: it asks.
+After the first read, only a paramUpdate of the master changes the cache. rospy before 1.14.4 has no cache and asks.
 """
 
 import json
@@ -26,7 +26,7 @@ def main():
             if value != seen:
                 say("value", json.dumps(value))
                 seen = value
-        except Exception as error:  # a failed look must be seen by the test, not end the node
+        except Exception as error:  # a failed read must be reported to the test, not end the node
             say("failed", type(error).__name__, error)
             rospy.sleep(0.1)
 

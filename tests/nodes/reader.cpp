@@ -1,4 +1,4 @@
-// Reads a parameter again and again with a default that it should never get, from before it is registered.
+// Reads a parameter again and again, with a default value that it should never get. It starts before it registers.
 // Usage: reader KEY
 #include <thread>
 

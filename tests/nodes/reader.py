@@ -1,7 +1,7 @@
 #!/usr/bin/python3
-"""Reads a parameter again and again with a default that it should never get. Usage: reader.py KEY
+"""Reads a parameter again and again, with a default value that it should never get. Usage: reader.py KEY
 
-It begins before it is a node: a held registration blocks every other call of a rospy process.
+It starts reading before it registers as a node, because a held registration blocks all other calls of a rospy process.
 """
 
 import rospy
@@ -12,12 +12,12 @@ DEFAULT = -1
 
 
 def read(key, count):
-    """Reads once and says how often it has."""
+    """Reads once and prints how often it has."""
     try:
         value = rospy.get_param(key, DEFAULT)
         if value == DEFAULT or rospy.has_param("/not/there"):
             say("failed", "it got its default")
-    except Exception as error:  # what a node would die of must be seen by the test
+    except Exception as error:  # an error that would end a node must be reported to the test
         say("failed", type(error).__name__, error)
     if count % 10 == 0:
         say("reads", count)

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""A real rosmaster whose port another program takes first: if the file `rob` is in `ROS_HOME`, it says its port
-in the file `port` there, and begins only when somebody listens at that port."""
+"""A real rosmaster whose port another program takes first. If there is a file `rob` in `ROS_HOME`, it writes its port
+into the file `port` there, and starts only when another program listens at that port."""
 
 import os
 import socket

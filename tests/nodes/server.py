@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Offers the service `who`, which answers with the name of this node.
 
-The type is roscpp/GetLoggers, which every ROS installation has for rospy and for roscpp.
+Its type is roscpp/GetLoggers, which every ROS installation provides for both rospy and roscpp.
 """
 
 import rospy
@@ -14,7 +14,7 @@ calls = 0
 
 
 def answer(_request):
-    """Names this node and counts the call."""
+    """Answers with the name of this node, and counts the call."""
     global calls
     calls += 1
     say("called", calls)

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A real rosmaster whose notifier threads never wake: it changes its state, and tells no node of it."""
+"""A real rosmaster whose notifying threads never wake up: it changes its state and tells no node."""
 
 import rosmaster
 from rosmaster.threadpool import ThreadPoolThread

@@ -1,6 +1,6 @@
 #!/usr/bin/python3
-"""A rosmaster that takes its time for each call: so many seconds as the file `slow` in `ROS_HOME` says, or if
-that names a method too, for requests in which it occurs."""
+"""A rosmaster that is slow. The file `slow` in `ROS_HOME` has the number of seconds for each call. If it also names a
+method, only requests that mention the method are slow."""
 
 import os
 import time
@@ -16,7 +16,7 @@ _dispatch = SimpleXMLRPCDispatcher._marshaled_dispatch
 
 
 def slow_dispatch(self, data, *arguments, **options):
-    """Waits, then does what is to be done."""
+    """Waits, then runs the call."""
     try:
         with open(os.path.join(os.environ["ROS_HOME"], "slow")) as seconds:
             words = (seconds.read() or "0").split()

@@ -1,9 +1,9 @@
 // Publishes std_msgs/String "NAME N" on `chatter`, numbered from 1. Usage: talker [HZ [quiet [logged]]]
 //
-// `logged`: as if it had logged before. A roscpp node that is told to shut down logs that; if it is the first thing
-// that it logs it calls subscribeParam, and so takes its name back from whoever displaced it.
+// `logged`: the node has already logged something. A roscpp node that is told to shut down logs that. If this is the
+// first line that it logs, it calls subscribeParam, and so takes its name back from the node that displaced it.
 //
-// A quiet one does not say what it has sent. Nothing is thrown away when a listener is slow.
+// A quiet talker does not print what it has sent. No message is dropped when a listener is slow.
 #include <cstdlib>
 #include <ros/ros.h>
 #include <std_msgs/String.h>

@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Publishes `std_msgs/String` "NAME N" on `chatter`, numbered from 1. Usage: talker.py [HZ [quiet]]
 
-A quiet one does not say what it has sent. Nothing is thrown away when a listener is slow.
+A quiet talker does not print what it has sent. No message is dropped when a listener is slow.
 """
 
 import rospy
@@ -11,7 +11,7 @@ from lines import say, ticks
 
 
 class Links(rospy.SubscribeListener):
-    """Says how many subscribers are connected whenever that changes."""
+    """Prints how many subscribers are connected whenever that changes."""
 
     def __init__(self):
         rospy.SubscribeListener.__init__(self)

@@ -1,7 +1,7 @@
-"""Runs a command on a terminal of its own: terminal.py SECONDS KEY COLUMNSxROWS PROGRAM ARGUMENT...
+"""Runs a command on a new terminal: terminal.py SECONDS KEY COLUMNSxROWS PROGRAM ARGUMENT...
 
-Types KEY after so many seconds, or sends the signal of that number; prints the exit status, whether the terminal is as
-it was, and then what was shown.
+After SECONDS it types KEY, or sends the signal with that number. It prints the exit status, whether the settings of the
+terminal are as before, and then what was shown.
 """
 import fcntl
 import os

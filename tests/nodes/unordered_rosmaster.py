@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A real rosmaster whose dictionaries come in an order of their own, as in Python 2, and that says so."""
+"""A real rosmaster whose dictionaries have no defined order, as on Python 2, and which reports to run on Python 2."""
 
 import zlib
 from xmlrpc.client import Marshaller
@@ -10,13 +10,13 @@ from rosmaster.master_api import ROSMasterHandler
 
 
 def hashed(item):
-    """The place of a name, or of a list that begins with one."""
+    """The sort key of a name, or of a list that starts with one."""
     name = item if isinstance(item, str) else item[0]
     return zlib.crc32(name.encode())
 
 
 def shuffled(method, lists):
-    """The method with its answer's lists in another order."""
+    """Wraps a method so that the lists in its answer are in another order."""
 
     def call(self, *arguments):
         code, message, value = method(self, *arguments)

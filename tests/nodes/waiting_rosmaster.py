@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A real rosmaster that begins only when the file `away` in `ROS_HOME` is not there (any more)."""
+"""A real rosmaster that starts only when there is no file `away` in `ROS_HOME`."""
 
 import os
 import time

@@ -1,14 +1,14 @@
 #!/usr/bin/python3
 """Watches the example robot (examples/robot): streams, transforms, diagnostics, and whether drives succeed.
 
-    witness.py                 every second says the lines below, and each gap as it comes (lines.py)
-    witness.py bag FILE        says what a bag holds, and ends
+    witness.py                 prints the lines below every second, and each gap when it occurs (lines.py)
+    witness.py bag FILE        prints the contents of a bag, and ends
 
-    heard JSON                 the number of messages by topic so far
-    transforms SECONDS         how old the oldest of the transforms from the map is
-    diagnostics NAMES          what the aggregator has put together, without what is stale
-    drive TEXT                 what the mission says
-    bagged TOPIC FIRST LAST COUNT      the times of the first and the last message
+    heard JSON                 number of messages received so far, by topic
+    transforms SECONDS         age of the oldest transform from the map
+    diagnostics NAMES          the groups of the aggregator that are not stale
+    drive TEXT                 the state that the mission publishes
+    bagged TOPIC FIRST LAST COUNT      times of the first and the last message, and their number
 """
 
 import json
@@ -37,7 +37,7 @@ FRAMES = ["lidar_front", "lidar_rear", "camera_front", "camera_rear", "left_whee
 
 
 class Numbers:
-    """Of a topic whose messages are numbered."""
+    """Counts the messages of a topic that are numbered."""
 
     def __init__(self, topic):
         self.topic, self.last, self.count = topic, None, 0

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A picture of the page, by Chromium: screenshot.py URL FILE [WIDTH HEIGHT [dark]]
+"""Takes a picture of the page with Chromium: screenshot.py URL FILE [WIDTH HEIGHT [dark]]
 
 It waits until the graph, the list and some seconds of the curve are there.
 """
@@ -17,7 +17,7 @@ READY = """document.querySelectorAll('#picture .box').length > 3 && document.que
 
 
 class Page:
-    """A page of a Chromium without a window, by the DevTools protocol over its file descriptors 3 and 4."""
+    """A page in a headless Chromium, driven by the DevTools protocol over its file descriptors 3 and 4."""
 
     def __init__(self, profile):
         # Above 3 and 4, which the child needs.

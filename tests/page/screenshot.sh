@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes docs/page.png: the page of examples/robot after two rescues. It needs what the tests need, and pngquant.
+# Makes docs/page.png: the page of examples/robot after two rescues. Needs everything that the tests need, and pngquant.
 #
 #     tests/page/screenshot.sh [FILE]
 
@@ -15,7 +15,7 @@ command -v pngquant >/dev/null || give_up "there is no pngquant: apt-get install
 step "rosrescue core and the robot of examples/robot"
 start_core
 start_node robot examples/robot/launch.sh "$scratch"
-within 180 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot does not come up"
+within 180 rosparam get /mission/arrived >/dev/null 2>&1 || give_up "the robot did not start"
 
 step "kill -9 of the master, twice"
 for recoveries in 2 3; do

@@ -1,6 +1,6 @@
-//! The wall clock jumps: by years when a robot without a battery finds the network, by seconds back
-//! when it is corrected. Nothing depends on it. rosrescue runs under libfaketime, which changes what
-//! it reads of the wall clock and leaves the monotonic clock alone.
+//! The wall clock jumps: by years when a robot without a clock battery finds a time server, by seconds when
+//! it is corrected. rosrescue must not depend on it. It runs under libfaketime, which changes the wall clock
+//! that it reads and leaves the monotonic clock alone.
 
 use std::fs;
 use std::ops::Deref;
@@ -13,14 +13,14 @@ use crate::support::{
     params, signal, status, unreadable,
 };
 
-/// A wall clock that is wrong by so many seconds.
+/// A wall clock that is wrong by a settable number of seconds.
 struct WallClock {
     file: PathBuf,
 }
 
 const DAY: i64 = 86_400;
-/// Forward by 20 years, back to 63 days ago, then again and again by 13 seconds; to 1970, about,
-/// where a robot without a battery wakes up. No kernel's clock is before that.
+/// Forward by 20 years, back to 63 days ago, then several times by 13 seconds, and to about 1970, where a
+/// robot without a clock battery starts. The clock of a kernel is never before that.
 const JUMPS: [i64; 7] = [
     20 * 365 * DAY,
     -63 * DAY,
@@ -52,7 +52,7 @@ impl WallClock {
             .flatten()
             .map(|folder| folder.path().join("faketime/libfaketimeMT.so.1"))
             .find(|library| library.exists())
-            .expect("this test needs libfaketime: `tests/run.sh` installs it");
+            .expect("libfaketime is not installed: `tests/run.sh` installs it");
         setup
             .env("LD_PRELOAD", library)
             .env("FAKETIME_TIMESTAMP_FILE", &self.file)
@@ -61,7 +61,7 @@ impl WallClock {
     }
 }
 
-/// rosrescue by that clock.
+/// A robot whose rosrescue reads that clock.
 struct Robot {
     failing: Failing,
     clock: WallClock,
@@ -98,7 +98,7 @@ impl Robot {
         });
     }
 
-    /// What rosrescue's last report takes for the time of the outage, less the right time.
+    /// The length of the outage in rosrescue's last report, minus the real length, in seconds.
     fn clock_error(&self) -> f64 {
         let report = &status(&self.client())["last_recovery"];
         report["detected_at"].as_f64().unwrap() - rosrescue::clock::wall_time()
@@ -106,7 +106,7 @@ impl Robot {
 }
 
 #[test]
-fn recovery_does_not_depend_on_it() {
+fn recovery_does_not_depend_on_the_wall_clock() {
     let robot = Robot::core(&[]);
     let client = robot.client();
     let node = FakeNode::start("/fake");
@@ -117,7 +117,7 @@ fn recovery_does_not_depend_on_it() {
         let start = Instant::now();
         robot.clock.jump(jump);
         let dead = robot.kill_master();
-        // It is answered without a master, or by the new one, whatever the clock says meanwhile.
+        // These calls are answered without a master or by the new one, whatever the clock does.
         client.set_param("/held", 1);
         client.ok("deleteParam", params!["/test", "/held"]);
         robot.await_recovery(dead);
@@ -138,14 +138,14 @@ fn recovery_does_not_depend_on_it() {
         let error = robot.clock_error();
         assert!(
             (error - jump as f64).abs() < took + 1.0,
-            "{error} instead of {jump}"
+            "the clock was wrong by {error} s instead of {jump} s"
         );
     }
     assert_eq!(status(&client)["deaths"], JUMPS.len());
 }
 
 #[test]
-fn neither_hold_nor_probes_depend_on_it() {
+fn hold_and_probes_do_not_depend_on_the_wall_clock() {
     let options = [
         "--hold",
         "2",
@@ -157,7 +157,7 @@ fn neither_hold_nor_probes_depend_on_it() {
         "3",
     ];
     let robot = Robot::start(|scratch, port, _| {
-        // Before rosrescue, whose start waits for it; the scratch folder ends it.
+        // rosmaster is started first, because rosrescue waits for it. The scratch folder ends it.
         std::mem::forget(Rosmaster::start_at(scratch, port));
         Setup::proxy(scratch, port).args(options)
     });
@@ -165,22 +165,22 @@ fn neither_hold_nor_probes_depend_on_it() {
     let pid = robot.bare().master_pid().unwrap();
     let mut jumps = JUMPS.into_iter().cycle();
     let mut jump = || robot.clock.jump(jumps.next().unwrap());
-    // A master that answers is not taken for hung.
+    // A master that answers does not count as hung.
     assert!(holds(Duration::from_secs(2), || {
         jump();
         status(&client)["open"] == true
     }));
-    // One that hangs is, after three times 0.3 s.
+    // A master that hangs does, after three probes of 0.3 s.
     let start = Instant::now();
     crate::support::stop(pid);
-    eventually("the hung master is found", || {
+    eventually("the hung master is noticed", || {
         jump();
         status(&client)["open"] == false
     });
     let found = start.elapsed();
     assert!(found > Duration::from_millis(700), "{found:?}");
     assert!(found < Duration::from_secs(15), "{found:?}");
-    // What only a master understands is held for two seconds, neither less nor much more.
+    // A call that only a master understands is held for two seconds, no less and not much more.
     let start = Instant::now();
     let waiting = thread::spawn({
         let client = client.clone();
@@ -189,7 +189,7 @@ fn neither_hold_nor_probes_depend_on_it() {
             (answer.is_err(), start.elapsed())
         }
     });
-    eventually("the call is given back", || {
+    eventually("the held call ends", || {
         jump();
         waiting.is_finished()
     });
@@ -199,7 +199,7 @@ fn neither_hold_nor_probes_depend_on_it() {
     assert!(held < Duration::from_secs(12), "{held:?}");
     signal(pid, rustix::process::Signal::CONT);
     client.set_param("/late", 2);
-    eventually("the master goes on", || {
+    eventually("the master serves calls again", || {
         jump();
         status(&client)["open"] == true
     });
@@ -209,18 +209,18 @@ fn neither_hold_nor_probes_depend_on_it() {
 }
 
 #[test]
-fn pauses_between_restarts_do_not_depend_on_it() {
+fn pauses_between_restarts_do_not_depend_on_the_wall_clock() {
     let robot = Robot::core(&[]);
     let client = robot.client();
     let before = robot.failures.starts().len();
     robot.failures.set("at once");
     robot.kill_master();
     let mut jumps = JUMPS.into_iter().cycle();
-    eventually("it is a crash loop", || {
+    eventually("the status reports a crash loop", || {
         robot.clock.jump(jumps.next().unwrap());
         robot.failures.starts().len() >= before + 9
     });
-    // Five at once, then after 0.5, 1, 2 and 4 s.
+    // Five restarts at once, then after pauses of 0.5, 1, 2 and 4 s.
     let starts = robot.failures.starts().split_off(before);
     for (number, pause) in [(5, 0.5), (6, 1.0), (7, 2.0), (8, 4.0)] {
         let took = starts[number] - starts[number - 1];
@@ -234,9 +234,9 @@ fn pauses_between_restarts_do_not_depend_on_it() {
     });
 }
 
-/// Kept files are numbered; none takes the place of another.
+/// Kept files are numbered, so none replaces another.
 #[test]
-fn names_of_files_do_not_depend_on_it() {
+fn kept_files_do_not_replace_each_other_when_the_wall_clock_jumps() {
     let mut robot = Robot::core(&["--restore", "never"]);
     let mut jumps = JUMPS.into_iter();
     for number in 1..=3 {
@@ -260,7 +260,7 @@ fn names_of_files_do_not_depend_on_it() {
         .filter(|name| name.starts_with("session-"))
         .collect();
     names.sort();
-    // Of each session its file, and perhaps its previous generation.
+    // For each session its file, and possibly its previous generation.
     assert!(names.len() >= 3, "{names:?}");
     for number in 1..=3 {
         let key = format!("\"session{number}\": {number}");

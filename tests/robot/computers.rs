@@ -1,5 +1,5 @@
-//! What `docs/several-computers.md` tells people to do works on three computers: `tests/support/computers.sh` makes
-//! them, with real etcd servers and a real keepalived.
+//! The instructions in `docs/several-computers.md` work on three computers, which
+//! `tests/support/computers.sh` provides with real etcd servers and a real keepalived.
 
 use std::{fs, path::Path, process::Command};
 
@@ -13,7 +13,7 @@ const COMPUTERS: [(&str, &str); 3] = [
 ];
 const ALL: [&str; 3] = ["base", "arm", "head"];
 
-/// The commands of the document, section by section.
+/// The document, whose commands are read section by section.
 struct Document(String);
 
 impl Document {
@@ -21,13 +21,13 @@ impl Document {
         Self(fs::read_to_string(Path::new(ROOT).join("docs/several-computers.md")).unwrap())
     }
 
-    /// What is in the fence of text whose first line begins so.
+    /// The contents of the `text` fence whose first line starts with `first`.
     fn text(&self, first: &str) -> String {
         let (_, rest) = self.0.split_once(&format!("```text\n{first}")).unwrap();
         format!("{first}{}", rest.split("```").next().unwrap())
     }
 
-    /// The blocks of `section`, of which there are as many as expected.
+    /// The command blocks of `section`, which must have exactly `COUNT` of them.
     fn section<const COUNT: usize>(&self, section: &str) -> [String; COUNT] {
         let blocks = blocks(&self.0);
         let blocks = blocks.into_iter().filter(|block| block.section == section);
@@ -38,7 +38,8 @@ impl Document {
     }
 }
 
-/// `text`, done on each of `computers` by a person who changes the first line as the document says.
+/// A script that runs `text` on each of `computers`, with the first line changed for each as the document
+/// says.
 fn on(computers: &[&str], text: &str) -> String {
     let own = COMPUTERS
         .iter()
@@ -55,7 +56,7 @@ fn on(computers: &[&str], text: &str) -> String {
     scripts.collect()
 }
 
-/// In namespaces of its own, which end with the shell and all that it has started.
+/// Runs `script` in namespaces of its own, which end with the shell and everything that it has started.
 #[track_caller]
 fn run(script: &str) -> String {
     let scratch = Scratch::new();
@@ -86,7 +87,7 @@ fn run(script: &str) -> String {
     said
 }
 
-/// Steps 1 to 3, and then until a majority has formed.
+/// A script for steps 1 to 3, which then waits until a majority has formed.
 fn three_etcd(document: &Document) -> String {
     let [install, settings, start, _] = document.section("etcd on three computers");
     let steps = [install, settings, start]
@@ -96,16 +97,16 @@ fn three_etcd(document: &Document) -> String {
 }
 
 #[test]
-fn etcd_runs_as_the_document_says_and_a_member_is_replaced() {
+fn etcd_can_be_set_up_and_a_member_replaced_as_documented() {
     let document = Document::new();
     let [_, settings, start, look] = document.section("etcd on three computers");
     let [replace] = document.section("One etcd is replaced");
     let new = settings.replace("STATE=new", "STATE=existing");
-    assert_ne!(new, settings, "the document says what to change");
+    assert_ne!(new, settings, "the text to change is not in the document");
     let said = run(&[
         three_etcd(&document),
         on(&["arm"], &look),
-        // The disk is gone, too.
+        // The disk of the old member is lost too.
         on(
             &["head"],
             "sudo systemctl stop etcd\nrm -r /var/lib/etcd/robot",
@@ -121,7 +122,7 @@ fn etcd_runs_as_the_document_says_and_a_member_is_replaced() {
 }
 
 #[test]
-fn a_full_etcd_is_emptied_as_the_document_says() {
+fn a_full_etcd_can_be_emptied_as_documented() {
     let document = Document::new();
     let [_, settings, ..] = document.section::<4>("etcd on three computers");
     let small = settings.replace(
@@ -147,7 +148,7 @@ fn a_full_etcd_is_emptied_as_the_document_says() {
 }
 
 #[test]
-fn certificates_and_users_are_made_as_the_document_says() {
+fn certificates_and_users_can_be_made_as_documented() {
     let document = Document::new();
     let [authority, bring, look] = document.section("TLS");
     let [users] = document.section("Users");
@@ -177,7 +178,7 @@ fn certificates_and_users_are_made_as_the_document_says() {
 }
 
 #[test]
-fn rosrescue_runs_as_the_document_says_and_hands_over() {
+fn rosrescue_can_be_run_and_handed_over_as_documented() {
     let document = Document::new();
     let [core, _, _, check] = document.section("rosrescue");
     let [look] = document.section("Seeing it, and trying it");
@@ -185,9 +186,9 @@ fn rosrescue_runs_as_the_document_says_and_hands_over() {
         three_etcd(&document),
         on(&ALL, &core),
         on(&["head"], &look),
-        // Its exit status says whether the next master is there yet.
+        // The exit status says whether the next master is there yet.
         on(&["base"], "rosrescue status || true"),
-        // There is more to say of such a computer.
+        // On such a computer `check` has other findings as well.
         on(&["head"], &format!("{} || true", check.trim_end())),
     ]
     .concat());
@@ -201,7 +202,7 @@ fn rosrescue_runs_as_the_document_says_and_hands_over() {
 }
 
 #[test]
-fn the_virtual_address_leaves_a_computer_that_is_cut_off_or_without_rosrescue() {
+fn the_virtual_address_moves_away_from_a_computer_that_is_cut_off_or_without_rosrescue() {
     let document = Document::new();
     let said = run(&[
         three_etcd(&document),

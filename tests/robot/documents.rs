@@ -1,5 +1,6 @@
-//! The commands of the documents work: each section's blocks are pasted into a shell, as they stand, on a computer
-//! of its own (`tests/support/documents.sh`). What cannot be run there is in [`blocks::NOT_RUN`].
+//! The commands in the documents work: the blocks of each section are pasted unchanged into a shell, on a
+//! computer of their own (`tests/support/documents.sh`). [`blocks::NOT_RUN`] lists the ones that cannot be
+//! run there.
 
 use std::{fmt::Write as _, fs, path::Path, process::Command};
 
@@ -7,10 +8,10 @@ use super::support::{Scratch, blocks, documents};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// What a section that starts no rosrescue is read beside.
+/// Run before a section that needs a running rosrescue but starts none itself.
 const A_ROBOT: &str = "rosrescue core\nroslaunch --wait my_robot.launch\n";
 
-/// Runs what `document` has; panics with the output of the section that fails.
+/// Runs the blocks of `document`. Panics with the output of a section that fails.
 fn run(document: &str) {
     let text = fs::read_to_string(Path::new(ROOT).join(document)).unwrap();
     let mut blocks = blocks(&text);
@@ -36,7 +37,8 @@ fn run(document: &str) {
     }
 }
 
-/// In namespaces of its own: its ports are free, `pkill` meets nobody else, and everything ends with the shell.
+/// Runs a script in namespaces of its own: its ports are free, `pkill` finds no other processes, and
+/// everything ends with the shell.
 #[track_caller]
 fn run_section(script: &str) -> String {
     let scratch = Scratch::new();
@@ -68,17 +70,17 @@ fn run_section(script: &str) -> String {
 }
 
 #[test]
-fn the_readme() {
+fn the_commands_of_the_readme_work() {
     run("README.md");
 }
 
 #[test]
-fn the_way_into_a_robot() {
+fn the_commands_of_the_guide_for_robots_work() {
     run("ROS_MASTER_URI.md");
 }
 
 #[test]
-fn all_other_documents() {
+fn the_commands_of_all_other_documents_work() {
     for document in documents() {
         let name = document.strip_prefix(ROOT).unwrap().to_str().unwrap();
         if !["README.md", "ROS_MASTER_URI.md"].contains(&name) {
@@ -87,7 +89,7 @@ fn all_other_documents() {
     }
 }
 
-/// The lines of a picture, without its numbers.
+/// The lines of a picture without numbers.
 fn lines(picture: &str) -> Vec<String> {
     let lines = picture
         .lines()
@@ -105,13 +107,13 @@ fn lines(picture: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_recording_is_what_its_script_makes() {
+fn the_recording_matches_the_output_of_its_script() {
     let ours = fs::read_to_string(Path::new(ROOT).join("docs/rescue.svg")).unwrap();
     let made = run_section(". tests/support/documents.sh\nexamples/record.sh");
     assert!(lines(&made).len() > 10, "{made}");
     assert_eq!(
         lines(&ours),
         lines(&made),
-        "examples/record.sh >docs/rescue.svg makes it anew"
+        "the picture is out of date; to make it again: examples/record.sh >docs/rescue.svg"
     );
 }

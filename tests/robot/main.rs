@@ -1,5 +1,5 @@
-//! The whole program, with real rosmasters and real rospy and roscpp nodes. What measures times is in
-//! `tests/timing`.
+//! The whole program, with real rosmasters and real rospy and roscpp nodes. `tests/timing` has the tests that
+//! measure times.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,8 +18,8 @@ mod paper {
     mod cases_0_and_1;
 }
 
-/// While there is no master nodes start, find each other, talk, are displaced and end as if there were one; the
-/// next master is given what came of it.
+/// While there is no master, nodes start, find each other, exchange messages, are displaced and end as if
+/// there were one. The next master is given the result.
 mod outage {
     mod calls;
     mod durability;
@@ -32,7 +32,7 @@ mod outage {
     mod same_name;
 }
 
-/// What a node hears of a topic, a parameter or its own name comes in the order of the state.
+/// What a node hears about a topic, a parameter or its own name comes in the order of the state.
 mod order {
     mod answers;
     mod links;
@@ -56,7 +56,7 @@ mod master {
     mod unreturnable_values;
 }
 
-/// A new master is given the state, and the nodes are looked after.
+/// A new master is given the state, and the health check examines the nodes.
 mod recovery {
     mod health_check;
     mod host_names;
@@ -70,14 +70,14 @@ mod recovery {
     mod unreachable;
 }
 
-/// Long lives of nodes, and the tools of ROS.
+/// Nodes that run for a long time, and the tools of ROS.
 mod nodes {
     mod example;
     mod streams;
     mod tools;
 }
 
-/// HTTP and XML-RPC as clients send them.
+/// HTTP and XML-RPC in all forms that clients send.
 mod clients {
     mod connections;
     mod forwarding;
@@ -86,7 +86,7 @@ mod clients {
     mod reads;
 }
 
-/// Memory, connections, files and turns of writes.
+/// Limits of memory, connections, file descriptors and write queues.
 mod limits {
     mod answers;
     mod connections;
@@ -95,7 +95,7 @@ mod limits {
     mod writes;
 }
 
-/// Options, start and stop.
+/// Command line options, start and stop.
 mod cli {
     mod addresses;
     mod as_roscore;
@@ -106,14 +106,14 @@ mod cli {
     mod stop;
 }
 
-/// The page in a browser, and what it is made of.
+/// The page in a browser, and the data that it shows.
 mod page {
     mod answers;
     mod browser;
     mod computers;
 }
 
-/// The commands that do not serve.
+/// The commands other than `core` and `proxy`.
 mod commands {
     mod check;
     mod checkpoints;
@@ -128,7 +128,7 @@ mod commands {
     mod wait;
 }
 
-/// The checkpoint as the whole program keeps it.
+/// The checkpoint as kept by the whole program.
 mod checkpoint {
     mod at_the_start;
     mod by_port;
@@ -140,7 +140,7 @@ mod checkpoint {
     mod unreadable;
 }
 
-/// rosrescue itself dies, and is started again.
+/// rosrescue itself dies and is started again.
 mod restart {
     mod guardian;
     mod older_checkpoint;
@@ -150,7 +150,7 @@ mod restart {
     mod worker;
 }
 
-/// It is installed, as a service of a real systemd and as a package.
+/// Installation as a service of a real systemd, and as a package.
 mod service {
     mod booted;
     mod catkin;
@@ -159,14 +159,14 @@ mod service {
     mod package;
 }
 
-/// Random deaths on a disk that fails at random.
+/// Random deaths, on a disk that fails at random.
 mod soak;
 
 /// The wall clock jumps.
 mod clock;
 
-/// The commands that the documents show.
+/// The commands in the documents.
 mod documents;
 
-/// What the document on several computers tells people to do.
+/// The instructions in the document about several computers.
 mod computers;

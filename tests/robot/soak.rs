@@ -1,10 +1,10 @@
-//! Random deaths and stops under calls, on a disk that hangs, slows down, fills up and goes read-only at random. In
-//! every silence the state equals the acknowledged calls.
+//! Random deaths and stops under calls, on a disk that hangs, slows down, fills up and becomes read-only at
+//! random. Whenever the calls pause, the state must equal the acknowledged calls.
 //!
-//! Where rosrescue and the master end together, only what was recorded is owed: everything acknowledged before a
-//! status that said so.
+//! When rosrescue and the master end together, only what was recorded is owed: everything acknowledged before
+//! a status that reported it as recorded.
 //!
-//! `ROSRESCUE_SOAK_SECONDS` is the length, `ROSRESCUE_SEED` repeats the numbers of an earlier run.
+//! `ROSRESCUE_SOAK_SECONDS` is the length. `ROSRESCUE_SEED` repeats the random numbers of an earlier run.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -21,11 +21,11 @@ use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
 const WRITERS: usize = 4;
-/// Parameters, topics and services of each writer.
+/// Number of parameters, topics and services of each writer.
 const NAMES: u64 = 4;
-/// Before a call is sent again.
+/// Pause before a call is repeated.
 const AGAIN: Duration = Duration::from_millis(20);
-/// How long the disk may be in one state, in ms: a start waits for 20 s for a disk that hangs.
+/// Maximum time for which the disk stays in one state, in ms. A start waits 20 s for a disk that hangs.
 const TROUBLE_MS: u64 = 8000;
 
 fn number(name: &str, default: u64) -> u64 {
@@ -36,7 +36,7 @@ fn lock<T>(of: &Mutex<T>) -> MutexGuard<'_, T> {
     of.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What one writer has in the master.
+/// Everything that one writer has in the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Own {
     params: BTreeMap<String, i32>,
@@ -45,7 +45,7 @@ struct Own {
     offered: BTreeSet<String>,
 }
 
-/// What a call does to it.
+/// The effect of a call on that.
 #[derive(Clone, Debug)]
 enum Step {
     Set(String, i32),
@@ -80,7 +80,7 @@ impl Own {
         }
     }
 
-    /// What the master at `client` holds of writer `index`.
+    /// What the master at `client` holds for writer `index`.
     fn read(client: &Client, index: usize) -> Self {
         let state = State::read(client);
         let (space, node) = (space(index), format!("/soaked_{index}"));
@@ -110,13 +110,13 @@ fn space(index: usize) -> String {
     format!("/soak/w{index}/")
 }
 
-/// What a writer was acknowledged.
+/// Everything that was acknowledged to a writer.
 #[derive(Debug, Default)]
 struct Past {
-    /// Its state after each call since the last silence; at least one.
+    /// The states after each call since the last pause. There is always at least one.
     states: Vec<Own>,
     last: Option<Step>,
-    /// The first of them that a loss of everything may lead back to.
+    /// Index of the oldest of them that may be restored after a loss of everything.
     owed: usize,
 }
 
@@ -128,7 +128,7 @@ struct Writer {
     parked: AtomicBool,
 }
 
-/// What all threads look at.
+/// Flags shared by all threads.
 #[derive(Default)]
 struct Flags {
     pause: AtomicBool,
@@ -188,7 +188,7 @@ impl Writer {
         }
     }
 
-    /// Sends the call of `step` again and again until it is answered, as nodes do. False at the end of the test.
+    /// Repeats the call of `step` until it is answered, like nodes do. Returns false at the end of the test.
     fn make(&self, step: &Step, flags: &Flags) -> bool {
         const TYPE: &str = "std_msgs/String";
         let (node, api) = (self.node.name.as_str(), self.node.api.as_str());
@@ -239,7 +239,8 @@ impl Writer {
         lock(&self.past).states.last().unwrap().clone()
     }
 
-    /// Whether all that is owed led to `found`: the recorded calls up to some moment, and the one under way then.
+    /// Whether `found` is a state that may be restored: after the recorded calls up to some moment, and the
+    /// call that was under way then.
     fn leads_to(&self, found: &Own) -> bool {
         let past = lock(&self.past);
         past.states[past.owed..].iter().any(|state| {
@@ -257,7 +258,7 @@ impl Writer {
     }
 }
 
-/// rosrescue, its master, its disk and its callers.
+/// rosrescue with its master, disk and callers.
 struct Stage<'a> {
     scratch: &'a Scratch,
     disk: &'a FailingDisk,
@@ -273,7 +274,7 @@ impl Stage<'_> {
         self.rescue.client()
     }
 
-    /// A number of the status; none if there is no answer.
+    /// A field of the status. `None` if there is no answer.
     fn status(&self, field: &str) -> Option<serde_json::Value> {
         let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";
         let response = self.client().exchange(get).ok()?;
@@ -285,7 +286,7 @@ impl Stage<'_> {
         u32::try_from(self.status("pid")?.as_u64()?).ok()
     }
 
-    /// Waits until calls pass to a master, by another worker than `dead`.
+    /// Waits until calls pass to a master, by a worker other than `dead`.
     #[track_caller]
     fn await_service(&self, dead: Option<u32>) {
         let is_so = || {
@@ -297,7 +298,7 @@ impl Stage<'_> {
         assert!(!never, "no calls pass to a master: {}", self.rescue.log());
     }
 
-    /// All that was acknowledged so far is owed, if rosrescue says that it is recorded.
+    /// Marks everything acknowledged so far as owed, if rosrescue reports that it is recorded.
     fn note_what_is_owed(&self) -> bool {
         let of = |writer: &Writer| lock(&writer.past).states.len() - 1;
         let counts: Vec<_> = self.writers.iter().map(of).collect();
@@ -310,7 +311,7 @@ impl Stage<'_> {
         is_recorded
     }
 
-    /// No call is under way when this returns.
+    /// Pauses the calls. No call is under way when this returns.
     #[track_caller]
     fn pause(&self) {
         self.flags.pause.store(true, Ordering::SeqCst);
@@ -331,7 +332,7 @@ impl Stage<'_> {
         *self.tally.entry(what).or_default() += 1;
     }
 
-    /// In a silence the state is that of the acknowledged calls.
+    /// Checks, during a pause, that the state is that of the acknowledged calls.
     #[track_caller]
     fn assert_state(&mut self) {
         self.pause();
@@ -366,7 +367,7 @@ impl Stage<'_> {
         self.go_on();
     }
 
-    /// After rosrescue and its master ended together, and were started again.
+    /// Checks the state after rosrescue and its master ended together and were started again.
     #[track_caller]
     fn assert_what_is_owed(&mut self) {
         self.pause();
@@ -403,7 +404,7 @@ impl Stage<'_> {
         });
     }
 
-    /// One more death or stop.
+    /// Causes one more death or stop.
     #[track_caller]
     fn next(&mut self, dice: &mut Dice) {
         self.note_what_is_owed();
@@ -437,13 +438,13 @@ impl Stage<'_> {
                 self.start_again();
                 self.assert_what_is_owed();
                 if is_whole {
-                    self.count("of them recorded");
+                    self.count("of these with everything recorded");
                 }
             }
             _ => {
                 self.count("orderly stops");
                 if dice.below(2) == 0 && self.heal() {
-                    self.count("of them recorded");
+                    self.count("of these with everything recorded");
                 }
                 self.flags.pause.store(true, Ordering::SeqCst);
                 assert_eq!(self.rescue.terminate().code(), Some(0));
@@ -453,14 +454,14 @@ impl Stage<'_> {
         }
     }
 
-    /// Whether all is recorded afterwards.
+    /// Heals the disk. Returns whether everything is recorded afterwards.
     fn heal(&self) -> bool {
         self.disk.heal();
         !holds(Duration::from_secs(4), || !self.note_what_is_owed())
     }
 }
 
-/// The disk's troubles, until the end.
+/// Runs the troubles of the disk until the end of the test.
 fn trouble(disk: &FailingDisk, mut dice: Dice, flags: &Flags) -> BTreeMap<String, u32> {
     let mut tally = BTreeMap::new();
     while !flags.over.load(Ordering::SeqCst) {
@@ -486,7 +487,7 @@ fn trouble(disk: &FailingDisk, mut dice: Dice, flags: &Flags) -> BTreeMap<String
 }
 
 #[test]
-fn the_state_is_that_of_the_acknowledged_calls_whatever_dies() {
+fn the_state_always_equals_the_acknowledged_calls_whatever_dies() {
     let seconds = number("ROSRESCUE_SOAK_SECONDS", 30);
     let seed = number("ROSRESCUE_SEED", u64::from(std::process::id()) << 20);
     println!("seed {seed}, {seconds} s");

@@ -1,13 +1,14 @@
-//! The commands that documents show. A fenced block without a language, or in sh, bash or console, and every
-//! indented block is a block of commands, but for a launch file; what a program prints is in a fence of `text`.
+//! The command blocks in documents. A fenced block without a language, or in sh, bash or console, and every
+//! indented block is a block of commands, except for launch files. Program output is in a fence marked
+//! `text`.
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
 
-/// What the test of the documents does not run, why, and what tests it otherwise. A block that has one of these
-/// words is left out.
+/// Commands in documents that the test does not run, the reason, and where they are tested instead. A block
+/// that contains one of these texts is left out.
 #[rustfmt::skip]
 pub(crate) const NOT_RUN: [(&str, &str); 21] = [
     ("sudo ", "changes this computer: `tests/robot/service/booted.rs` and `tests/robot/service/package.rs` have their own"),
@@ -19,10 +20,10 @@ pub(crate) const NOT_RUN: [(&str, &str); 21] = [
     ("catkin_make", "needs a workspace: `tests/robot/service/catkin.rs`"),
     ("rosrun rosrescue", "needs a workspace: `tests/robot/service/catkin.rs`"),
     ("docker ", "no Docker in CI: `tests/robot/restart/guardian.rs` has a process namespace"),
-    ("robot_upstart", "not in Debian: nobody has run it, as `ROS_MASTER_URI.md` says"),
+    ("robot_upstart", "not in Debian: it was never run, as `ROS_MASTER_URI.md` says"),
     ("cargo ", "builds and tests: `tests/run.sh`"),
     ("tests/run.sh", "runs this very test: `tests/run.sh`"),
-    ("ROSRESCUE_SCRIPT=failed.txt", "wants a failure's output: `tests/differential/script.rs`"),
+    ("ROSRESCUE_SCRIPT=failed.txt", "needs the output of a failure: `tests/differential/script.rs`"),
     ("examples/robot/", "takes minutes: `tests/robot/nodes/example.rs`"),
     ("ROSRESCUE_CHECKPOINT=", "settings of a unit: `tests/robot/service/install.rs`"),
     ("ROSRESCUE_CLUSTER=", "settings of a unit: `tests/robot/service/install.rs`"),
@@ -33,24 +34,25 @@ pub(crate) const NOT_RUN: [(&str, &str); 21] = [
     ("rosrescue handover", "needs several computers: `tests/robot/computers.rs` has them"),
 ];
 
-/// A block of commands as a document has it, without its indentation.
+/// A block of commands as it stands in a document, without its indentation.
 #[derive(Clone, Debug)]
 pub(crate) struct Block {
-    /// The line of the document on which it begins.
+    /// The line of the document on which the block starts.
     pub(crate) line: usize,
-    /// The heading above it.
+    /// The heading above the block.
     pub(crate) section: String,
     pub(crate) text: String,
 }
 
 impl Block {
-    /// Why it is not run, if it is not.
+    /// Why the block is not run. `None` if it is.
     pub(crate) fn reason(&self) -> Option<&'static str> {
         let found = NOT_RUN.iter().find(|(word, _)| self.text.contains(word));
         found.map(|(_, reason)| *reason)
     }
 
-    /// What a program printed, with the command above it: `$ rosrescue core --help`.
+    /// Whether the block shows the output of a program, with the command above it, as in `$ rosrescue core
+    /// --help`.
     pub(crate) fn is_transcript(&self) -> bool {
         self.text.starts_with("$ ")
     }
@@ -77,7 +79,7 @@ pub(crate) fn documents() -> Vec<PathBuf> {
     files
 }
 
-/// The blocks of commands of a document, in its order.
+/// The command blocks of a document, in order.
 pub(crate) fn blocks(document: &str) -> Vec<Block> {
     let mut blocks = Vec::new();
     let mut section = String::new();

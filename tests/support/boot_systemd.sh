@@ -1,6 +1,6 @@
 #!/bin/sh
-# boot_systemd.sh FOLDER PROGRAM GIVEN: becomes a systemd as process 1 of namespaces of its own, over a copy of this
-# computer's files that vanishes with it. PROGRAM is there as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
+# boot_systemd.sh FOLDER PROGRAM GIVEN: becomes a systemd that is process 1 in its own namespaces, over a copy of this
+# computer's files that vanishes with it. PROGRAM appears there as /opt/rosrescue/rosrescue, the folder GIVEN as /given.
 # Needs root.
 #
 #     unshare --mount --pid --cgroup --net --uts --ipc --fork --kill-child boot_systemd.sh FOLDER PROGRAM GIVEN
@@ -36,7 +36,7 @@ hostname robot
 echo robot >"$root/etc/hostname"
 echo "127.0.0.1 localhost robot" >"$root/etc/hosts"
 : >"$root/etc/machine-id"
-# Nothing of this computer's own services; the journal is what is looked at.
+# No services of this computer, and an empty journal, which the tests read.
 rm -rf "$root"/etc/systemd/system/*.wants "$root"/var/log/journal
 for unit in sysctl modules-load remount-fs udevd udev-trigger; do
     ln -sf /dev/null "$root/etc/systemd/system/systemd-$unit.service"

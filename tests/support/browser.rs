@@ -1,4 +1,4 @@
-//! A real Chromium without a window, driven by the Chrome DevTools Protocol over two pipes.
+//! A real headless Chromium, driven by the Chrome DevTools Protocol over two pipes.
 
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Write};
@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use super::patience::{PATIENCE, eventually};
 use super::scratch::Scratch;
 
-/// Where Chromium's end of the pipes must be.
+/// The file descriptor at which Chromium reads commands.
 const COMMANDS_FD: i32 = 3;
 const ANSWERS_FD: i32 = 4;
 
@@ -24,7 +24,7 @@ struct Inbox {
     closed: bool,
 }
 
-/// One page of a browser of its own.
+/// A page in a Chromium that was started for it.
 #[derive(Debug)]
 pub(crate) struct Browser {
     process: Child,
@@ -43,7 +43,7 @@ impl Browser {
             .iter()
             .flat_map(|name| std::env::split_paths(&path).map(move |folder| folder.join(name)))
             .find(|program| program.is_file())
-            .expect("there is no Chromium here: apt-get install chromium");
+            .expect("Chromium is not installed: apt-get install chromium");
         let (commands_out, commands) = std::io::pipe().unwrap();
         let (answers, answers_in) = std::io::pipe().unwrap();
         let mut command = Command::new(program);
@@ -80,7 +80,8 @@ impl Browser {
             ])
             .unwrap();
         let process = command.spawn().unwrap();
-        // It holds the other ends of the pipes, whose closing tells of the browser's end.
+        // The command holds the other ends of the pipes. They must be closed for Chromium's end to be
+        // noticed.
         drop(command);
         let inbox = Arc::default();
         thread::spawn({
@@ -128,7 +129,7 @@ impl Browser {
         answer["result"].take()
     }
 
-    /// A screen of this size, in the dark or not.
+    /// Sets the size of the screen, and whether it is dark.
     pub(crate) fn screen(&mut self, width: u32, height: u32, dark: bool) {
         let size = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600});
         self.call("Emulation.setDeviceMetricsOverride", size);
@@ -143,7 +144,7 @@ impl Browser {
         assert!(opened["errorText"].is_null(), "{url}: {opened}");
     }
 
-    /// The value of an expression in the page.
+    /// Evaluates an expression in the page.
     #[track_caller]
     pub(crate) fn js(&mut self, expression: &str) -> Value {
         let params = json!({"expression": expression, "awaitPromise": true, "returnByValue": true});
@@ -156,21 +157,21 @@ impl Browser {
     /// Waits until an expression is true.
     #[track_caller]
     pub(crate) fn shows(&mut self, what: &str, expression: &str) {
-        // What it looks at may not be there yet.
+        // The elements that the expression looks at may not exist yet.
         let expression = format!(
             "(() => {{ try {{ return Boolean({expression}) }} catch {{ return false }} }})()"
         );
         eventually(what, || self.js(&expression) == true);
     }
 
-    /// What the page reads as, for a person.
+    /// The visible text of the page.
     #[track_caller]
     pub(crate) fn text(&mut self) -> String {
         let text = self.js("document.body.innerText");
         text.as_str().unwrap_or_default().to_owned()
     }
 
-    /// The whole page as PNG.
+    /// A picture of the whole page, as PNG.
     pub(crate) fn screenshot(&mut self) -> Vec<u8> {
         let params = json!({"format": "png", "captureBeyondViewport": true});
         let shot = self.call("Page.captureScreenshot", params);
@@ -178,7 +179,7 @@ impl Browser {
         engine.decode(shot["data"].as_str().unwrap()).unwrap()
     }
 
-    /// A key, as a person presses it.
+    /// Presses a key like a user.
     pub(crate) fn press(&mut self, key: &str) {
         for kind in ["keyDown", "keyUp"] {
             self.call("Input.dispatchKeyEvent", json!({"type": kind, "key": key}));
@@ -192,8 +193,8 @@ impl Browser {
         events.map(|event| event["params"].clone()).collect()
     }
 
-    /// Errors and warnings of the console, and exceptions. Without those of the network: a browser says so when
-    /// its server dies.
+    /// Errors and warnings on the console, and exceptions. Network errors are left out: a browser reports
+    /// them whenever its server dies.
     pub(crate) fn complaints(&self) -> Vec<String> {
         let exceptions = self.events("Runtime.exceptionThrown").into_iter();
         let said = self.events("Runtime.consoleAPICalled").into_iter();
@@ -204,7 +205,7 @@ impl Browser {
         all.map(|complaint| complaint.to_string()).collect()
     }
 
-    /// The addresses of all requests.
+    /// The addresses of all requests so far.
     pub(crate) fn requests(&self) -> Vec<String> {
         let sent = self.events("Network.requestWillBeSent").into_iter();
         let urls = sent.filter_map(|event| Some(event["request"]["url"].as_str()?.to_owned()));
@@ -219,7 +220,7 @@ impl Drop for Browser {
     }
 }
 
-/// Collects what the browser says, until its end.
+/// Collects Chromium's messages until it ends.
 fn read(answers: PipeReader, inbox: &(Mutex<Inbox>, Condvar)) {
     let (inbox, arrived) = inbox;
     for message in BufReader::new(answers).split(0) {

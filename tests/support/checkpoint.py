@@ -13,17 +13,17 @@ import yaml
 
 
 def canonical(value):
-    """`value` with its type, the same for what came from YAML and for what came from the master."""
+    """`value` with its type, in the same form for a value from YAML and one from the master."""
     if isinstance(value, dict):
         return "struct", [(key, canonical(member)) for key, member in value.items()]
     if isinstance(value, list) and len(value) == 1 and isinstance(value[0], tuple):
-        kind, text = value[0]  # what YAML has no type for
+        kind, text = value[0]  # a type that YAML lacks
         return kind, text
     if isinstance(value, list):
         return "array", [canonical(element) for element in value]
     if isinstance(value, xmlrpc.client.DateTime):
         return "dateTime.iso8601", value.value
-    if isinstance(value, datetime.datetime):  # a time that YAML has a type for
+    if isinstance(value, datetime.datetime):  # a type that YAML has
         return "dateTime.iso8601", value.strftime("%Y%m%dT%H:%M:%S")
     if isinstance(value, xmlrpc.client.Binary):
         return "bytes", value.data
@@ -31,7 +31,7 @@ def canonical(value):
 
 
 def replay(parameters, journal):
-    """Does to `parameters` what the journal's calls did to the master's."""
+    """Applies the calls in the journal to `parameters`."""
     for record in journal or []:
         if record.get("call") not in ("setParam", "deleteParam"):
             continue
@@ -49,7 +49,7 @@ def replay(parameters, journal):
 
 
 def difference(ours, theirs, path=""):
-    """The first difference in words."""
+    """Describes the first difference."""
     if ours[0] == theirs[0] == "struct" and [k for k, _ in ours[1]] == [k for k, _ in theirs[1]]:
         for (key, mine), (_, yours) in zip(ours[1], theirs[1]):
             found = difference(mine, yours, path + "/" + key)

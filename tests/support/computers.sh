@@ -1,7 +1,7 @@
-# Three computers on one switch, for what docs/several-computers.md tells people to do: base, arm and head, with a
-# network, a host name and an /etc of their own each. Run as root in a network, a mount and a process namespace.
+# Simulates three computers on one switch, for the instructions in docs/several-computers.md: base, arm and head, each
+# with its own network, host name and /etc. Run as root in a network, a mount and a process namespace.
 #
-# The functions stand for what a computer has and a test does not: sudo, apt, and a systemd that runs etcd.
+# The functions replace what a real computer has and a test does not: sudo, apt, and a systemd that runs etcd.
 
 scratch=$ROS_HOME
 declare -A process address=([base]=10.0.0.1 [arm]=10.0.0.2 [head]=10.0.0.3)
@@ -13,7 +13,7 @@ within() { # SECONDS COMMAND...
     shift
     until "$@" >/dev/null 2>&1; do
         if [ "$SECONDS" -ge "$end" ]; then
-            echo "in vain: $*" >&2
+            echo "did not succeed in time: $*" >&2
             tail -n 20 "$scratch"/*/*.log >&2
             return 1
         fi
@@ -27,10 +27,10 @@ inside() { # COMPUTER COMMAND...
     nsenter --target "${process[$name]}" --net --mount --uts "$@"
 }
 
-# Its own namespaces are there.
+# Whether the computer's namespaces exist.
 is_apart() { ! [ "/proc/$1/ns/$2" -ef "/proc/self/ns/$2" ]; }
 
-# One more computer; the cable is called as the computer is.
+# Starts one more computer. The cable has the computer's name.
 switch_on() { # COMPUTER
     local name=$1
     unshare --net --mount --uts sleep infinity &
@@ -49,7 +49,7 @@ switch_on() { # COMPUTER
     inside "$name" ip link set eth0 up
 }
 
-# Runs what is on the standard input, as a person there would.
+# Runs the script on standard input like a user on that computer.
 on() { # COMPUTER
     local name=$1
     cat "$REPOSITORY/tests/support/computer.sh" - >"$scratch/$name/script"
@@ -65,12 +65,12 @@ for name in $computers; do
     switch_on "$name"
 done
 
-# Whether all three etcd are members of a majority.
+# Whether all three etcd servers are healthy members.
 all_healthy() { # SCHEME
     local folder=$scratch/base/etc/etcd
     local tls=
     [ "$1" = http ] || tls="--cacert $folder/ca.pem --cert $folder/own.pem --key $folder/own.key"
-    # shellcheck disable=SC2086 # words are what is wanted
+    # shellcheck disable=SC2086 # splitting is intended
     inside base env ETCDCTL_API=3 etcdctl $tls endpoint health \
         --endpoints="$1://10.0.0.1:2379,$1://10.0.0.2:2379,$1://10.0.0.3:2379"
 }

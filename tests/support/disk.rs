@@ -1,4 +1,4 @@
-//! A disk of a test's own.
+//! Disks that belong to one test.
 
 use std::fs;
 use std::io::{ErrorKind, Write};
@@ -9,7 +9,7 @@ use super::process::{Process, behind};
 use super::rescue::{Rescue, Setup};
 use super::scratch::{Scratch, free_port};
 
-/// A small disk that only those see who are run [on](Self::on) it.
+/// A small disk that is visible only to commands that are run [on](Self::on) it.
 pub(crate) struct SmallDisk {
     holder: Process,
     pub(crate) folder: PathBuf,
@@ -27,24 +27,24 @@ impl SmallDisk {
             .arg(&folder)
             .arg(size);
         let mut holder = Process::start("a disk (mounts need root)", &mut command);
-        holder.wait_line("that it is there", |line| line == "ready");
+        holder.wait_line("the disk is mounted", |line| line == "ready");
         Self { holder, folder }
     }
 
-    /// `command`, run by somebody who sees the disk.
+    /// Wraps `command` so that it sees the disk.
     pub(crate) fn on(&self, command: &Command) -> Command {
         let mut nsenter = Command::new("nsenter");
         nsenter.args(["--mount", "--target", &self.holder.pid().to_string()]);
         behind(nsenter, command)
     }
 
-    /// The disk's folder, for us.
+    /// The folder through which the test itself sees the disk.
     pub(crate) fn seen(&self) -> PathBuf {
         let root = PathBuf::from(format!("/proc/{}/root", self.holder.pid()));
         root.join(self.folder.strip_prefix("/").unwrap())
     }
 
-    /// Takes what is left of the disk.
+    /// Fills the disk. Returns the file that takes the space.
     pub(crate) fn fill(&self) -> PathBuf {
         let path = self.seen().join("somebody-elses.log");
         let mut file = fs::File::create(&path).unwrap();
@@ -74,21 +74,21 @@ impl SmallDisk {
     }
 }
 
-/// A disk that misbehaves on demand (`tests/failing/disk.c`), for the checkpoint of a rosrescue that runs
+/// A disk that misbehaves on request (`tests/failing/disk.c`), for the checkpoint of a rosrescue that runs
 /// [on](Self::under) it.
 pub(crate) struct FailingDisk {
     library: PathBuf,
     state: PathBuf,
 }
 
-/// What is the matter with a [`FailingDisk`].
+/// What is wrong with a [`FailingDisk`].
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Trouble {
-    /// Nothing is answered until that is over.
+    /// No operation is answered until the trouble is over.
     Hangs,
-    /// No file can be opened until that is over.
+    /// No file can be opened until the trouble is over.
     HangsOnOpen,
-    /// Nothing is forced to it until that is over.
+    /// No sync finishes until the trouble is over.
     HangsOnSync,
     /// Each operation takes 0.2 s.
     Slow,
@@ -108,7 +108,7 @@ impl FailingDisk {
         Self { library, state }
     }
 
-    /// `setup` on this disk.
+    /// Runs `setup` with its checkpoint on this disk.
     pub(crate) fn under(&self, setup: Setup) -> Setup {
         setup
             .env("LD_PRELOAD", &self.library)
@@ -130,7 +130,7 @@ impl FailingDisk {
         fs::rename(half, &self.state).unwrap();
     }
 
-    /// All is well again.
+    /// Ends the trouble.
     pub(crate) fn heal(&self) {
         let _ = fs::remove_file(&self.state);
     }

@@ -1,21 +1,21 @@
-# A computer for the commands of a document: what `tests/robot/documents.rs` puts before them. It is run as root in
-# a network, a mount and a process namespace, so that port 11311 and /opt are free to use, and `pkill` meets nobody else.
+# Simulates a computer for the commands in a document. `tests/robot/documents.rs` runs it before them, as root in a
+# network, a mount and a process namespace, so that port 11311 and /opt are free, and `pkill` finds no other processes.
 #
-# The functions stand for what a person does beside the commands: what goes on running is given a terminal of its
-# own, and is waited for.
+# The functions do what a user does beside the commands: they give a program that keeps running its own terminal, and
+# wait until it is ready.
 
 scratch=$ROS_HOME
 ip link set lo up
 ip addr add 10.0.0.7/24 dev lo
 export HOME=$scratch/home
-unset ROS_HOME ROS_LOG_DIR # they lead there by themselves
+unset ROS_HOME ROS_LOG_DIR # the defaults lead there
 if [ ! -d /opt/ros/noetic ]; then
     mount -t tmpfs none /opt
     mkdir -p /opt/ros/noetic
-    : >/opt/ros/noetic/setup.bash # Debian's ROS needs no set-up
+    : >/opt/ros/noetic/setup.bash # Debian's ROS needs no set-up script
 fi
 
-# The repository, but files that the commands write stay here.
+# The repository, except that files which the commands write stay here.
 mkdir -p "$HOME" "$scratch/here" "$scratch/bin" "$scratch/packages"
 cd "$scratch/here"
 ln -s "$REPOSITORY"/* .
@@ -40,7 +40,7 @@ within() { # SECONDS COMMAND...
     shift
     until "$@" >/dev/null 2>&1; do
         if [ "$SECONDS" -ge "$end" ]; then
-            echo "in vain: $*" >&2
+            echo "did not succeed in time: $*" >&2
             tail -n 20 "$scratch"/terminal-*.log >&2
             return 1
         fi
@@ -65,7 +65,7 @@ rosrescue() {
             within 60 calls_are_answered
             ;;
         top) command rosrescue "$@" --count 2 ;;
-        drill) command rosrescue "$@" --yes ;; # the person's answer
+        drill) command rosrescue "$@" --yes ;; # the user's answer
         *) command rosrescue "$@" ;;
     esac
 }
@@ -77,11 +77,11 @@ roslaunch() {
     in_a_terminal roslaunch "$@"
     within 60 robot_is_up
 }
-# Debian has it in a package of its own, which needs catkin.
+# In Debian it is in a separate package, which needs catkin.
 if ! command -v rosrun >/dev/null; then
     rosrun() { "/usr/lib/$1/$2" "${@:3}"; }
 fi
-# What would go on until Ctrl-C: something has to come.
+# Commands that would run until Ctrl-C: they must print something.
 rostopic() {
     case ${1:-} in
         echo | hz) timeout 20 "$(type -P rostopic)" "$@" 2>&1 | grep -m 1 . ;;

@@ -1,4 +1,4 @@
-//! A real rosmaster that is made to die (`tests/failing/rosmaster`), and what rosrescue says of it.
+//! A real rosmaster that can be made to die (`tests/failing/rosmaster`), and what rosrescue reports about it.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -14,39 +14,39 @@ use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 use super::state::State;
 
-/// The program.
+/// The program that runs such a rosmaster.
 pub(crate) const FAILING_ROSMASTER: &str =
     concat!(env!("CARGO_MANIFEST_DIR"), "/tests/failing/rosmaster");
 
-/// What masters die of: a file that they read at their start.
+/// The reasons why masters die, in a file that they read when they start.
 #[derive(Debug)]
 pub(crate) struct Failures {
     pub(crate) file: PathBuf,
 }
 
 impl Failures {
-    /// None yet.
+    /// Starts without any reason to die.
     pub(crate) fn new(scratch: &Scratch) -> Self {
         Self {
             file: scratch.path("failures"),
         }
     }
 
-    /// `rosrescue core` with a rosmaster that fails so.
+    /// `rosrescue core` whose rosmasters fail for these reasons.
     pub(crate) fn core(&self, scratch: &Scratch, master_port: u16) -> Setup {
         Setup::core(scratch, master_port)
             .args(["--no-rosout", "--rosmaster", FAILING_ROSMASTER])
             .env("FAILURES", &self.file)
     }
 
-    /// From the next start on, masters die of this.
+    /// Makes masters die for these reasons, from the next start on.
     pub(crate) fn set(&self, lines: &str) {
         let half = self.file.with_extension("half");
         fs::write(&half, lines).unwrap();
         fs::rename(half, &self.file).unwrap();
     }
 
-    /// From the next start on, masters live.
+    /// Lets masters live, from the next start on.
     pub(crate) fn clear(&self) {
         fs::remove_file(&self.file).unwrap();
     }
@@ -56,12 +56,12 @@ impl Failures {
         text.lines().map(str::to_owned).collect()
     }
 
-    /// What masters have died of.
+    /// The reasons for which masters have died so far.
     pub(crate) fn deaths(&self) -> Vec<String> {
         self.lines("deaths")
     }
 
-    /// When masters were started, in seconds.
+    /// The times at which masters were started, in seconds.
     pub(crate) fn starts(&self) -> Vec<f64> {
         let starts = self.lines("starts");
         starts.iter().map(|line| line.parse().unwrap()).collect()
@@ -84,7 +84,7 @@ impl Failing {
         Self::start(|scratch, port, failures| failures.core(scratch, port).args(options))
     }
 
-    /// What `setup` makes of a master's port.
+    /// Starts the rosrescue that `setup` describes for the given port of the master.
     #[track_caller]
     pub(crate) fn start(setup: impl FnOnce(&Scratch, u16, &Failures) -> Setup) -> Self {
         let scratch = Scratch::new();
@@ -102,12 +102,12 @@ impl Failing {
         self.rescue.client()
     }
 
-    /// A client of the real master.
+    /// A client that talks directly to the real master.
     pub(crate) fn bare(&self) -> Client {
         Client::new(self.master_port)
     }
 
-    /// The state of the real master, once roscore's parameters are in it.
+    /// The state of the real master, once the parameters of roscore are set.
     #[track_caller]
     pub(crate) fn state(&self) -> State {
         eventually("the parameters of core are set", || {
@@ -117,7 +117,7 @@ impl Failing {
         State::read(&self.bare())
     }
 
-    /// SIGKILL to the real master; its process id.
+    /// Kills the real master with SIGKILL. Returns its process id.
     #[track_caller]
     pub(crate) fn kill_master(&self) -> u32 {
         let pid = self.bare().master_pid().expect("a master");
@@ -126,7 +126,7 @@ impl Failing {
     }
 }
 
-/// A process that starts masters in a fraction of the time.
+/// A process that starts masters much faster than usual, by forking.
 #[derive(Debug)]
 pub(crate) struct Forkserver {
     child: Child,
@@ -158,18 +158,19 @@ impl Forkserver {
         answer.trim_end().to_owned()
     }
 
-    /// Starts a master on `port` that dies of this, if it is not empty; gives its process id.
+    /// Starts a master on `port` and returns its process id. It dies for the reasons in `failures`, unless
+    /// that is empty.
     pub(crate) fn start(&mut self, port: u16, failures: &str) -> u32 {
         let order = format!("start {port} {failures}");
         self.order(order.trim_end()).parse().unwrap()
     }
 
-    /// Returns when that master has died.
+    /// Waits until that master has died.
     pub(crate) fn wait(&mut self, pid: u32) {
         assert_eq!(self.order(&format!("wait {pid}")), format!("ended {pid}"));
     }
 
-    /// SIGKILL to that master, and its end.
+    /// Kills that master with SIGKILL and waits for its end.
     pub(crate) fn kill(&mut self, pid: u32) {
         assert_eq!(self.order(&format!("kill {pid}")), format!("ended {pid}"));
     }
@@ -177,13 +178,13 @@ impl Forkserver {
 
 impl Drop for Forkserver {
     fn drop(&mut self) {
-        // Its masters end with the scratch folder.
+        // The masters are killed together with the scratch folder.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// A page of rosrescue.
+/// Fetches a page of rosrescue.
 pub(crate) fn page(client: &Client, path: &str) -> String {
     let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
     client.exchange(request.as_bytes()).unwrap().text()

@@ -1,4 +1,4 @@
-//! Fakes of both ends: a node that records what the master tells it, and a master that says anything.
+//! Fakes of both sides: a node that records what it is told, and a master that can answer anything.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -19,7 +19,7 @@ use super::scratch::free_port;
 pub(crate) struct Heard {
     pub(crate) method: String,
     pub(crate) params: Vec<Value>,
-    /// rosrescue itself made the call: it names the master as the caller, as nodes expect.
+    /// Whether rosrescue itself made the call, under the name of the master, as nodes expect.
     pub(crate) from_rosrescue: bool,
 }
 
@@ -30,18 +30,17 @@ struct Inner {
     released: Condvar,
     publications: Mutex<BTreeMap<String, String>>,
     subscriptions: Mutex<BTreeMap<String, String>>,
-    /// The process id that it says, if that is not the test's.
+    /// The process id that the node reports. `None` stands for that of the test.
     pid: Mutex<Option<i32>>,
-    /// Its process id is another one each time.
+    /// Whether the node reports a different process id each time.
     restless: AtomicBool,
-    /// The master that it names.
+    /// The address of the master that the node reports.
     master: Mutex<Option<String>>,
-    /// A method that it never answers.
+    /// A method that the node never answers.
     ignored: Mutex<Option<String>>,
 }
 
-/// A node without TCPROS: an XML-RPC server that answers what a node must answer, truthfully, and
-/// remembers what it was sent.
+/// A node without TCPROS: an XML-RPC server that gives the answers of a real node and records every call.
 #[derive(Debug)]
 pub(crate) struct FakeNode {
     pub(crate) name: String,
@@ -55,12 +54,12 @@ impl FakeNode {
         Self::start_at(name, 0)
     }
 
-    /// Starts one at `port`, such as that of a node that has ended; 0 for any.
+    /// Starts a node at `port`, for example the port of a node that has ended. 0 means any port.
     pub(crate) fn start_at(name: &str, port: u16) -> Self {
         Self::start_on(name, Ipv4Addr::LOCALHOST, port)
     }
 
-    /// As [`Self::start_at`], on another address of this computer.
+    /// Like [`Self::start_at`], at another address of this computer.
     pub(crate) fn start_on(name: &str, address: Ipv4Addr, port: u16) -> Self {
         let inner = Arc::new(Inner::default());
         let state = Arc::clone(&inner);
@@ -73,7 +72,7 @@ impl FakeNode {
         }
     }
 
-    /// Registers under this host name from now on, which leads to the address on which it was started.
+    /// Registers under this host name from now on. It must lead to the address at which the node was started.
     pub(crate) fn at_host(mut self, host: &str) -> Self {
         self.api = format!("http://{host}:{}/", self.server.port);
         self
@@ -83,28 +82,28 @@ impl FakeNode {
         self.server.port
     }
 
-    /// It says that it is this process.
+    /// Reports this process id from now on.
     pub(crate) fn claim_pid(&self, pid: i32) {
         *lock(&self.inner.pid) = Some(pid);
     }
 
-    /// From now on it says another process id each time.
+    /// Reports a different process id each time from now on.
     pub(crate) fn claim_restless_pid(&self) {
         self.claim_pid(5000);
         self.inner.restless.store(true, Ordering::SeqCst);
     }
 
-    /// It says that this is its master.
+    /// Reports this address as that of its master.
     pub(crate) fn claim_master(&self, uri: &str) {
         *lock(&self.inner.master) = Some(uri.to_owned());
     }
 
-    /// From now on it never answers `method`, and everything else.
+    /// Never answers `method` from now on, but still answers everything else.
     pub(crate) fn ignore(&self, method: &str) {
         *lock(&self.inner.ignored) = Some(method.to_owned());
     }
 
-    /// What the master (or rosrescue) sent, without the questions that everybody asks.
+    /// The parameters of each call of `method`, without the questions that every node is asked.
     pub(crate) fn heard(&self, method: &str) -> Vec<Vec<Value>> {
         let heard = lock(&self.inner.heard);
         heard
@@ -114,12 +113,12 @@ impl FakeNode {
             .collect()
     }
 
-    /// All that it was sent, as it came.
+    /// All calls that the node was sent, in order.
     pub(crate) fn calls(&self) -> Vec<Heard> {
         lock(&self.inner.heard).clone()
     }
 
-    /// The publishers of every publisherUpdate for `topic`, as they came.
+    /// The list of publishers in each publisherUpdate for `topic`, in order.
     pub(crate) fn updates(&self, topic: &str) -> Vec<Vec<String>> {
         self.heard("publisherUpdate")
             .into_iter()
@@ -133,12 +132,12 @@ impl FakeNode {
             .collect()
     }
 
-    /// From now on calls are taken and not answered.
+    /// Accepts calls from now on, but does not answer them.
     pub(crate) fn hold(&self) {
         *lock(&self.inner.holding) = true;
     }
 
-    /// Answers again.
+    /// Answers calls again, including those that are waiting.
     pub(crate) fn release(&self) {
         *lock(&self.inner.holding) = false;
         self.inner.released.notify_all();
@@ -172,17 +171,17 @@ impl FakeNode {
         assert_eq!(master.ok("unregisterSubscriber", params), Value::Int(1));
     }
 
-    /// What the node says when it is asked, without a call to the master.
+    /// Changes what the node reports to publish, without a call to the master. `None` removes the topic.
     pub(crate) fn claim_publication(&self, topic: &str, topic_type: Option<&str>) {
         claim(&self.inner.publications, topic, topic_type);
     }
 
-    /// As [`Self::claim_publication`], for a topic that it subscribes.
+    /// Like [`Self::claim_publication`], for a topic that the node subscribes to.
     pub(crate) fn claim_subscription(&self, topic: &str, topic_type: Option<&str>) {
         claim(&self.inner.subscriptions, topic, topic_type);
     }
 
-    /// Its address for services. Nobody answers there in TCPROS.
+    /// The node's address for services. No TCPROS server is there.
     pub(crate) fn service_api(&self) -> String {
         format!("rosrpc://127.0.0.1:{}", self.server.port)
     }
@@ -288,14 +287,14 @@ fn serve_node(inner: &Inner, stream: TcpStream) {
     }
 }
 
-/// A server that answers a request with whatever bytes the test says, then closes.
+/// A server that answers each request with the bytes that the test gives it, then closes the connection.
 #[derive(Debug)]
 pub(crate) struct FakeMaster {
     server: Server,
 }
 
 impl FakeMaster {
-    /// `answer` gets the body of a request and gives all the bytes that go back.
+    /// Starts a server. `answer` gets the body of a request and returns all bytes to send back.
     pub(crate) fn start(answer: impl Fn(&[u8]) -> Vec<u8> + Send + Sync + 'static) -> Self {
         let server = Server::start(move |stream| {
             let mut stream = BufReader::new(stream);
@@ -315,7 +314,7 @@ impl FakeMaster {
         self.server.port
     }
 
-    /// The bytes of a proper answer with `value`; the connection stays open.
+    /// The bytes of a well-formed answer with `reply`, after which the connection stays open.
     pub(crate) fn proper(reply: &Reply) -> Vec<u8> {
         let body = xmlrpc::encode_reply(reply);
         let head = format!(
@@ -334,7 +333,7 @@ fn http_reply(body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// Head and body of the next request; nothing at the end of the connection.
+/// Reads the head and body of the next request. `None` at the end of the connection.
 pub(crate) fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String, Vec<u8>)> {
     let mut head = String::new();
     loop {
@@ -357,7 +356,7 @@ pub(crate) fn read_request(stream: &mut BufReader<TcpStream>) -> Option<(String,
     Some((head, body))
 }
 
-/// A listener with a thread a connection; all connections end on drop.
+/// A listener with one thread per connection. All connections are closed when it is dropped.
 #[derive(Debug)]
 struct Server {
     address: Ipv4Addr,
@@ -377,7 +376,7 @@ impl Server {
         port: u16,
         serve: impl Fn(TcpStream) + Send + Sync + 'static,
     ) -> Self {
-        // The kernel could give a port of its own to a connection while nobody listens there.
+        // Not port 0: the kernel could give the same port to an outgoing connection before we listen.
         let port = match port {
             0 => free_port(),
             port => port,
@@ -404,7 +403,8 @@ impl Server {
                 thread::spawn(move || {
                     let closing = stream.try_clone();
                     serve(stream);
-                    // The list above holds a second handle: say explicitly that it is over.
+                    // The list above holds a second handle, so dropping this one would not close the
+                    // connection.
                     if let Ok(stream) = closing {
                         let _ = stream.shutdown(Shutdown::Both);
                     }
@@ -426,7 +426,7 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.done.store(true, Ordering::SeqCst);
         let _ = TcpStream::connect((self.address, self.port));
-        // From here on the port refuses.
+        // From here on the port refuses connections.
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -436,7 +436,7 @@ impl Drop for Server {
     }
 }
 
-/// The lock, also after the panic of another thread: the panic is reported where it was.
+/// Takes the lock even if another thread has panicked: the panic is reported where it happened.
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

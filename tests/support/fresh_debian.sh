@@ -1,18 +1,18 @@
 #!/bin/sh
-# fresh_debian.sh CACHE FOLDER COMMAND...: runs COMMAND in a Debian (or Ubuntu) as debootstrap makes it, of this
-# computer's own release. FOLDER is there as /given. What COMMAND changes vanishes. CACHE is made once; it takes about
-# a minute. Needs root and debootstrap.
+# fresh_debian.sh CACHE FOLDER COMMAND...: runs COMMAND in a fresh Debian (or Ubuntu) of this computer's own release,
+# made by debootstrap. FOLDER appears there as /given. All changes by COMMAND vanish. CACHE is made once, which takes
+# about a minute. Needs root and debootstrap.
 set -eu
 cache=$1
 folder=$2
 shift 2
 if [ ! -d "$cache" ]; then
     . /etc/os-release
-    # As apt of this computer has it.
+    # The same archive as this computer's apt uses.
     mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' "Codename: $VERSION_CODENAME" | head -n 1)
     rm -rf "$cache.new"
     debootstrap --variant=minbase "$VERSION_CODENAME" "$cache.new" "$mirror" >"$cache.log" 2>&1 || {
-        echo "fresh_debian.sh: debootstrap cannot make a $VERSION_CODENAME:" >&2
+        echo "fresh_debian.sh: debootstrap cannot install $VERSION_CODENAME:" >&2
         tail -n 3 "$cache.log" >&2
         exit 1
     }

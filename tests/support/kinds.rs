@@ -6,7 +6,7 @@ use rosrescue::xmlrpc::Value;
 
 use super::tree;
 
-/// Values that YAML, XML or Python tend to spoil, and that a master can return.
+/// Values that a master can return, and that YAML, XML or Python code tends to break.
 pub(crate) fn kinds() -> Value {
     #[rustfmt::skip]
     let texts = [
@@ -31,13 +31,13 @@ pub(crate) fn kinds() -> Value {
     }
 }
 
-/// Whether the dictionaries of the master under test have no order (`ROSRESCUE_UNORDERED`): those of Python 2.
+/// Whether the dictionaries of the master under test have no order, as on Python 2 (`ROSRESCUE_UNORDERED`).
 pub(crate) fn unordered() -> bool {
     static UNORDERED: OnceLock<bool> = OnceLock::new();
     *UNORDERED.get_or_init(|| std::env::var_os("ROSRESCUE_UNORDERED").is_some())
 }
 
-/// Keys in the order of the alphabet, at every level: for what was sent in an order of its own.
+/// Sorts the keys at every level, to compare values that were sent in another order.
 pub(crate) fn sorted(value: &Value) -> Value {
     match value {
         Value::Struct(members) => {

@@ -1,5 +1,5 @@
-//! Many real nodes that start at the same moment, and whether each subscriber is connected to exactly the
-//! publishers of the master's state.
+//! Starts many real nodes at the same moment, and checks that each subscriber is connected to exactly the
+//! publishers in the master's state.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -22,31 +22,31 @@ mod traces;
 pub(crate) use stage::{Place, Stage};
 pub(crate) use traces::Traces;
 
-/// Subscribers of each topic, on different nodes; each topic has one publisher.
+/// Number of subscribers of each topic, on different nodes. Each topic has one publisher.
 const SUBSCRIBERS: usize = 3;
 const SPACE: &str = "/links/";
-/// Between two looks at the nodes' connections: each look costs every node some milliseconds.
+/// Pause between two checks of the nodes' connections. Each check takes some milliseconds of every node.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// In which order a node registers its ends.
+/// The order in which a node registers its publishers and subscribers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Order {
-    /// All nodes by topic: the ends of one topic register at about the same time.
+    /// All nodes register in the order of topics, so that those of one topic register at about the same time.
     Same,
-    /// Each in an order of its own.
+    /// Each node registers in a random order of its own.
     Shuffled,
 }
 
-/// Which nodes start.
+/// The nodes to start.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     pub(crate) library: Library,
     pub(crate) nodes: usize,
     pub(crate) links: usize,
     pub(crate) order: Order,
-    /// Busy processes beside them.
+    /// Number of busy processes that run beside them.
     pub(crate) load: usize,
-    /// How long after the last node was ready a link may take, without load.
+    /// How long a link may take after the last node was ready, on a computer without other load.
     pub(crate) wait: Duration,
 }
 
@@ -63,7 +63,7 @@ impl Default for Plan {
     }
 }
 
-/// Numbers that a seed decides.
+/// Random numbers that depend on a seed.
 #[derive(Debug)]
 pub(crate) struct Dice(pub(crate) u64);
 
@@ -86,7 +86,7 @@ impl Dice {
 }
 
 impl Plan {
-    /// The ends of each node: kind and topic.
+    /// The publishers and subscribers of each node, as kind and topic.
     fn ends(&self, dice: &mut Dice) -> BTreeMap<String, Vec<(&'static str, String)>> {
         let count = self.nodes;
         assert!(
@@ -112,39 +112,39 @@ impl Plan {
             .collect()
     }
 
-    /// How long after the last node was ready its links are waited for.
+    /// How long to wait for the links after the last node was ready.
     fn bound(&self) -> Duration {
         self.wait.mul_f64(1.0 + self.load as f64 / 4.0)
     }
 }
 
-/// What one start was.
+/// The outcome of one start.
 #[derive(Debug)]
 pub(crate) struct Start {
-    /// Links that the state asks for.
+    /// Number of links in the master's state.
     pub(crate) links: usize,
-    /// Subscribers that are not connected to a publisher, each with what happened.
+    /// The subscribers that are not connected to a publisher, each with what happened.
     pub(crate) never_made: Vec<String>,
-    /// Links to nodes that are no publishers, and registrations that the state lacks.
+    /// Links to nodes that are not publishers, and registrations that the state lacks.
     pub(crate) wrong: Vec<String>,
-    /// Answers with a list that was older than one that had been told before, each with what happened.
+    /// Answers whose list was older than one that the node had heard before, each with what happened.
     pub(crate) overtaken: Vec<String>,
-    /// Updates with a list that was older than one before, each with what happened.
+    /// Updates whose list was older than one before, each with what happened.
     pub(crate) went_back: Vec<String>,
-    /// Until the last node had registered.
+    /// The time until the last node had registered.
     pub(crate) time: Duration,
 }
 
 impl Start {
-    /// Panics unless every link was made. On a starved computer a node may read an answer after a notification that
-    /// came later; it is told once more then.
+    /// Panics unless every link was made. On an overloaded computer a node may read an answer after a
+    /// notification that was sent later; it is then told once more.
     #[track_caller]
     pub(crate) fn assert_whole(&self, plan: &Plan) {
         println!("answers read too late: {}", self.overtaken.len());
         assert_eq!(self.links, plan.links, "{:#?}", self.wrong);
         for (what, found) in [
             ("never made", &self.never_made),
-            ("not of the state", &self.wrong),
+            ("links that the state lacks", &self.wrong),
             ("updates with an older list", &self.went_back),
         ] {
             assert!(
@@ -157,7 +157,7 @@ impl Start {
     }
 }
 
-/// Nodes that wait for the word.
+/// Nodes that are loaded and wait for the signal to begin.
 #[derive(Debug)]
 struct Fleet {
     processes: Vec<Process>,
@@ -166,7 +166,7 @@ struct Fleet {
     library: Library,
 }
 
-/// What a node said when it was ready.
+/// What a node reports when it has registered.
 #[derive(Clone, Debug)]
 struct Ready {
     name: String,
@@ -220,7 +220,8 @@ impl Fleet {
         fleet
     }
 
-    /// The word that a FIFO is. It is for those, too, that open it later, while the file is kept.
+    /// Opens the FIFO that is the signal to begin. As long as the file is kept, nodes that open it later get
+    /// the signal too.
     fn open(&self, name: &str) -> File {
         File::options()
             .write(true)
@@ -260,7 +261,7 @@ impl Fleet {
         self.wait_for_all("ready").iter().map(parse).collect()
     }
 
-    /// What each node was told; none of roscpp's.
+    /// What each node was told. roscpp nodes report nothing.
     #[track_caller]
     fn traces(&self, nodes: &[Ready]) -> Traces {
         let begin = nodes
@@ -289,10 +290,10 @@ impl Fleet {
     }
 }
 
-/// A link: topic, subscriber and the publisher's address.
+/// A link: topic, subscriber, and address of the publisher.
 type Link = (String, String, String);
 
-/// The links that the state asks for.
+/// The links that belong to a state of the master.
 fn wanted(state: &State) -> BTreeSet<Link> {
     let apis: BTreeMap<_, _> = state.nodes.iter().cloned().collect();
     let mut links = BTreeSet::new();
@@ -311,7 +312,7 @@ fn wanted(state: &State) -> BTreeSet<Link> {
     links
 }
 
-/// The links that the nodes have.
+/// The links that the nodes have made.
 fn made(nodes: &[Ready]) -> BTreeSet<Link> {
     let mut links = BTreeSet::new();
     for node in nodes {
@@ -332,7 +333,7 @@ fn made(nodes: &[Ready]) -> BTreeSet<Link> {
     links
 }
 
-/// Starts the nodes of `plan` at a master of `place` and compares their links with its state.
+/// Starts the nodes of `plan` at a master of the kind `place`, and compares their links with its state.
 #[track_caller]
 pub(crate) fn start(place: Place, plan: &Plan, seed: u64) -> Start {
     let mut dice = Dice(seed);

@@ -1,8 +1,8 @@
-//! What every integration test stands on: real rosmasters and nodes, rosrescue itself, fakes of both
-//! ends, the state of a master, and patience.
+//! The base of all integration tests: real rosmasters and nodes, rosrescue itself, fakes of both sides, the
+//! state of a master, and waiting for conditions.
 //!
-//! Whatever a test starts carries the token of its [`Scratch`] in its environment and is ended, by its
-//! own process id, when the scratch folder is dropped, after a panic too.
+//! Every process that a test starts carries the token of its [`Scratch`] in its environment. When the scratch
+//! folder is dropped, even after a panic, all of them are ended by their process ids.
 
 #![allow(
     dead_code,
@@ -66,12 +66,12 @@ pub(crate) use status::{names, status};
 pub(crate) use streams::{LIBRARIES, Streams, port_of};
 pub(crate) use twins::{Twins, assert_form};
 
-/// `value` for a message, cut where it becomes long.
+/// `value` as text for a message, shortened if it is long.
 pub(crate) fn short(value: impl std::fmt::Debug) -> String {
     format!("{value:?}").chars().take(200).collect()
 }
 
-/// The parameters of a call: everything that [`rosrescue::xmlrpc::Value`] can be made from.
+/// The parameters of a call, from anything that converts to [`rosrescue::xmlrpc::Value`].
 #[allow(unused_macros)]
 macro_rules! params {
     ($($param:expr),* $(,)?) => {
@@ -91,7 +91,8 @@ macro_rules! tree {
 }
 pub(crate) use tree;
 
-/// A test for each way to run rosrescue, `name::core` and `name::proxy`, that call `name` with the mode.
+/// Makes a test for each way to run rosrescue, `name::core` and `name::proxy`, which call `name` with the
+/// mode.
 #[allow(unused_macros)]
 macro_rules! in_both_modes {
     ($($test:ident),* $(,)?) => {$(
@@ -112,7 +113,7 @@ macro_rules! in_both_modes {
 }
 pub(crate) use in_both_modes;
 
-/// As [`in_both_modes`], for each client library, too: each test is called with a library and the mode.
+/// Like [`in_both_modes`], also for each client library: each test is called with a library and a mode.
 #[allow(unused_macros)]
 macro_rules! everywhere {
     ($($test:ident),* $(,)?) => {$(

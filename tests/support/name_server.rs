@@ -1,4 +1,4 @@
-//! A name server of a test's own, for single processes.
+//! A name server that a test runs for single processes.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -12,31 +12,31 @@ use std::time::Duration;
 use super::process::behind;
 use super::scratch::Scratch;
 
-/// A name server on a loopback address of its own. Needs root. Ends with the test's process.
+/// A name server at a loopback address of its own. Needs root. It ends with the test's process.
 #[derive(Debug)]
 pub(crate) struct NameServer {
     resolv: PathBuf,
     says: Arc<Mutex<Says>>,
 }
 
-/// What it says to a question.
+/// How the name server answers.
 #[derive(Debug)]
 enum Says {
     Nothing,
-    /// Every name is this one's, said after some time.
+    /// Every name has this address; the answer comes after this time.
     Always(Ipv4Addr, Duration),
-    /// There are these hosts and no others.
+    /// Only these hosts exist.
     Hosts(BTreeMap<String, Ipv4Addr>),
 }
 
 impl NameServer {
-    /// One that never answers.
+    /// Starts a name server that never answers.
     #[track_caller]
     pub(crate) fn silent(scratch: &Scratch) -> Self {
         Self::start(scratch, Says::Nothing)
     }
 
-    /// One that knows no host yet.
+    /// Starts a name server that knows no hosts yet.
     #[track_caller]
     pub(crate) fn of_hosts(scratch: &Scratch) -> Self {
         Self::start(scratch, Says::Hosts(BTreeMap::new()))
@@ -49,7 +49,7 @@ impl NameServer {
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
         let host = format!("127.{}.{}.{}", 64 + (id >> 8) % 128, id & 255, 53 + number);
         let socket = UdpSocket::bind((host.as_str(), 53));
-        let socket = socket.expect("root, and the port of name servers");
+        let socket = socket.expect("the port of name servers cannot be bound: it needs root");
         let resolv = scratch.path("resolv.conf");
         let text = format!("nameserver {host}\noptions timeout:5\n");
         std::fs::write(&resolv, text).unwrap();
@@ -62,26 +62,26 @@ impl NameServer {
         this
     }
 
-    /// Every name is that of `address` from now on; it says so after `delay`.
+    /// Gives every name this address from now on, and answers after `delay`.
     pub(crate) fn say(&self, address: Ipv4Addr, delay: Duration) {
         *self.says.lock().unwrap() = Says::Always(address, delay);
     }
 
-    /// It answers no more.
+    /// Answers no more questions.
     pub(crate) fn fall_silent(&self) {
         *self.says.lock().unwrap() = Says::Nothing;
     }
 
-    /// The host is there from now on, or has moved.
+    /// Adds a host, or moves it to another address.
     pub(crate) fn set(&self, host: &str, address: Ipv4Addr) {
         let mut says = self.says.lock().unwrap();
         let Says::Hosts(hosts) = &mut *says else {
-            panic!("it knows no hosts");
+            panic!("this name server has no list of hosts");
         };
         hosts.insert(host.to_owned(), address);
     }
 
-    /// `command`, to be run with this as its name server: `unshare` gives it a resolv.conf of its own.
+    /// Wraps `command` so that it uses this name server: `unshare` gives it a resolv.conf of its own.
     pub(crate) fn serving(&self, command: &Command) -> Command {
         let mut unshare = Command::new("unshare");
         unshare
@@ -110,7 +110,7 @@ fn serve(socket: &UdpSocket, says: &Mutex<Says>) {
     }
 }
 
-/// The host that a query of one question is about.
+/// The host name in a query with one question.
 fn host(query: &[u8]) -> String {
     let (mut labels, mut at) = (Vec::new(), 12);
     while query[at] != 0 {
@@ -121,20 +121,20 @@ fn host(query: &[u8]) -> String {
     labels.join(".")
 }
 
-/// The reply to a query of one question: the address if it asks for one of IPv4; NXDOMAIN if the host is
-/// not there.
+/// The reply to a query with one question: the address if the question is for IPv4, or NXDOMAIN if there is
+/// no such host.
 fn reply(query: &[u8], address: Option<Ipv4Addr>) -> Vec<u8> {
     let name = query[12..].iter().position(|&byte| byte == 0).unwrap();
     let question = &query[12..12 + name + 5];
     let code = if address.is_some() { 0 } else { 3 };
     let address = address.filter(|_| question[name + 1..] == [0, 1, 0, 1]);
-    // Id, "a reply, recursion available" with the code, counts, the question as it came.
+    // Id, flags "reply, recursion available" with the code, counts, and the question unchanged.
     let mut reply = query[..2].to_vec();
     let count = u8::from(address.is_some());
     reply.extend([0x81, 0x80 | code, 0, 1, 0, count, 0, 0, 0, 0]);
     reply.extend(question);
     if let Some(address) = address {
-        // The name of the question, type A, class IN, for no time at all, four bytes.
+        // The name in the question, type A, class IN, time to live 0, length 4.
         reply.extend([0xc0, 12, 0, 1, 0, 1, 0, 0, 0, 0, 0, 4]);
         reply.extend(address.octets());
     }

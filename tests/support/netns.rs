@@ -1,12 +1,12 @@
-//! A computer of its own beyond a cable: a network namespace, from which and to which packets can be
-//! made to vanish. Needs root and iproute2.
+//! Another computer at the end of a cable: a network namespace, with a way to make packets to it or from it
+//! vanish. Needs root and iproute2.
 
 use std::process::Command;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use super::process::behind;
 
-/// A network namespace with a veth to this one. Both go on drop.
+/// A network namespace with a veth to this one. Both are removed on drop.
 #[derive(Debug)]
 pub(crate) struct Netns {
     name: String,
@@ -14,11 +14,11 @@ pub(crate) struct Netns {
     net: String,
 }
 
-/// Runs `ip`; panics with what it says.
+/// Runs `ip`. Panics with its output if it fails.
 #[track_caller]
 pub(crate) fn ip(words: &str) {
     let output = Command::new("ip").args(words.split(' ')).output();
-    let output = output.expect("`ip`: tests/run.sh installs iproute2");
+    let output = output.expect("`ip` is missing: tests/run.sh installs iproute2");
     assert!(
         output.status.success(),
         "ip {words}: {}(network namespaces need root)",
@@ -32,7 +32,7 @@ impl Netns {
         static COUNT: AtomicU8 = AtomicU8::new(0);
         let number = COUNT.fetch_add(1, Ordering::Relaxed);
         let pid = std::process::id();
-        // 32 networks for each of 1,024 test processes that may run at the same time.
+        // 32 networks for each of the 1,024 test processes that may run at the same time.
         let net = (pid % 1024) * 32 + u32::from(number) % 32;
         let net = format!("10.{}.{}", 64 + (net >> 8), net & 255);
         let near = format!("rr{pid}n{number}");
@@ -57,20 +57,20 @@ impl Netns {
         this
     }
 
-    /// Our own address, as the other side sees it.
+    /// The address of this side, as the other side sees it.
     pub(crate) fn near(&self) -> String {
         format!("{}.1", self.net)
     }
 
-    /// An address of the other side. There are those from 2 to 39.
+    /// An address of the other side. `host` is from 2 to 39.
     pub(crate) fn far(&self, host: u8) -> String {
         format!("{}.{host}", self.net)
     }
 
-    /// Gives both sides addresses of IPv6, too: [`Self::near6`], and those of [`Self::far6`] from 2 to 5.
+    /// Gives both sides IPv6 addresses as well: [`Self::near6`], and [`Self::far6`] from 2 to 5.
     pub(crate) fn add_ipv6(&self) {
         let Self { name, near, .. } = self;
-        // At once, and not after a search for the same address elsewhere.
+        // `nodad`: usable at once, without a search for duplicates.
         ip(&format!("addr add {}/64 dev {near} nodad", self.near6()));
         let far = near.replacen('n', "f", 1);
         for host in 2..6 {
@@ -81,32 +81,32 @@ impl Netns {
         }
     }
 
-    /// As [`Self::near`], of IPv6.
+    /// The IPv6 address of this side.
     pub(crate) fn near6(&self) -> String {
         self.far6(1)
     }
 
-    /// As [`Self::far`], of IPv6.
+    /// An IPv6 address of the other side.
     pub(crate) fn far6(&self, host: u8) -> String {
         let net = self.net.replace('.', ":");
         format!("fd00:{net}::{host}")
     }
 
-    /// Packets to that address vanish from now on.
+    /// Makes packets to that address vanish.
     pub(crate) fn cut(&self, host: u8) {
         let Self { near, net, .. } = self;
-        // A permanent entry for an Ethernet address that nobody has.
+        // A permanent entry for an Ethernet address that no device has.
         ip(&format!(
             "neigh replace {net}.{host} lladdr 02:00:00:00:00:99 dev {near} nud permanent"
         ));
     }
 
-    /// Packets to that address arrive again.
+    /// Lets packets to that address arrive again.
     pub(crate) fn mend(&self, host: u8) {
         ip(&format!("neigh del {}.{host} dev {}", self.net, self.near));
     }
 
-    /// Our own address changes, as by DHCP: what was connected from [`near`](Self::near) is lost, and
+    /// Changes the address of this side, as DHCP may do: connections from [`near`](Self::near) are lost, and
     /// nobody is told.
     pub(crate) fn move_near(&self) {
         let Self { near, net, .. } = self;
@@ -114,7 +114,7 @@ impl Netns {
         ip(&format!("addr add {net}.100/24 dev {near}"));
     }
 
-    /// `command`, to be run on the other side.
+    /// Wraps `command` so that it runs on the other side.
     pub(crate) fn inside(&self, command: &Command) -> Command {
         let mut inside = Command::new("ip");
         inside.args(["netns", "exec", &self.name]);
@@ -124,7 +124,8 @@ impl Netns {
 
 impl Drop for Netns {
     fn drop(&mut self) {
-        // The veth goes with the namespace once its last process has ended, and at once by name.
+        // The veth vanishes with the namespace, after its last process has ended. Deleting it by name is
+        // immediate.
         let _ = Command::new("ip")
             .args(["link", "del", &self.near])
             .output();

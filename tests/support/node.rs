@@ -1,4 +1,4 @@
-//! Real nodes of both client libraries, and what they say (`tests/nodes/lines.py`).
+//! Real nodes of both client libraries, and what they print (`tests/nodes/lines.py`).
 
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::process::Process;
 use super::ros::{NODES, cpp_nodes, ros_command};
 use super::scratch::Scratch;
 
-/// A client library of ROS.
+/// A ROS client library.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Library {
     Rospy,
@@ -17,7 +17,7 @@ pub(crate) enum Library {
 }
 
 impl Library {
-    /// A command that runs `node` of this library at the master at `port`. Debian's rospy belongs to
+    /// A command that runs `node` of this library with the master at `port`. Debian's rospy works only with
     /// the system's Python, whatever the PATH says.
     pub(crate) fn command(self, scratch: &Scratch, port: u16, node: &str) -> Command {
         match self {
@@ -38,7 +38,7 @@ pub(crate) struct Node {
 }
 
 impl Node {
-    /// Starts `node` with `arguments` (remappings too) and does not wait for it.
+    /// Starts `node` with `arguments` (including remappings) without waiting for it.
     #[track_caller]
     pub(crate) fn spawn(
         scratch: &Scratch,
@@ -55,7 +55,7 @@ impl Node {
         }
     }
 
-    /// Starts `node` and waits until it is at work.
+    /// Starts `node` and waits until it is ready.
     #[track_caller]
     pub(crate) fn start(
         scratch: &Scratch,
@@ -69,7 +69,7 @@ impl Node {
         node
     }
 
-    /// Runs a node by `command` and waits until it is at work.
+    /// Runs a node by `command` and waits until it is ready.
     #[track_caller]
     pub(crate) fn run(command: &mut Command) -> Self {
         let process = Process::start(format!("{command:?}"), command);
@@ -78,7 +78,7 @@ impl Node {
         node
     }
 
-    /// The rest of every line that begins with `word`.
+    /// The rest of each line that starts with `word`.
     pub(crate) fn said(&self, word: &str) -> Vec<String> {
         let start = format!("{word} ");
         let lines = self.process.stdout();
@@ -89,7 +89,7 @@ impl Node {
             .collect()
     }
 
-    /// The numbers of the messages of `publisher` that a listener got, as they came.
+    /// The numbers of the messages that a listener received from `publisher`, in order.
     pub(crate) fn messages(&self, publisher: &str) -> Vec<u64> {
         let start = format!("{publisher} ");
         let got = self.said("got");
@@ -98,7 +98,7 @@ impl Node {
             .collect()
     }
 
-    /// The numbers of live links, as they changed.
+    /// The number of live links, each time it changed.
     pub(crate) fn links(&self) -> Vec<usize> {
         self.said("links")
             .iter()
@@ -106,7 +106,7 @@ impl Node {
             .collect()
     }
 
-    /// The publishers of every publisherUpdate for `topic`, as they came.
+    /// The list of publishers in each publisherUpdate for `topic`, in order.
     pub(crate) fn updates(&self, topic: &str) -> Vec<Vec<String>> {
         let updates = self.said("update");
         updates
@@ -117,7 +117,7 @@ impl Node {
             .collect()
     }
 
-    /// Waits until `more` further messages of `publisher` have come.
+    /// Waits until `more` further messages of `publisher` have been received.
     #[track_caller]
     pub(crate) fn wait_messages(&self, publisher: &str, more: usize) {
         let before = self.messages(publisher).len();
@@ -127,38 +127,38 @@ impl Node {
         );
     }
 
-    /// Panics unless the messages of `publisher` came without a gap, a repetition or a disorder.
+    /// Panics unless all messages of `publisher` were received once and in order.
     #[track_caller]
     pub(crate) fn assert_no_message_lost(&self, publisher: &str) {
         let messages = self.messages(publisher);
         assert!(
             !messages.is_empty(),
-            "no message of {publisher} came at all"
+            "no message of {publisher} was received"
         );
         for pair in messages.windows(2) {
             assert!(
                 pair[1] == pair[0] + 1,
-                "after message {} of {publisher} came {}",
+                "after message {} of {publisher}, message {} was received",
                 pair[0],
                 pair[1]
             );
         }
     }
 
-    /// Panics unless a listener that says only some messages has seen no gap between those of
-    /// `publisher`. Answers how many came at least.
+    /// Panics unless a listener that prints only some messages has seen no gap between those of `publisher`.
+    /// Returns how many were received at least.
     #[track_caller]
     pub(crate) fn assert_no_gap(&self, publisher: &str) -> u64 {
         let messages = self.messages(publisher);
         let [first, .., last] = messages.as_slice() else {
-            panic!("hardly a message of {publisher} came: {messages:?}");
+            panic!("too few messages of {publisher} were received: {messages:?}");
         };
         let gaps = self.said("gap");
         assert!(gaps.is_empty(), "{gaps:?}\n{}", self.process.log());
         last - first + 1
     }
 
-    /// Panics if the number of links ever went down.
+    /// Panics if the number of links ever decreased.
     #[track_caller]
     pub(crate) fn assert_no_link_lost(&self) {
         let links = self.links();

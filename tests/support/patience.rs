@@ -1,10 +1,10 @@
-//! Waiting: for a condition, with a bound, never for a time.
+//! Waiting for a condition, with a limit, instead of for a fixed time.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-/// How long anything may take on two busy cores before a test gives up.
+/// How long anything may take on two busy cores before a test fails.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 
 const STEP: Duration = Duration::from_millis(10);
@@ -25,13 +25,13 @@ pub(crate) fn eventually_some<T>(what: &str, mut look: impl FnMut() -> Option<T>
         }
         assert!(
             start.elapsed() < PATIENCE,
-            "never happened in {PATIENCE:?}: {what}"
+            "did not happen within {PATIENCE:?}: {what}"
         );
         sleep(STEP);
     }
 }
 
-/// Whether `condition` holds all through `span`: for what must *not* happen.
+/// Whether `condition` holds during all of `span`. For what must *not* happen.
 pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool {
     let start = Instant::now();
     while start.elapsed() < span {
@@ -43,7 +43,7 @@ pub(crate) fn holds(span: Duration, mut condition: impl FnMut() -> bool) -> bool
     true
 }
 
-/// Tells the threads that look at it to end, when it is dropped: after a panic, too.
+/// Tells threads to end when it is dropped, even after a panic.
 pub(crate) struct Finish<'a>(pub(crate) &'a AtomicBool);
 
 impl Drop for Finish<'_> {

@@ -1,4 +1,4 @@
-//! A child process whose output is watched.
+//! Child processes whose output is recorded.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -11,7 +11,7 @@ use rustix::process::{Pid, Signal};
 
 use super::patience::{eventually, eventually_some};
 
-/// Sends `signal` to one process. A process that is gone is no error.
+/// Sends `signal` to one process. It is not an error if the process is gone.
 pub(crate) fn signal(pid: u32, signal: Signal) {
     let pid = i32::try_from(pid)
         .ok()
@@ -20,7 +20,7 @@ pub(crate) fn signal(pid: u32, signal: Signal) {
     let _ = rustix::process::kill_process(pid, signal);
 }
 
-/// SIGSTOP, and the stop: the kernel takes its time with the threads that run on another core.
+/// Sends SIGSTOP and waits until all threads have stopped, which takes a moment for those on other cores.
 #[track_caller]
 pub(crate) fn stop(pid: u32) {
     signal(pid, Signal::STOP);
@@ -33,15 +33,15 @@ pub(crate) fn stop(pid: u32) {
     });
 }
 
-/// Whether a process with this id is there and is no zombie.
+/// Whether there is a process with this id that is not a zombie.
 pub(crate) fn alive(pid: u32) -> bool {
     state(Path::new(&format!("/proc/{pid}"))).is_some_and(|state| state != 'Z')
 }
 
-/// The state letter of a process or thread, if it is there.
+/// The state letter of a process or thread. `None` if it is gone.
 fn state(folder: &Path) -> Option<char> {
     let stat = std::fs::read_to_string(folder.join("stat")).ok()?;
-    // The command's name comes before, in parentheses, with whatever it likes in it.
+    // The name of the command comes first, in parentheses, and may itself contain any characters.
     stat.rsplit(')').next()?.trim_start().chars().next()
 }
 
@@ -58,7 +58,7 @@ struct Line {
     text: String,
 }
 
-/// A running (or ended) child. It is killed on drop; after a panic its output is shown.
+/// A child process, running or ended. It is killed on drop; after a panic its output is shown.
 #[derive(Debug)]
 pub(crate) struct Process {
     name: String,
@@ -97,7 +97,7 @@ impl Process {
         self.child.id()
     }
 
-    /// A value of its `/proc/PID/status` that is in KiB, such as `VmRSS`, and `VmHWM`, the most that it was.
+    /// A value in KiB from `/proc/PID/status`, such as `VmRSS` or its maximum so far, `VmHWM`.
     #[track_caller]
     pub(crate) fn kib(&self, name: &str) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
@@ -111,20 +111,20 @@ impl Process {
         }
     }
 
-    /// SIGKILL, and the end of the process.
+    /// Sends SIGKILL and waits for the end of the process.
     pub(crate) fn kill(&mut self) {
         self.signal(Signal::KILL);
         self.wait();
     }
 
-    /// SIGTERM, and the end of the process within [`PATIENCE`].
+    /// Sends SIGTERM and waits up to [`PATIENCE`] for the end of the process.
     #[track_caller]
     pub(crate) fn terminate(&mut self) -> ExitStatus {
         self.signal(Signal::TERM);
         self.wait()
     }
 
-    /// The exit status, if the process has ended.
+    /// The exit status. `None` while the process runs.
     pub(crate) fn exited(&mut self) -> Option<ExitStatus> {
         if self.ended.is_none() {
             self.ended = self.child.try_wait().expect("cannot wait for a child");
@@ -132,34 +132,34 @@ impl Process {
         self.ended
     }
 
-    /// The exit status once the process has ended by itself.
+    /// Waits until the process ends by itself. Returns its exit status.
     #[track_caller]
     pub(crate) fn wait(&mut self) -> ExitStatus {
         let what = format!("{} ends", self.name);
         eventually_some(&what, || self.exited())
     }
 
-    /// The exit status once the process has ended by itself and all that it wrote has been read. Whoever
+    /// Waits until the process ends by itself and all its output has been read. Every process that has
     /// inherited its pipes must have ended too.
     #[track_caller]
     pub(crate) fn wait_output(&mut self) -> ExitStatus {
         let status = self.wait();
-        let what = format!("the output of {} is whole", self.name);
+        let what = format!("all output of {} has been read", self.name);
         eventually(&what, || self.readers.iter().all(JoinHandle::is_finished));
         status
     }
 
-    /// What it wrote to standard output so far, line by line.
+    /// What it has written to standard output so far, line by line.
     pub(crate) fn stdout(&self) -> Vec<String> {
         self.text(Some(Stream::Out))
     }
 
-    /// What it wrote to standard error so far, line by line.
+    /// What it has written to standard error so far, line by line.
     pub(crate) fn stderr(&self) -> Vec<String> {
         self.text(Some(Stream::Err))
     }
 
-    /// Everything it wrote so far, line by line.
+    /// Everything it has written so far, line by line.
     pub(crate) fn output(&self) -> Vec<String> {
         self.text(None)
     }
@@ -173,7 +173,7 @@ impl Process {
             .collect()
     }
 
-    /// Waits for a line, on either stream, that `wanted` accepts. Panics if the process ends first.
+    /// Waits for a line on either stream that `wanted` accepts. Panics if the process ends first.
     #[track_caller]
     pub(crate) fn wait_line(&mut self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
         let what = format!("{} says {what}", self.name);
@@ -181,12 +181,12 @@ impl Process {
             let ended = self.exited();
             let found = self.output().into_iter().find(|line| wanted(line));
             if let (None, Some(status)) = (&found, ended) {
-                // What it wrote last may still be on its way through the pipe.
+                // Its last output may still be on the way through the pipe.
                 thread::sleep(Duration::from_millis(200));
                 let found = self.output().into_iter().find(|line| wanted(line));
                 assert!(
                     found.is_some(),
-                    "never happened: {what}; it ended with {status}"
+                    "did not happen: {what}; the process ended with {status}"
                 );
                 return found;
             }
@@ -194,11 +194,11 @@ impl Process {
         })
     }
 
-    /// The output for a person.
+    /// The output as text to show when a test fails.
     pub(crate) fn log(&self) -> String {
         let lines = self.lines.lock().unwrap();
         let mut log = format!("---- {} (process {})\n", self.name, self.pid());
-        // A talker says thousands of lines; of a run of them the first and the last tell the story.
+        // A talker prints thousands of lines. The first and the last one of a run are enough.
         let run = |line: &Line| {
             line.text
                 .split(' ')
@@ -243,7 +243,7 @@ fn collect(
     thread::spawn(move || {
         let mut from = BufReader::new(from);
         let mut bytes = Vec::new();
-        // The end of the pipe, or an error, is the end of what there is to read.
+        // The end of the pipe and an error both mean that there is nothing more to read.
         while from
             .read_until(b'\n', &mut bytes)
             .is_ok_and(|count| count > 0)
@@ -259,7 +259,7 @@ fn collect(
     })
 }
 
-/// `inner`, run by `outer`, which takes a command behind its own arguments.
+/// Runs `inner` by `outer`, which takes a command after its own arguments.
 pub(crate) fn behind(mut outer: Command, inner: &Command) -> Command {
     outer.arg(inner.get_program()).args(inner.get_args());
     for (key, value) in inner.get_envs() {

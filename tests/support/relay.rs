@@ -1,4 +1,4 @@
-//! What stands between rosrescue and a master, and swallows replies.
+//! A relay between rosrescue and a master that can swallow replies.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -9,21 +9,21 @@ use super::rescue::{Rescue, Setup};
 use super::ros::Rosmaster;
 use super::scratch::Scratch;
 
-/// A marker in a request, and how many replies to such requests are to be swallowed yet.
-type Hunger = Arc<Mutex<(Vec<u8>, u32)>>;
+/// A text in requests, and how many replies to such requests are still to be swallowed.
+type Swallow = Arc<Mutex<(Vec<u8>, u32)>>;
 
-/// Relays connections to a port on this computer. Ends with the test's process.
+/// Relays connections to a port on this computer. It ends with the test's process.
 #[derive(Debug)]
 pub(crate) struct Relay {
     port: u16,
-    hunger: Hunger,
+    to_swallow: Swallow,
     target: Arc<Mutex<u16>>,
-    /// The connections to the present target.
+    /// The open connections to the present target.
     open: Arc<Mutex<Vec<TcpStream>>>,
 }
 
 impl Relay {
-    /// A rosmaster behind a relay, and rosrescue before it.
+    /// A rosmaster, a relay in front of it, and rosrescue in front of the relay.
     pub(crate) fn between(scratch: &Scratch) -> (Rosmaster, Self, Rescue) {
         let master = Rosmaster::start(scratch);
         let relay = Self::to(master.port);
@@ -31,38 +31,38 @@ impl Relay {
         (master, relay, rescue)
     }
 
-    /// A relay to `port`.
+    /// Starts a relay to `port`.
     pub(crate) fn to(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
-        let hunger = Hunger::default();
+        let to_swallow = Swallow::default();
         let (target, open) = (Arc::new(Mutex::new(port)), Arc::default());
         let relay = Self {
             port: listener.local_addr().unwrap().port(),
-            hunger: hunger.clone(),
+            to_swallow: to_swallow.clone(),
             target: Arc::clone(&target),
             open: Arc::clone(&open),
         };
         thread::spawn(move || {
             for near in listener.incoming().map_while(Result::ok) {
                 let port = *target.lock().unwrap();
-                // Without a master the connection is closed.
+                // If there is no master, the connection is closed.
                 if let Ok(far) = TcpStream::connect(("127.0.0.1", port)) {
-                    let hunger = hunger.clone();
+                    let to_swallow = to_swallow.clone();
                     open.lock().unwrap().push(near.try_clone().unwrap());
-                    thread::spawn(move || carry(&near, &far, &hunger));
+                    thread::spawn(move || carry(&near, &far, &to_swallow));
                 }
             }
         });
         relay
     }
 
-    /// Where it listens.
+    /// The port at which the relay listens.
     pub(crate) fn port(&self) -> u16 {
         self.port
     }
 
-    /// From now on it leads to `port`, and its connections end: a virtual address moves, or a cable is
-    /// cut if nobody listens there.
+    /// Relays to `port` from now on, and ends the present connections: as when a virtual address moves, or,
+    /// if no process listens there, when a cable is cut.
     pub(crate) fn turn_to(&self, port: u16) {
         *self.target.lock().unwrap() = port;
         for connection in self.open.lock().unwrap().drain(..) {
@@ -70,19 +70,19 @@ impl Relay {
         }
     }
 
-    /// The next `count` requests that hold `marker` reach the master, and their replies do not come
-    /// back: the connection is closed instead.
+    /// Lets the next `count` requests that contain `marker` reach the master, but closes their connections
+    /// instead of passing on the replies.
     pub(crate) fn swallow(&self, marker: &str, count: u32) {
-        *self.hunger.lock().unwrap() = (marker.into(), count);
+        *self.to_swallow.lock().unwrap() = (marker.into(), count);
     }
 
-    /// How many replies are to be swallowed yet.
-    pub(crate) fn hunger(&self) -> u32 {
-        self.hunger.lock().unwrap().1
+    /// How many replies are still to be swallowed.
+    pub(crate) fn to_swallow(&self) -> u32 {
+        self.to_swallow.lock().unwrap().1
     }
 }
 
-fn carry(near: &TcpStream, far: &TcpStream, hunger: &Hunger) {
+fn carry(near: &TcpStream, far: &TcpStream, to_swallow: &Swallow) {
     let request = Arc::new(Mutex::new(Vec::new()));
     let (mut from, mut to) = (near.try_clone().unwrap(), far.try_clone().unwrap());
     let seen = request.clone();
@@ -99,15 +99,15 @@ fn carry(near: &TcpStream, far: &TcpStream, hunger: &Hunger) {
     let (mut far, mut near) = (far, near);
     let mut buffer = [0; 65536];
     while let Ok(count @ 1..) = far.read(&mut buffer) {
-        // The master has run what it answers.
+        // The master has run the request, because it answers.
         let request = std::mem::take(&mut *request.lock().unwrap());
-        let mut hunger = hunger.lock().unwrap();
-        let (marker, left) = &mut *hunger;
+        let mut to_swallow = to_swallow.lock().unwrap();
+        let (marker, left) = &mut *to_swallow;
         if *left > 0 && request.windows(marker.len()).any(|part| part == marker) {
             *left -= 1;
             break;
         }
-        drop(hunger);
+        drop(to_swallow);
         if near.write_all(&buffer[..count]).is_err() {
             break;
         }

@@ -1,4 +1,4 @@
-//! rosrescue itself, as a person starts it.
+//! rosrescue itself, started like a user would.
 
 use std::ffi::OsStr;
 use std::ops::{Deref, DerefMut};
@@ -13,13 +13,13 @@ use super::process::{Process, behind};
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 
-/// Set, rosrescue is a single process.
+/// If this variable is set, rosrescue runs as a single process.
 const NO_GUARDIAN: &str = "ROSRESCUE_NO_GUARDIAN";
 
-/// The rosrescue that is started: this build's, unless another one is set before.
+/// The program to start: the one that was just built, unless another one has been set.
 pub(crate) static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
-/// How to start rosrescue; the same again after a crash.
+/// How to start rosrescue. After a crash it can be started again in the same way.
 #[derive(Debug)]
 pub(crate) struct Setup {
     command: Command,
@@ -28,7 +28,7 @@ pub(crate) struct Setup {
 }
 
 impl Setup {
-    /// `rosrescue` with `arguments` and nothing else but the environment of the scratch folder.
+    /// `rosrescue` with `arguments` and only the environment of the scratch folder.
     pub(crate) fn bare<I: AsRef<OsStr>>(
         scratch: &Scratch,
         arguments: impl IntoIterator<Item = I>,
@@ -37,11 +37,11 @@ impl Setup {
         let mut command = Command::new(PROGRAM.get_or_init(own));
         scratch.prepare(&mut command);
         command.args(arguments).current_dir(scratch.path(""));
-        // Most tests are about the worker: it is the process that they signal and measure. Its memory is
-        // managed as under a guardian.
+        // Most tests signal and measure the worker, so it runs without a guardian. Its memory is managed as
+        // under a guardian.
         let (name, value) = TUNABLES;
         command.env(NO_GUARDIAN, "1").env(name, value);
-        // On a busy computer any master is late at times. Tests of that give the time themselves.
+        // On a busy computer any master is late from time to time. Tests about that set a time themselves.
         command.env("ROSRESCUE_STAND_IN_AFTER", "5000");
         Self {
             command,
@@ -50,7 +50,7 @@ impl Setup {
         }
     }
 
-    /// `rosrescue core` on a free port, its rosmaster on `master_port`.
+    /// `rosrescue core` on a free port, with its rosmaster on `master_port`.
     pub(crate) fn core(scratch: &Scratch, master_port: u16) -> Self {
         let port = free_port();
         let setup = Self::bare(scratch, ["core", "-p", &port.to_string()]);
@@ -58,7 +58,7 @@ impl Setup {
         setup.arg("--master-port").arg(master_port.to_string())
     }
 
-    /// `rosrescue proxy` on a free port before the master at `master_port`.
+    /// `rosrescue proxy` on a free port, in front of the master at `master_port`.
     pub(crate) fn proxy(scratch: &Scratch, master_port: u16) -> Self {
         let port = free_port();
         let master = format!("http://127.0.0.1:{master_port}");
@@ -81,13 +81,13 @@ impl Setup {
         self
     }
 
-    /// Runs it by another command, which `wrap` makes of its own.
+    /// Runs it by another command, which `wrap` makes from the original one.
     pub(crate) fn wrapped(mut self, wrap: impl FnOnce(&Command) -> Command) -> Self {
         self.command = wrap(&self.command);
         self
     }
 
-    /// With its guardian, as a person runs it: the process that is started is the guardian then.
+    /// Runs it with its guardian, as users do. The process that is started is then the guardian.
     pub(crate) fn guarded(mut self) -> Self {
         self.command.env_remove(NO_GUARDIAN).env_remove(TUNABLES.0);
         self
@@ -106,8 +106,8 @@ impl Setup {
         self
     }
 
-    /// As if the computer had been booted with `boot_id`: a private mount shows it in place of the
-    /// kernel's own.
+    /// Makes the computer look as if it had booted with `boot_id`: a private mount shows it in place of the
+    /// kernel's file.
     fn in_boot(&mut self, boot_id: &Path) {
         const SHOW: &str = r#"mount --bind "$0" /proc/sys/kernel/random/boot_id && exec "$@""#;
         let mut command = Command::new("unshare");
@@ -118,7 +118,7 @@ impl Setup {
         self.command = behind(command, &self.command);
     }
 
-    /// Starts it and waits until it serves a living master.
+    /// Starts rosrescue and waits until it serves calls with a living master.
     #[track_caller]
     pub(crate) fn start(self) -> Rescue {
         let mut rescue = self.spawn();
@@ -126,7 +126,7 @@ impl Setup {
         rescue
     }
 
-    /// Starts it and waits for nothing.
+    /// Starts rosrescue without waiting.
     #[track_caller]
     pub(crate) fn spawn(mut self) -> Rescue {
         let process = Process::start("rosrescue", &mut self.command);
@@ -137,7 +137,7 @@ impl Setup {
     }
 }
 
-/// A running rosrescue. On drop it is killed; what it started ends with the scratch folder.
+/// A running rosrescue. It is killed on drop; what it has started ends with the scratch folder.
 #[derive(Debug)]
 pub(crate) struct Rescue {
     process: Process,
@@ -157,27 +157,30 @@ impl Rescue {
         Client::new(self.setup.port)
     }
 
-    /// Waits until it has said its address and that it protects a living master.
+    /// Waits until it has printed its address and reports that it protects a living master.
     #[track_caller]
     pub(crate) fn wait_serving(&mut self) {
         self.wait_line("its address", |line| {
             line.contains("ROS_MASTER_URI=http://")
         });
-        self.wait_line("the paper's words", |line| {
+        self.wait_line("rosrescue prints the paper's message", |line| {
             line.contains("ROS Rescue enabled. Master is now fault tolerant!!")
         });
     }
 
-    /// Starts it again, with the same arguments, after it has ended; waits for nothing.
+    /// Starts it again after it has ended, with the same arguments and without waiting.
     #[track_caller]
     pub(crate) fn start_again(&mut self) {
-        assert!(self.process.exited().is_some(), "rosrescue still runs");
+        assert!(
+            self.process.exited().is_some(),
+            "rosrescue is still running"
+        );
         self.assert_no_panic();
         self.process = Process::start("rosrescue, again", &mut self.setup.command);
     }
 
-    /// Starts it again as after a reboot of its computer, `boot_id` being a file that holds the new
-    /// boot's id; waits for nothing.
+    /// Starts it again without waiting, as after a reboot of its computer. `boot_id` is a file with the boot
+    /// id of the new boot.
     #[track_caller]
     pub(crate) fn start_after_reboot(&mut self, boot_id: &Path) {
         self.setup.in_boot(boot_id);

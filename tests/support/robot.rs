@@ -1,4 +1,4 @@
-//! A robot's ROS with rosrescue in it, in either mode: what a test kills and brings back.
+//! The ROS of a robot with rosrescue, in either mode, whose parts a test can kill and bring back.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -18,12 +18,12 @@ use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 use super::state::State;
 
-/// How rosrescue is run.
+/// Which command of rosrescue runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mode {
-    /// rosrescue starts and restarts the master.
+    /// `rosrescue core`: rosrescue starts and restarts the master.
     Core,
-    /// The test starts and restarts it.
+    /// `rosrescue proxy`: the test starts and restarts the master.
     Proxy,
 }
 
@@ -31,13 +31,13 @@ pub(crate) enum Mode {
 #[derive(Debug)]
 pub(crate) struct Robot {
     mode: Mode,
-    // The order is that of the drops: who restarts others goes first, the scratch folder last.
+    // Fields are dropped in this order: processes that restart others first, the scratch folder last.
     pub(crate) rescue: Rescue,
     master: Option<Rosmaster>,
     master_port: u16,
-    /// The program and arguments of a proxy's master.
+    /// Program and arguments of the master of a proxy.
     program: (PathBuf, Vec<String>),
-    /// While this file is there, a core's next master waits (`tests/nodes/waiting_rosmaster.py`).
+    /// While this file exists, the next master of a core waits (`tests/nodes/waiting_rosmaster.py`).
     away: Option<PathBuf>,
     pub(crate) scratch: Scratch,
 }
@@ -48,19 +48,19 @@ impl Robot {
         Self::start_with(mode, &[])
     }
 
-    /// Starts one with more options for rosrescue.
+    /// Starts a robot, with further options for rosrescue.
     #[track_caller]
     pub(crate) fn start_with(mode: Mode, options: &[&str]) -> Self {
         Self::begin(mode, options, find_program("rosmaster"), &[])
     }
 
-    /// Starts one whose masters are `program` with `arguments`, in either mode.
+    /// Starts a robot whose masters run `program` with `arguments`, in either mode.
     #[track_caller]
     pub(crate) fn start_under(mode: Mode, program: &str, arguments: &[&str]) -> Self {
         Self::start_under_with(mode, program, arguments, &[])
     }
 
-    /// As [`Self::start_under`], with more options for rosrescue.
+    /// Like [`Self::start_under`], with further options for rosrescue.
     #[track_caller]
     pub(crate) fn start_under_with(
         mode: Mode,
@@ -78,8 +78,8 @@ impl Robot {
         }
     }
 
-    /// Starts one whose master, once it is killed, stays away until [`Self::revive_master`], also that
-    /// of a core.
+    /// Starts a robot whose master stays away after it was killed, until [`Self::revive_master`] is called,
+    /// even in core mode.
     #[track_caller]
     pub(crate) fn start_for_outages(mode: Mode) -> Self {
         let mut robot = Self::start_under(mode, "waiting_rosmaster.py", &[]);
@@ -111,7 +111,7 @@ impl Robot {
             scratch,
         };
         if mode == Mode::Core && !options.contains(&"--no-rosout") {
-            eventually("rosout is at work", || {
+            eventually("rosout is running", || {
                 State::try_read(&robot.bare()).is_ok_and(|state| state.knows("/rosout"))
             });
         }
@@ -123,12 +123,12 @@ impl Robot {
         self.rescue.port()
     }
 
-    /// A client through rosrescue.
+    /// A client that talks to rosrescue.
     pub(crate) fn client(&self) -> Client {
         self.rescue.client()
     }
 
-    /// A client of the real master: what it says is not what rosrescue says.
+    /// A client that talks directly to the real master.
     pub(crate) fn bare(&self) -> Client {
         Client::new(self.master_port)
     }
@@ -139,11 +139,11 @@ impl Robot {
         State::read(&self.bare())
     }
 
-    /// The state of the real master once nobody changes it any more.
+    /// The state of the real master, as soon as it stops changing.
     #[track_caller]
     pub(crate) fn settled_state(&self) -> State {
         let mut last = None;
-        eventually_some("the master's state is at rest", || {
+        eventually_some("the master's state stops changing", || {
             let now = State::try_read(&self.bare()).ok()?;
             if last.as_ref() == Some(&now) {
                 return last.take();
@@ -183,18 +183,18 @@ impl Robot {
     /// The process id of the real master.
     #[track_caller]
     pub(crate) fn master_pid(&self) -> u32 {
-        eventually_some("the master says its process id", || {
+        eventually_some("the master reports its process id", || {
             self.bare().master_pid()
         })
     }
 
-    /// From now on the master of one that was started under `waiting_rosmaster.py` stays away once it is
-    /// killed, until [`Self::revive_master`].
+    /// Makes the master of a robot that was started under `waiting_rosmaster.py` stay away after its next
+    /// death, until [`Self::revive_master`] is called.
     pub(crate) fn stay_away(&mut self) {
         self.away = (self.mode == Mode::Core).then(|| self.scratch.path("away"));
     }
 
-    /// SIGKILL to the real master.
+    /// Kills the real master with SIGKILL.
     #[track_caller]
     pub(crate) fn kill_master(&mut self) {
         if let Some(away) = &self.away {
@@ -206,7 +206,7 @@ impl Robot {
         }
     }
 
-    /// SIGKILL to the real master, until the mirror stands in.
+    /// Kills the real master with SIGKILL, and waits until the mirror stands in.
     #[track_caller]
     pub(crate) fn take_master_away(&mut self) {
         self.kill_master();

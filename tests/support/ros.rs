@@ -1,4 +1,4 @@
-//! The real things of ROS: rosmaster, the command line tools, and the place of the test nodes.
+//! The real parts of ROS: rosmaster, the command line tools, and where the test nodes are.
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
@@ -13,12 +13,12 @@ use super::process::Process;
 use super::rpc::Client;
 use super::scratch::{Scratch, free_port};
 
-/// The folder of the rospy nodes and of the sources of the roscpp ones.
+/// The folder with the rospy nodes and the sources of the roscpp nodes.
 pub(crate) const NODES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/nodes");
 
 const MISSING: &str = "this test needs ROS 1: `tests/run.sh` installs what is missing";
 
-/// A program of ROS, from the PATH or from where ROS installs itself.
+/// Finds a program of ROS in the PATH or where ROS installs it.
 pub(crate) fn find_program(name: &str) -> PathBuf {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let on_path = std::env::split_paths(&path).map(|folder| folder.join(name));
@@ -30,10 +30,10 @@ pub(crate) fn find_program(name: &str) -> PathBuf {
     on_path
         .chain(installed)
         .find(|program| program.is_file())
-        .unwrap_or_else(|| panic!("there is no `{name}`; {MISSING}"))
+        .unwrap_or_else(|| panic!("`{name}` is not installed; {MISSING}"))
 }
 
-/// A command with the environment of a node that belongs to the master at `port`.
+/// A command with the environment of a node that uses the master at `port`.
 pub(crate) fn ros_command(scratch: &Scratch, program: impl AsRef<OsStr>, port: u16) -> Command {
     let mut command = Command::new(program);
     scratch.prepare(&mut command);
@@ -49,7 +49,7 @@ pub(crate) fn ros_command(scratch: &Scratch, program: impl AsRef<OsStr>, port: u
     command
 }
 
-/// A real rosmaster, nothing else.
+/// A real rosmaster and nothing else.
 #[derive(Debug)]
 pub(crate) struct Rosmaster {
     process: Process,
@@ -57,19 +57,19 @@ pub(crate) struct Rosmaster {
 }
 
 impl Rosmaster {
-    /// Starts one on a free port and waits until it answers.
+    /// Starts a rosmaster on a free port and waits until it answers.
     #[track_caller]
     pub(crate) fn start(scratch: &Scratch) -> Self {
         Self::start_at(scratch, free_port())
     }
 
-    /// Starts one on `port` and waits until it answers.
+    /// Starts a rosmaster on `port` and waits until it answers.
     #[track_caller]
     pub(crate) fn start_at(scratch: &Scratch, port: u16) -> Self {
         Self::start_with(scratch, port, |_| {})
     }
 
-    /// As [`Self::start_at`], with more arguments or another environment.
+    /// Like [`Self::start_at`], with further arguments or environment variables.
     #[track_caller]
     pub(crate) fn start_with(
         scratch: &Scratch,
@@ -109,13 +109,13 @@ impl Rosmaster {
         self.process.pid()
     }
 
-    /// SIGKILL, and the end of the process.
+    /// Sends SIGKILL and waits for the end of the process.
     pub(crate) fn kill(&mut self) {
         self.process.kill();
     }
 }
 
-/// One run of a command line tool of ROS.
+/// One run of a command line tool of ROS or of rosrescue.
 #[derive(Debug)]
 pub(crate) struct Tool {
     pub(crate) status: ExitStatus,
@@ -124,7 +124,7 @@ pub(crate) struct Tool {
 }
 
 impl Tool {
-    /// Runs `name` against the master at `port` until it ends by itself.
+    /// Runs `name` with the master at `port` until it ends by itself.
     #[track_caller]
     pub(crate) fn run(scratch: &Scratch, port: u16, name: &str, arguments: &[&str]) -> Self {
         Self::wait(
@@ -133,7 +133,7 @@ impl Tool {
         )
     }
 
-    /// Runs a command of rosrescue for the one at `port`, until it ends by itself.
+    /// Runs a command of rosrescue with the master at `port` until it ends by itself.
     #[track_caller]
     pub(crate) fn rosrescue(scratch: &Scratch, port: u16, arguments: &[&str]) -> Self {
         Self::wait(&mut command(scratch, port, &[]), arguments)
@@ -154,29 +154,29 @@ impl Tool {
         }
     }
 
-    /// What it printed, after it has ended with `status`.
+    /// Its output. Panics unless it has ended with `status`.
     #[track_caller]
     pub(crate) fn ended(self, status: i32) -> String {
         assert_eq!(self.status.code(), Some(status), "{self:?}");
         self.stdout
     }
 
-    /// The JSON that it printed, after it has ended with `status`.
+    /// Its output as JSON. Panics unless it has ended with `status`.
     #[track_caller]
     pub(crate) fn json(self, status: i32) -> serde_json::Value {
         serde_json::from_str(&self.ended(status)).expect("JSON")
     }
 }
 
-/// `rosrescue ARGUMENTS`, with `ROS_MASTER_URI` for the port.
+/// `rosrescue ARGUMENTS`, with a `ROS_MASTER_URI` for this port.
 pub(crate) fn command(scratch: &Scratch, port: u16, arguments: &[&str]) -> Command {
     let mut command = ros_command(scratch, env!("CARGO_BIN_EXE_rosrescue"), port);
     command.args(arguments).current_dir(scratch.path(""));
     command
 }
 
-/// The folder of the compiled roscpp nodes. They are compiled here, and nowhere else, when a source
-/// is newer; a lock keeps test processes that run at the same time from doing it twice.
+/// The folder with the compiled roscpp nodes. Compiles those whose source has changed; a lock keeps test
+/// processes that run at the same time from doing so twice.
 pub(crate) fn cpp_nodes() -> &'static Path {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     FOLDER.get_or_init(|| {
@@ -214,8 +214,8 @@ fn compile(folder: &Path) {
         if changed(&node) > changed(source).max(headers) {
             continue;
         }
-        // Debian has no catkin; these lines are all that a plain node needs. `listener.cpp` says why
-        // access is not checked. A node that is half written has another name.
+        // Debian has no catkin, but a plain node needs no more than this. `listener.cpp` explains why access
+        // is not checked. An unfinished node has another name.
         let half = node.with_extension("half");
         let output = Command::new("g++")
             .args(["-O1", "-Wall", "-fno-access-control", "-o"])
@@ -231,7 +231,7 @@ fn compile(folder: &Path) {
         );
         fs::rename(half, node).unwrap();
     }
-    // roslaunch finds a node by the package that its folder is.
+    // roslaunch finds a node by its package, which is this folder.
     let package = fs::read_to_string(Path::new(NODES).join("package.xml")).unwrap();
     let package = package.replace("rosrescue_nodes", "rosrescue_cpp_nodes");
     fs::write(folder.join("package.xml"), package).unwrap();

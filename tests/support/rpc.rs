@@ -1,4 +1,4 @@
-//! A client of a master: calls, and raw bytes.
+//! A client of a master, for calls and for raw bytes.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -6,20 +6,20 @@ use std::time::Duration;
 
 use rosrescue::xmlrpc::{self, Call, Reply, Value};
 
-/// How long a client waits for an answer: longer than any call may be held.
+/// How long a client waits for an answer: longer than rosrescue may hold any call.
 const ANSWER: Duration = Duration::from_secs(60);
 
-/// The body of a call.
+/// Encodes the body of a call.
 pub(crate) fn encode_call(method: &str, params: Vec<Value>) -> Vec<u8> {
     xmlrpc::encode_call(&Call::new(method, params))
 }
 
-/// A request as XML-RPC clients send it: HTTP/1.1 to `/RPC2`, keep-alive, with a length.
+/// An HTTP request as XML-RPC clients send it: HTTP/1.1 to `/RPC2`, keep-alive, with a length.
 pub(crate) fn http_request(body: &[u8]) -> Vec<u8> {
     request("POST /RPC2 HTTP/1.1", &[], body)
 }
 
-/// A request with `first` line, `headers` beside the usual ones, and `body`.
+/// An HTTP request with this `first` line, `headers` in addition to the usual ones, and `body`.
 pub(crate) fn request(first: &str, headers: &[&str], body: &[u8]) -> Vec<u8> {
     let mut head = format!("{first}\r\nHost: localhost\r\nContent-Type: text/xml\r\n");
     for header in headers {
@@ -30,7 +30,7 @@ pub(crate) fn request(first: &str, headers: &[&str], body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// A request to set `key` to `value`, in UTF-16: rosmaster understands it and rosrescue does not.
+/// A request in UTF-16 that sets `key` to `value`. rosmaster understands it and rosrescue does not.
 pub(crate) fn unreadable(key: &str, value: i32) -> Vec<u8> {
     let params = vec!["/test".into(), key.into(), value.into()];
     let call = String::from_utf8(encode_call("setParam", params)).unwrap();
@@ -40,7 +40,7 @@ pub(crate) fn unreadable(key: &str, value: i32) -> Vec<u8> {
     http_request(&body)
 }
 
-/// Calls one master; each call has a connection of its own and is sent exactly once.
+/// A client of one master. Each call uses a new connection and is sent exactly once.
 #[derive(Clone, Debug)]
 pub(crate) struct Client {
     host: String,
@@ -48,12 +48,12 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// A client of 127.0.0.1.
+    /// A client of a master on 127.0.0.1.
     pub(crate) fn new(port: u16) -> Self {
         Self::at("127.0.0.1", port)
     }
 
-    /// A client of `host`: a name, an IPv4 address, or an IPv6 address in brackets.
+    /// A client of a master on `host`: a name, an IPv4 address, or an IPv6 address in brackets.
     pub(crate) fn at(host: &str, port: u16) -> Self {
         Self {
             host: host.to_owned(),
@@ -73,14 +73,14 @@ impl Client {
         Wire::connect(&self.host, self.port)
     }
 
-    /// The raw answer to a raw request.
+    /// Sends a raw request and returns the raw answer.
     pub(crate) fn exchange(&self, request: &[u8]) -> io::Result<Response> {
         let mut wire = self.connect()?;
         wire.send(request)?;
         wire.response()
     }
 
-    /// Makes all of `calls`, in multicalls that rosrescue does not take apart.
+    /// Makes all of `calls`, in multicalls so large that rosrescue does not split them.
     #[track_caller]
     pub(crate) fn call_all(&self, calls: &[Call]) {
         for some in calls.chunks(200) {
@@ -93,17 +93,17 @@ impl Client {
         }
     }
 
-    /// The decoded answer, or why there is none.
+    /// Makes a call and decodes the answer.
     pub(crate) fn call(&self, method: &str, params: Vec<Value>) -> io::Result<Reply> {
         let response = self.exchange(&http_request(&encode_call(method, params)))?;
         if response.code != 200 {
-            let text = format!("{method}: the answer is `{}`", response.status);
+            let text = format!("{method}: the HTTP status is `{}`", response.status);
             return Err(io::Error::other(text));
         }
         xmlrpc::decode_reply(&response.body).map_err(io::Error::other)
     }
 
-    /// Code, message and value of the answer of a method of the Master API.
+    /// Code, message and value of the answer to a method of the Master API.
     pub(crate) fn status(
         &self,
         method: &str,
@@ -120,7 +120,7 @@ impl Client {
         }
     }
 
-    /// The value of a call that succeeds.
+    /// The value of a call that must succeed.
     #[track_caller]
     pub(crate) fn ok(&self, method: &str, params: Vec<Value>) -> Value {
         let shown = format!("{method}{}", super::short(&params));
@@ -130,7 +130,7 @@ impl Client {
         }
     }
 
-    /// The value of a call if it succeeds.
+    /// The value of a call, if it succeeds.
     pub(crate) fn ask(&self, method: &str, params: Vec<Value>) -> Option<Value> {
         match self.status(method, params) {
             Ok((1, _, value)) => Some(value),
@@ -149,13 +149,13 @@ impl Client {
         self.ok("setParam", vec!["/test".into(), key.into(), value.into()]);
     }
 
-    /// A parameter, if it is set.
+    /// The value of a parameter, if it is set.
     pub(crate) fn param(&self, key: &str) -> Option<Value> {
         self.ask("getParam", vec!["/test".into(), key.into()])
     }
 }
 
-/// One connection; the next one after an answer of HTTP/1.0.
+/// One connection. After an HTTP/1.0 answer it connects again.
 #[derive(Debug)]
 pub(crate) struct Wire {
     stream: BufReader<TcpStream>,
@@ -184,7 +184,7 @@ impl Wire {
         })
     }
 
-    /// The same connection, to look at.
+    /// A second handle of the connection.
     pub(crate) fn stream(&self) -> TcpStream {
         self.stream.get_ref().try_clone().expect("a connection")
     }
@@ -196,7 +196,7 @@ impl Wire {
         self.stream.get_mut().write_all(bytes)
     }
 
-    /// No more requests: the client's half of the connection is closed.
+    /// Closes this half of the connection, after the last request.
     pub(crate) fn finish(&mut self) -> io::Result<()> {
         self.stream.get_mut().shutdown(std::net::Shutdown::Write)
     }
@@ -208,7 +208,7 @@ impl Wire {
             .unwrap();
     }
 
-    /// The head of an answer: status line and headers.
+    /// Reads the head of an answer: status line and headers.
     pub(crate) fn head(&mut self) -> io::Result<Response> {
         let mut lines = Vec::new();
         loop {
@@ -236,14 +236,14 @@ impl Wire {
         })
     }
 
-    /// What has come, or comes next.
+    /// Returns bytes that have been received, or waits for some.
     pub(crate) fn some(&mut self) -> io::Result<Vec<u8>> {
         let part = self.stream.fill_buf()?.to_vec();
         self.stream.consume(part.len());
         Ok(part)
     }
 
-    /// One whole answer, as long as its Content-Length says; without one, up to the end.
+    /// Reads one whole answer, as long as its Content-Length says, or up to the end without one.
     pub(crate) fn response(&mut self) -> io::Result<Response> {
         let mut response = self.head()?;
         match response.header("content-length") {
@@ -261,7 +261,7 @@ impl Wire {
         Ok(response)
     }
 
-    /// Whether the other side closes within `patience` and sends nothing more.
+    /// Whether the other side closes the connection within `patience` and sends nothing more.
     pub(crate) fn closes(&mut self, patience: Duration) -> bool {
         self.set_patience(patience);
         match self.stream.read(&mut [0; 1]) {
@@ -277,13 +277,13 @@ pub(crate) struct Response {
     /// The status line.
     pub(crate) status: String,
     pub(crate) code: u16,
-    /// The header lines, as they came.
+    /// The header lines, unchanged.
     pub(crate) headers: Vec<String>,
     pub(crate) body: Vec<u8>,
 }
 
 impl Response {
-    /// The value of a header; `name` in lower case.
+    /// The value of a header. `name` must be in lower case.
     pub(crate) fn header(&self, name: &str) -> Option<&str> {
         self.headers.iter().find_map(|line| {
             let (found, value) = line.split_once(':')?;

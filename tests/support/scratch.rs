@@ -18,15 +18,15 @@ use tempfile::TempDir;
 
 use super::process::signal;
 
-/// The variable that marks every process of a test.
+/// The environment variable that marks every process of a test.
 const TOKEN: &str = "ROSRESCUE_SCRATCH_TOKEN";
 
-/// Set, every rosmaster and rospy node speaks HTTP/1.0, as on a kernel before 4.16.
+/// If this variable is set, all rosmasters and rospy nodes speak HTTP/1.0, as on a kernel before 4.16.
 const HTTP_1_0: &str = "ROSRESCUE_HTTP_1_0";
-/// A folder with a `sitecustomize.py` that shows an old kernel.
+/// A folder with a `sitecustomize.py` that makes Python see an old kernel.
 const OLD_KERNEL: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/nodes/old_kernel");
 
-/// A folder for one test. On drop everything that was started in it is killed; the folder is removed
+/// A folder for one test. On drop every process that was started in it is killed. The folder is removed
 /// unless the test failed.
 #[derive(Debug)]
 pub(crate) struct Scratch {
@@ -45,7 +45,7 @@ impl Scratch {
         let folder = tempfile::Builder::new()
             .prefix(&format!("scratch-{token}-"))
             .tempdir_in(env!("CARGO_TARGET_TMPDIR"))
-            .expect("cannot make a scratch folder");
+            .expect("cannot create a scratch folder");
         fs::create_dir_all(folder.path().join("log")).unwrap();
         Self { folder, token }
     }
@@ -54,13 +54,13 @@ impl Scratch {
         self.folder.path().join(name)
     }
 
-    /// `$ROS_LOG_DIR` of everything in this test.
+    /// The `ROS_LOG_DIR` of all processes in this test.
     pub(crate) fn log_dir(&self) -> PathBuf {
         self.path("log")
     }
 
-    /// Gives `command` this folder for everything that ROS writes, the token, and an address that
-    /// needs no name service. Nothing of the caller's own ROS set-up is left but where it is installed.
+    /// Prepares `command`: everything that ROS writes goes to this folder, the token is set, and its address
+    /// needs no name service. Of the caller's own ROS environment only the place of installation is kept.
     pub(crate) fn prepare(&self, command: &mut Command) {
         for (key, _) in std::env::vars_os() {
             let name = key.to_string_lossy();
@@ -80,7 +80,7 @@ impl Scratch {
         }
     }
 
-    /// Processes that this test started, directly or not, and that are still there: id and command.
+    /// Processes that this test has started, directly or not, and that still run: id and command.
     pub(crate) fn survivors(&self) -> Vec<(u32, String)> {
         let mark = format!("{TOKEN}={}", self.token);
         let mut found = Vec::new();
@@ -108,7 +108,7 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let start = Instant::now();
-        // Again and again: a supervisor may have started another child meanwhile.
+        // Repeated, because a supervisor may have started another child in the meantime.
         while start.elapsed() < Duration::from_secs(10) {
             let survivors = self.survivors();
             if survivors.is_empty() {
@@ -141,14 +141,14 @@ fn is_install(variable: &str) -> bool {
     .contains(&variable)
 }
 
-/// A port that nobody listens at, on IPv4 and IPv6, and below those that the kernel gives to
-/// outgoing connections: nobody gets it by chance before the test binds it. No other test program gets it either,
-/// for as long as this one runs.
+/// A port at which no process listens, on IPv4 or IPv6. It is below the ports that the kernel gives to
+/// outgoing connections, so nothing takes it by chance before the test binds it. Other test programs do not
+/// get it either as long as this one runs.
 pub(crate) fn free_port() -> u16 {
     const FIRST: u16 = 12_000;
     const BLOCKS: u16 = 200;
     const BLOCK: u16 = 100;
-    /// The sockets that say which blocks are ours, and the ports of the last one that are left.
+    /// The sockets that reserve our blocks of ports, and the unused ports of the last block.
     static OURS: Mutex<(Vec<UnixListener>, Range<u16>)> = Mutex::new((Vec::new(), 0..0));
     let mut ours = OURS.lock().unwrap_or_else(PoisonError::into_inner);
     loop {
@@ -161,7 +161,7 @@ pub(crate) fn free_port() -> u16 {
                     let name = SocketAddr::from_abstract_name(name).unwrap();
                     Some((block, UnixListener::bind_addr(&name).ok()?))
                 })
-                .expect("a block of ports that no test program has");
+                .expect("a block of ports that no other test program has reserved");
             let first = FIRST + block * BLOCK;
             ours.0.push(socket);
             ours.1 = first..first + BLOCK;
@@ -169,14 +169,14 @@ pub(crate) fn free_port() -> u16 {
         };
         let v4 = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port));
         let v6 = TcpListener::bind((Ipv6Addr::LOCALHOST, port));
-        // Not every computer has IPv6.
+        // Some computers have no IPv6.
         if v4.is_ok() && !v6.is_err_and(|error| error.kind() == ErrorKind::AddrInUse) {
             return port;
         }
     }
 }
 
-/// The text of an environment value for a message.
+/// The text of an environment variable, for a message.
 pub(crate) fn shown(text: &OsString) -> String {
     text.to_string_lossy().into_owned()
 }

@@ -1,4 +1,4 @@
-//! A cluster of etcd.
+//! A cluster of etcd servers.
 
 use std::{fs::File, process::Child, process::Command, time::Duration};
 
@@ -34,7 +34,7 @@ impl Servers {
         Self::with(Scratch::new(), count, "http", &[]).await
     }
 
-    /// With further arguments of etcd.
+    /// Starts a cluster whose members get further arguments for etcd.
     pub(crate) async fn with(
         scratch: Scratch,
         count: usize,
@@ -98,7 +98,7 @@ impl Servers {
         self.scratch.prepare(&mut command);
         let child = command
             .spawn()
-            .expect("there is no etcd: run `. tests/install_etcd.sh`");
+            .expect("etcd is not installed: run `. tests/install_etcd.sh`");
         self.members[index].child = Some(child);
     }
 
@@ -112,7 +112,7 @@ impl Servers {
         child.wait().unwrap();
     }
 
-    /// It hangs.
+    /// Stops a member, so that it hangs.
     pub(crate) fn stop(&self, index: usize) {
         stop(self.pid(index));
     }
@@ -125,7 +125,7 @@ impl Servers {
         self.members.len()
     }
 
-    /// The endpoints from `first` on, in turn.
+    /// The endpoints of all members, starting with number `first`.
     pub(crate) fn endpoints(&self, first: usize) -> Vec<String> {
         let all = self
             .members
@@ -137,7 +137,7 @@ impl Servers {
             .collect()
     }
 
-    /// The port for the other members, which serves no client.
+    /// The address for other members, which serves no client.
     pub(crate) fn peer(&self, index: usize) -> String {
         format!("http://127.0.0.1:{}", self.members[index].peer)
     }
@@ -151,7 +151,7 @@ impl Servers {
         Etcd::new(&Options { endpoints, access }).unwrap()
     }
 
-    /// The member that leads etcd.
+    /// The number of the member that leads etcd.
     pub(crate) async fn leader(&self) -> usize {
         let client = self.client();
         loop {
@@ -165,7 +165,7 @@ impl Servers {
         }
     }
 
-    /// What `etcdctl`, or rather the gateway, answers.
+    /// Sends a request to etcd's JSON gateway and returns the answer, like `etcdctl`.
     pub(crate) fn post(&self, path: &str, body: &serde_json::Value) -> serde_json::Value {
         self.post_to(0, path, body)
     }
@@ -180,13 +180,13 @@ impl Servers {
         post(&url, path, body)
     }
 
-    /// The name of a member, and of its folder.
+    /// The name of a member, which is also that of its folder.
     pub(crate) fn folder(index: usize) -> String {
         format!("m{index}")
     }
 }
 
-/// A request of our own, past the client.
+/// Sends a request without rosrescue's etcd client.
 fn post(authority: &str, path: &str, body: &serde_json::Value) -> serde_json::Value {
     use std::io::{Read, Write};
     let mut stream = std::net::TcpStream::connect(authority).unwrap();

@@ -1,4 +1,4 @@
-//! All that can be read of a master's state, and the difference of two states in words.
+//! Everything that can be read of a master's state, and how two states differ.
 
 use std::fmt::{self, Display, Formatter};
 use std::io;
@@ -8,25 +8,25 @@ use rosrescue::xmlrpc::Value;
 use super::kinds::{sorted, unordered};
 use super::rpc::Client;
 
-/// The state of a master as its clients see it. Every list keeps the master's order, unless that is
+/// The state of a master as its clients see it. Every list keeps the master's order, unless the master is
 /// [`unordered`].
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct State {
-    /// Publishers, subscribers and service providers: name and node names.
+    /// Topics or services, each with the names of its nodes.
     pub(crate) publishers: Vec<(String, Vec<String>)>,
     pub(crate) subscribers: Vec<(String, Vec<String>)>,
     pub(crate) services: Vec<(String, Vec<String>)>,
     pub(crate) topic_types: Vec<(String, String)>,
-    /// The address of every node that appears above.
+    /// The address of each node that is named above.
     pub(crate) nodes: Vec<(String, String)>,
-    /// The address of every service.
+    /// The address of each service.
     pub(crate) service_apis: Vec<(String, String)>,
     pub(crate) params: Value,
     pub(crate) param_names: Vec<String>,
 }
 
 impl State {
-    /// Reads it with one call after the other: the master should be at rest.
+    /// Reads the state with one call after another, so the master should be at rest.
     #[track_caller]
     pub(crate) fn read(client: &Client) -> Self {
         Self::try_read(client).unwrap_or_else(|error| panic!("{}: {error}", client.uri()))
@@ -92,7 +92,7 @@ impl State {
         Ok(state)
     }
 
-    /// Puts what comes out of dictionaries into the order of the alphabet.
+    /// Sorts everything that comes from a dictionary.
     fn sort(&mut self) {
         self.publishers.sort();
         self.subscribers.sort();
@@ -103,7 +103,7 @@ impl State {
         self.param_names.sort();
     }
 
-    /// This state without one node: what is left when it has gone. Topic types stay.
+    /// This state without one node, as after the node has ended. Topic types stay.
     pub(crate) fn without_node(&self, node: &str) -> Self {
         let mut rest = self.clone();
         for table in [
@@ -164,7 +164,7 @@ impl State {
         found.map(|(_, nodes)| nodes.clone()).unwrap_or_default()
     }
 
-    /// What differs from `other`, a line a fact; empty if nothing does.
+    /// The differences to `other`, one fact per line. Empty if there are none.
     pub(crate) fn difference(&self, other: &Self) -> String {
         let (mine, theirs) = (self.to_string(), other.to_string());
         let (mine, theirs): (Vec<_>, Vec<_>) = (mine.lines().collect(), theirs.lines().collect());
@@ -181,7 +181,7 @@ impl State {
                 .map(|line| format!("+ {line}")),
         );
         if lines.is_empty() && mine != theirs {
-            lines.push("the same facts in another order; was:".to_owned());
+            lines.push("the same facts in another order; they were:".to_owned());
             lines.extend(mine.iter().map(|line| format!("- {line}")));
             lines.push("is:".to_owned());
             lines.extend(theirs.iter().map(|line| format!("+ {line}")));
@@ -189,7 +189,7 @@ impl State {
         lines.join("\n")
     }
 
-    /// Panics with the difference unless `now` is the same.
+    /// Panics with the differences unless `now` is the same state.
     #[track_caller]
     pub(crate) fn assert_same(&self, now: &Self, when: &str) {
         assert!(
@@ -200,7 +200,7 @@ impl State {
     }
 }
 
-/// One fact a line.
+/// Prints one fact per line.
 impl Display for State {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let tables = [

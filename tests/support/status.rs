@@ -1,10 +1,10 @@
-//! What rosrescue says of itself.
+//! The status that rosrescue reports.
 
 use serde_json::Value;
 
 use super::rpc::Client;
 
-/// The page `/status.json`.
+/// Fetches `/status.json`.
 #[track_caller]
 pub(crate) fn status(client: &Client) -> Value {
     let get = b"GET /status.json HTTP/1.1\r\nHost: localhost\r\n\r\n";

@@ -1,4 +1,4 @@
-//! Live streams of messages: talkers of one topic and listeners to it, of both libraries.
+//! Live streams of messages: talkers and listeners on one topic, from both client libraries.
 
 use rosrescue::xmlrpc::Value;
 
@@ -7,7 +7,7 @@ use super::params;
 use super::robot::Robot;
 use super::rpc::Client;
 
-/// The client libraries, each with the end of its nodes' names.
+/// The client libraries, each with the suffix of its nodes' names.
 pub(crate) const LIBRARIES: [(Library, &str); 2] =
     [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
 
@@ -19,19 +19,19 @@ pub(crate) fn port_of(client: &Client, node: &str) -> u16 {
     port.map(|port| port.parse().unwrap()).next().unwrap()
 }
 
-/// Two talkers on one topic and two listeners, one of each library.
+/// Two talkers and two listeners on one topic, one from each client library.
 #[derive(Debug)]
 pub(crate) struct Streams {
     talkers: [Node; 2],
     listeners: [Node; 2],
     topic: String,
-    /// What the nodes say of their links when all are there.
+    /// What the nodes report about their links when all are connected.
     links: Vec<Value>,
 }
 
 impl Streams {
-    /// Starts all four, whose names end in that of the topic. The talkers talk at `hz`; the listeners say each
-    /// `every`th message, and every gap.
+    /// Starts all four nodes, whose names end in the name of the topic. Talkers publish at `hz`; listeners
+    /// print each `every`th message and every gap.
     #[track_caller]
     pub(crate) fn start(robot: &Robot, topic: &str, hz: &str, every: &str) -> Self {
         let remap = format!("chatter:=/{topic}");
@@ -59,7 +59,7 @@ impl Streams {
         LIBRARIES.map(|(_, suffix)| format!("/{node}_{suffix}_{}", self.topic))
     }
 
-    /// Waits until messages have come from everybody to everybody.
+    /// Waits until every listener has received messages from every talker.
     #[track_caller]
     fn flow(&self) {
         for listener in &self.listeners {
@@ -69,7 +69,7 @@ impl Streams {
         }
     }
 
-    /// What each node says of its links of the topic: they have numbers, and ports.
+    /// What each node reports about its links for the topic, including their numbers and ports.
     fn links(&self, robot: &Robot) -> Vec<Value> {
         let topic = Value::String(format!("/{}", self.topic));
         let of = |name: &String| {
@@ -83,7 +83,7 @@ impl Streams {
         names.iter().flatten().map(of).collect()
     }
 
-    /// Panics if a message was lost or a link was made anew, or nothing comes any more.
+    /// Panics if a message was lost, a link was replaced, or no more messages arrive.
     #[track_caller]
     pub(crate) fn assert_whole(&self, robot: &Robot) {
         self.flow();

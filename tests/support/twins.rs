@@ -1,4 +1,4 @@
-//! A bare master and one behind rosrescue, asked the same.
+//! A bare master and one behind rosrescue that are asked the same.
 
 use rosrescue::xmlrpc::{Reply, Value};
 
@@ -32,7 +32,7 @@ impl Twins {
         }
     }
 
-    /// Sends the same bytes to both; gives rosrescue's answer, or how it differs.
+    /// Sends the same bytes to both. Returns rosrescue's answer, or a description of the difference.
     pub(crate) fn compare(&self, request: &[u8]) -> Result<Response, String> {
         let shown = String::from_utf8_lossy(&request[..request.len().min(400)]).into_owned();
         let mut answers = Vec::new();
@@ -41,7 +41,7 @@ impl Twins {
             ("rosrescue", &self.through),
         ] {
             let mut wire = client.connect().unwrap();
-            // A server may answer and close before it has read everything.
+            // A server may answer and close before it has read the whole request.
             let _ = wire.send(request);
             let answer = wire.response();
             answers.push(answer.map_err(|error| format!("{who}: {error}\n{shown}"))?);
@@ -57,14 +57,14 @@ impl Twins {
         Ok(through)
     }
 
-    /// Sends the same bytes to both and gives the one answer.
+    /// Sends the same bytes to both, which must give the same answer. Returns it.
     #[track_caller]
     pub(crate) fn same(&self, request: &[u8]) -> Response {
         self.compare(request)
             .unwrap_or_else(|difference| panic!("{difference}"))
     }
 
-    /// As [`Self::same`], for a call.
+    /// Like [`Self::same`], for a call.
     #[track_caller]
     pub(crate) fn same_call(&self, method: &str, params: Vec<Value>) -> Reply {
         self.same(&http_request(&encode_call(method, params)))
@@ -72,8 +72,9 @@ impl Twins {
     }
 }
 
-/// What of an answer must be the same: all that is not a date or a name of a program. (rosmaster says
-/// HTTP/1.1 to HTTP/1.0 clients too; what matters to them, the end of the connection, has its own test.)
+/// The part of an answer that must be the same: everything but dates and names of programs. rosmaster says
+/// HTTP/1.1 even to HTTP/1.0 clients; a separate test covers what matters to these, the end of the
+/// connection.
 fn essence(response: &Response) -> (String, Option<String>, Option<String>, String) {
     let header = |name| response.header(name).map(str::to_owned);
     (
@@ -84,7 +85,7 @@ fn essence(response: &Response) -> (String, Option<String>, Option<String>, Stri
     )
 }
 
-/// What roscpp's parser of HTTP needs: a length, with one space before it, and no pieces.
+/// Checks what roscpp's HTTP parser requires: a length, with one space before it, and no chunks.
 #[track_caller]
 pub(crate) fn assert_form(response: &Response, shown: &str) {
     let lengths: Vec<_> = response

@@ -1,6 +1,7 @@
-# keepalived on three computers, of which one leads. For `tests/robot/computers.rs`, after computers.sh and three etcd.
+# Runs keepalived on three computers, one of which leads. For `tests/robot/computers.rs`, after computers.sh and the start
+# of three etcd servers.
 
-# keepalived runs no script that others than root could have changed.
+# keepalived refuses to run a script that users other than root can change.
 touch /run/rosrescue
 ip addr add 10.0.0.9/24 dev switch # a computer without rosrescue
 
@@ -9,7 +10,7 @@ for name in $computers; do
     own=${address[$name]}
     inside "$name" mount --bind "$ROSRESCUE" /run/rosrescue
     mkdir -p "$scratch/$name/etc/keepalived"
-    # What the document says to change, and where the program is.
+    # Change what the document says to change, and the path of the program.
     sed "s|^\( *\)10.0.0.1$|\1first|; s|^\( *\)$own$|\110.0.0.1|; s|first|10.0.0.1|
         s|unicast_src_ip .*|unicast_src_ip $own|; s|priority .*|priority $priority|; s|/usr/bin/|/run/|" \
         "$REPOSITORY/packaging/keepalived/keepalived.conf" >"$scratch/$name/etc/keepalived/keepalived.conf"
@@ -37,7 +38,7 @@ ask() {
 }
 is_elsewhere() { ask && [ "$holder" != "$left" ]; }
 
-# Waits until the address has left its computer, and says what that took.
+# Waits until the address has moved to another computer, and prints how long that took.
 moves() { # WHY
     local start=${EPOCHREALTIME/./}
     left=$holder
@@ -45,7 +46,7 @@ moves() { # WHY
     "$@"
     within 20 is_elsewhere
     echo "$*: from $left to $holder after $(((${EPOCHREALTIME/./} - start) / 1000)) ms"
-    # A node that had a connection hears that it has ended.
+    # A node that was connected must notice that its connection has ended.
     (printf 'GET /live HTTP/1.1\r\nHost: 10.0.0.100\r\n\r\n' >&3) || true
     timeout 10 cat <&3 >/dev/null 2>&1 || [ $? -ne 124 ]
     exec 3<&-
@@ -57,7 +58,7 @@ within 20 ask
 moves cut
 cut_off=$left
 moves stop
-# The computer that was cut off comes back, and is in nobody's way.
+# The computer that was cut off comes back and does not disturb the others.
 ip link set "$cut_off" up
 left=nobody
 within 10 is_elsewhere

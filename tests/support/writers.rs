@@ -1,5 +1,5 @@
-//! Writes that notify: writers with a parameter that only grows and a publisher that comes and goes, and nodes that
-//! are notified of all of them.
+//! Writes that cause notifications: writers that each have a parameter that only grows and a publisher that
+//! comes and goes, and nodes that are notified of all of these.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,26 +18,26 @@ pub(crate) const SUBSCRIBERS: usize = 4;
 /// How long a node takes to answer.
 const ANSWER: Duration = Duration::from_millis(1);
 
-/// What a subscriber was told of each parameter and each topic, as it came.
+/// Everything that a subscriber was told about each parameter and each topic, in order.
 #[derive(Debug, Default)]
 pub(crate) struct Told {
     pub(crate) values: BTreeMap<String, Vec<i32>>,
     pub(crate) publishers: BTreeMap<String, Vec<Value>>,
 }
 
-/// A node that is notified of all parameters and topics.
+/// A node that subscribes to all parameters and topics.
 #[derive(Debug)]
 pub(crate) struct Subscriber {
     told: Arc<Mutex<Told>>,
     _server: FakeMaster,
 }
 
-/// The parameter of a writer.
+/// The parameter that a writer sets.
 pub(crate) fn key(writer: usize) -> String {
     format!("/order/value_{writer}")
 }
 
-/// The topic of a writer's publisher.
+/// The topic on which a writer publishes.
 pub(crate) fn topic(writer: usize) -> String {
     format!("/order/topic_{writer}")
 }
@@ -47,7 +47,7 @@ fn lock(told: &Mutex<Told>) -> MutexGuard<'_, Told> {
 }
 
 impl Subscriber {
-    /// Four of them.
+    /// Starts all [`SUBSCRIBERS`].
     #[track_caller]
     pub(crate) fn start_all(master: &Client) -> Vec<Self> {
         (0..SUBSCRIBERS)
@@ -76,7 +76,7 @@ impl Subscriber {
         }
     }
 
-    /// How many notifications have come.
+    /// Number of notifications that have been received.
     pub(crate) fn count(&self) -> usize {
         let told = self.told();
         let values = told.values.values().map(Vec::len);
@@ -107,7 +107,7 @@ fn answer(told: &Mutex<Told>, body: &[u8]) -> Vec<u8> {
         }
     }
     thread::sleep(ANSWER);
-    // A node that does not say what it subscribes is left alone.
+    // rosrescue leaves a node alone that does not report what it subscribes to.
     let (code, value) = match call.method.as_str() {
         "getPid" => (1, i32::try_from(std::process::id()).unwrap()),
         "getSubscriptions" | "getPublications" => (0, 0),
@@ -116,8 +116,8 @@ fn answer(told: &Mutex<Told>, body: &[u8]) -> Vec<u8> {
     FakeMaster::proper(&Reply::Value(params![code, "", value].into()))
 }
 
-/// Sets a writer's parameter to ever larger values, and has its publisher come and go, for `time`, with random pauses
-/// of up to `pause` between two calls. How long each call took.
+/// Sets a writer's parameter to ever larger values and registers and unregisters its publisher for `time`,
+/// with random pauses of up to `pause` between calls. Returns how long each call took.
 #[track_caller]
 pub(crate) fn write(
     master: &Client,

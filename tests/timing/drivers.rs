@@ -1,11 +1,11 @@
-//! Drivers of robots that log at 10 Hz and run `diagnostic_updater` at 4 Hz: both call `subscribeParam` each time,
-//! because rospy caches no parameter that is not set. None of their loops stalls, whatever happens to the
-//! master, and no exception reaches them.
+//! Drivers of robots that log at 10 Hz and run `diagnostic_updater` at 4 Hz. Both call `subscribeParam` each
+//! time, because rospy does not cache a parameter that is not set. None of their loops stalls, whatever
+//! happens to the master, and no exception reaches them.
 //!
-//! The bound is [`PASS`], or what the same driver takes at the same time at a bare rosmaster to which
-//! nothing happens, [`NOISE`] times, if that is longer: the starts of rosmasters take every core of a small computer.
+//! The limit is [`PASS`], or [`NOISE`] times what the same driver takes at the same time with an undisturbed
+//! bare rosmaster if that is longer, because starting rosmasters takes all cores of a small computer.
 //!
-//! `ROSRESCUE_LOOP_SECONDS` is how long a crash loop lasts; 600 is the full size.
+//! `ROSRESCUE_LOOP_SECONDS` sets the length of a crash loop; the full length is 600.
 
 use std::{
     thread::sleep,
@@ -17,19 +17,20 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// The longest pass of a driver's loop, in milliseconds. Where drivers wait for the master they stall for 350 at
-/// least; measured on a computer with little else to do, no pass takes more than 15.
+/// Maximum time of one pass of a driver's loop, in milliseconds. If drivers had to wait for the master, they
+/// would stall for at least 350. On a computer with little other load no pass takes more than 15.
 const PASS: f64 = 300.0;
-/// The same behind a master that hangs: the mirror answers after 100. Where drivers wait, 6,500 at least.
+/// The same limit with a master that hangs, where the mirror answers after 100 ms. If drivers had to wait, it
+/// would take at least 6,500.
 const PASS_HUNG: f64 = 1_000.0;
-/// How much longer than an undisturbed driver's longest pass one may take.
+/// How many times longer a pass may take than the longest one of an undisturbed driver.
 const NOISE: f64 = 3.0;
-/// Between two kills.
+/// Pause between two kills.
 const PAUSE: Duration = Duration::from_secs(2);
-/// How long a crash loop lasts by default.
+/// Default length of a crash loop.
 const LOOP_SECONDS: u64 = 14;
 
-/// Drivers at rosrescue, and one at a bare rosmaster.
+/// Drivers with rosrescue, and one driver with a bare rosmaster.
 struct Drivers {
     drivers: [Node; 2],
     undisturbed: Node,
@@ -56,18 +57,18 @@ impl Drivers {
         self.drivers.iter().chain([&self.undisturbed])
     }
 
-    /// Waits until every driver has made its passes for a second more.
+    /// Waits until every driver has made passes for another second.
     #[track_caller]
     fn go_on(&self) {
         for driver in self.all() {
             let before = driver.said("pass").len();
-            eventually("a driver goes on", || {
+            eventually("a driver makes more passes", || {
                 driver.said("pass").len() >= before + 5
             });
         }
     }
 
-    /// Panics if a pass takes longer than `limit` while `event` takes place, or anything fails.
+    /// Panics if a pass takes longer than `limit` while `event` takes place, or if anything fails.
     #[track_caller]
     fn assert_no_stall(&mut self, what: &str, limit: f64, event: impl FnOnce()) {
         self.go_on();
@@ -141,7 +142,7 @@ fn no_driver_stalls_while_the_master_dies_again_and_again(mode: Mode) {
         let end = Instant::now() + Duration::from_secs(seconds);
         while Instant::now() < end {
             let next = Instant::now() + PAUSE;
-            // A core answers a crash loop with pauses of its own.
+            // A core makes pauses of its own in a crash loop.
             if robot.bare().master_pid().is_some() {
                 robot.kill_master();
                 robot.revive_master();

@@ -1,5 +1,6 @@
-//! The whole program, where a short time is the promise: one test at a time, because another one's processes
-//! would be measured too. What may run beside others is in `tests/robot`.
+//! The whole program, where a short time is the promise. These tests run one at a time, because otherwise the
+//! processes of another test would be measured too. `tests/robot` has the tests that can run beside each
+//! other.
 
 #![allow(
     clippy::unwrap_used,
@@ -13,15 +14,15 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Loops of drivers do not stall.
+/// The loops of drivers do not stall.
 mod drivers;
-/// Who cannot be told, or does not answer, delays nobody while there is no master.
+/// Nodes that cannot be told, or do not answer, delay no other node while there is no master.
 mod notifications;
-/// Nodes that cannot be reached delay nobody.
+/// Nodes that cannot be reached delay no other node.
 mod unreachable;
 
-/// Whoever holds this runs alone. A test takes it first, so that it is let go after all that the test has
-/// started has ended.
+/// A lock that lets one test run alone. A test takes it first, so that it is released after everything that
+/// the test has started has ended.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)

@@ -1,12 +1,13 @@
-//! While there is no master, subscribers that cannot be told, or do not answer, delay nobody.
+//! While there is no master, subscribers that cannot be told or do not answer delay no other node.
 
 use std::time::{Duration, Instant};
 
 use crate::support::{Client, FakeNode, Mode, Netns, Robot, eventually, eventually_some, params};
 
-/// By then whoever can be reached has been told, on a busy computer. Whoever waits for the others waits for longer.
+/// Maximum time until every reachable node has been told, on a busy computer. It would take longer if nodes
+/// waited for each other.
 const SOON: Duration = Duration::from_secs(4);
-/// More than rosrescue notifies at the same time.
+/// Number of unreachable nodes: more than rosrescue notifies at the same time.
 const UNREACHABLE: u16 = 100;
 
 fn robot_without_master() -> (Robot, Client) {
@@ -28,9 +29,10 @@ fn time_to_hear(client: &Client, publisher: &FakeNode, subscriber: &FakeNode) ->
     })
 }
 
-/// Their computer has vanished, and nobody has noticed before: each is waited for until a time limit.
+/// The computer of these nodes has vanished, which has not been noticed yet, so each attempt runs into its
+/// time limit.
 #[test]
-fn subscribers_that_cannot_be_reached_delay_nobody() {
+fn unreachable_subscribers_delay_no_other_node() {
     let _alone = crate::alone();
     let net = Netns::new();
     let (_robot, client) = robot_without_master();
@@ -41,18 +43,20 @@ fn subscribers_that_cannot_be_reached_delay_nobody() {
         let params = params![name.as_str(), "/chatter", "std_msgs/String", api.as_str()];
         client.ok("registerSubscriber", params);
     }
-    // The last in the list.
+    // This subscriber is the last one in the list.
     let living = FakeNode::start("/living");
     living.subscribe(&client, "/chatter", "std_msgs/String");
     let [first, second] = ["/first", "/second"].map(FakeNode::start);
     let times = [&first, &second].map(|publisher| time_to_hear(&client, publisher, &living));
-    println!("{UNREACHABLE} beside it are unreachable: told after {times:?}");
+    println!(
+        "with {UNREACHABLE} unreachable nodes beside it, the subscriber was told after {times:?}"
+    );
     assert!(times.iter().all(|time| *time < SOON), "{times:?}");
 }
 
-/// It takes calls and does not answer.
+/// The node accepts calls and does not answer them.
 #[test]
-fn a_subscriber_that_does_not_answer_delays_nobody() {
+fn a_subscriber_that_does_not_answer_delays_no_other_node() {
     let _alone = crate::alone();
     let (_robot, client) = robot_without_master();
     let [silent, living] = ["/silent", "/living"].map(FakeNode::start);
@@ -64,9 +68,9 @@ fn a_subscriber_that_does_not_answer_delays_nobody() {
     let times = [&first, &second].map(|publisher| time_to_hear(&client, publisher, &living));
     assert!(times.iter().all(|time| *time < SOON), "{times:?}");
     silent.release();
-    // As soon as it answers again it is told everything.
+    // As soon as it answers again, it is told everything.
     let both = [first.api.clone(), second.api.clone()];
-    eventually("the silent one is told at last", || {
+    eventually("the silent subscriber is told at last", || {
         silent
             .updates("/chatter")
             .last()

@@ -1,4 +1,4 @@
-//! Nodes that cannot be reached, because packets to them vanish, hold up nobody.
+//! Nodes that cannot be reached, because packets to them vanish, delay no other node.
 
 use std::time::{Duration, Instant};
 
@@ -7,13 +7,13 @@ use crate::support::{
     in_both_modes, names, params, status,
 };
 
-/// Nodes that cannot be reached, and others.
+/// Number of unreachable nodes, and of others.
 const UNREACHABLE: u8 = 20;
 const LIVING: usize = 18;
-/// By then a living subscriber knows a new publisher.
+/// Maximum time until a living subscriber knows a new publisher.
 const SOON: Duration = Duration::from_secs(5);
 
-/// The living half: fakes, and a real node of each library.
+/// The living nodes: fakes, and a real node of each library.
 struct Living {
     fakes: Vec<FakeNode>,
     real: [Node; 2],
@@ -34,7 +34,7 @@ impl Living {
         Self { fakes, real }
     }
 
-    /// How long it takes each to hear of a publisher that registers now.
+    /// How long it takes until each of them hears of a publisher that registers now.
     #[track_caller]
     fn hear_of(&self, publisher: &FakeNode, client: &Client) -> Vec<Duration> {
         let start = Instant::now();
@@ -64,13 +64,13 @@ fn summary(times: &[Duration]) -> (f64, f64) {
     (times[times.len() / 2], times[times.len() - 1])
 }
 
-/// How long it takes from the new master's open port to the open gate, in milliseconds, when the
-/// master dies: the rest is the start of a Python program.
+/// Kills the master. Returns the time from the open port of the new master to the open gate, in milliseconds;
+/// the rest of a recovery is the start of a Python program.
 #[track_caller]
 fn crash(robot: &mut Robot) -> f64 {
     let before = status(&robot.client())["recoveries"].as_u64();
     robot.crash_master();
-    eventually_some("the recovery is reported", || {
+    eventually_some("the recovery has a report", || {
         let status = status(&robot.client());
         let new = status["recoveries"].as_u64() > before;
         let phase = |name: &str| status["last_recovery"]["phases"][name].as_f64();
@@ -78,10 +78,10 @@ fn crash(robot: &mut Robot) -> f64 {
     })
 }
 
-in_both_modes!(living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable);
+in_both_modes!(with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon);
 
-/// With the three threads and without the timeout that rosmaster has when nobody says otherwise.
-fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mode: Mode) {
+/// rosmaster has its default settings: three threads that notify nodes, and no timeout.
+fn with_twenty_unreachable_nodes_the_living_ones_are_still_told_soon(mode: Mode) {
     let _alone = crate::alone();
     let net = Netns::new();
     let mut robot = Robot::start(mode);
@@ -94,7 +94,7 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
         node.watch_param(&client, "/gain");
     }
     let without = [(); 3].map(|()| crash(&mut robot));
-    // The same registrations, where nobody can be reached.
+    // The same registrations again, of nodes that cannot be reached.
     for (host, name) in gone() {
         net.cut(host);
         let api = format!("http://{}:4711/", net.far(host));
@@ -109,7 +109,7 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
     let before = robot.settled_state();
     let with = [(); 3].map(|()| crash(&mut robot));
 
-    // At once, when nobody knows yet who is unreachable; and later, when it is known.
+    // Measured at once, when it is not yet known which nodes are unreachable, and again later.
     let mut publishers: Vec<FakeNode> = Vec::new();
     let mut tell = |count: usize| {
         let mut times = Vec::new();
@@ -121,7 +121,7 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
         times
     };
     let at_once = tell(5);
-    eventually("they are known to be unreachable", || {
+    eventually("the nodes are known to be unreachable", || {
         names(&status(&client)["unreachable"]).len() == usize::from(UNREACHABLE)
     });
     let later = tell(5);
@@ -136,12 +136,12 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
     for times in [at_once, later] {
         assert!(times.iter().all(|time| *time < SOON), "{times:?}");
     }
-    // One attempt to connect that was waited for would be 1000 ms.
+    // Waiting for a single connection attempt would take 1000 ms.
     assert!(
         least(with) < least(without) * 2.0 + 500.0,
         "{with:?} {without:?}"
     );
-    // Parameters reach the living, too, and nobody was taken out or disturbed.
+    // The living nodes also hear of parameters, and no node was unregistered or disturbed.
     let state = robot.state();
     assert!(gone().all(|(_, name)| state.knows(&name)));
     assert_eq!(
@@ -156,9 +156,9 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
         !watcher.heard("paramUpdate").is_empty()
     });
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
-    // A list that the master sends late does not stand for long.
+    // If the master sends an outdated list late, it is corrected soon.
     let all: Vec<_> = publishers.iter().map(|node| node.api.clone()).collect();
-    eventually("all know all publishers", || {
+    eventually("all nodes know all publishers", || {
         let fakes = living.fakes.iter().map(|fake| fake.updates("/chatter"));
         let real = living.real.iter().map(|node| node.updates("/chatter"));
         fakes
@@ -167,7 +167,7 @@ fn living_subscribers_are_told_soon_of_forty_of_which_twenty_are_unreachable(mod
     });
     for fake in &living.fakes {
         let updates = fake.updates("/chatter");
-        // A core has more threads than there are nodes to hold them up.
+        // A core has more notifying threads than there are nodes to hold them up.
         assert!(
             mode == Mode::Proxy || updates.is_sorted_by_key(Vec::len),
             "{updates:?}"

@@ -18,33 +18,33 @@ pub enum OpenError {
     )]
     Locked {
         path: PathBuf,
-        /// The process that holds the lock, if known.
+        /// The process id of the lock's holder, if known.
         holder: Option<u32>,
     },
-    /// The file is something else.
+    /// The file is not a checkpoint.
     #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
     NotACheckpoint { path: PathBuf },
-    /// A later rosrescue wrote it.
+    /// A newer rosrescue wrote the file.
     #[error(
-        "`{}` was written in checkpoint format {version} by a newer rosrescue; use that one, or move the file away",
+        "`{}` was written in checkpoint format {version} by a newer rosrescue; use that version, or move the file away",
         path.display()
     )]
     NewerVersion { path: PathBuf, version: u32 },
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error(
         "cannot {doing} `{}`: {source}; make it readable and writable for this user or choose another file with --checkpoint",
         path.display()
     )]
     Io {
         doing: &'static str,
-        /// The file or folder.
+        /// The file or folder that could not be used.
         path: PathBuf,
         source: io::Error,
     },
 }
 
 impl OpenError {
-    /// The operating system's error, without advice.
+    /// The operating system's error without advice.
     pub fn without_advice(&self) -> String {
         match self {
             Self::Io {
@@ -57,23 +57,23 @@ impl OpenError {
     }
 }
 
-/// Why something was not recorded. Calls are still forwarded.
+/// Why something was not recorded. Calls are forwarded nevertheless.
 #[derive(Debug, Error)]
 pub enum StoreError {
-    /// An earlier failure, or no [`begin`](super::Store::begin) yet.
+    /// An earlier failure, or [`begin`](super::Store::begin) was not called yet.
     #[error("`{}` records nothing: {reason}", path.display())]
     Unprotected { path: PathBuf, reason: String },
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("cannot {doing} `{}`: {source}", path.display())]
     Io {
         doing: &'static str,
         path: PathBuf,
         source: io::Error,
     },
-    /// Another process changed the file.
-    #[error("`{}` was changed by somebody else: {change}", path.display())]
+    /// Another process has changed the file.
+    #[error("another process changed `{}`: {change}", path.display())]
     Changed { path: PathBuf, change: Change },
-    /// Another rosrescue took the lock after ours had been removed.
+    /// The lock file was removed, and then another rosrescue took the lock.
     #[error(
         "`{}` is in use by another rosrescue{} now; stop one of the two",
         path.display(),
@@ -81,7 +81,7 @@ pub enum StoreError {
     )]
     Taken {
         path: PathBuf,
-        /// The process that holds the lock, if known.
+        /// The process id of the lock's holder, if known.
         holder: Option<u32>,
     },
     /// The snapshot is older than the journal.
@@ -89,19 +89,19 @@ pub enum StoreError {
         "a snapshot as of record {snapshot} cannot replace a journal that has reached {journal}; take a new one"
     )]
     Stale {
-        /// The last record in the snapshot.
+        /// The number of the last record in the snapshot.
         snapshot: u64,
-        /// The journal's last record.
+        /// The number of the last record in the journal.
         journal: u64,
     },
     /// A new generation is already being written.
     #[error("another generation of the checkpoint is being written; finish that one first")]
     Busy,
     /// The new generation is obsolete: a later one was begun, the file was set aside, or too much was
-    /// recorded meanwhile.
+    /// recorded in the meantime.
     #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
     Overtaken { path: PathBuf },
-    /// The content cannot be encoded.
+    /// The state or the record cannot be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
 }

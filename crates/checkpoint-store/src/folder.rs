@@ -1,4 +1,4 @@
-//! Whether other users may change the files in a checkpoint's folder.
+//! Checks whether other users may change the files in a checkpoint's folder.
 
 use std::{
     fs, io,
@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// The bit that lets only a file's owner rename or remove it.
+/// The mode bit that lets only the owner of a file rename or remove it.
 const STICKY: u32 = 0o1000;
 
 /// Owner and mode of a folder.
@@ -27,9 +27,9 @@ impl Access {
         })
     }
 
-    /// Which others than the user `own` may create files here.
+    /// Who else than the user `own` may create files in the folder. `None` if no other user may.
     fn others(self, own: u32) -> Option<&'static str> {
-        // Many distributions give each user a group of the same number, without other members.
+        // Many distributions give each user a group with the same number and no other members.
         let is_private = self.group == self.user || self.group == 0;
         if self.mode & 0o002 != 0 {
             Some("every user may write to it")
@@ -43,8 +43,8 @@ impl Access {
     }
 }
 
-/// The first of the folders that hold the checkpoint at `path` in which other users may plant or swap files, and why;
-/// none if all are safe or cannot be looked at.
+/// The first folder above the checkpoint at `path` in which other users may plant or swap files, and the
+/// reason. `None` if all folders are safe or cannot be examined.
 pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
     let own = rustix::process::geteuid().as_raw();
     let path = std::path::absolute(path).ok()?;
@@ -59,7 +59,7 @@ pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
     folders
         .flatten()
         .enumerate()
-        // In a sticky folder others may plant a file beside the checkpoint, but not swap what is below it.
+        // In a sticky folder others may plant a file beside the checkpoint, but not swap a folder below it.
         .filter(|(level, (_, access))| *level == 0 || access.mode & STICKY == 0)
         .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.others(own)?)))
 }
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn others_are_those_who_may_write_beside_the_owner_and_root() {
+    fn a_folder_is_open_to_others_if_anyone_but_its_user_and_root_may_write() {
         let others = |mode, user, group| Access { mode, user, group }.others(1000);
         assert_eq!(others(0o755, 1000, 1000), None);
         assert_eq!(others(0o755, 0, 0), None);

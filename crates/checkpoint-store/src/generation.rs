@@ -1,4 +1,4 @@
-//! Writes a new generation of the file while calls are still recorded.
+//! Writes a new generation of the file while records are still being appended.
 
 use std::io;
 use std::path::Path;
@@ -9,54 +9,54 @@ use super::storage::FileId;
 use super::{Names, Present, Storage, Store, StoreError, SyncJob, Synced};
 use rescue_core::checkpoint::format::{self, Checkpoint, Stamp};
 
-/// A smaller journal is not worth a new generation.
+/// Size of a journal that makes a new generation worth writing.
 pub(super) const COMPACTION_BYTES_MIN: u64 = 64 * 1024;
-/// Records made while a new generation is written are also kept in memory, up to this size. Beyond it the new
+/// Maximum size of the records that are kept in memory while a new generation is written. Beyond it the new
 /// generation is dropped and the present file stays in use.
 pub(super) const MEANWHILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 
 pub(super) struct Pending {
     generation: u64,
-    /// Bodies of the records made meanwhile, each with a line feed.
+    /// The records appended since the new generation was begun, each with a line feed.
     pub(super) meanwhile: Vec<u8>,
     superseded: bool,
-    /// Dangles if the job or its result was dropped unfinished.
+    /// Its `Arc` is gone if the job or its result was dropped unfinished.
     ticket: Weak<Ticket>,
 }
 
-/// Whether a generation is still wanted. Locked while its job renames files, so that a superseded job cannot
-/// touch its successor's files.
+/// Whether a generation is still wanted. It is locked while the generation's job renames files, so that an
+/// obsolete job cannot touch its successor's files.
 #[derive(Debug)]
 struct Ticket(Mutex<bool>);
 
 impl Ticket {
     fn lock(&self) -> MutexGuard<'_, bool> {
-        // A poisoned boolean is still valid.
+        // A boolean is valid even if the lock is poisoned.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Writes a new generation; see [`Store::begin_compaction`](super::Store::begin_compaction).
-#[must_use = "the journal goes on growing until the job has run and has been finished"]
+/// A job that writes a new generation; see [`Store::begin_compaction`](super::Store::begin_compaction).
+#[must_use = "the journal keeps growing until the job has run and has been finished"]
 pub struct CompactionJob<S: Storage> {
     plan: Plan<S>,
     checkpoint: Checkpoint,
 }
 
-/// What a job needs to write a new generation.
+/// Everything that a job needs to write a new generation.
 struct Plan<S: Storage> {
     storage: S,
     names: Names,
     generation: u64,
-    /// The present file, if it becomes the previous generation.
+    /// The present file, if it is to become the previous generation.
     keep_present: Option<FileId>,
-    /// Runs first if the present file is kept: some of its records may be on the medium only in the older
-    /// generation.
+    /// Runs first if the present file is kept. Some of its records may not be durable anywhere but in the
+    /// older generation, which is about to be replaced.
     settle: Option<SyncJob<S>>,
     ticket: Arc<Ticket>,
 }
 
-/// A new generation on disk under a temporary name, or why there is none.
+/// A new generation on disk under a temporary name, or the reason why there is none.
 #[must_use = "give it to `Store::finish_compaction`"]
 pub struct Compacted<S: Storage> {
     generation: u64,
@@ -70,15 +70,15 @@ struct Written<S: Storage> {
     stamp: Stamp,
     snapshot_bytes: u64,
     crc: u32,
-    /// The new previous generation.
+    /// The file that has become the previous generation.
     previous: Option<FileId>,
-    /// Whether the previous generation is the present file itself. Then it also gets what is appended until
-    /// the new one replaces it.
+    /// Whether the previous generation is the present file itself, under a second name. Then it also receives
+    /// the records that are appended until the new generation replaces it.
     linked: bool,
 }
 
 impl<S: Storage> CompactionJob<S> {
-    /// Encodes, writes and syncs. Blocks as long as the disk does.
+    /// Encodes, writes and syncs. Blocks for as long as the disk does.
     pub fn run(self) -> Compacted<S> {
         self.plan.run(&self.checkpoint)
     }
@@ -126,8 +126,8 @@ impl<S: Storage> Plan<S> {
                 .map_err(failed("keep", &path))?;
             previous = self.keep_present;
         }
-        // Both names are on the medium before the new generation takes the path. So whatever a loss of power
-        // undoes later, the records are in one of the two files.
+        // Both names are durable before the new generation takes the path. So whatever a loss of power undoes
+        // later, all records are in one of the two files.
         storage
             .sync_dir(names.folder())
             .map_err(failed("sync the folder of", &path))?;
@@ -142,7 +142,7 @@ impl<S: Storage> Plan<S> {
         })
     }
 
-    /// Whether the present file is to be kept and is still at its path.
+    /// Whether the present file is to be kept and is still at the path.
     fn present_is_there(&self) -> bool {
         let there = self.storage.id_at(&self.names.path).ok().flatten();
         there.is_some() && there == self.keep_present
@@ -158,8 +158,8 @@ impl<S: Storage> Plan<S> {
         Ok(file)
     }
 
-    /// Removes the previous generation, which is about to be replaced anyway. Never the present file: it is
-    /// the only copy until there is a new one.
+    /// Removes the previous generation, which is about to be replaced anyway. Never removes the present file,
+    /// which is the only copy until there is a new one.
     fn make_room(&self) -> bool {
         let wanted = self.ticket.lock();
         *wanted && self.present_is_there() && self.storage.remove(&self.names.previous()).is_ok()
@@ -172,8 +172,8 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If it cannot be written: the store stays unprotected if it was, otherwise it keeps using the present
-    /// file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
+    /// If it cannot be written. An unprotected store then stays unprotected; any other continues to use the
+    /// present file. If [`Checkpoint::seq`] is behind [`seq`](Self::seq), nothing is done.
     pub fn begin(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         if checkpoint.seq >= self.seq {
             self.overtake();
@@ -194,9 +194,10 @@ impl<S: Storage> Store<S> {
             })
     }
 
-    /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] is
-    /// [`seq`](Self::seq). Run the job on any thread, continue to append, then pass its result to
-    /// [`finish_compaction`](Self::finish_compaction). Also re-arms an unprotected store beside traffic.
+    /// Begins a new generation with `checkpoint`, which must be current: its [`Checkpoint::seq`] equals
+    /// [`seq`](Self::seq). Run the job on any thread, continue to append, then pass the result to
+    /// [`finish_compaction`](Self::finish_compaction). This also re-arms an unprotected store while calls go
+    /// on.
     ///
     /// # Errors
     ///
@@ -249,7 +250,7 @@ impl<S: Storage> Store<S> {
         ticket.is_some_and(|ticket| ticket.strong_count() > 0)
     }
 
-    /// Invalidates the generation being written: from now on it touches only its own file.
+    /// Makes the generation being written obsolete: from now on its job touches only its own file.
     pub(super) fn overtake(&mut self) {
         if let Some(ticket) = self
             .pending
@@ -260,13 +261,13 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Appends the records made meanwhile to the new generation and moves it to the path. Quick: it waits for
-    /// the disk only where the file system has no hard links.
+    /// Appends the records made in the meantime to the new generation, and moves it to the path. This is
+    /// quick: it waits for the disk only if the file system has no hard links.
     ///
     /// # Errors
     ///
     /// If there is no new generation. The present file stays in use, and the next compaction is due when it
-    /// has doubled.
+    /// has doubled in size.
     pub fn finish_compaction(&mut self, mut done: Compacted<S>) -> Result<(), StoreError> {
         let fresh = self.names.fresh(done.generation);
         let pending = self
@@ -275,7 +276,7 @@ impl<S: Storage> Store<S> {
         let settled = done.settled.take().map_or(Ok(()), |it| self.synced(it));
         let finished = settled.and_then(|()| self.switch(pending, done));
         if finished.is_err() {
-            // It may not exist. If it stays, the next start removes it.
+            // The file may not exist. If it stays, the next start removes it.
             let _ = self.storage.remove(&fresh);
             let journal = self
                 .active
@@ -305,7 +306,7 @@ impl<S: Storage> Store<S> {
         append_all(&self.storage, &written.file, &journal)
             .and_then(|()| match written.linked {
                 true => Ok(()),
-                // The only wait: on file systems such as FAT.
+                // This is the only wait, on file systems such as FAT.
                 false => self.storage.sync(&written.file),
             })
             .map_err(failed("write", &fresh))?;
@@ -339,20 +340,20 @@ impl<S: Storage> Store<S> {
         Ok(())
     }
 
-    /// Ends being unprotected. Same as [`begin`](Self::begin).
+    /// Ends the unprotected state. Does the same as [`begin`](Self::begin).
     ///
     /// # Errors
     ///
-    /// As `begin`; try again later.
+    /// The errors of [`begin`](Self::begin). Try again later.
     pub fn rearm(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         self.begin(checkpoint)
     }
 
-    /// Writes a last generation, marked as closed in `checkpoint`, and stops recording.
+    /// Writes a last generation, which `checkpoint` must mark as closed, and stops recording.
     ///
     /// # Errors
     ///
-    /// As [`begin`](Self::begin).
+    /// The errors of [`begin`](Self::begin).
     pub fn close(&mut self, checkpoint: &Checkpoint) -> Result<(), StoreError> {
         self.begin(checkpoint)?;
         self.active = None;
@@ -385,7 +386,7 @@ pub(super) fn append_all<S: Storage>(storage: &S, file: &S::File, bytes: &[u8]) 
     Ok(())
 }
 
-/// Adds to an error what failed, and on which file.
+/// Adds to an error what was being done, and to which file.
 pub(super) fn failed(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> StoreError {
     move |source| StoreError::Io {
         doing,

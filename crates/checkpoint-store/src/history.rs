@@ -1,4 +1,4 @@
-//! The checkpoints that are kept beside the present one: the last sessions, and the states of rescues.
+//! The checkpoints that are kept beside the present one: those of the last sessions and of the last rescues.
 
 use std::fs;
 use std::io;
@@ -11,25 +11,25 @@ use super::{Disk, Names, Storage};
 use rescue_core::checkpoint::format::{self, Checkpoint};
 use ros1_master::xmlrpc::Value;
 
-/// Earlier sessions that are kept.
-const SESSIONS_MOST: usize = 5;
-/// Rescues that are kept.
-const RESCUES_MOST: usize = 20;
+/// Maximum number of earlier sessions that are kept.
+const SESSIONS_MAX: usize = 5;
+/// Maximum number of rescues that are kept.
+const RESCUES_MAX: usize = 20;
 
-/// Names of the nodes and parameters of `rosrescue drill` begin with this. The process id follows.
+/// The names of nodes and parameters of `rosrescue drill` start with this. The process id follows.
 pub const DRILLS: &str = "/rosrescue_drill_";
 
 /// Why a checkpoint is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// It was the last of a session when another one began.
+    /// It was the last one of a session when another session began.
     Session,
-    /// The state that was given to a new master.
+    /// It is the state that was given to a new master.
     Rescue,
 }
 
 impl Kind {
-    /// As in the file's name.
+    /// The name of the kind, as in file names.
     pub fn name(self) -> &'static str {
         match self {
             Self::Session => "session",
@@ -38,19 +38,19 @@ impl Kind {
     }
 }
 
-/// A file of the history.
+/// A checkpoint that is kept beside the present one.
 #[derive(Clone, Debug)]
 pub struct Kept {
     pub kind: Kind,
-    /// Grows with each file of its kind.
+    /// A number that grows with each file of the same kind.
     pub number: u64,
     pub path: PathBuf,
     pub bytes: u64,
-    /// Wall clock time of its last record, in seconds since 1970.
+    /// Wall clock time of the last record, in seconds since 1970.
     pub written: i64,
 }
 
-/// What is kept beside the checkpoint at `path`, whose links are resolved: sessions first, the last ones first.
+/// The checkpoints kept beside the one at `path`, whose links must be resolved: sessions first, newest first.
 ///
 /// # Errors
 ///
@@ -61,7 +61,7 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
     for kind in [Kind::Session, Kind::Rescue] {
         for number in names.numbers(&Disk, kind.name())?.into_iter().rev() {
             let path = names.numbered(kind.name(), number);
-            // Another process may have removed it.
+            // Another process may have removed the file.
             let Ok(metadata) = fs::metadata(&path) else {
                 continue;
             };
@@ -77,7 +77,7 @@ pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
     Ok(kept)
 }
 
-/// The last number of a rescue's state beside the checkpoint at `path`; 0 if there is none.
+/// The number of the last rescue that was kept beside the checkpoint at `path`. 0 if there is none.
 pub fn last_rescue(path: &Path) -> u64 {
     let numbers = names_of(path).numbers(&Disk, Kind::Rescue.name());
     numbers
@@ -86,12 +86,13 @@ pub fn last_rescue(path: &Path) -> u64 {
         .unwrap_or(0)
 }
 
-/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. It is not synced: it is a copy, and
-/// a memory card wears out. Drills are left out: `rosrescue restore` must not set what they had set.
+/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. It is not synced,
+/// because it is only a copy, and memory cards wear out. Nodes and parameters of drills are left out, so that
+/// `rosrescue restore` does not bring them back.
 ///
 /// # Errors
 ///
-/// If it cannot be written; nothing is left of it then.
+/// If it cannot be written. Nothing is left of it then.
 pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
     checkpoint.snapshot.remove_named(DRILLS);
     checkpoint.pending.retain(|call| {
@@ -101,7 +102,7 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
     let names = names_of(path);
     let kept = names.numbered(Kind::Rescue.name(), number);
     let encoded = format::encode_checkpoint(&checkpoint, 1).map_err(io::Error::other)?;
-    // The next start removes what a crash leaves of it.
+    // If a crash leaves this file, the next start removes it.
     let fresh = with(&kept, ".new");
     let written = Disk
         .create(&fresh)
@@ -113,8 +114,8 @@ pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::
     written.map(|()| kept)
 }
 
-/// Removes what is too much: all but the last sessions and rescues, and of these the oldest, until they take no
-/// more than `bytes_most`. The last session stays in any case.
+/// Removes surplus files: all but the last sessions and rescues, and of these the oldest until the rest take
+/// no more than `bytes_most`. The last session always stays.
 ///
 /// # Errors
 ///
@@ -123,9 +124,9 @@ pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
     let all = kept(path)?;
     let (mut sessions, mut rescues): (Vec<_>, Vec<_>) =
         all.into_iter().partition(|kept| kept.kind == Kind::Session);
-    let mut surplus = sessions.split_off(SESSIONS_MOST.min(sessions.len()));
-    surplus.extend(rescues.split_off(RESCUES_MOST.min(rescues.len())));
-    // By age: the last of each kind, the last but one, …
+    let mut surplus = sessions.split_off(SESSIONS_MAX.min(sessions.len()));
+    surplus.extend(rescues.split_off(RESCUES_MAX.min(rescues.len())));
+    // By age: the last one of each kind, the last but one of each kind, and so on.
     let mut ranked: Vec<_> = sessions.into_iter().enumerate().collect();
     ranked.extend(rescues.into_iter().enumerate());
     ranked.sort_by_key(|(rank, _)| *rank);
@@ -138,7 +139,7 @@ pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
         }
     }
     for kept in surplus {
-        // A failed removal must not prevent anything.
+        // A failed removal must not prevent anything else.
         let _ = fs::remove_file(&kept.path);
         let _ = fs::remove_file(previous(&kept.path));
     }
@@ -173,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_sessions_and_rescues_stay() {
+    fn only_the_last_sessions_and_rescues_are_kept() {
         let (_folder, path) = place();
         for number in 1..=7 {
             file(&path, &format!("session-{number}"), 1);
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_give_way_to_the_limit_but_the_last_session_stays() {
+    fn the_oldest_files_are_removed_to_meet_the_size_limit_but_the_last_session_stays() {
         let (_folder, path) = place();
         for number in 1..=3 {
             file(&path, &format!("session-{number}"), 10);
@@ -209,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rescue_is_a_whole_checkpoint_with_its_number() {
+    fn the_state_of_a_rescue_is_kept_as_a_whole_checkpoint_with_its_number() {
         let (_folder, path) = place();
         let checkpoint = Checkpoint {
             seq: 7,
@@ -228,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rescue_is_kept_without_the_drill_that_caused_it() {
+    fn the_state_of_a_rescue_is_kept_without_the_drill_that_caused_it() {
         let (_folder, path) = place();
         let list = |nodes: &[&str]| nodes.iter().map(|node| (*node).to_owned()).collect();
         let robot = || {

@@ -8,10 +8,10 @@ use super::storage::FileId;
 use super::{Names, Storage, Store, StoreError};
 use rescue_core::checkpoint::format::{self, Entry, Stamp};
 
-/// Most encoding buffer that is kept between appends.
+/// Maximum size of the encoding buffer that is kept between appends.
 const BUFFER_BYTES_MAX: usize = 1024 * 1024;
 
-/// The file that receives the records.
+/// The file to which records are appended.
 pub(super) struct Active<S: Storage> {
     pub(super) file: Arc<S::File>,
     pub(super) stamp: Stamp,
@@ -19,27 +19,27 @@ pub(super) struct Active<S: Storage> {
     pub(super) snapshot_bytes: u64,
     pub(super) journal_bytes: u64,
     pub(super) id: FileId,
-    /// Check sum of everything written.
+    /// Check sum of everything that was written.
     pub(super) crc: u32,
-    /// Modification time after our last write.
+    /// Modification time of the file after our last write.
     pub(super) modified: i128,
-    /// Whether another process may have written to it, so that its content must be read.
+    /// Whether another process may have written to the file, so that its content must be read.
     pub(super) suspect: bool,
-    /// Whether everything appended has been synced.
+    /// Whether everything that was appended has been synced.
     pub(super) clean: bool,
-    /// Whether the file's name has been synced.
+    /// Whether the name of the file has been synced.
     pub(super) named: bool,
 }
 
 impl<S: Storage> Store<S> {
-    /// Records `entries` with one write. Each gets a number, whether it could be recorded or not; returns the
-    /// last one. After that they survive the death of every process; a [`sync_job`](Self::sync_job) makes
-    /// them survive a loss of power.
+    /// Records `entries` with one write. Each entry gets a number, even if it cannot be recorded; returns the
+    /// last one. After this call the entries survive the death of any process; a [`sync_job`](Self::sync_job)
+    /// makes them survive a loss of power as well.
     ///
     /// # Errors
     ///
-    /// If they were not recorded. The store is then unprotected, unless the reason is an
-    /// [`EncodeError`](rescue_core::checkpoint::format::EncodeError).
+    /// If the entries were not recorded. The store is then unprotected, unless the reason is an
+    /// [`EncodeError`](crate::checkpoint::format::EncodeError).
     pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
         let first = self.seq.saturating_add(1);
         self.seq = self.seq.saturating_add(entries.len() as u64);
@@ -71,7 +71,7 @@ impl<S: Storage> Store<S> {
                 });
             }
         };
-        // Nothing may be acknowledged that was appended after foreign bytes, or to a truncated file.
+        // A record after another process's bytes, or in a truncated file, must not be acknowledged.
         if let Ok(status) = self.storage.status(&active.file)
             && let Err(change) = active.compare(&status)
         {
@@ -86,10 +86,10 @@ impl<S: Storage> Store<S> {
         };
         let written = match appended {
             Ok(taken) if taken == self.buffer.len() => Ok(()),
-            // Not retried: the rest would fail too, only with a clearer error.
+            // Not retried, because writing the rest would fail too, only with a clearer error.
             Ok(taken) => Err(io::Error::new(
                 io::ErrorKind::StorageFull,
-                format!("only {taken} of {} bytes were taken", self.buffer.len()),
+                format!("only {taken} of {} bytes were written", self.buffer.len()),
             )),
             Err(error) => Err(error),
         };
@@ -110,8 +110,8 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Stops recording to the present file for good: records are missing in it, because the disk was silent.
-    /// `reason`: in words.
+    /// Stops recording to the present file for good, because the disk did not answer and so records are
+    /// missing in it. `reason` is shown to the user.
     pub fn give_up(&mut self, reason: &str) {
         self.latch(failed("write", &self.names.path)(io::Error::new(
             io::ErrorKind::TimedOut,
@@ -119,19 +119,19 @@ impl<S: Storage> Store<S> {
         )));
     }
 
-    /// Stops recording to the present file for good.
+    /// Stops recording to the present file for good, because of `error`.
     pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
         self.unprotected = Some(error.to_string());
         if self.active.take().is_some_and(|active| !active.named)
             && let Some(present) = &mut self.present
         {
-            // It is unknown how much of it is on the medium. The previous generation has everything that was.
+            // It is unknown how much of the file is durable. The previous generation has everything that was.
             present.usable = false;
         }
         error
     }
 
-    /// The sync that is due; `None` if none is.
+    /// The sync that is due. `None` if none is.
     pub fn sync_job(&self) -> Option<SyncJob<S>> {
         let active = self
             .active
@@ -150,7 +150,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If it failed: the store is now unprotected.
+    /// If the sync failed. The store is now unprotected.
     pub fn synced(&mut self, done: Synced) -> Result<(), StoreError> {
         let active = self
             .active
@@ -166,19 +166,19 @@ impl<S: Storage> Store<S> {
                 Ok(())
             }
             (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
-            // Of a file that has been replaced since. Its successor holds the same records and is not synced
-            // yet.
+            // It was a file that has been replaced since. Its successor holds the same records and has not
+            // been synced yet.
             (Err(_), None) => Ok(()),
         }
     }
 }
 
-/// Syncs everything appended so far; see [`Store::sync_job`](super::Store::sync_job).
+/// A job that syncs everything appended so far; see [`Store::sync_job`](super::Store::sync_job).
 #[must_use = "nothing is synced until it has run"]
 pub struct SyncJob<S: Storage> {
     pub(super) storage: S,
     pub(super) file: Arc<S::File>,
-    /// Present if the folder must be synced too.
+    /// Set if the folder must be synced too.
     pub(super) names: Option<Names>,
     generation: u64,
     seq: u64,
@@ -194,7 +194,7 @@ pub struct Synced {
 }
 
 impl<S: Storage> SyncJob<S> {
-    /// Syncs. Blocks as long as the disk does.
+    /// Syncs. Blocks for as long as the disk does.
     pub fn run(self) -> Synced {
         let mut result = self.storage.sync(&self.file);
         if let (Ok(()), Some(names)) = (&result, &self.names) {

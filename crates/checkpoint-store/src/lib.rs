@@ -1,15 +1,15 @@
-//! The checkpoint on disk.
+//! The store of a checkpoint on disk.
 //!
 //! A [`Store`] owns one file and its companions: it takes the lock, loads the file ([`Loaded`]), appends
 //! records, and replaces the file by a new generation when the journal is too large or the disk has failed.
-//! It is synchronous and never decides when to do so. Slow work ([`SyncJob`], [`CompactionJob`]) is returned
-//! as a job for a blocking thread; meanwhile records can be appended. `docs/checkpoint.md` has the commit
-//! procedure and the assumptions about the disk.
+//! It is synchronous and never decides by itself when to do so. It returns slow work ([`SyncJob`],
+//! [`CompactionJob`]) as a job for a blocking thread, and can append records meanwhile. `docs/checkpoint.md`
+//! describes the commit procedure and the assumptions about the disk.
 //!
-//! A failed write or sync *latches*: the file is never written again, because the data that a failed `fsync`
-//! has dropped is reported only once. The store is then [unprotected](Store::unprotected) until
-//! [`Store::rearm`] has written a new file. A change by another process to the file, its folder or its lock
-//! makes no write fail; a [`CheckJob`] finds it, and it latches too.
+//! A failed write or sync *latches*: the file is never written again, because a failed `fsync` reports only
+//! once that data was lost. The store is then [unprotected](Store::unprotected) until [`Store::rearm`] has
+//! written a new file. When another process changes the file, its folder or its lock, no write fails, but a
+//! [`CheckJob`] notices, and that latches too.
 
 mod aside;
 mod error;
@@ -43,12 +43,12 @@ use names::Names;
 pub use storage::{Disk, FileId, FileStatus, Storage};
 pub use watch::{Change, CheckJob, Checked};
 
-/// Kinds of names for files that are kept: damaged ones,
+/// Part of the name under which a damaged file is kept.
 const BROKEN: &str = "broken";
-/// and unreadable ones.
+/// Part of the name under which an unreadable file is kept.
 const UNREADABLE: &str = "unreadable";
 
-/// The file that is known to be at the path.
+/// The file known to be at the checkpoint's path.
 #[derive(Clone, Copy, Debug)]
 struct Present {
     id: FileId,
@@ -56,25 +56,26 @@ struct Present {
     usable: bool,
 }
 
-/// A checkpoint, locked and open.
+/// A checkpoint that is locked and open.
 pub struct Store<S: Storage = Disk> {
     storage: S,
     names: Names,
     /// The file that receives the records.
     active: Option<Active<S>>,
-    /// Why nothing is recorded. `None` only if `active` is set.
+    /// Why nothing is being recorded. `None` only if `active` is set.
     unprotected: Option<String>,
     pending: Option<Pending>,
-    /// Number of the last record, recorded or not: a number is never used twice.
+    /// The number of the last record, even if it could not be recorded. No number is used twice.
     seq: u64,
     synced_seq: u64,
     /// The highest generation that was begun.
     generation: u64,
-    /// The known file. Any other file at the path is kept before it is replaced,
+    /// The file known to be at the path. Any other file there is kept under another name before it is
+    /// replaced.
     present: Option<Present>,
-    /// under this kind of name;
+    /// Part of the name under which the next such file is kept.
     aside_kind: &'static str,
-    /// this is where the last one went.
+    /// The name under which the last such file was kept.
     kept: Option<PathBuf>,
     compact_above: u64,
     file_bytes_max: u64,
@@ -83,12 +84,12 @@ pub struct Store<S: Storage = Disk> {
     lock_id: FileId,
 }
 
-/// Reads the checkpoint at `path` and changes nothing: no lock, no folder, no copies. For a disk on which
-/// [`Store::open`] fails because it is read-only.
+/// Reads the checkpoint at `path` without changing anything: takes no lock, creates no folder, makes no
+/// copies. Meant for a disk on which [`Store::open`] fails because it is read-only.
 ///
 /// # Errors
 ///
-/// If the file cannot be read, is not a checkpoint or is too new.
+/// If the file cannot be read, is not a checkpoint, or was written by a newer version.
 pub fn read(path: &Path) -> Result<Option<Loaded>, OpenError> {
     let names = Names {
         path: path.to_owned(),
@@ -97,26 +98,26 @@ pub fn read(path: &Path) -> Result<Option<Loaded>, OpenError> {
 }
 
 impl Store<Disk> {
-    /// Opens the checkpoint at `path` on this machine's disk; see [`Store::open_on`].
+    /// Opens the checkpoint at `path` on this computer's disk; see [`Store::open_on`].
     ///
     /// # Errors
     ///
-    /// As [`Store::open_on`].
+    /// The errors of [`Store::open_on`].
     pub fn open(path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         Self::open_on(Disk, path)
     }
 
-    /// Opens the checkpoint at `path` for a state from elsewhere; see [`Store::open_over_on`].
+    /// Opens the checkpoint at `path` to store a state from elsewhere; see [`Store::open_over_on`].
     ///
     /// # Errors
     ///
-    /// As [`Store::open_over_on`].
+    /// The errors of [`Store::open_over_on`].
     pub fn open_over(path: &Path) -> Result<Self, OpenError> {
         Self::open_over_on(Disk, path)
     }
 }
 
-/// The name of the generation before the file at `path`.
+/// The name of the previous generation of the file at `path`.
 pub fn previous_of(path: &Path) -> PathBuf {
     names::previous(path)
 }
@@ -131,20 +132,20 @@ fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) 
 }
 
 impl<S: Storage> Store<S> {
-    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. A damaged file
-    /// is also copied to another name, and so is a torn append. An unreadable file is kept when it is
-    /// replaced. Nothing can be recorded before [`begin`](Self::begin).
+    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. Copies a
+    /// damaged file and an incomplete append to other names. Keeps an unreadable file under another name when
+    /// it is replaced. Nothing can be recorded before [`begin`](Self::begin).
     ///
     /// # Errors
     ///
-    /// If the folder or the file cannot be used, another rosrescue has it, or the file is not a checkpoint or
-    /// too new. The file is then untouched.
+    /// If the folder or the file cannot be used, if another rosrescue uses it, or if the file is not a
+    /// checkpoint or was written by a newer version. The file is unchanged in all these cases.
     pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
         let Some(found) = load::load(storage, names)? else {
-            // The operator removed the file to start afresh; the previous generation must not be restored
-            // later.
+            // The operator has removed the file in order to start afresh, so the previous generation must not
+            // be restored later.
             names
                 .remove_unfinished(storage)
                 .and_then(|()| set_aside_previous(storage, names, "old"))
@@ -156,7 +157,7 @@ impl<S: Storage> Store<S> {
         if store.present.is_none() {
             store.aside_kind = UNREADABLE;
         }
-        // Best effort: a read-only disk can still be read.
+        // A failure does not matter here: a read-only disk can still be read.
         let _ = names.remove_unfinished(storage);
         let kept = match store.present {
             Some(_) => keep_aside(storage, names, &mut loaded, found.torn),
@@ -167,25 +168,25 @@ impl<S: Storage> Store<S> {
         if let Err(error) = kept.and(cleared) {
             let path = names.path.display();
             loaded.damage.push(format!(
-                "what is damaged of `{path}` could not be kept: {error}"
+                "the damaged part of `{path}` could not be kept: {error}"
             ));
-            // Kept when it is replaced, then.
+            // So it will be kept when it is replaced.
             store.present = store.present.filter(|present| present.usable);
         }
         store.set_counts(found.seq, found.generation);
         Ok((store, Some(loaded)))
     }
 
-    /// Takes the lock of the checkpoint at `path` for a state from elsewhere. The present file and its
+    /// Takes the lock of the checkpoint at `path` to store a state from elsewhere. The present file and its
     /// previous generation are kept under other names before they are replaced.
     ///
     /// # Errors
     ///
-    /// As [`open_on`](Self::open_on). Other files and folders are not renamed.
+    /// The errors of [`open_on`](Self::open_on). Other files and folders are not renamed.
     pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let mut store = Self::lock_on(storage, path)?;
         let (storage, names) = (&store.storage, &store.names);
-        // Its numbers must not be used again.
+        // The numbers that the file has used must not be used again.
         let found = load::load(storage, names)?.unwrap_or_default();
         let _ = names.remove_unfinished(storage);
         set_aside_previous(storage, names, UNREADABLE)
@@ -195,11 +196,11 @@ impl<S: Storage> Store<S> {
         Ok(store)
     }
 
-    /// Locks `path`, without reading what is there.
+    /// Locks `path` without reading the file there.
     fn lock_on(storage: S, path: &Path) -> Result<Self, OpenError> {
         let path = storage
             .locate(path)
-            .map_err(open_failed("make the folder of", path))?;
+            .map_err(open_failed("create the folder of", path))?;
         let names = Names { path };
         let lock_path = names.lock();
         let lock = storage
@@ -216,7 +217,7 @@ impl<S: Storage> Store<S> {
             storage,
             names,
             active: None,
-            unprotected: Some("it has not been begun yet".to_owned()),
+            unprotected: Some("recording has not begun yet".to_owned()),
             pending: None,
             seq: 0,
             synced_seq: 0,
@@ -236,22 +237,22 @@ impl<S: Storage> Store<S> {
         (self.seq, self.synced_seq, self.generation) = (seq, seq, generation);
     }
 
-    /// The file's path, links resolved.
+    /// The path of the file, with links resolved.
     pub fn path(&self) -> &Path {
         &self.names.path
     }
 
-    /// Number of the last record, recorded or not.
+    /// The number of the last record, even if it could not be recorded.
     pub fn seq(&self) -> u64 {
         self.seq
     }
 
-    /// Number of the last record known to survive a loss of power.
+    /// The number of the last record known to survive a loss of power.
     pub fn synced_seq(&self) -> u64 {
         self.synced_seq
     }
 
-    /// Number of times the file has been rewritten.
+    /// How often the file has been rewritten.
     pub fn generation(&self) -> u64 {
         self.generation
     }
@@ -263,14 +264,14 @@ impl<S: Storage> Store<S> {
             .map_or(0, |active| active.journal_bytes)
     }
 
-    /// Size of the part before the journal, in bytes.
+    /// Size of the snapshot and everything else before the journal, in bytes.
     pub fn snapshot_bytes(&self) -> u64 {
         self.active
             .as_ref()
             .map_or(0, |active| active.snapshot_bytes)
     }
 
-    /// Why nothing is recorded; `None` if records are written.
+    /// Why nothing is being recorded. `None` if records are written.
     pub fn unprotected(&self) -> Option<&str> {
         self.unprotected.as_deref()
     }

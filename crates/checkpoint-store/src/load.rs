@@ -1,4 +1,4 @@
-//! Loads a checkpoint from its present and previous generations.
+//! Loads a checkpoint from its present and its previous generation.
 
 use std::io;
 use std::path::Path;
@@ -9,21 +9,21 @@ use rescue_core::checkpoint::format::{
     self, Checkpoint, Damage, DecodeError, Entry, Framed, Record, Session,
 };
 
-/// Larger files are not read; no checkpoint is larger.
+/// Maximum size of a file that is read. No checkpoint is larger.
 pub(super) const FILE_BYTES_MAX: u64 = 1 << 30;
 
-/// What was found on disk.
+/// Everything that was found on disk.
 #[derive(Debug, Default)]
 pub struct Loaded {
     /// The newest whole snapshot. Without one, only `records` are left of the state.
     pub checkpoint: Option<Checkpoint>,
-    /// The whole records after it, in order.
+    /// The whole records after the snapshot, in order.
     pub records: Vec<Record>,
-    /// Whether this is exactly the recorded state; if not, something is missing.
+    /// Whether this is exactly the recorded state. If not, something is missing.
     pub exact: bool,
-    /// An append torn by a crash: it was never acknowledged.
+    /// Describes an append that a crash cut short. It was never acknowledged.
     pub torn: Option<String>,
-    /// Other damage, a sentence each; to be logged as errors.
+    /// Describes any other damage, one sentence each. To be logged as errors.
     pub damage: Vec<String>,
 }
 
@@ -41,28 +41,28 @@ impl Loaded {
     }
 }
 
-/// [`Loaded`], and what the store needs to continue.
+/// What [`Loaded`] holds, and what the store needs to continue.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     pub(super) loaded: Loaded,
-    /// The highest known record number.
+    /// The highest record number known.
     pub(super) seq: u64,
-    /// The highest known generation.
+    /// The highest generation known.
     pub(super) generation: u64,
-    /// Whether the present file can become the next previous generation.
+    /// Whether the present file can become the previous generation.
     usable: bool,
     /// The present file, if it was readable.
     pub(super) present: Option<Present>,
-    /// For a previous generation that is no usable fallback: the kind of name to keep it under.
+    /// For a previous generation that is no usable fallback: part of the name under which to keep it.
     pub(super) bad_previous: Option<&'static str>,
-    /// The bytes of a torn append.
+    /// The bytes of an incomplete append.
     pub(super) torn: Option<Vec<u8>>,
 }
 
-/// Reads the checkpoint of `names`; `None` if there is none.
+/// Reads the checkpoint of `names`. `None` if there is none.
 pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found>, OpenError> {
     let path = &names.path;
-    // Taken before reading: a file that replaces it later has another id, and is kept.
+    // Taken before reading: a file that replaces this one later has another id, and so is kept.
     let id = storage.id_at(path).ok().flatten();
     let bytes = match read(storage, path) {
         Ok(None) => return Ok(None),
@@ -97,7 +97,7 @@ pub(super) fn load(storage: &impl Storage, names: &Names) -> Result<Option<Found
             );
             let nothing = Framed::unreadable(&[]);
             let mut found = join(names, &nothing, Err(why), Some(&previous), &[]);
-            // The next generation must not have the number of the unreadable one.
+            // The next generation must not get the number of the unreadable one.
             found.generation += 1;
             found
         }
@@ -118,7 +118,7 @@ fn load_present(
             let path = path.clone();
             return Err(OpenError::NewerVersion { path, version });
         }
-        // Next to a previous generation of ours, this file was ours too.
+        // Because there is a previous generation of ours, this file was ours too.
         (Err(DecodeError::NotACheckpoint), Some(_)) => Framed::unreadable(bytes),
         (Err(DecodeError::NotACheckpoint), None) => {
             return Err(OpenError::NotACheckpoint { path: path.clone() });
@@ -168,7 +168,7 @@ fn join(
     // just after a compaction.
     let mut records = present.records(base, &mut damaged);
     let own = records.len();
-    // A file restored from a copy does not follow the previous generation.
+    // If the present file was restored from a copy, it does not follow the previous generation.
     let generation = |framed: &Framed<'_>| framed.header.map(|header| header.generation);
     let older = previous.filter(|previous| {
         generation(present).is_none_or(|present| generation(previous).is_some_and(|g| g < present))
@@ -176,7 +176,7 @@ fn join(
     if let Some(previous) = older {
         let mut ignored: Vec<Damage> = Vec::new();
         records.extend(previous.records(base, &mut ignored));
-        // Stable: of two equal numbers the present generation's is kept.
+        // The sort is stable: of two records with the same number, the one of the present generation is kept.
         records.sort_by_key(|record| record.seq);
         records.dedup_by_key(|record| record.seq);
     }
@@ -203,7 +203,7 @@ fn join(
         expected = begun.saturating_add(1);
     }
     let torn = present.torn.clone();
-    // Above every number in either file, usable or not: remains of a file may stay next to later generations,
+    // Above every number in either file, usable or not: parts of a file may stay beside later generations,
     // and must not be taken for their records.
     let last = |framed: &Framed<'_>| framed.lines.last().map(|line| line.seq);
     let seen = last(present).max(previous.and_then(last)).unwrap_or(0);
@@ -213,7 +213,7 @@ fn join(
             .and_then(generation)
             .max(generation(present))
             .unwrap_or(0),
-        // Not while it lacks records that the previous generation has.
+        // Not while the file lacks records that the previous generation has.
         usable: whole && records.len() == own,
         present: None,
         bad_previous: None,

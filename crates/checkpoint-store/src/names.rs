@@ -1,14 +1,14 @@
-//! The names of the files next to a checkpoint.
+//! The names of the files beside a checkpoint.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use super::{Storage, StoreError};
 
-/// Files to keep of one kind. Older ones are removed, so that daily starts do not fill the disk.
+/// Number of files to keep of one kind. Older ones are removed, so that daily starts do not fill the disk.
 const ASIDE_MAX: usize = 10;
 
-/// A checkpoint's path and its companions', all in one folder.
+/// The path of a checkpoint and of its companions, which are all in one folder.
 #[derive(Clone, Debug)]
 pub(super) struct Names {
     pub(super) path: PathBuf,
@@ -40,7 +40,7 @@ impl Names {
         self.path.parent().unwrap_or_else(|| Path::new("/"))
     }
 
-    /// The endings of all names in the folder that start with the checkpoint's name and a dot.
+    /// The rest of each name in the folder that starts with the checkpoint's name and a dot.
     fn endings(&self, storage: &impl Storage) -> io::Result<Vec<String>> {
         let stem = self.path.file_name().unwrap_or_default().to_string_lossy() + ".";
         let names = storage.list(self.folder())?.into_iter();
@@ -49,7 +49,7 @@ impl Names {
             .collect())
     }
 
-    /// The numbers of the files called `PATH.KIND-NUMBER`, lowest first.
+    /// The numbers of the files named `PATH.KIND-NUMBER`, lowest first.
     pub(super) fn numbers(&self, storage: &impl Storage, kind: &str) -> io::Result<Vec<u64>> {
         let number = |ending: &String| {
             ending
@@ -67,8 +67,8 @@ impl Names {
         self.with(&format!(".{kind}-{number}"))
     }
 
-    /// A new name for a file of this kind; removes surplus old ones. Numbered, because the clock may be
-    /// wrong.
+    /// A new name for a file of this kind. Removes surplus old files. Names are numbered, because the clock
+    /// may be wrong.
     pub(super) fn aside(&self, storage: &impl Storage, kind: &str) -> io::Result<PathBuf> {
         let found = self.numbers(storage, kind)?;
         let surplus = (found.len() + 1).saturating_sub(ASIDE_MAX);
@@ -82,7 +82,7 @@ impl Names {
         Ok(self.numbered(kind, number))
     }
 
-    /// Removes files that a crash left unfinished: new generations, and files being renamed.
+    /// Removes files that a crash left unfinished: new generations, and files that were being renamed.
     pub(super) fn remove_unfinished(&self, storage: &impl Storage) -> io::Result<()> {
         for generation in self.numbers(storage, "new")? {
             storage.remove(&self.fresh(generation))?;
@@ -98,7 +98,7 @@ impl Names {
     }
 }
 
-/// The name of the generation before the file at `path`.
+/// The name of the previous generation of the file at `path`.
 pub(super) fn previous(path: &Path) -> PathBuf {
     with(path, ".previous")
 }

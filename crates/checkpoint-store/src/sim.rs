@@ -1,4 +1,4 @@
-//! A simulated disk that can stop, lose what was not synced, and fail.
+//! A simulated disk that can stop, lose everything that was not synced, and fail.
 
 mod storage;
 
@@ -12,9 +12,9 @@ use super::FileId;
 /// How an operation fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// The process dies before the operation. A write still takes this many eighths of its bytes.
+    /// The process dies before this operation. A write still writes this many eighths of its bytes.
     Kill(usize),
-    /// This operation and all later ones fail with this error number. A write first takes half of its bytes
+    /// This operation and all later ones fail with this error number. A write first writes half of its bytes
     /// and reports that.
     Short(i32),
     /// This operation and all later ones fail with this error number.
@@ -23,16 +23,17 @@ pub(super) enum Fault {
     Once(i32),
 }
 
-/// A file: its content on the medium, and the writes since.
+/// A file: its durable content, and the writes since the last sync.
 #[derive(Clone, Default)]
 struct Inode {
     durable: Vec<u8>,
     writes: Vec<Vec<u8>>,
-    /// Number of writes.
+    /// Number of writes so far.
     modified: i128,
-    /// The medium cannot read it.
+    /// Whether the disk fails to read it.
     unreadable: bool,
-    /// A sync failed: using the file again is an error, because its dirty pages may be gone.
+    /// Whether a sync of it failed. Using the file again is an error, because its unwritten pages may be
+    /// lost.
     poisoned: bool,
 }
 
@@ -42,7 +43,7 @@ impl Inode {
     }
 }
 
-/// A rename since the folder was synced.
+/// A change of names since the folder was last synced.
 #[derive(Clone)]
 enum NameOp {
     Set(PathBuf, usize),
@@ -84,7 +85,7 @@ struct World {
     dead: bool,
 }
 
-/// The simulated disk; clones share it.
+/// The simulated disk. Clones share it.
 #[derive(Clone, Default)]
 pub(super) struct SimFs(Arc<Mutex<World>>);
 
@@ -97,7 +98,7 @@ impl SimFile {
     }
 }
 
-/// Whether an operation proceeds, or its error.
+/// Whether an operation may proceed; if not, its error.
 enum Step {
     Go,
     Partly(usize),
@@ -105,7 +106,7 @@ enum Step {
 }
 
 impl World {
-    /// Counts an operation and returns whether it proceeds.
+    /// Counts an operation and returns whether it may proceed.
     fn step(&mut self) -> Step {
         let op = self.ops;
         self.ops += 1;
@@ -138,7 +139,7 @@ impl World {
         }
     }
 
-    /// [`step`](Self::step) of an atomic operation.
+    /// Like [`step`](Self::step), for an atomic operation.
     fn whole_step(&mut self) -> io::Result<()> {
         match self.step() {
             Step::Go => Ok(()),
@@ -154,7 +155,7 @@ impl World {
             .ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
-    /// A new file with a durable name.
+    /// Adds a new file with a durable name.
     fn add(&mut self, path: &Path) -> usize {
         let inode = self.inodes.len();
         self.inodes.push(Inode::default());
@@ -177,14 +178,14 @@ impl SimFs {
         world.hit = false;
     }
 
-    /// Ends all faults. Returns whether there was one.
+    /// Ends all faults. Returns whether one has occurred.
     pub(super) fn disarm(&self) -> bool {
         let mut world = self.0.lock().unwrap();
         world.fault = None;
         world.hit
     }
 
-    /// Another process writes `bytes` to `path`, as a new file or in place.
+    /// Acts as another process that writes `bytes` to `path`, as a new file or in place.
     pub(super) fn overwrite(&self, path: &Path, bytes: &[u8], in_place: bool) {
         let mut world = self.0.lock().unwrap();
         let inode = match world.find(path) {
@@ -206,14 +207,14 @@ impl SimFs {
         world.inodes[inode].unreadable = true;
     }
 
-    /// Another process removes the file at `path`.
+    /// Acts as another process that removes the file at `path`.
     pub(super) fn take_away(&self, path: &Path) {
         let mut world = self.0.lock().unwrap();
         world.names.remove(path);
         world.durable_names.remove(path);
     }
 
-    /// Whether any file has this content.
+    /// Whether any file on the disk has this content.
     pub(super) fn has(&self, bytes: &[u8]) -> bool {
         let world = self.0.lock().unwrap();
         let mut inodes = world.names.values();
@@ -239,8 +240,8 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// The disk for the next process after a kill: all writes are there, but none is more durable than
-    /// before.
+    /// The disk as the next process finds it after a kill: all writes are there, and none is more durable
+    /// than before.
     pub(super) fn after_kill(&self) -> Self {
         let mut world = self.0.lock().unwrap().clone();
         (world.fault, world.dead, world.ops) = (None, false, 0);
@@ -251,9 +252,9 @@ impl SimFs {
         Self(Arc::new(Mutex::new(world)))
     }
 
-    /// Possible disks after a loss of power: any subset of the renames; of every file what was synced and
-    /// then nothing, or every later write as it was or as zeros, the last one whole or cut at an eighth of
-    /// it. All combinations, or about `limit` of them if there are more.
+    /// The disks that a loss of power may leave: any subset of the renames, and for each file what was
+    /// synced, followed by nothing or by each later write either unchanged or as zeros, the last one whole or
+    /// cut at an eighth. Returns all combinations, or about `limit` of them if there are more.
     pub(super) fn after_power_loss(&self, limit: usize) -> Vec<Self> {
         let world = self.0.lock().unwrap().clone();
         let unsynced: Vec<usize> = (0..world.inodes.len())
@@ -261,7 +262,7 @@ impl SimFs {
             .collect();
         let ways = |nth: &usize| (8_usize << world.inodes[*nth].writes.len()) + 1;
         let combinations = unsynced.iter().map(ways).product::<usize>() << world.pending.len();
-        // Odd, so that every choice of names meets every other choice.
+        // Odd, so that every choice of names is combined with every other choice.
         let stride = (combinations / limit) | 1;
         let mut seen = BTreeSet::new();
         let mut images = Vec::new();

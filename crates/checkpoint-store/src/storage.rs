@@ -1,4 +1,4 @@
-//! The store's disk operations, and the real disk.
+//! The disk operations of the store, and their implementation for a real disk.
 
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, Read, Write};
@@ -26,7 +26,7 @@ impl FileId {
         }
     }
 
-    /// Of the file at `path`, if any; a broken link counts as a file.
+    /// The id of the file at `path`, if there is one. A broken link counts as a file.
     pub(super) fn at(path: &Path) -> io::Result<Option<Self>> {
         match fs::metadata(path).or_else(|_| fs::symlink_metadata(path)) {
             Ok(metadata) => Ok(Some(Self::of(&metadata))),
@@ -48,49 +48,49 @@ fn is_absence(error: &io::Error) -> bool {
 pub struct FileStatus {
     pub id: FileId,
     pub length: u64,
-    /// Time of the last write, in nanoseconds; only compared with itself.
+    /// Time of the last write in nanoseconds. Only compared with itself.
     pub modified: i128,
 }
 
 /// The disk operations that a checkpoint needs. `append` makes one `write(2)`. Names are whole paths in one
-/// folder. Nothing is durable before `sync` (contents) and `sync_dir` (names).
+/// folder. Nothing is durable before `sync` (for contents) and `sync_dir` (for names).
 pub trait Storage: Clone + Send + Sync + 'static {
     type File: Send + Sync + 'static;
     type Lock: Send + 'static;
 
-    /// Creates the folder of `path` if needed. Returns the file's real path.
+    /// Creates the folder of `path` if needed. Returns the real path of the file.
     fn locate(&self, path: &Path) -> io::Result<PathBuf>;
-    /// Takes the lock of `checkpoint` and writes our process id to the lock file `path`. If it is taken,
-    /// returns its holder.
+    /// Takes the lock of `checkpoint` and writes our process id to the lock file at `path`. If the lock is
+    /// taken, returns its holder.
     fn lock(&self, checkpoint: &Path, path: &Path) -> io::Result<Result<Self::Lock, Option<u32>>>;
-    /// Makes a new lock file `path`, and its folder, if the present one is not ours any more. If it is taken,
-    /// returns its holder.
+    /// Makes a new lock file at `path`, and its folder, if the present one is not ours any more. If the lock
+    /// is taken, returns its holder.
     fn renew_lock(&self, lock: &mut Self::Lock, path: &Path)
     -> io::Result<Result<(), Option<u32>>>;
-    /// The lock file's id.
+    /// The id of the lock file.
     fn lock_id(&self, lock: &Self::Lock) -> io::Result<FileId>;
-    /// The whole content, but at most `limit` + 1 bytes.
+    /// Reads the whole content, but at most `limit` + 1 bytes.
     fn read(&self, path: &Path, limit: u64) -> io::Result<Vec<u8>>;
-    /// A new empty file, readable and writable for its owner only. Replaces an existing one.
+    /// Creates an empty file, readable and writable for its owner only. Replaces an existing one.
     fn create(&self, path: &Path) -> io::Result<Self::File>;
-    /// Writes at the end of the file. Returns the number of bytes taken.
+    /// Writes at the end of the file. Returns how many bytes were written.
     fn append(&self, file: &Self::File, bytes: &[u8]) -> io::Result<usize>;
-    /// Returns when the content is on the medium.
+    /// Returns when the content is durable.
     fn sync(&self, file: &Self::File) -> io::Result<()>;
-    /// Renames `from` to `to`. Atomically replaces an existing file.
+    /// Renames `from` to `to`. Replaces an existing file atomically.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Makes a hard link `to` of the file `from` and returns `true`. Atomically replaces an existing file.
-    /// Makes a copy and returns `false` where the file system has no hard links.
+    /// Makes a hard link `to` to the file `from` and returns `true`. Replaces an existing file atomically. If
+    /// the file system has no hard links, makes a copy and returns `false`.
     fn link(&self, from: &Path, to: &Path) -> io::Result<bool>;
-    /// Renames `from` to `path`, and the present file at `path` to `aside`, an unused name.
+    /// Renames `from` to `path`, and the file that was at `path` to `aside`, an unused name.
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()>;
     fn status(&self, file: &Self::File) -> io::Result<FileStatus>;
-    /// The id of the file at `path`, if any.
+    /// The id of the file at `path`, if there is one.
     fn id_at(&self, path: &Path) -> io::Result<Option<FileId>>;
-    /// The CRC-32C of the first `length` bytes at `path`.
+    /// The CRC-32C of the first `length` bytes of the file at `path`.
     fn checksum(&self, path: &Path, length: u64) -> io::Result<u32>;
     fn remove(&self, path: &Path) -> io::Result<()>;
-    /// Returns when the names in `folder` are on the medium.
+    /// Returns when the names in `folder` are durable.
     fn sync_dir(&self, folder: &Path) -> io::Result<()>;
     /// The names in `folder` that are valid text.
     fn list(&self, folder: &Path) -> io::Result<Vec<String>>;
@@ -99,7 +99,7 @@ pub trait Storage: Clone + Send + Sync + 'static {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Disk;
 
-/// Linux follows at most 40 symbolic links.
+/// Number of symbolic links that Linux follows at most.
 const SYMLINKS_MAX: usize = 40;
 
 impl Disk {
@@ -125,7 +125,7 @@ impl Storage for Disk {
         let mut path = std::path::absolute(path)?;
         for _ in 0..SYMLINKS_MAX {
             match fs::read_link(&path) {
-                // A relative target starts at the link's folder; an absolute one replaces it.
+                // A relative target starts at the folder of the link; an absolute one replaces the path.
                 Ok(target) => {
                     path.pop();
                     path.push(target);
@@ -164,10 +164,10 @@ impl Storage for Disk {
     }
 
     fn create(&self, path: &Path) -> io::Result<File> {
-        // Never write to an inode that has another name.
+        // Remove it first, so as never to write to a file that has another name too.
         remove_if_there(path)?;
         let file = Self::private().append(true).create_new(true).open(path)?;
-        // The umask can only have removed bits.
+        // The umask can only have removed bits from the mode.
         file.set_permissions(fs::Permissions::from_mode(0o600))?;
         lock::claim(&file);
         Ok(file)
@@ -203,13 +203,13 @@ impl Storage for Disk {
             copy.sync_data()?;
         }
         fs::rename(&aside, to)?;
-        // Renaming over another name of the same file does nothing.
+        // The rename does nothing if both are names of the same file.
         remove_if_there(&aside)?;
         Ok(linked)
     }
 
     fn replace(&self, from: &Path, path: &Path, aside: &Path) -> io::Result<()> {
-        // Through `aside`, which remains: after a crash our file is there, and nothing is lost.
+        // This goes through `aside`, which remains: after a crash our file is there, and nothing is lost.
         fs::rename(from, aside)?;
         let exchanged = rustix::fs::renameat_with(CWD, aside, CWD, path, RenameFlags::EXCHANGE);
         let Err(error) = exchanged else {
@@ -217,7 +217,7 @@ impl Storage for Disk {
         };
         fs::rename(aside, from)?;
         match error {
-            // The file system or the kernel does not support it.
+            // The file system or the kernel does not support the exchange.
             Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP => {
                 fs::hard_link(path, aside).or_else(|_| fs::rename(path, aside))?;
                 fs::rename(from, path)

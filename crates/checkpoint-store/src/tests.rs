@@ -13,16 +13,17 @@ use ros1_master::xmlrpc::{Call, Value};
 
 const PATH: &str = "/log/latest-chkpt.yaml";
 
-/// The model: record `n` sets the parameter `n`, so a state is the set of the numbers it contains.
+/// What a store must hold: record `n` sets the parameter `n`, so a state is the list of the numbers that it
+/// contains.
 #[derive(Default)]
 struct Model {
     session: &'static str,
     applied: Vec<u64>,
-    /// The last record that was said to be recorded.
+    /// The last record that was acknowledged.
     acked: u64,
-    /// The last record that was said to survive a loss of power.
+    /// The last record that was reported to survive a loss of power.
     synced: u64,
-    /// Which calls of [`Model::sync`] do nothing, a bit each.
+    /// Which calls of [`Model::sync`] do nothing, one bit per call.
     lazy: u32,
 }
 
@@ -64,7 +65,7 @@ impl Model {
     fn begin(&mut self, store: &mut Store<SimFs>) -> bool {
         let done = store.begin(&self.checkpoint(store.seq())).is_ok();
         if done {
-            // All that had not been recorded while the disk failed is now.
+            // A new generation also holds everything that could not be recorded while the disk failed.
             self.acked = store.seq();
             self.synced = store.seq();
         }
@@ -76,7 +77,7 @@ fn entry(number: u64) -> Entry {
     Entry::call(Call::new("setParam", vec![number.to_string().into()]))
 }
 
-/// The set of numbers, in order of their application.
+/// The numbers that a loaded state contains, in the order in which they were applied.
 fn state(loaded: &Loaded) -> Vec<u64> {
     let snapshot = loaded
         .checkpoint
@@ -98,7 +99,7 @@ fn open(fs: &SimFs) -> Result<(Store<SimFs>, Option<Loaded>), OpenError> {
     Store::open_on(fs.clone(), Path::new(PATH))
 }
 
-/// Everything that a store does in its life. Each step goes on whatever became of the one before.
+/// Does everything that a store does in its life. Each step follows whatever became of the step before.
 fn life(fs: &SimFs, model: &mut Model) {
     model.session = "a";
     let Ok((mut store, _)) = open(fs) else { return };
@@ -107,7 +108,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     model.append(&mut store, 3);
     model.sync(&mut store);
     model.append(&mut store, 1);
-    // A compaction, with records before, while and after its file is written.
+    // A compaction, with records appended before, while and after its file is written.
     if let Ok(job) = store.begin_compaction(model.checkpoint(store.seq())) {
         model.append(&mut store, 1);
         model.sync(&mut store);
@@ -125,7 +126,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     model.append(&mut store, 2);
     model.begin(&mut store);
     model.append(&mut store, 1);
-    // A compaction that a new beginning overtakes.
+    // A compaction that becomes obsolete because of a new beginning.
     if let Ok(job) = store.begin_compaction(model.checkpoint(store.seq())) {
         model.append(&mut store, 1);
         model.begin(&mut store);
@@ -134,7 +135,7 @@ fn life(fs: &SimFs, model: &mut Model) {
     }
     model.append(&mut store, 1);
     model.sync(&mut store);
-    // The process ends without a farewell, and another one goes on with what it finds.
+    // The process ends without closing the store, and another one continues with what it finds.
     drop(store);
     let Ok((mut store, loaded)) = open(fs) else {
         return;
@@ -146,10 +147,11 @@ fn life(fs: &SimFs, model: &mut Model) {
     let _ = store.close(&model.checkpoint(store.seq()));
 }
 
-/// What was found is all that was acknowledged up to `least`, and nothing that never was.
+/// Checks that the loaded state has everything that was acknowledged up to `least`, and nothing that was
+/// never recorded.
 fn check(model: &Model, loaded: Option<&Loaded>, least: u64, context: &str) {
     let Some(loaded) = loaded else {
-        assert_eq!(least, 0, "{context}: nothing is left");
+        assert_eq!(least, 0, "{context}: no checkpoint is left");
         return;
     };
     let found = state(loaded);
@@ -158,24 +160,27 @@ fn check(model: &Model, loaded: Option<&Loaded>, least: u64, context: &str) {
         .applied
         .iter()
         .find(|n| **n <= least && !found.contains(n));
-    assert_eq!(missing, None, "{context}: lost; {loaded:?}");
+    assert_eq!(missing, None, "{context}: this record was lost; {loaded:?}");
     if loaded.exact {
         assert_eq!(
             found,
             model.applied[..found.len()],
-            "{context}: {known} records"
+            "{context}: the {known} records found"
         );
     } else {
-        assert!(!loaded.damage.is_empty(), "{context}: silent");
+        assert!(
+            !loaded.damage.is_empty(),
+            "{context}: the damage is not reported"
+        );
         assert!(
             found.iter().all(|n| model.applied.contains(n)),
-            "{context}: invented"
+            "{context}: {found:?} has records that were never written"
         );
-        assert!(found.is_sorted(), "{context}: out of order");
+        assert!(found.is_sorted(), "{context}: {found:?} is out of order");
     }
 }
 
-/// Starts anew on `fs`, records one more, and finds all of it again.
+/// Starts again on `fs`, appends two more records, and checks that a later start finds everything.
 fn go_on(fs: &SimFs, context: &str) {
     let (mut store, loaded) = open(fs).unwrap();
     let mut model = Model {
@@ -207,8 +212,8 @@ fn operations() -> usize {
     operations
 }
 
-/// Starts on what is left of `fs`, is killed at every operation of that, and finds again what there
-/// was up to `least`. Says how often.
+/// Starts on what is left of `fs` and is killed, once at each operation of the start. Checks each time that
+/// everything up to `least` is still found. Returns the number of kills.
 fn starts_killed(fs: &SimFs, least: u64, context: &str) -> usize {
     let mut model = Model {
         session: "a",
@@ -230,11 +235,11 @@ fn starts_killed(fs: &SimFs, least: u64, context: &str) -> usize {
             return at + 1;
         }
     }
-    unreachable!("there is a last operation")
+    unreachable!("the start has a last operation")
 }
 
 #[test]
-fn killed_at_every_operation_nothing_acknowledged_is_lost() {
+fn a_kill_at_any_operation_loses_nothing_that_was_acknowledged() {
     let mut crashes = 0;
     let shares: &[usize] = if cfg!(debug_assertions) {
         &[0, 4]
@@ -247,7 +252,7 @@ fn killed_at_every_operation_nothing_acknowledged_is_lost() {
             fs.arm(at, Fault::Kill(eighths));
             let mut model = Model::default();
             life(&fs, &mut model);
-            let context = format!("killed at operation {at} with {eighths}/8 written");
+            let context = format!("killed at operation {at}, with {eighths}/8 of the write done");
             let loaded = open(&fs.after_kill()).unwrap().1;
             check(&model, loaded.as_ref(), model.acked, &context);
             if let Some(loaded) = &loaded {
@@ -266,10 +271,10 @@ fn killed_at_every_operation_nothing_acknowledged_is_lost() {
 }
 
 #[test]
-fn without_power_at_every_operation_nothing_synced_is_lost() {
+fn a_loss_of_power_at_any_operation_loses_nothing_that_was_synced() {
     let mut images = 0;
     let limit = if cfg!(debug_assertions) { 10 } else { 4_096 };
-    // Synced always, never, and now and then.
+    // Syncs always, never, and from time to time.
     for lazy in [0, u32::MAX, 0b0110_0110, 0b1110_1110, 0b1000] {
         for at in 0..=operations() {
             let fs = SimFs::default();
@@ -280,7 +285,8 @@ fn without_power_at_every_operation_nothing_synced_is_lost() {
             };
             life(&fs, &mut model);
             for (nth, image) in fs.after_power_loss(limit).iter().enumerate() {
-                let context = format!("no power at operation {at}, syncs {lazy:b}, image {nth}");
+                let context =
+                    format!("power lost at operation {at}, skipped syncs {lazy:b}, image {nth}");
                 let loaded = open(image)
                     .unwrap_or_else(|error| panic!("{context}: {error}"))
                     .1;

@@ -1,8 +1,8 @@
-//! Whether the file at the path is still ours and unchanged.
+//! Checks whether the file at the path is still ours and unchanged.
 //!
-//! Renaming its folder, unmounting its file system, truncating or overwriting it makes no write fail: all
-//! writes succeed, into a file that cannot be found any more. So the path, the open file and the lock are
-//! compared with what is known, and a difference latches like a failed write.
+//! Renaming the folder, unmounting the file system, and truncating or overwriting the file make no write
+//! fail: all writes succeed, into a file that cannot be found any more. So the path, the open file and the
+//! lock are compared with what is known, and a difference latches like a failed write.
 
 use std::io;
 use std::path::PathBuf;
@@ -14,27 +14,27 @@ use super::journal::Active;
 use super::storage::{FileId, FileStatus};
 use super::{Names, Storage, Store, StoreError};
 
-/// A change by another process.
+/// A change made by another process.
 #[derive(Debug, Error)]
 pub enum Change {
-    /// The path does not exist.
+    /// Nothing is at the path any more.
     #[error("it was removed or renamed, or its file system was unmounted")]
     Gone,
-    /// The path is another file.
+    /// Another file is at the path.
     #[error("another file has taken its place")]
     Replaced,
-    /// Truncated or appended to.
+    /// The file was truncated or appended to.
     #[error("it has {found} bytes instead of {expected}")]
     Length { expected: u64, found: u64 },
-    /// Overwritten in place.
+    /// The file was overwritten in place.
     #[error("a part of it was overwritten")]
     Content,
-    /// The lock file's path does not exist, or is another file.
+    /// The lock file is gone, or another file is in its place.
     #[error("its lock file was removed or replaced")]
     Lock,
 }
 
-/// Why a file is not reliable.
+/// Why the file cannot be relied on.
 #[derive(Debug)]
 enum Finding {
     Changed(Change),
@@ -47,7 +47,7 @@ impl From<io::Error> for Finding {
     }
 }
 
-/// Compares the disk with what should be there; see [`Store::check_job`](super::Store::check_job).
+/// A job that compares the disk with what should be there; see [`Store::check_job`](super::Store::check_job).
 #[must_use = "nothing is checked until it has run"]
 pub struct CheckJob<S: Storage> {
     storage: S,
@@ -98,8 +98,9 @@ impl<S: Storage> Active<S> {
         self.snapshot_bytes + self.journal_bytes
     }
 
-    /// Compares the file's status with that after our last write. A different modification time alone proves
-    /// nothing: `touch` sets it, and some file systems update it late. The content is read then.
+    /// Compares the status of the file with that after our last write. A different modification time alone
+    /// proves nothing, because `touch` sets it and some file systems update it late; in that case the content
+    /// is read.
     pub(super) fn compare(&mut self, status: &FileStatus) -> Result<(), Change> {
         let expected = self.length();
         if status.length != expected {
@@ -116,7 +117,7 @@ impl<S: Storage> Active<S> {
 
 impl<S: Storage> Store<S> {
     /// The check that the file at the path is ours and unchanged, and that the lock is ours. `None` if
-    /// nothing is being recorded, or recording stops now because the length differs.
+    /// nothing is being recorded, or if recording stops now because the length differs.
     pub fn check_job(&mut self) -> Option<CheckJob<S>> {
         let active = self.active.as_mut()?;
         let status = self.storage.status(&active.file);
@@ -145,7 +146,7 @@ impl<S: Storage> Store<S> {
     ///
     /// # Errors
     ///
-    /// If the file is not as expected: the store is now unprotected.
+    /// If the file is not as expected. The store is now unprotected.
     pub fn checked(&mut self, done: Checked) -> Result<(), StoreError> {
         let active = self.active.as_ref();
         let current = active.is_some_and(|active| active.generation == done.generation);
@@ -156,14 +157,14 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// [`latch`](Self::latch) after a change by another process.
+    /// Like [`latch`](Self::latch), after a change by another process.
     pub(super) fn changed(&mut self, change: Change) -> StoreError {
         if matches!(change, Change::Lock) {
-            // Taken again now, while the open file, which is locked too, keeps others out. A failure shows
-            // again when the next generation is written.
+            // Taken again now, while the open file, which is locked too, keeps others out. If this fails, the
+            // next generation will report it.
             let _ = self.hold_lock();
         } else {
-            // A foreign file may be at the path now: it must be kept when it is replaced.
+            // Another process's file may be at the path now. It must be kept when it is replaced.
             self.present = None;
         }
         let path = self.names.path.clone();
@@ -177,7 +178,7 @@ impl<S: Storage> Store<S> {
         }
     }
 
-    /// Makes sure that the lock at the path is ours before anything is written there.
+    /// Makes sure that the lock at the path is ours, before anything is written there.
     pub(super) fn hold_lock(&mut self) -> Result<(), StoreError> {
         let path = self.names.lock();
         let renewed = self.storage.renew_lock(&mut self.lock, &path);
@@ -196,7 +197,7 @@ impl<S: Storage> Store<S> {
         Err(self.latch(error))
     }
 
-    /// The name under which a file found at the path was kept; returned once.
+    /// The name under which a file found at the path was kept. Each name is returned once.
     pub fn take_kept(&mut self) -> Option<PathBuf> {
         self.kept.take()
     }

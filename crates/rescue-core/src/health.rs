@@ -1,8 +1,8 @@
-//! Judges a node's answers: whether it is the node that registered, and where the mirror differs from its
+//! Judges a node's answers: whether it is the node that has registered, and where the mirror differs from its
 //! report.
 //!
-//! Without evidence to the contrary a node is the registered one: losing a healthy node is worse than keeping
-//! a dead one.
+//! Unless there is evidence against it, a node counts as the one that has registered: losing a healthy node
+//! is worse than keeping a dead one.
 
 mod backoff;
 mod liveness;
@@ -24,7 +24,7 @@ use crate::{
     xmlrpc::Value,
 };
 
-/// Topics that nodes of all kinds have: no evidence.
+/// Topics that all kinds of nodes have, so they are no evidence.
 const COMMON: [&str; 6] = [
     "/rosout",
     "/clock",
@@ -34,22 +34,22 @@ const COMMON: [&str; 6] = [
     "/diagnostics",
 ];
 
-/// A node's reaction to a call.
+/// How a node reacts to a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sign {
     /// It answered.
     Alive,
-    /// Its port refuses connections: the process is gone.
+    /// Its port refuses connections, so the process is gone.
     Dead,
-    /// No answer in time, or no valid one. That is no proof of death.
+    /// There was no valid answer in time. That does not prove that the node is dead.
     Silent,
 }
 
-/// Topics with their types, as listed by a node.
+/// Types by topic, as a node reports them.
 type Topics = BTreeMap<String, String>;
 
-/// The part of a node's address that says where to connect: what follows the port is not sent. Names whose
-/// addresses differ only there share a port, and what is asked there.
+/// The part of a node's address that says where to connect, without what follows the port. Nodes whose
+/// addresses differ only in that rest share a port and are asked together.
 pub fn port_of(api: &str) -> &str {
     let api = api.trim();
     let host = api.find("//").map_or(0, |at| at + 2);
@@ -57,7 +57,7 @@ pub fn port_of(api: &str) -> &str {
     end.map_or(api, |(end, _)| api.split_at(end).0)
 }
 
-/// What a node reports to publish and subscribe.
+/// The topics that a node reports to publish and to subscribe to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Claims {
     publications: Topics,
@@ -65,8 +65,8 @@ pub struct Claims {
 }
 
 impl Claims {
-    /// Reads the results of `getPublications` and `getSubscriptions`: lists of topic and type. None if any
-    /// entry could not be registered as it is: then the node's meaning is unclear.
+    /// Reads the results of `getPublications` and `getSubscriptions`, which are lists of topic and type.
+    /// `None` if any entry could not be registered as it is, because then it is unclear what the node means.
     pub fn read(publications: &Value, subscriptions: &Value) -> Option<Self> {
         Some(Self {
             publications: topics(publications)?,
@@ -74,7 +74,7 @@ impl Claims {
         })
     }
 
-    /// Whether it includes one of these topics, common ones excluded.
+    /// Whether the node reports one of these topics, not counting common ones.
     pub fn shares(&self, topics: &[String]) -> bool {
         let mut own = self.all().filter(|topic| !COMMON.contains(topic));
         own.any(|topic| topics.iter().any(|other| other == topic))
@@ -99,33 +99,33 @@ fn topics(list: &Value) -> Option<Topics> {
     topics.collect()
 }
 
-/// Whether the node behind a port is the one registered under a name.
+/// Whether the node behind a port is the one that is registered under a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// There is evidence that it has this name.
+    /// There is evidence that the node has this name.
     Itself,
-    /// There is evidence that it is another node.
+    /// There is evidence that another node is there.
     Another,
-    /// No evidence.
+    /// There is no evidence either way.
     Unknown,
 }
 
-/// A name registered with a port.
+/// A name that is registered at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Name {
     /// The caller id.
     pub node: String,
-    /// The process id behind the port when it was last asked.
+    /// The process id that was found at the port when it was last asked.
     pub known_pid: Option<i32>,
-    /// Whether it has registered something since: another process may have taken the port under the same
-    /// name.
+    /// Whether the name has registered anything since then. If so, another process may have taken the port
+    /// under the same name.
     pub registered_since: bool,
-    /// Grows with each registration; 0 if unknown.
+    /// A number that grows with each registration; 0 if unknown.
     pub registered: u64,
 }
 
-/// Judges each of `names`, which are registered with the same port. `pid` and `claims` are the present
-/// answers from the port.
+/// Judges each of `names`, which are all registered at the same port. `pid` and `claims` are what the node at
+/// the port answers now.
 pub fn judge(
     mirror: &Master,
     names: &[Name],
@@ -134,7 +134,7 @@ pub fn judge(
 ) -> Vec<Verdict> {
     let said = claims.into_iter().flat_map(Claims::all);
     let said: Vec<&str> = said.filter(|topic| !COMMON.contains(topic)).collect();
-    // How many of its topics are reported, and whether all are.
+    // How many topics of the node are reported, and whether these are all of them.
     let match_of = |node: &str| {
         let held = mirror.publications(node).chain(mirror.subscriptions(node));
         let held: Vec<_> = held.filter(|topic| !COMMON.contains(topic)).collect();
@@ -149,11 +149,11 @@ pub fn judge(
     let by_topics = |name: &Name, found: &Option<(usize, bool)>| match found {
         None => Verdict::Unknown,
         Some((0, _)) => Verdict::Another,
-        // It only shares topics with a later node.
+        // It only shares topics with a node that came later.
         Some((_, false)) if last_fitting > Some(name.registered) => Verdict::Another,
         Some(_) => Verdict::Itself,
     };
-    // A new node at the port may have been asked under the previous node's name.
+    // A new node at the port may have been asked while only the previous node's name was known.
     let of_pid = names.iter().filter(|name| name.known_pid == pid);
     let last_of_pid = of_pid.map(|name| name.registered).max();
     let last = names.iter().map(|name| name.registered).max();
@@ -163,8 +163,8 @@ pub fn judge(
             Verdict::Another if last_of_pid > Some(name.registered) => Verdict::Another,
             _ => Verdict::Itself,
         },
-        // All its topics are there, and no later node is: a process id can change, as behind some node
-        // libraries or when a node is restarted at its port.
+        // All its topics are reported, and no node came later. The process id can change nevertheless, with
+        // some client libraries or when a node is restarted at the same port.
         (Some(_), Some(_)) if matches!(found, Some((_, true))) && last == Some(name.registered) => {
             Verdict::Itself
         }
@@ -172,7 +172,7 @@ pub fn judge(
         _ => by_topics(name, found),
     });
     let mut verdicts: Vec<_> = verdicts.collect();
-    // A port has one process behind it: earlier registrants are gone.
+    // A port has only one process behind it, so nodes that registered earlier are gone.
     let present = names.iter().zip(&verdicts);
     let present = present.filter(|(_, verdict)| **verdict == Verdict::Itself);
     if let Some(last) = present.map(|(name, _)| name.registered).max() {
@@ -185,39 +185,40 @@ pub fn judge(
     verdicts
 }
 
-/// What follows when a port refuses connections.
+/// What to conclude when a port refuses connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// Nothing: the nodes there are kept as unreachable, and asked again later.
+    /// Nothing: keep the nodes at the port as unreachable, and ask again later.
     Keep,
-    /// The port is asked again after a pause.
+    /// Ask the port again after a pause.
     AskAgain,
-    /// The nodes there are dead.
+    /// The nodes at the port are dead.
     Dead,
 }
 
-/// Judges a port that refuses connections. `calls` are the last calls of the nodes there, and `before` those when
-/// it refused for the first time. A node may close its port before it unregisters: roslisp does.
+/// Judges a port that refuses connections. `calls` are the last calls of its nodes, and `before` their last
+/// calls when the port refused for the first time. A node may close its port before it unregisters, as
+/// roslisp does.
 pub fn judge_refusal<C: PartialEq>(master_serves: bool, before: Option<&C>, calls: &C) -> Refusal {
     match before {
-        // A living master would not have noticed. The health check after the recovery decides.
+        // No master would have noticed. The health check after the recovery decides.
         _ if !master_serves => Refusal::Keep,
         Some(before) if before == calls => Refusal::Dead,
         _ => Refusal::AskAgain,
     }
 }
 
-/// One registration of a node.
+/// A topic that a node publishes or subscribes to.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Registration {
-    /// Whether the node publishes the topic; else it subscribes it.
+    /// Whether the node publishes the topic; otherwise it subscribes to it.
     pub publishes: bool,
     pub topic: String,
     topic_type: String,
 }
 
 impl Registration {
-    /// The call with which the node itself would register it.
+    /// The call by which the node itself would register this.
     pub fn register(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::RegisterPublisher,
@@ -226,7 +227,7 @@ impl Registration {
         Request::new(method, [node, &self.topic, &self.topic_type, api])
     }
 
-    /// The call with which the node itself would unregister it.
+    /// The call by which the node itself would unregister this.
     pub fn unregister(&self, node: &str, api: &str) -> Request {
         let method = match self.publishes {
             true => Method::UnregisterPublisher,
@@ -235,7 +236,7 @@ impl Registration {
         Request::new(method, [node, &self.topic, api])
     }
 
-    /// In words, such as `/talker publishes /chatter`.
+    /// A description such as `/talker publishes /chatter`.
     pub fn describe(&self, node: &str) -> String {
         let verb = match self.publishes {
             true => "publishes",
@@ -244,25 +245,27 @@ impl Registration {
         format!("{node} {verb} {}", self.topic)
     }
 
-    /// Whether both are the same, types ignored.
+    /// Whether both are the same apart from the topic type.
     pub fn is_same(&self, other: &Self) -> bool {
         self.publishes == other.publishes && self.topic == other.topic
     }
 }
 
-/// Where the mirror differs from a node's report.
+/// The differences between the mirror and a node's report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reconciliation {
-    /// Reported by the node, missing in the mirror. No reason to register it: the node may have another
-    /// master, and be known here through a program that synchronises both.
+    /// Topics that the node reports and the mirror lacks. That is no reason to register them: the node may
+    /// have another master, and be known here only because a program synchronises the two masters.
     pub missing: Vec<Registration>,
-    /// In the mirror, but not reported by the node. Must be confirmed: a node may register first and list the
-    /// topic later. Nothing if the node lists nothing at all: it may be unable to tell.
+    /// Topics that the mirror has and the node does not report. They must be confirmed, because a node may
+    /// register a topic first and report it later. Empty if the node reports no topic at all, because then it
+    /// may be unable to tell.
     pub extra: Vec<Registration>,
 }
 
 impl Reconciliation {
-    /// The difference for `node`. Services are excluded: nodes cannot be asked for theirs.
+    /// Compares the mirror with the report of `node`. Services are left out, because nodes cannot be asked
+    /// for theirs.
     pub fn new(mirror: &Master, node: &str, claims: &Claims) -> Self {
         let mut reconciliation = Self::default();
         let publications: Vec<&str> = mirror.publications(node).collect();
@@ -281,7 +284,7 @@ impl Reconciliation {
                     topic: topic.clone(),
                     topic_type: topic_type.clone(),
                 }));
-            // Topics that a strange node name has changed cannot be compared.
+            // A topic that was changed by a malformed node name cannot be compared.
             let extra = held.iter().filter(|topic| {
                 !said.is_empty() && master::is_plain_topic(topic) && !said.contains_key(**topic)
             });

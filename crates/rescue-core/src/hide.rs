@@ -1,4 +1,4 @@
-//! Which values of parameters are not shown: passwords and the like belong neither on a page nor in a terminal.
+//! Which parameter values are hidden. Passwords and the like must not appear on a page or in a terminal.
 
 use std::str::FromStr;
 
@@ -6,17 +6,17 @@ use regex::{Regex, RegexBuilder};
 
 use crate::xmlrpc::{Struct, Value};
 
-/// The names whose values are hidden unless others are given.
+/// Regular expression for the parameter names whose values are hidden by default.
 pub const DEFAULT: &str =
     "password|passwd|passphrase|pwd|token|secret|key|credential|private|(^|[^a-z])pin([^a-z]|$)";
-/// Stands where a value is hidden.
+/// Replaces a hidden value.
 pub const HIDDEN: &str = "(hidden)";
 
-/// The parameters whose values are hidden, by their full names.
+/// Decides by their full names which parameters have hidden values.
 #[derive(Clone, Debug)]
 pub struct Hide(Option<Regex>);
 
-/// From a regular expression that ignores case. The empty one hides nothing.
+/// Parses a regular expression, which will ignore case. An empty one hides nothing.
 impl FromStr for Hide {
     type Err = String;
 
@@ -25,28 +25,29 @@ impl FromStr for Hide {
             return Ok(Self(None));
         }
         let regex = RegexBuilder::new(pattern).case_insensitive(true).build();
-        // Its first lines are a picture of the place.
+        // The first lines of regex's error only mark the position.
         let why = |error: regex::Error| error.to_string().lines().last().unwrap_or("").to_owned();
         regex.map(|regex| Self(Some(regex))).map_err(why)
     }
 }
 
 impl Hide {
-    /// Whether the value of the parameter `name`, as in `/robot/wifi/password`, is hidden: its own name says
-    /// so, or that of a namespace above it.
+    /// Whether the value of the parameter `name`, such as `/robot/wifi/password`, is hidden, because its own
+    /// name or the name of a namespace above it matches.
     pub fn hides(&self, name: &str) -> bool {
         let above = name.match_indices('/').map(|(end, _)| end).skip(1);
         let mut names = above.filter_map(|end| name.get(..end)).chain([name]);
         names.any(|name| self.matches(name))
     }
 
-    /// `value` of the parameter `name` with [`HIDDEN`] in place of what is hidden of it, which may be a part:
-    /// members of structs have names of their own, also in lists. The root is called ``.
+    /// The `value` of the parameter `name`, with [`HIDDEN`] in place of everything that is hidden. That may
+    /// be a part of the value: members of structs have names of their own, also inside lists. The name of the
+    /// root is the empty string.
     pub fn mask(&self, name: &str, value: &Value) -> Value {
         self.mask_below(name, value, self.hides(name))
     }
 
-    /// [`mask`](Self::mask) for the whole tree of parameters.
+    /// Masks the whole parameter tree like [`mask`](Self::mask).
     pub fn mask_tree(&self, tree: &Struct) -> Struct {
         let members = tree.iter().map(|(key, value)| {
             let shown = self.mask(&format!("/{key}"), value);
@@ -55,7 +56,7 @@ impl Hide {
         members.collect()
     }
 
-    /// [`mask`](Self::mask), if it is known whether `name` is hidden.
+    /// Like [`mask`](Self::mask), when it is already known whether `name` is hidden.
     fn mask_below(&self, name: &str, value: &Value, hidden: bool) -> Value {
         match value {
             Value::Struct(members) if !members.is_empty() => {
@@ -98,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn by_default_passwords_and_the_like_are_hidden_wherever_they_are() {
+    fn passwords_and_the_like_are_hidden_by_default_at_every_level() {
         let hide: Hide = DEFAULT.parse().unwrap();
         for name in ["/wifi/password", "/API_Key", "/secrets/user", "/a/tokens"] {
             assert!(hide.hides(name), "{name}");
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn the_empty_expression_hides_nothing_and_a_bad_one_is_refused() {
+    fn an_empty_expression_hides_nothing_and_an_invalid_one_is_refused() {
         let hide: Hide = "".parse().unwrap();
         assert!(!hide.hides("/password"));
         let error = "a(b".parse::<Hide>().unwrap_err();

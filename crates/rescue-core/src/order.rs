@@ -1,19 +1,21 @@
-//! The order in which a node hears of a topic, a parameter or its own name: the order of the state.
+//! Decides the order in which a node hears about a topic, a parameter or its own name: the order of the
+//! state.
 //!
-//! A node hears of one subject in two ways, in the answers to its own calls and in notifications, and reads
-//! them in different threads. rospy takes for the truth what comes last, and roscpp drops the links that the
-//! last list of publishers lacks. So the answer to a node's call is with the node before the node is notified
-//! of anything later about the same subject, and of two notifications the newer one comes last:
+//! A node hears about one subject in two ways, in the answers to its own calls and in notifications, and it
+//! reads these in different threads. rospy believes whatever comes last. roscpp drops every link that is
+//! missing in the last list of publishers. So a node must have the answer to its own call before it is
+//! notified of anything later about the same subject, and of two notifications the newer one must come last:
 //!
-//! * While the master serves, a write that can notify a node does not go to the master while an answer to that
-//!   node about the same subject is under way ([`Order::hold`]).
-//! * A notification of our own waits for such an answer, and for [`LEAD`] after it. Where the master may be
-//!   notifying the node of the same subject, ours is put off ([`Order::next`]).
-//! * Whoever is notified shortly after such an answer, or by two senders in a row, is told the state once more
-//!   ([`REPEAT_AFTER`]): the two may have been read in the wrong order. If the master notifies it of something newer
-//!   meanwhile, that is enough, and ours would be overtaken by the backlog of a master on a busy computer.
+//! * While the master serves, a write that can notify a node does not go to the master while an answer to
+//!   that node about the same subject is under way ([`Order::hold`]).
+//! * A notification that rosrescue sends waits for such an answer, and for [`LEAD`] after it. Where the
+//!   master may be notifying the node of the same subject, ours is put off ([`Order::next`]).
+//! * A node that is notified shortly after such an answer, or by two senders in a row, is told the state once
+//!   more ([`REPEAT_AFTER`]), because it may have read the two in the wrong order. If the master notifies it
+//!   of something newer meanwhile, that is enough: a notification of ours could then be overtaken by the
+//!   master's backlog on a busy computer.
 //!
-//! Pure: time is an argument, and so is the mirror.
+//! This module is pure: the time and the mirror are arguments.
 
 mod by_subject;
 mod outbox;
@@ -37,81 +39,82 @@ use self::{
 };
 use crate::{master::Master, xmlrpc::Call};
 
-/// How long a notification of ours waits after an answer about the same subject was written. rosmaster takes
-/// 0.3 ms at least, for its notifications go through another thread and a new connection.
+/// How long our notification waits after an answer about the same subject was written. rosmaster takes at
+/// least 0.3 ms, because its notifications go through another thread and a new connection.
 pub const LEAD: Duration = Duration::from_millis(10);
-/// A notification that follows an answer within this time may be read before it: with thirty runnable processes on
-/// two cores a node took 42 ms from the one to the other.
+/// A notification that follows an answer within this time may be read before it. With thirty runnable
+/// processes on two cores, a node took 42 ms from one to the other.
 pub const RECENT: Duration = Duration::from_millis(500);
-/// When such a node is told the state once more. Idle threads of rosmaster look for work every 100 ms, so by then
-/// a master without a backlog has sent what it was going to send.
+/// How long after such a notification the node is told the state once more. Idle threads of rosmaster look
+/// for work every 100 ms, so by then a master without a backlog has sent everything.
 pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
-/// How long a master may take for a notification while many wait: Python passes its lock on every 5 ms.
+/// How long a master may take for one notification while many wait. Python passes its lock on every 5 ms.
 const MASTER_TAKES: Duration = Duration::from_millis(5);
-/// Longest backlog of a master's notifications that ours wait for.
-const BACKLOG_MOST: Duration = Duration::from_secs(10);
-/// How long a client that does not read its answer holds up the writes of others.
+/// The longest backlog of the master's notifications for which ours wait.
+const BACKLOG_MAX: Duration = Duration::from_secs(10);
+/// How long a client that does not read its answer can delay the writes of others.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(1);
-/// How long a node that does not take a notification holds up writes about the subject. With thirty runnable
-/// processes on two cores a node took more than 100 ms, and the master's newer value came first.
+/// How long a node that does not take a notification can delay writes about the subject. With thirty runnable
+/// processes on two cores, a node took more than 100 ms, and the master's newer value came first.
 pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
 
-/// What is under way to nodes, and what waits for it.
+/// Answers and notifications that are under way to nodes, and whatever waits for them.
 #[derive(Debug, Default)]
 pub struct Order {
     under_way: UnderWay,
     outbox: Outbox,
-    /// Of what the master may be notifying nodes: it has not answered these calls.
+    /// The calls that the master has not answered yet. It may be notifying nodes because of them.
     in_flight: InFlight,
-    /// Of what the master has notified nodes lately.
+    /// The subjects of which the master has notified nodes lately.
     told: Told,
     repeats: Repeats,
-    /// Something waits until one of the above changes.
+    /// Whether a call or a notification waits for a change of any of the above.
     awaited: bool,
 }
 
-/// The calls that the master has and has not answered.
+/// The calls that the master has not answered yet.
 #[derive(Debug, Default)]
 struct InFlight {
     tells: BySubject<()>,
     answers: Vec<u64>,
 }
 
-/// Why a call waits.
+/// A call must wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Held {
-    /// When to ask again at the latest; none if a change will be reported.
+    /// When to ask again at the latest. `None` if a change will be reported.
     pub until: Option<Instant>,
 }
 
 impl Order {
-    /// An answer about `heard` is under way from now on. Returns its number, for [`Self::written`]; none if it
-    /// is about nothing that nodes are notified of.
+    /// Notes that an answer about `heard` is under way. Returns its number, for [`Self::written`]. `None` if
+    /// nodes are never notified of what it is about.
     pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
         self.under_way.forget(now);
         if heard.is_empty() {
             return None;
         }
         for Heard { port, subject } in &heard {
-            // What waits there is older than the answer.
+            // The notifications that wait there are older than the answer.
             self.outbox.renew(port, subject);
         }
         Some(self.under_way.add(under_way::Kind::Answer, heard, None))
     }
 
-    /// The answer is ready: from now on it holds up others for a limited time.
+    /// Notes that the answer is ready. From now on it delays others for a limited time only.
     pub fn ready(&mut self, now: Instant, answer: u64) {
         self.under_way.limit(answer, now + ANSWER_LIMIT);
     }
 
-    /// The answer has been written to its caller, or never will be. Returns whether something waits for that.
+    /// Notes that the answer has been written to its caller, or never will be. Returns whether anything waits
+    /// for that.
     pub fn written(&mut self, now: Instant, answer: u64) -> bool {
         self.under_way.written(now, answer);
         std::mem::take(&mut self.awaited)
     }
 
-    /// Whether a call has to wait before it goes to the master, because it may notify a node to which an answer
-    /// about the same subject is under way.
+    /// Whether a call must wait before it goes to the master, because it may notify a node while an answer to
+    /// that node about the same subject is under way.
     pub fn hold(&mut self, now: Instant, concern: &Concern) -> Option<Held> {
         let held = match concern.is_anything() {
             true => self.under_way.any(now),
@@ -124,8 +127,8 @@ impl Order {
         held.map(|until| Held { until })
     }
 
-    /// Whether a read has to wait for a call that the master has: its answer could be older than what the
-    /// master notifies the reader of.
+    /// Whether a read must wait for a call that the master has not answered. Otherwise its answer could be
+    /// older than a notification that the master sends to the reader.
     pub fn holds_read(&mut self, heard: &[Heard]) -> bool {
         let mut heard = heard.iter();
         let held = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
@@ -133,9 +136,10 @@ impl Order {
         held
     }
 
-    /// Calls go to the master that may notify nodes of `tells`. `answers`: the answers to them.
+    /// Notes that the master is given calls that may notify nodes of `tells`. `answers` are the numbers of
+    /// the answers to them.
     pub fn sent<'a>(&mut self, tells: impl IntoIterator<Item = &'a Subject>, answers: Vec<u64>) {
-        // A node does not take its own name from itself, and other calls of its need not wait.
+        // A node never displaces itself, so its other calls need not wait for its own name.
         let told = tells
             .into_iter()
             .filter(|it| !matches!(it, Subject::Name(_)));
@@ -145,14 +149,14 @@ impl Order {
         self.in_flight.answers = answers;
     }
 
-    /// The master has no unanswered calls any more, or the mirror has answered them. Returns whether something
-    /// waits for that.
+    /// Notes that the master has no unanswered calls any more, or that the mirror has answered them. Returns
+    /// whether anything waits for that.
     pub fn settled(&mut self) -> bool {
         self.in_flight = InFlight::default();
         std::mem::take(&mut self.awaited)
     }
 
-    /// The master notifies so many nodes of `subject`.
+    /// Notes that the master notifies this many nodes of `subject`.
     pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
         let until = self.told.add(now, subject, nodes);
         self.outbox.renew_all(subject);
@@ -160,20 +164,22 @@ impl Order {
         let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
         self.repeats.drop_all_but(subject, &ports);
         for (answer, port) in about {
-            // Its own call was run later, or is what the node is notified of.
+            // Not for an answer in the same batch: that call ran later, or is itself the reason for the
+            // notification.
             if !self.in_flight.answers.contains(&answer) {
                 self.repeats.add(until, port, subject.clone());
             }
         }
     }
 
-    /// The master that has notified nodes is gone: it sends nothing any more.
+    /// Notes that the master which has notified nodes is gone and sends nothing any more.
     pub fn master_is_gone(&mut self) {
         self.told = Told::default();
     }
 
-    /// The node at `port` is to be notified by `call`, which a master would send now. What a master that is away
-    /// may have run, and is run again, may be older than what that one has told: the state is told instead.
+    /// Queues `call`, which a master would send now, for the node at `port`. If a master that is away may
+    /// already have run the write, `call` may be older than what that master has sent. Then the node is told
+    /// the state instead.
     pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
         let is_news = !self.in_flight.tells.has(&subject);
         let content = is_news.then_some(Content::Call(call));
@@ -181,22 +187,22 @@ impl Order {
             .add(port, subject, content.unwrap_or(Content::State));
     }
 
-    /// The node at `port` is to be told the state of `subject` as it is when it is sent.
+    /// Queues a notification that tells the node at `port` the state of `subject` at the time of sending.
     pub fn tell_state(&mut self, port: &str, subject: Subject) {
         self.outbox.add(port, subject, Content::State);
     }
 
-    /// As [`Self::tell_state`], but not before `at`.
+    /// Like [`Self::tell_state`], but not before the time `at`.
     pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
         self.repeats.add(at, port.to_owned(), subject);
     }
 
-    /// The ports for which notifications wait and nobody sends them yet.
+    /// The ports that have notifications waiting and need a sender.
     pub fn take_idle_ports(&mut self) -> Vec<String> {
         self.outbox.take_idle_ports()
     }
 
-    /// What to do next for the node at `port`.
+    /// The next thing to do for the node at `port`.
     pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> Next {
         self.under_way.forget(now);
         while let Some(subject) = self.outbox.first(port) {
@@ -220,7 +226,7 @@ impl Order {
             let Some(notification) = self.outbox.pop(port) else {
                 continue;
             };
-            // Of two senders the slower one may tell what is older: the state goes last.
+            // The slower of two senders may tell something older, so the state is told last.
             if is_being_told || told.is_some() && notification.is_state() {
                 let again = told.unwrap_or(now + REPEAT_AFTER);
                 self.repeats.add(again, port.to_owned(), subject);
@@ -247,42 +253,42 @@ impl Order {
         Next::Idle
     }
 
-    /// The node has taken the notification with this number, so that it takes what comes next later, or has not.
-    /// Returns whether something waits for that.
+    /// Notes that the node has taken the notification with this number, and so will read later ones after it,
+    /// or that it could not be delivered. Returns whether anything waits for that.
     pub fn taken(&mut self, number: u64) -> bool {
         self.under_way.remove(number);
         std::mem::take(&mut self.awaited)
     }
 
-    /// Drops what waits for the node at `port`.
+    /// Drops all notifications that wait for the node at `port`.
     pub fn drop_port(&mut self, port: &str) {
         self.outbox.remove(port);
     }
 
-    /// Drops all that waits: another computer notifies nodes from now on.
+    /// Drops all notifications that wait, because another computer notifies nodes from now on.
     pub fn forget_notifications(&mut self) {
         self.outbox.clear();
         (self.told, self.repeats) = Default::default();
     }
 
-    /// Queues what is to be told once more by now.
+    /// Queues the notifications that are to be repeated by now.
     pub fn repeat(&mut self, now: Instant) {
         while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
             self.outbox.add(&port, subject, Content::StateAgain);
         }
     }
 
-    /// Whether [`Self::next_repeat`] has become earlier since the last time that this was asked.
+    /// Whether [`Self::next_repeat`] has become earlier since this was last asked.
     pub fn has_new_repeat(&mut self) -> bool {
         std::mem::take(&mut self.repeats.is_new)
     }
 
-    /// When [`Self::repeat`] is due.
+    /// When [`Self::repeat`] is due next.
     pub fn next_repeat(&self) -> Option<Instant> {
         self.repeats.at.next()
     }
 
-    /// Whether an answer to the node at `port` about `subject` is under way, and until when it holds up others.
+    /// Whether an answer to the node at `port` about `subject` is under way, and until when it delays others.
     pub fn is_under_way(&mut self, now: Instant, port: &str, subject: &Subject) -> Option<Held> {
         match self.under_way.answer_to(now, port, subject)? {
             under_way::Answer::UnderWay { limit } => {
@@ -294,23 +300,23 @@ impl Order {
     }
 }
 
-/// Of what the master may still be notifying nodes.
+/// The subjects of which the master may still be notifying nodes.
 #[derive(Debug, Default)]
 struct Told {
-    /// Until when, the latest time for each subject.
+    /// When the master will have sent everything about each subject.
     until: BySubject<Instant>,
     ends: Schedule<Subject>,
-    /// When the master will have sent everything, as far as can be told.
+    /// When the master is expected to have sent everything.
     busy: Option<Instant>,
 }
 
 impl Told {
-    /// It has begun to notify so many nodes. Returns when it will have done so.
+    /// Notes that the master has begun to notify this many nodes. Returns when it will be done.
     fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
         self.forget(now);
         let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
         let busy = self.busy.map_or(now, |busy| busy.max(now));
-        let busy = (busy + takes.min(BACKLOG_MOST)).min(now + BACKLOG_MOST);
+        let busy = (busy + takes.min(BACKLOG_MAX)).min(now + BACKLOG_MAX);
         self.busy = Some(busy);
         let until = busy + REPEAT_AFTER;
         if let Some(before) = self.ends.set(subject.clone(), until) {
@@ -332,7 +338,8 @@ impl Told {
     }
 }
 
-/// What nodes are told once more, by port, after the last time that they might have read it in the wrong order.
+/// Which nodes, by port, are told the state of a subject once more, and when: after the last time at which
+/// they may have read notifications in the wrong order.
 #[derive(Debug, Default)]
 struct Repeats {
     at: Schedule<(Subject, String)>,
@@ -345,7 +352,7 @@ impl Repeats {
         self.at.set((subject, port), at);
     }
 
-    /// The nodes at other ports than `kept` are not told of `subject` once more.
+    /// Drops the repeats of `subject` for nodes at ports other than `kept`.
     fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
         let from = (subject.clone(), String::new());
         let about = self.at.at.range(from..);
@@ -359,7 +366,7 @@ impl Repeats {
     }
 }
 
-/// When each of several things is due.
+/// The times at which several things are due.
 #[derive(Debug)]
 struct Schedule<T> {
     at: BTreeMap<T, Instant>,
@@ -376,7 +383,7 @@ impl<T> Default for Schedule<T> {
 }
 
 impl<T: Clone + Ord> Schedule<T> {
-    /// Returns when it was due before.
+    /// Sets when `thing` is due. Returns when it was due before.
     fn set(&mut self, thing: T, at: Instant) -> Option<Instant> {
         let before = self.at.insert(thing.clone(), at);
         if let Some(before) = before {

@@ -1,11 +1,11 @@
 //! Recognises a master, reads its state, and brings it to the mirror's state.
 //!
-//! * [`Token`] and [`Inspection`]: recognising a master, and reading the state of an unknown one.
-//! * [`Plan`]: the one call that brings a new master to the mirror's state, and its verification.
-//! * [`treatment`]: what is done with a master, by what it bears and what is known of it.
-//! * [`reconcile`]: the state for a master that was unreachable.
-//! * [`accepted`]: which parts of a call a master has executed, by its reply.
-//! * [`difference`]: how two states differ, for people.
+//! * [`Token`] and [`Inspection`] recognise a master and read the state of an unknown one.
+//! * [`Plan`] is the one call that brings a new master to the mirror's state, and verifies the answer.
+//! * [`treatment`] decides what to do with a master, by its token and by what is known of it.
+//! * [`reconcile`] computes the state for a master that was unreachable.
+//! * [`accepted`] tells from a master's reply which parts of a call it has executed.
+//! * [`difference`] describes how two states differ.
 
 mod accepted;
 mod difference;

@@ -1,10 +1,10 @@
-//! The Master and Parameter API as a pure state machine.
+//! The ROS Master API and Parameter API as a pure state machine.
 //!
 //! * [`Master`]: a complete master without IO. [`Master::apply`] answers a call as rosmaster does.
-//! * [`Request`]: a call, parsed once; its [`Method`] and its [`Kind`].
+//! * [`Request`]: a call, parsed once, with its [`Method`] and its [`Kind`].
 //!
-//! Everything follows rosmaster 1.15.15 under Python 3.11, function by function, including quirks that
-//! clients see. Only texts of errors that no ROS client provokes are our own.
+//! Everything follows rosmaster 1.15.15 on Python 3.11, function by function, including the quirks that
+//! clients can see. Only the texts of errors that no ROS client causes are our own.
 
 mod api;
 mod checks;

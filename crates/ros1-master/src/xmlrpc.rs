@@ -1,4 +1,4 @@
-//! XML-RPC: values, and their decoding and encoding. Independent of ROS.
+//! XML-RPC values, and their encoding and decoding as CPython does it. Knows nothing of ROS.
 
 mod decode;
 mod encode;

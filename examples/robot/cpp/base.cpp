@@ -1,5 +1,5 @@
-// The driver of a base with two wheels: takes `cmd_vel`, publishes `odom`, the wheels' joints and the transform
-// to the base, and says how it is on /diagnostics.
+// The driver of a base with two wheels: subscribes to `cmd_vel`, publishes `odom`, the joints of the wheels and the
+// transform to the base, and reports its state on /diagnostics.
 
 #include <cmath>
 #include <diagnostic_msgs/DiagnosticArray.h>

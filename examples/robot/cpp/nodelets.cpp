@@ -1,5 +1,5 @@
-// The front camera's pipeline, in one process without copies of images: `Grey` makes the image grey, and
-// `Preview` lets few of them pass (nodelet_topic_tools).
+// The pipeline of the front camera, in one process without copying images: `Grey` converts images to grey, and
+// `Preview` lets only some of them pass (nodelet_topic_tools).
 
 #include <boost/make_shared.hpp>
 #include <nodelet/nodelet.h>

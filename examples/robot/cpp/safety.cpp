@@ -1,5 +1,5 @@
-// Lets commands to the base pass unless a scanner sees something closer than `~distance`. Says which on `stopped`,
-// latched.
+// Passes commands on to the base unless a scanner sees something closer than `~distance`. Publishes whether the robot is
+// stopped on `stopped`, latched.
 
 #include <algorithm>
 #include <geometry_msgs/Twist.h>

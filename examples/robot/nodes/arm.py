@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""The arm: swings its joints, and folds them when it is asked to."""
+"""The arm: swings its joints, and folds them on request."""
 
 import math
 

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""The battery: how full it is, once a second, and on /diagnostics."""
+"""The battery: publishes its charge once a second and on /diagnostics."""
 
 import diagnostic_updater
 import rospy

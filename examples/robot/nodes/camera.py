@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A camera: publishes a moving picture and its calibration. `rate` and `brightness` by dynamic_reconfigure."""
+"""A camera: publishes a moving picture and its calibration. dynamic_reconfigure sets `rate` and `brightness`."""
 
 import diagnostic_updater
 import dynamic_reconfigure.server
@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 64, 48
 
 
 class Config:
-    """What dynamic_reconfigure would generate from a .cfg file, if Debian had catkin."""
+    """The type that dynamic_reconfigure would generate from a .cfg file if Debian had catkin."""
 
     defaults = {"rate": 10.0, "brightness": 128, "mirrored": False}
     min = {"rate": 1.0, "brightness": 0, "mirrored": False}

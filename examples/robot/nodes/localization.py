@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Says where the robot is on the map, of what it knows of scans, odometry and transforms."""
+"""Publishes where the robot is on the map, from scans, odometry and transforms."""
 
 import rospy
 import tf2_ros

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Publishes the map, latched, and gives it to who asks for it."""
+"""Publishes the map, latched, and offers it as a service."""
 
 import rospy
 from nav_msgs.msg import MapMetaData, OccupancyGrid

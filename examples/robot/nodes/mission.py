@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Sends the robot from one place of `~places` to the next, for ever."""
+"""Sends the robot from one place in `~places` to the next, forever."""
 
 import itertools
 

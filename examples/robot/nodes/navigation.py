@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Drives to where it is told: an action server of `move_base`. A drive takes `~seconds`."""
+"""Drives to a goal: an action server for `move_base`. A drive takes `~seconds`."""
 
 import actionlib
 import rospy

@@ -1,4 +1,4 @@
-//! Files that are damaged, foreign or gone.
+//! Files that are damaged, belong to another program, or are gone.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use rosrescue::checkpoint::store::{OpenError, Store};
 use super::{checkpoint, entry, names, place, seqs, started};
 
 #[test]
-fn a_torn_record_is_cut_and_kept() {
+fn a_torn_record_is_cut_off_and_kept() {
     let (folder, path) = place();
     drop(started(&path, 3));
     let bytes = fs::read(&path).unwrap();
@@ -20,7 +20,7 @@ fn a_torn_record_is_cut_and_kept() {
     let torn = fs::read_to_string(folder.path().join("c.yaml.torn-1")).unwrap();
     assert!(torn.starts_with("- {seq: 3"));
 
-    // Goes on behind the cut, and the torn record never comes back.
+    // Recording continues where the torn record was cut off, and that record never comes back.
     store.begin(&checkpoint(2)).unwrap();
     store.append(&[entry(33)]).unwrap();
     drop(store);
@@ -38,7 +38,7 @@ fn a_torn_record_is_cut_and_kept() {
 }
 
 #[test]
-fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
+fn the_previous_generation_replaces_a_damaged_snapshot() {
     let (folder, path) = place();
     let mut store = started(&path, 3);
     store.begin(&checkpoint(3)).unwrap();
@@ -75,7 +75,7 @@ fn a_broken_snapshot_is_replaced_by_the_previous_generation() {
 }
 
 #[test]
-fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
+fn a_damaged_file_never_replaces_a_good_previous_generation() {
     let (_folder, path) = place();
     let mut store = started(&path, 3);
     store.begin(&checkpoint(3)).unwrap();
@@ -93,7 +93,7 @@ fn a_broken_file_does_not_take_the_place_of_a_good_fallback() {
 }
 
 #[test]
-fn a_file_put_back_from_a_copy_is_what_it_was() {
+fn a_file_restored_from_a_copy_has_the_state_of_the_copy() {
     let (_folder, path) = place();
     let mut store = started(&path, 2);
     let copy = fs::read(&path).unwrap();
@@ -113,7 +113,7 @@ fn a_file_put_back_from_a_copy_is_what_it_was() {
 }
 
 #[test]
-fn a_lost_record_is_said_and_the_others_are_used() {
+fn a_lost_record_is_reported_and_the_others_are_used() {
     let (_folder, path) = place();
     drop(started(&path, 3));
     let text = fs::read_to_string(&path).unwrap();
@@ -128,7 +128,7 @@ fn a_lost_record_is_said_and_the_others_are_used() {
 }
 
 #[test]
-fn without_any_snapshot_the_records_are_left() {
+fn without_any_snapshot_the_records_are_still_used() {
     let (_folder, path) = place();
     drop(started(&path, 3));
     let mut bytes = fs::read(&path).unwrap();
@@ -158,7 +158,7 @@ fn a_file_removed_under_a_running_store_is_noticed_by_the_next_check() {
 }
 
 #[test]
-fn what_a_crash_left_unfinished_is_removed() {
+fn files_that_a_crash_left_unfinished_are_removed() {
     let (folder, path) = place();
     drop(started(&path, 1));
     for name in [
@@ -176,7 +176,7 @@ fn what_a_crash_left_unfinished_is_removed() {
 }
 
 #[test]
-fn a_later_format_is_refused_and_left_alone() {
+fn a_file_of_a_newer_format_is_refused_and_left_alone() {
     let (_folder, path) = place();
     let line = "# rosrescue checkpoint v9 header=";
     let text = format!("{line}{:08x}\nnew: true\n", crc32c::crc32c(line.as_bytes()));
@@ -190,7 +190,7 @@ fn a_later_format_is_refused_and_left_alone() {
 }
 
 #[test]
-fn a_folder_that_cannot_be_made_is_named() {
+fn the_error_names_a_folder_that_cannot_be_created() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("file");
     fs::write(&file, "").unwrap();
@@ -203,7 +203,7 @@ fn a_folder_that_cannot_be_made_is_named() {
 }
 
 #[test]
-fn a_fallback_of_a_later_history_adds_nothing_to_the_next_generation() {
+fn a_previous_generation_of_a_later_history_adds_nothing() {
     let (_folder, path) = place();
     let mut store = started(&path, 0);
     let mut copy = fs::read(&path).unwrap();
@@ -213,7 +213,7 @@ fn a_fallback_of_a_later_history_adds_nothing_to_the_next_generation() {
     }
     store.begin(&checkpoint(5)).unwrap();
     drop(store);
-    // An old copy, damaged too, beside the fallback of what came after it.
+    // An old and damaged copy, beside the previous generation of a later history.
     copy[200] ^= 4;
     fs::write(&path, copy).unwrap();
     let (mut store, loaded) = Store::open(&path).unwrap();

@@ -1,4 +1,4 @@
-//! A lock file that was taken away, and that somebody else holds by now.
+//! A lock file that was removed, and that another process has locked since.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -14,11 +14,13 @@ fn check(store: &mut Store) {
 }
 
 fn assert_refused(path: &Path) {
-    let error = Store::open(path).err().expect("two of them");
+    let error = Store::open(path)
+        .err()
+        .expect("a second store must be refused");
     assert!(matches!(error, OpenError::Locked { .. }), "{error}");
 }
 
-/// The files are where they belong, and hold everything.
+/// Checks that the files are in their places and hold everything.
 fn assert_whole(path: &Path, mut store: Store) {
     let reason = store.unprotected().unwrap().to_owned();
     assert!(reason.contains("c.yaml"), "{reason}");
@@ -34,9 +36,9 @@ fn assert_whole(path: &Path, mut store: Store) {
     assert_eq!(store.seq(), seq);
 }
 
-/// In another container, say, where the socket is not seen.
+/// As from another container, which does not see the socket.
 #[test]
-fn a_lock_that_another_one_took_is_waited_for() {
+fn recording_resumes_when_another_process_gives_the_lock_back() {
     let (folder, path) = place();
     let mut store = started(&path, 3);
     let lock = folder.path().join("c.yaml.lock");

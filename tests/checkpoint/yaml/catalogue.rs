@@ -1,9 +1,9 @@
-//! Values that some reader or other takes for something else, and random ones.
+//! Values that some YAML readers misread, and random values.
 
 use proptest::prelude::*;
 use rosrescue::xmlrpc::{Struct, Value};
 
-/// Texts that some YAML reader or other takes for something else.
+/// Texts that some YAML readers take for something else.
 #[rustfmt::skip]
 const TEXTS: &[&str] = &[
     "", " ", "  both  ", "no", "No", "on", "OFF", "y", "yes", "true", "null", "~", "Null", "1:30",
@@ -116,7 +116,7 @@ pub(crate) fn values() -> impl Strategy<Value = Value> {
         any::<bool>().prop_map(Value::Bool),
         any::<i32>().prop_map(Value::Int),
         "-?[1-9][0-9]{10,40}".prop_map(Value::BigInt),
-        // NaN has one spelling on the wire and here.
+        // NaN has only one form, on the wire and in a checkpoint.
         any::<f64>().prop_map(|n| Value::Double(if n.is_nan() { f64::NAN } else { n })),
         any::<u64>()
             .prop_map(f64::from_bits)

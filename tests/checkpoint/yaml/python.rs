@@ -1,4 +1,4 @@
-//! PyYAML, the reader of everybody else.
+//! PyYAML, the YAML reader that most programs use.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -11,7 +11,7 @@ use super::{file_with, in_array, in_struct, nested};
 
 const PYTHON: &str = "/usr/bin/python3";
 
-/// What PyYAML sees, with its types, in a notation of our own.
+/// Prints what PyYAML reads, with types, in a notation of our own.
 const DESCRIBE: &str = r#"
 import base64, datetime, struct, sys, yaml
 
@@ -99,7 +99,7 @@ fn python(script: &str, input: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Writes one file per value and compares what PyYAML makes of them.
+/// Writes one file per value, and compares how PyYAML reads them.
 fn assert_python_agrees(values: &[Value]) {
     let folder = tempfile::tempdir().unwrap();
     let mut names = String::new();
@@ -118,7 +118,7 @@ fn assert_python_agrees(values: &[Value]) {
 
 #[test]
 fn python_reads_every_kind_of_value_alike() {
-    // Integers of 40 digits at most, which `shown` can convert; the longest are looked at apart.
+    // `shown` can convert integers of at most 40 digits. The longest ones have a test of their own.
     let values: Vec<Value> = catalogue()
         .into_iter()
         .filter(|value| !matches!(value, Value::BigInt(digits) if digits.len() == 4_000))
@@ -135,7 +135,7 @@ fn python_reads_random_values_alike() {
     let values: Vec<Value> = (0..400)
         .map(|_| values().new_tree(&mut runner).unwrap().current())
         .collect();
-    // `shown` knows integers of 128 bits.
+    // `shown` can convert integers of 128 bits.
     let few_digits = |value: &Value| !format!("{value:?}").contains("BigInt");
     assert_python_agrees(&values.into_iter().filter(few_digits).collect::<Vec<_>>());
 }

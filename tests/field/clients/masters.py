@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Masters other than rosmaster behind `rosrescue proxy`: whether calls pass, and if not, what is said and how soon.
+"""Tests masters other than rosmaster behind `rosrescue proxy`: whether calls pass, and if not, which error comes how soon.
 
     masters.py --work FOLDER --rosrescue PROGRAM
 
@@ -23,7 +23,7 @@ CALLS = [
 
 
 def answers(uri):
-    """What a master answers to each call, and to a multicall; a text where it fails."""
+    """The master's answer to each call and to a multicall, or a text for each call that fails."""
     master, found = xmlrpc.client.ServerProxy(uri), {}
     for method, *params in CALLS:
         try:
@@ -57,7 +57,7 @@ def look(options, label, command):
             return result
         start = time.monotonic()
         uri, listen = "http://127.0.0.1:%d" % port, "127.0.0.1:%d" % front
-        # It goes first: what is asked below changes the master.
+        # This comes first, because the calls below change the master.
         rescue = Process(
             label + "-rosrescue",
             [options.rosrescue, "proxy", "-m", uri, "-l", listen, "--checkpoint", checkpoint], env, log,
@@ -74,7 +74,7 @@ def look(options, label, command):
         result["bare"] = answers(uri)
     finally:
         if rescue:
-            # In order: a worker has a process group of its own.
+            # A clean stop, because the worker has a process group of its own.
             rescue.popen.terminate()
             rescue.popen.wait(20)
         master.end()

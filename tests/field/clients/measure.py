@@ -1,19 +1,19 @@
 #!/usr/bin/python3
-"""Foreign clients through the deaths of master and worker, beside a node of rospy each.
+"""Runs other client libraries through deaths of master and worker, each beside a rospy node.
 
     measure.py --work FOLDER --rosrescue PROGRAM [--clients a,b] [--modes core,proxy] [--kills 3] [--away 60]
 
-A client is a program that takes a name NAME and is one node `/NAME`, with a `/ref_NAME` of rospy beside it
+A client is a program that is given a name NAME and runs one node `/NAME`, beside a rospy node `/ref_NAME`
 (reference.py). Each of the two
 
-* publishes the numbers from 1 on `/OWN/out`, ten each second, and says `heard NUMBER` of the other one's;
-* calls the other one's service `/OTHER/serve` five times a second, looked up each time: `call NUMBER MS`;
-* sets and reads the parameter `/NAME/value` (the reference only reads): `param NUMBER MS`;
-* says `call-failed NUMBER MS WHY` and `param-failed NUMBER MS WHY` if that fails;
-* says `ready`, and `shutdown` when it is told to shut down.
+* publishes the numbers from 1 on `/OWN/out`, ten per second, and prints `heard NUMBER` for those of the other node;
+* calls the other node's service `/OTHER/serve` five times a second, with a lookup each time: `call NUMBER MS`;
+* sets and reads the parameter `/NAME/value` (the rospy node only reads): `param NUMBER MS`;
+* prints `call-failed NUMBER MS WHY` or `param-failed NUMBER MS WHY` if that fails;
+* prints `ready`, and `shutdown` when it is told to shut down.
 
-All clients run side by side behind one rosrescue. Writes the lines of the tables to FOLDER/result.json, and
-everything that was said to FOLDER/log.
+All clients run side by side behind one rosrescue. Writes the lines of the tables to FOLDER/result.json, and all output
+to FOLDER/log.
 """
 
 import argparse
@@ -32,7 +32,7 @@ import xmlrpc.client
 HERE = pathlib.Path(__file__).resolve().parent
 NODES = HERE.parent.parent / "nodes"
 KINDS = ("master", "worker", "both")
-# What a busy computer may take for anything, in seconds.
+# Maximum time for anything on a busy computer, in seconds.
 PATIENCE = 120
 
 
@@ -43,7 +43,7 @@ def free_port():
 
 
 def wait(what, holds, patience=PATIENCE):
-    """Whether `holds` became true in time."""
+    """Waits until `holds` is true. Returns whether that was in time."""
     end = time.monotonic() + patience
     while not holds():
         if time.monotonic() > end:
@@ -54,7 +54,7 @@ def wait(what, holds, patience=PATIENCE):
 
 
 class Process:
-    """A program whose lines are kept with the time at which they came."""
+    """A program whose output is kept, with the time of each line."""
 
     def __init__(self, label, command, env, log):
         self.label, self.lines = label, []
@@ -79,7 +79,7 @@ class Process:
         return self.popen.poll() is None
 
     def end(self):
-        """SIGKILL to the program and what it has started."""
+        """Kills the program and everything that it has started."""
         try:
             os.killpg(self.popen.pid, signal.SIGKILL)
         except ProcessLookupError:
@@ -95,7 +95,7 @@ def kill(pid):
 
 
 class Stage:
-    """A master, rosrescue in front of it if `mode` is not `bare`, and where nodes are started."""
+    """A master, rosrescue in front of it unless `mode` is `bare`, and the environment of the nodes."""
 
     def __init__(self, options, mode):
         self.options, self.mode, self.all = options, mode, []
@@ -105,7 +105,7 @@ class Stage:
         shutil.rmtree(self.home, ignore_errors=True)
         self.home.mkdir(parents=True)
         self.away = self.home / "away"
-        # What finds messages: see run.sh.
+        # Where message types are found; see run.sh.
         messages = str(options.work / "messages")
         self.env = dict(
             os.environ, ROS_IP="127.0.0.1", ROS_MASTER_URI=self.uri, ROS_HOME=str(self.home),
@@ -130,7 +130,7 @@ class Stage:
             self.rescue = self.start("rosrescue", [options.rosrescue] + command + common)
 
     def begin(self):
-        """Waits until calls pass, and starts what all clients share."""
+        """Waits until calls pass, and starts the programs that all clients share."""
         if self.rescue and not wait("rosrescue serves", self.open):
             raise RuntimeError("rosrescue does not serve")
         options = self.options
@@ -167,7 +167,7 @@ class Stage:
         return self.master.popen.pid if self.mode != "core" else self.status()["master_pid"]
 
     def worker_pid(self):
-        """The guardian's child that is rosrescue."""
+        """The child of the guardian that runs rosrescue."""
         for stat in pathlib.Path("/proc").glob("[0-9]*/stat"):
             try:
                 name, _, rest = stat.read_text().partition("(")[2].rpartition(")")
@@ -178,7 +178,7 @@ class Stage:
         raise RuntimeError("there is no worker")
 
     def kill(self, kind):
-        """One death, until calls pass to a master again."""
+        """Causes one death, and waits until calls pass to a master again."""
         victims = []
         if kind in ("master", "both"):
             victims.append(self.master_pid())
@@ -206,7 +206,7 @@ class Stage:
 
 
 def client_command(options, client, name):
-    """What starts the node `name` of `client`."""
+    """The command that starts the node `name` of `client`."""
     rust = options.work / "rust" / "debug" / client
     if client in ("rosrust", "rosrust_async", "roslibrust"):
         return [rust, name]
@@ -222,7 +222,7 @@ def client_command(options, client, name):
     return ["/usr/bin/python3", HERE / "xmlrpc_node.py", name]
 
 
-# What a client cannot do by itself; `serve`: its service closes the connections of rospy, which names no type.
+# What a client cannot do. `serve`: its service closes connections of rospy, because these name no type.
 LACKS = {
     "roslibrust": {"param"},
     "rosrust_async": {"serve"},
@@ -232,7 +232,7 @@ LACKS = {
 
 
 class Pair:
-    """A client and its reference."""
+    """A client and the rospy node beside it."""
 
     def __init__(self, stage, client, name):
         self.stage, self.client, self.name = stage, client, name
@@ -241,7 +241,7 @@ class Pair:
         self.lacks = LACKS.get(client, set())
 
     def kinds(self):
-        """What both say when they work: `(process, word)`."""
+        """The words that both print when they work, as `(process, word)`."""
         words = [word for word in ("heard", "call", "param") if word not in self.lacks]
         both = [(process, word) for process in (self.reference, self.node) for word in words]
         return [one for one in both if not ("serve" in self.lacks and one == (self.reference, "call"))]
@@ -250,7 +250,7 @@ class Pair:
         return all(process.said(word, since) for process, word in self.kinds())
 
     def counts(self, since, until):
-        """What came and what did not between two times."""
+        """Counts what succeeded and what failed between two times."""
         sums = {"heard": 0, "lost": 0, "calls": 0, "failed": 0, "longest": 0, "silent": [], "why": []}
         for process, word in self.kinds():
             said = process.said(word, since, until)
@@ -272,7 +272,7 @@ class Pair:
 
 
 def namesakes(stage, pair, patience=15):
-    """Starts a second node of the name of `pair`'s; how the first one takes it."""
+    """Starts a second node with the name of the one in `pair`. Returns how the first one reacts."""
     master = xmlrpc.client.ServerProxy(stage.uri)
     first, before = pair.node, master.lookupNode("/measure", "/" + pair.name)[2]
     start = time.monotonic()
@@ -289,7 +289,7 @@ def namesakes(stage, pair, patience=15):
 
 
 def measure(options, mode):
-    """All windows of a mode: {client: {window: counts}}."""
+    """Measures all spans of time in a mode: {client: {window: counts}}."""
     print("==", mode, flush=True)
     stage = Stage(options, mode)
     results = {client: {} for client in options.clients}
@@ -301,7 +301,7 @@ def measure(options, mode):
                 results[client]["start"] = "does not work at the start"
                 del pairs[client]
         if mode == "bare":
-            # What is lost and fails without any death.
+            # Counts losses and failures without any death.
             since = time.monotonic()
             time.sleep(20)
             for client, pair in pairs.items():
@@ -320,10 +320,10 @@ def measure(options, mode):
             since = time.monotonic()
             for _ in range(options.kills):
                 stage.kill(kind)
-                # Fewer deaths than make a crash loop.
+                # Fewer deaths than a crash loop has.
                 time.sleep(12)
             window(kind, since, pairs)
-        # A long time without a master, in which nodes start, and displace each other.
+        # A long time without a master, during which nodes start and displace each other.
         since = time.monotonic()
         stage.away.touch()
         kill(stage.master_pid())

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A node of rospy that talks with one client in each way: what it does and says is in measure.py.
+"""A rospy node that communicates with one client in every way. measure.py describes what it does and prints.
 
     reference.py NAME
 """
@@ -21,7 +21,7 @@ def say(*words):
 
 
 def forever(what, act):
-    """Runs `act` every 200 ms, one at a time, and says how long it took."""
+    """Runs `act` every 200 ms, one at a time, and prints how long it took."""
     number = 0
     while not rospy.is_shutdown():
         number += 1

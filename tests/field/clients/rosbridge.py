@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A rosbridge_websocket as the node NAME, and a client of it. What they do and say is in measure.py.
+"""A rosbridge_websocket as the node NAME, and a client of it. measure.py describes what they do and print.
 
     rosbridge.py FOLDER roslibpy|roslib NAME
 """
@@ -48,7 +48,7 @@ def start_bridge(port):
 
 
 def forever(what, act):
-    """Runs `act` every 200 ms, one at a time, and says how long it took."""
+    """Runs `act` every 200 ms, one at a time, and prints how long it took."""
     number = 0
     while True:
         number += 1

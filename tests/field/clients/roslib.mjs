@@ -1,9 +1,9 @@
-// A client of rosbridge_websocket by roslib; what it does and says is in tests/field/clients/measure.py.
+// A client of rosbridge_websocket that uses roslib. tests/field/clients/measure.py describes what it does and prints.
 const [folder, name, port] = process.argv.slice(2);
 const { Param, Ros, Service, Topic } = await import(`${folder}/node_modules/roslib/dist/RosLib.js`);
 const say = (...words) => console.log(words.join(" "));
 
-// Runs `act` every 200 ms, one at a time, and says how long it took.
+// Runs `act` every 200 ms, one at a time, and prints how long it took.
 async function forever(what, act) {
   for (let number = 1; ; number += 1) {
     const start = Date.now();

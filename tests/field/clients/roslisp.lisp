@@ -1,4 +1,4 @@
-;;; A node of roslisp; what it does and says is in tests/field/clients/measure.py.
+;;; A node of roslisp. tests/field/clients/measure.py describes what it does and prints.
 
 (require :asdf)
 (require :sb-posix)
@@ -21,7 +21,7 @@
 
 (defun ms () (round (* 1000 (/ (get-internal-real-time) internal-time-units-per-second))))
 
-;; Runs ACT every 200 ms, one at a time, and says how long it took.
+;; Runs ACT every 200 ms, one at a time, and prints how long it took.
 (defun forever (what act)
   (sb-thread:make-thread
    (lambda ()

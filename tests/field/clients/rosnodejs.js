@@ -1,10 +1,10 @@
-// A node of rosnodejs; what it does and says is in tests/field/clients/measure.py.
+// A node of rosnodejs. tests/field/clients/measure.py describes what it does and prints.
 const rosnodejs = require("rosnodejs");
 
 const [name] = process.argv.slice(2);
 const say = (...words) => console.log(words.join(" "));
 
-// Runs `act` every 200 ms, one at a time, and says how long it took.
+// Runs `act` every 200 ms, one at a time, and prints how long it took.
 async function forever(what, act) {
   for (let number = 1; ; number += 1) {
     const start = Date.now();

@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Writes what was measured between the marks of docs/compatibility.md.
+"""Writes the results between the marks of docs/compatibility.md.
 
     table.py clients|robots FOLDER DOCUMENT
 """

@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""A node by nothing but Python 2's or 3's XML-RPC: a node's API and calls of the master. It publishes, and offers a
-service, by name only: who connects is told so. What it says is in measure.py, and `told` for each notification.
+"""A node made of nothing but the XML-RPC of Python 2 or 3: the API of a node, and calls to the master. It registers a
+publisher and a service but accepts no connections. It prints the lines in measure.py, and `told` for each notification.
 """
 
 import os
@@ -41,7 +41,7 @@ class Node(SimpleXMLRPCServer):
 
 
 def call(method, *params):
-    # A connection each, as rospy does.
+    # One connection for each, as in rospy.
     code, message, value = getattr(ServerProxy(MASTER), method)(NAME, *params)
     if code != 1:
         raise ValueError(message)

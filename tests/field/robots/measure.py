@@ -3,11 +3,11 @@
 
     measure.py --work FOLDER --rosrescue PROGRAM [--robots 10] [--deaths 100] [--minutes 60] [--seed N]
 
-Robot I has the nodes /rI/teleop, which publishes /cmd_vel, and /rI/base, which drives by it, publishes /rI/odom,
-hears the next robot's odometry and offers /rI/reset. /cmd_vel is filtered: it belongs to each robot alone. A death is
-that of a master, a worker, both, or a link, which is cut for 3 to 30 s. After each the graphs are compared with those
-of the start once they are the same again, and all along no filtered registration may be seen. Exit status 1 if
-anything was not as it should be. Needs root.
+Robot I has the node /rI/teleop, which publishes /cmd_vel, and the node /rI/base, which subscribes to it, publishes
+/rI/odom, subscribes to the next robot's odometry and offers /rI/reset. /cmd_vel is filtered, so each robot has its own.
+What dies is a master, a worker, or both, or a link is cut for 3 to 30 s. After each death the graphs must become equal
+to those at the start, and no filtered registration may be seen at any time. The exit status is 1 if anything was wrong.
+Needs root.
 """
 
 import argparse
@@ -27,7 +27,7 @@ import xmlrpc.client
 HERE = pathlib.Path(__file__).resolve().parent
 LAN = "rrlan%d" % os.getpid()
 FILTERED = ["/cmd_vel", "/rosout", "/rosout_agg"]
-# What a busy computer may take for anything, in seconds.
+# Maximum time for anything on a busy computer, in seconds.
 PATIENCE = 180
 READ = """
 import json, sys, xmlrpc.client
@@ -51,7 +51,7 @@ def wait(what, holds, patience=PATIENCE):
 
 
 def normal(state):
-    """A system state without order: three dictionaries."""
+    """A system state without order, as three dictionaries."""
     return [{name: sorted(nodes) for name, nodes in kind} for kind in state]
 
 
@@ -117,20 +117,20 @@ class Robot:
             return {}
 
     def graph(self):
-        """What rosrescue answers; nothing if it does not."""
+        """The answer of rosrescue. None if there is none."""
         try:
             return normal(xmlrpc.client.ServerProxy(self.uri).getSystemState("/measure")[2])
         except (OSError, xmlrpc.client.Error):
             return None
 
     def master_graph(self):
-        """What the real master answers."""
+        """The answer of the real master."""
         command = self.inside(["/usr/bin/python3", "-c", READ, "http://127.0.0.1:11411"])
         read = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
         return normal(json.loads(read.stdout)) if read.returncode == 0 else None
 
     def worker_pid(self):
-        """The child of the guardian, which `ip` has become."""
+        """The child of the guardian. The process of `ip` has become the guardian."""
         children = pathlib.Path("/proc/{0}/task/{0}/children".format(self.processes["rosrescue"].pid))
         for pid in children.read_text().split():
             if pathlib.Path("/proc", pid, "comm").read_text().strip() == "rosrescue":
@@ -138,7 +138,7 @@ class Robot:
         raise RuntimeError("there is no worker")
 
     def dead(self):
-        """Labels of programs that have ended, which nothing here does."""
+        """Labels of programs that have ended, which none of them should do."""
         return [label for label, process in self.processes.items() if process.poll() is not None]
 
     def end(self):
@@ -155,7 +155,7 @@ class Robot:
 
 
 def expected(robots):
-    """Whether the robots know each other, and nothing more."""
+    """Whether the robots know each other, and no filtered registration is there."""
     for robot in robots:
         graph = robot.graph()
         if not graph:
@@ -217,7 +217,7 @@ def differences(now, before):
 
 
 def run(options, robots, dice):
-    """The wrongs that were found, and what was done."""
+    """The errors that were found, and what was done."""
     for robot in robots:
         wait("%s serves" % robot.name, lambda robot=robot: robot.status().get("open") is True)
         robot.start_nodes()
@@ -227,7 +227,7 @@ def run(options, robots, dice):
         for robot in robots:
             print(robot.name, json.dumps(robot.graph()), flush=True)
         return ["the robots do not find each other"], {}
-    # Private topics of the sync, too.
+    # Private topics of the synchronisation are filtered as well.
     before = None
     while before != (before := [robot.graph() for robot in robots]):
         time.sleep(5)
@@ -247,9 +247,9 @@ def run(options, robots, dice):
 
         quiet = wait("all graphs are what they were", same)
         quiet = quiet and wait("%s is open" % robot.name, lambda: robot.status().get("open") is True)
-        # The health check is over, and changed nothing that matters.
+        # The health check has finished and changed nothing that matters.
         wait("the health check", lambda: robot.status().get("last_recovery", {}).get("health_check_ms") is not None)
-        # Sync may be changing something, which ends as it began.
+        # The synchronisation may be changing something, but ends with the same state.
         if not wait("the master of " + robot.name, lambda: robot.master_graph() == before[robot.index], 60):
             lines = differences(robot.master_graph(), before[robot.index])
             wrong += ["master of %s: %s" % (robot.name, line) for line in lines]
@@ -263,7 +263,7 @@ def run(options, robots, dice):
             number + 1, kind, robot.name, time.monotonic() - since, wrong[:3] or ""), flush=True)
         if wrong:
             break
-    # Sync goes on.
+    # The synchronisation still works.
     own = robots[0]
     own.start("late", ["/usr/bin/python3", HERE / "node.py", "__ns:=/r0", "__name:=late", "pub:/r0/late"])
     late = lambda: all((one.graph() or [{}])[0].get("/r0/late") == ["/r0/late"] for one in robots)
@@ -298,7 +298,7 @@ def main():
         ip("-n %s link add lan type bridge mcast_snooping 0" % LAN)
         ip("-n %s addr add 10.99.0.1/24 dev lan" % LAN)
         ip("-n %s link set lan up" % LAN)
-        # What follows is a host in the network that the robots share.
+        # The rest runs on a host in the network that the robots share.
         enter(LAN)
         for index in range(options.robots):
             robots.append(Robot(options, index))
@@ -314,7 +314,7 @@ def main():
 
 
 def enter(space):
-    """Moves this process into a network namespace: os.setns of Python 3.12."""
+    """Moves this process into a network namespace, like os.setns of Python 3.12."""
     file = os.open("/run/netns/" + space, os.O_RDONLY)
     if ctypes.CDLL(None, use_errno=True).setns(file, 0x40000000) != 0:
         raise OSError(ctypes.get_errno(), "setns")

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Several robots with multimaster_fkie, each behind its own rosrescue: takes multimaster_fkie's source into
-# target/field/robots, runs measure.py, and writes the section "Several robots" of docs/compatibility.md. Needs root,
-# iproute2, and a Debian or Ubuntu with ROS 1.
+# Tests several robots with multimaster_fkie, each behind its own rosrescue: downloads the source of multimaster_fkie
+# into target/field/robots, runs measure.py, and writes the section "Several robots" of docs/compatibility.md. Needs
+# root, iproute2, and a Debian or Ubuntu with ROS 1.
 #
 #     tests/field/robots/run.sh [OPTIONS OF measure.py]
 #
-# ROSRESCUE=/path/to/rosrescue takes a binary that is there already, and FKIE_GIT a repository of multimaster_fkie.
+# ROSRESCUE=/path/to/rosrescue uses a program that is already built, and FKIE_GIT names a repository of multimaster_fkie.
 set -eu
 cd "$(dirname "$0")/../../.."
 . tests/install_ros.sh

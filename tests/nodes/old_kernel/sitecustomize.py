@@ -1,4 +1,4 @@
-"""Shows Python an old kernel, so that rosgraph makes servers of HTTP/1.0, as on a kernel before 4.16."""
+"""Makes Python see an old kernel, so that rosgraph's servers speak HTTP/1.0, as on a kernel before 4.16."""
 
 import platform
 

@@ -1,16 +1,16 @@
-//! How rosrescue starts with the checkpoint that it finds: unwritable, somebody else's, empty, damaged. It
-//! serves all the same, says what is the matter, and nothing of a person's is lost.
+//! How rosrescue starts with the checkpoint that it finds: unwritable, not a checkpoint, empty, or damaged.
+//! It serves calls in any case, reports the problem, and never destroys a user's file.
 
 use std::fs;
 
 use crate::support::{Rosmaster, Scratch, Setup, eventually, free_port, params};
 use rustix::process::Signal;
 
-/// The robot runs on: rosrescue says that it is unprotected and why, and restores a dead master from
-/// what it remembers. (Tests may run as root, who may write everywhere: what nobody can write is a file
-/// where a folder should be, and a folder where the file should be.)
+/// The robot keeps running: rosrescue reports that it is unprotected and why, and restores a dead master from
+/// memory. Tests may run as root, who may write to any file, so the unwritable places are a file where a
+/// folder should be, and a folder where the file should be.
 #[test]
-fn a_checkpoint_that_cannot_be_written() {
+fn rosrescue_serves_calls_without_a_writable_checkpoint() {
     let scratch = Scratch::new();
     let file = scratch.path("file");
     fs::write(&file, "a file").unwrap();
@@ -24,7 +24,7 @@ fn a_checkpoint_that_cannot_be_written() {
         let mut rescue = Setup::core(&scratch, free_port())
             .at_checkpoint(checkpoint.clone())
             .start();
-        rescue.wait_line("which file it cannot write", |line| {
+        rescue.wait_line("the log names the file that cannot be written", |line| {
             line.contains("unprotected") && line.contains(checkpoint.to_str().unwrap())
         });
         let client = rescue.client();
@@ -40,13 +40,13 @@ fn a_checkpoint_that_cannot_be_written() {
         assert_eq!(scratch.survivors(), vec![]);
     }
     assert_eq!(fs::read_to_string(&file).unwrap(), "a file");
-    // A person's folder is not renamed, either.
+    // The user's folder is not renamed either.
     assert!(folder.is_dir() && !scratch.path("folder.unreadable-1").exists());
 }
 
-/// What somebody else wrote is never lost: it stays where it is, or is kept under another name.
+/// A file of another program is never lost: it stays in its place or is kept under another name.
 #[test]
-fn a_checkpoint_that_is_not_ours() {
+fn a_file_of_another_program_at_the_checkpoints_path_is_never_lost() {
     let scratch = Scratch::new();
     let contents: &[&[u8]] = &[
         b"my: precious\nnotes: [1, 2]\n",
@@ -68,10 +68,10 @@ fn a_checkpoint_that_is_not_ours() {
             .at_checkpoint(checkpoint.clone())
             .spawn();
         let client = rescue.client();
-        eventually("it serves or refuses", || {
+        eventually("rosrescue serves calls or refuses to start", || {
             rescue.exited().is_some() || client.ask("setParam", params!["/c", "/x", 1]).is_some()
         });
-        eventually("it names the file", || {
+        eventually("the log names the file", || {
             rescue
                 .output()
                 .iter()
@@ -91,7 +91,7 @@ fn a_checkpoint_that_is_not_ours() {
 }
 
 #[test]
-fn an_empty_checkpoint_is_a_fresh_start() {
+fn an_empty_checkpoint_starts_a_new_session() {
     let scratch = Scratch::new();
     let checkpoint = scratch.path("empty.yaml");
     fs::write(&checkpoint, "").unwrap();
@@ -102,7 +102,7 @@ fn an_empty_checkpoint_is_a_fresh_start() {
 }
 
 #[test]
-fn a_damaged_checkpoint_gives_what_is_whole_and_says_so() {
+fn the_whole_records_of_a_damaged_checkpoint_are_restored_and_the_damage_is_reported() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
@@ -112,7 +112,7 @@ fn a_damaged_checkpoint_gives_what_is_whole_and_says_so() {
     rescue.kill();
     let checkpoint = rescue.checkpoint();
     let mut bytes = fs::read(&checkpoint).unwrap();
-    // The last record is torn: it was never acknowledged for all that the file can tell.
+    // The last record is incomplete, so as far as the file can tell it was never acknowledged.
     let end = bytes
         .iter()
         .rposition(|&byte| byte == b'{')

@@ -1,4 +1,4 @@
-//! The default checkpoint: one for each port.
+//! The default checkpoint, of which there is one per port.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +11,7 @@ use rosrescue::checkpoint::{
 use crate::support::{Rescue, Scratch, Setup, Tool, eventually, free_port, status};
 
 #[test]
-fn two_cores_in_one_home_are_protected_and_each_is_restored_from_its_own() {
+fn two_cores_in_one_home_have_separate_checkpoints() {
     let scratch = Scratch::new();
     let start = || {
         let setup = Setup::core(&scratch, free_port()).guarded();
@@ -21,7 +21,7 @@ fn two_cores_in_one_home_are_protected_and_each_is_restored_from_its_own() {
     for core in &cores {
         core.client().set_param("/port", i32::from(core.port()));
         let client = core.client();
-        eventually("it is protected", || {
+        eventually("rosrescue is protected", || {
             status(&client)["unprotected"].is_null()
         });
         assert_eq!(
@@ -35,7 +35,7 @@ fn two_cores_in_one_home_are_protected_and_each_is_restored_from_its_own() {
         crate::support::signal(worker, rustix::process::Signal::KILL);
     }
     for core in &mut cores {
-        // Commands find the same file where none runs.
+        // Commands find the same file when no rosrescue runs.
         let port = core.port();
         let tool = |words: &[&str]| Tool::rosrescue(&scratch, port, words).ended(0);
         assert!(tool(&["params", "present"]).contains(&format!("\"port\": {port}")));
@@ -50,7 +50,7 @@ fn two_cores_in_one_home_are_protected_and_each_is_restored_from_its_own() {
     }
 }
 
-/// Writes the checkpoint at `path` as an earlier version does, which does not record the port.
+/// Rewrites the checkpoint at `path` as an earlier version would write it, without the port.
 fn forget_port(path: &Path) {
     let loaded = store::read(path).unwrap().unwrap();
     let first = loaded.checkpoint.as_ref().unwrap().seq;
@@ -73,7 +73,7 @@ fn forget_port(path: &Path) {
 }
 
 #[test]
-fn the_default_of_an_earlier_version_is_taken_over_by_its_port_only() {
+fn the_default_checkpoint_of_an_earlier_version_is_used_only_for_its_own_port() {
     let scratch = Scratch::new();
     let old = scratch.log_dir().join("latest-chkpt.yaml");
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
@@ -85,13 +85,21 @@ fn the_default_of_an_earlier_version_is_taken_over_by_its_port_only() {
         setup.at_port(port).start()
     };
     let value = |rescue: &Rescue| rescue.client().param("/old");
-    assert_eq!(value(&other(free_port())), None, "it is in use");
+    assert_eq!(value(&other(free_port())), None, "the checkpoint is in use");
     rescue.kill();
-    assert_eq!(value(&other(free_port())), None, "it is of another port");
+    assert_eq!(
+        value(&other(free_port())),
+        None,
+        "the checkpoint belongs to another port"
+    );
     forget_port(&old);
     let rescue = other(rescue.port());
     assert_eq!(value(&rescue), Some(1.into()));
-    assert_eq!(rescue.client().master_pid(), master, "it goes on");
+    assert_eq!(
+        rescue.client().master_pid(),
+        master,
+        "the same master stays in use"
+    );
     assert!(
         rescue
             .log()

@@ -1,5 +1,5 @@
-//! A disk that cannot be written (FAULTS.md F10, F11): calls go on being forwarded, it says that it
-//! is unprotected, and it re-arms by itself.
+//! A disk that cannot be written (FAULTS.md F10, F11): calls are still forwarded, rosrescue reports that it
+//! is unprotected, and it recovers by itself.
 
 use std::fs;
 
@@ -10,7 +10,7 @@ fn unprotected(rescue: &Rescue) -> bool {
     !status(&rescue.client())["unprotected"].is_null()
 }
 
-/// Both die, and the state is that of `/last`.
+/// Kills rosrescue and the master, and checks that `/last` is restored.
 fn assert_survives(rescue: &mut Rescue, last: i32) {
     let master = rescue.client().master_pid().unwrap();
     rescue.kill();
@@ -20,12 +20,11 @@ fn assert_survives(rescue: &mut Rescue, last: i32) {
     assert_eq!(rescue.client().param("/last"), Some(last.into()));
 }
 
-/// Each set is answered while the disk is unusable; the state of memory is what a dead master is
-/// restored from.
+/// Checks that calls are answered while the disk is unusable, and that a dead master is restored from memory.
 fn goes_on_without(rescue: &mut Rescue) {
     let client = rescue.client();
     let mut count = 0;
-    eventually("it is said to be unprotected", || {
+    eventually("rosrescue reports that it is unprotected", || {
         count += 1;
         client.set_param("/last", count);
         unprotected(rescue)
@@ -41,14 +40,14 @@ fn goes_on_without(rescue: &mut Rescue) {
 }
 
 fn is_protected_again(rescue: &mut Rescue) {
-    eventually("it is protected again", || !unprotected(rescue));
+    eventually("rosrescue is protected again", || !unprotected(rescue));
     rescue.wait_line("that", |line| line.contains("protected again"));
     rescue.client().set_param("/last", 1000);
     assert_survives(rescue, 1000);
 }
 
 #[test]
-fn a_disk_that_somebody_fills() {
+fn calls_are_answered_on_a_full_disk_and_recorded_when_it_has_room_again() {
     let scratch = Scratch::new();
     let disk = SmallDisk::new(&scratch, "1m");
     let mut rescue = disk.rescue(&scratch);
@@ -59,9 +58,9 @@ fn a_disk_that_somebody_fills() {
     assert_eq!(rescue.terminate().code(), Some(0));
 }
 
-/// While files are open for writing, a disk does not become read-only.
+/// A disk does not become read-only while files are open for writing.
 #[test]
-fn a_disk_that_is_read_only_at_the_start() {
+fn calls_are_answered_on_a_read_only_disk_and_recorded_when_it_is_writable_again() {
     let scratch = Scratch::new();
     let disk = SmallDisk::new(&scratch, "1m");
     disk.remount("remount,ro");

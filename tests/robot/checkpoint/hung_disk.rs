@@ -1,5 +1,5 @@
-//! A disk that does not answer, such as a dying SD card or an NFS server that is away. Reads go on as usual, writes
-//! wait for a limited time, and the recording begins again when the disk answers.
+//! A disk that does not answer, such as a dying SD card or an NFS server that is away. Reads continue, writes
+//! wait for a limited time, and recording resumes when the disk answers.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -10,9 +10,9 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// Longest time for a call that waits for no disk. Who waits for the disk waits for 5 s.
+/// Maximum time for a call that does not wait for the disk. Calls that do wait for 5 s.
 const SOON: Duration = Duration::from_secs(4);
-/// Longest time for a write on a disk that hangs: rosrescue gives up after 5 s.
+/// Maximum time for a write on a disk that hangs. rosrescue gives up after 5 s.
 const LATE: Duration = Duration::from_secs(30);
 
 fn unprotected(client: &Client) -> Option<String> {
@@ -29,7 +29,7 @@ fn within<T>(limit: Duration, what: &str, work: impl FnOnce() -> T) -> T {
     result
 }
 
-/// All kinds of reads, while `write` is under way on a disk that hangs.
+/// Makes all kinds of reads while `write` is under way on a disk that hangs.
 #[track_caller]
 fn assert_reads_go_on<T: Send + 'static>(
     client: &Client,
@@ -53,7 +53,7 @@ fn assert_reads_go_on<T: Send + 'static>(
     write.join().unwrap()
 }
 
-/// Rosrescue and the master die, and the state is `wanted` afterwards.
+/// Kills rosrescue and the master, and checks that the state is `wanted` afterwards.
 #[track_caller]
 fn assert_survives(rescue: &mut Rescue, wanted: &State) {
     let client = rescue.client();
@@ -68,7 +68,7 @@ fn assert_survives(rescue: &mut Rescue, wanted: &State) {
 }
 
 #[test]
-fn reads_go_on_and_writes_wait_for_a_limited_time() {
+fn on_a_hung_disk_reads_continue_and_writes_wait_for_a_limited_time() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
@@ -82,12 +82,12 @@ fn reads_go_on_and_writes_wait_for_a_limited_time() {
         let client = client.clone();
         move || client.set_param("/during", 1)
     });
-    let reason = unprotected(&client).expect("a write that is not on the disk");
+    let reason = unprotected(&client).expect("rosrescue must be unprotected");
     assert!(reason.contains("has not answered"), "{reason}");
     rescue.wait_line("that", |line| {
         line.contains("unprotected") && line.contains("has not answered")
     });
-    // Nodes go on without the disk.
+    // Nodes continue without the disk.
     within(SOON, "the next write", || client.set_param("/during", 2));
     node.publish(&client, "/topic", "std_msgs/String");
     let dead = client.master_pid().unwrap();
@@ -98,16 +98,18 @@ fn reads_go_on_and_writes_wait_for_a_limited_time() {
     assert_eq!(client.param("/during"), Some(2.into()));
 
     disk.heal();
-    eventually("it is protected again", || unprotected(&client).is_none());
+    eventually("rosrescue is protected again", || {
+        unprotected(&client).is_none()
+    });
     rescue.wait_line("that", |line| line.contains("protected again"));
     client.set_param("/after", 1);
     let wanted = State::read(&client);
     assert_survives(&mut rescue, &wanted);
 }
 
-/// It hangs once more before the whole checkpoint that follows the first time is written.
+/// The disk hangs again before the whole checkpoint that follows the first hang has been written.
 #[test]
-fn what_is_written_between_two_silences_is_not_taken_for_recorded() {
+fn writes_between_two_hangs_of_the_disk_are_not_lost() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
     let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
@@ -124,13 +126,15 @@ fn what_is_written_between_two_silences_is_not_taken_for_recorded() {
         client.set_param("/slow", round);
     }
     disk.heal();
-    eventually("it is protected again", || unprotected(&client).is_none());
+    eventually("rosrescue is protected again", || {
+        unprotected(&client).is_none()
+    });
     let wanted = State::read(&client);
     assert_survives(&mut rescue, &wanted);
 }
 
 #[test]
-fn a_stop_on_a_disk_that_hangs_ends_and_says_so() {
+fn rosrescue_can_be_stopped_on_a_hung_disk_and_reports_it() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
     let setup = Setup::core(&scratch, free_port());
@@ -140,11 +144,11 @@ fn a_stop_on_a_disk_that_hangs_ends_and_says_so() {
     disk.begin(Trouble::Hangs);
     let status = within(LATE, "the stop", || rescue.terminate());
     assert_eq!(status.code(), Some(0));
-    rescue.wait_line("why there is no closing checkpoint", |line| {
+    rescue.wait_line("the log says why there is no closing checkpoint", |line| {
         line.contains("stopped without a closing checkpoint")
     });
     assert_eq!(scratch.survivors(), vec![]);
-    // The next start takes it for a crash, and restores the state.
+    // The next start treats this as a crash and restores the state.
     disk.heal();
     rescue.start_again();
     rescue.wait_serving();
@@ -153,7 +157,7 @@ fn a_stop_on_a_disk_that_hangs_ends_and_says_so() {
 
 /// The first generation of the checkpoint cannot be written.
 #[test]
-fn a_start_on_a_disk_that_hangs_serves() {
+fn rosrescue_serves_calls_when_it_starts_on_a_hung_disk() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let disk = FailingDisk::new(&scratch);
@@ -163,16 +167,16 @@ fn a_start_on_a_disk_that_hangs_serves() {
     disk.begin(Trouble::Slow);
     rescue.start_again();
     let client = rescue.client();
-    eventually("it answers", || client.param("/before").is_some());
+    eventually("rosrescue answers", || client.param("/before").is_some());
     disk.begin(Trouble::Hangs);
     within(LATE, "a write", || client.set_param("/during", 1));
     disk.heal();
-    eventually("it is protected", || unprotected(&client).is_none());
+    eventually("rosrescue is protected", || unprotected(&client).is_none());
 }
 
-/// What is promised with `--sync always` holds again as soon as the disk answers.
+/// The promise of `--sync always` holds again as soon as the disk answers.
 #[test]
-fn answers_wait_for_a_disk_that_syncs_again() {
+fn answers_wait_for_the_disk_again_as_soon_as_it_syncs() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
     let setup = Setup::core(&scratch, free_port()).args(["--no-rosout", "--sync", "always"]);
@@ -188,7 +192,9 @@ fn answers_wait_for_a_disk_that_syncs_again() {
     });
     assert!(unprotected(&client).is_some());
     disk.heal();
-    eventually("it is protected again", || unprotected(&client).is_none());
+    eventually("rosrescue is protected again", || {
+        unprotected(&client).is_none()
+    });
     disk.begin(Trouble::Hangs);
     let write = thread::spawn({
         let client = client.clone();
@@ -196,7 +202,7 @@ fn answers_wait_for_a_disk_that_syncs_again() {
     });
     let waits = holds(Duration::from_millis(700), || !write.is_finished());
     disk.heal();
-    assert!(waits, "it did not wait for the disk");
+    assert!(waits, "the answer did not wait for the disk");
     write.join().unwrap();
     let wanted = State::read(&client);
     assert_survives(&mut rescue, &wanted);

@@ -1,6 +1,6 @@
-//! Somebody moves or changes the checkpoint while rosrescue runs: it is said within about a second, the
-//! state is at the path again, no second rosrescue gets in meanwhile, and when both die then, nothing is
-//! lost.
+//! The checkpoint is moved or changed by another program while rosrescue runs. rosrescue reports it within
+//! about a second, writes the state to the path again, and lets no second rosrescue use it in the meantime.
+//! When rosrescue and the master die then, nothing is lost.
 
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
@@ -11,13 +11,13 @@ use std::time::{Duration, Instant};
 use crate::support::{Rescue, Scratch, Setup, SmallDisk, eventually, free_port, signal, status};
 use rustix::process::Signal;
 
-/// How soon it must be said: within a second, or later on a busy computer, but long before the disk is forced.
+/// How soon it must be reported: within a second, or later on a busy computer, but long before the next sync.
 const SAID: Duration = Duration::from_secs(10);
 
 fn robot(scratch: &Scratch) -> Rescue {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();
-    // However seldom it forces the disk, it looks.
+    // It checks the file however seldom it syncs.
     Setup::core(scratch, free_port())
         .args(["--sync-interval", "30000"])
         .at_checkpoint(folder.join("chkpt.yaml"))
@@ -29,28 +29,30 @@ fn said(rescue: &Rescue, words: &str) -> usize {
     output.iter().filter(|line| line.contains(words)).count()
 }
 
-/// Another rosrescue with the same checkpoint ends at once and says why.
+/// Checks that another rosrescue with the same checkpoint ends at once and says why.
 fn assert_refused(second: Setup) {
     let mut second = second.spawn();
-    eventually("the second one ends", || second.exited().is_some());
+    eventually("the second rosrescue ends", || second.exited().is_some());
     assert_eq!(second.exited().unwrap().code(), Some(1));
-    second.wait_line("why", |line| line.contains("in use by another rosrescue"));
+    second.wait_line("the second rosrescue says why", |line| {
+        line.contains("in use by another rosrescue")
+    });
 }
 
 fn second(scratch: &Scratch, checkpoint: PathBuf) -> Setup {
     Setup::core(scratch, free_port()).at_checkpoint(checkpoint)
 }
 
-/// Does `deed` in a quiet time, tries a second rosrescue at once and again when all is well, and kills
-/// everything.
+/// Does `deed` while no calls come, tries to start a second rosrescue at once and again when all is well, and
+/// then kills everything.
 fn assert_survives(rescue: &mut Rescue, deed: impl FnOnce(&Path), second: impl Fn() -> Setup) {
     rescue.client().set_param("/before", 1);
     deed(&rescue.checkpoint());
     let start = Instant::now();
-    eventually("it is said", || said(rescue, "unprotected: ") > 0);
+    eventually("rosrescue reports it", || said(rescue, "unprotected: ") > 0);
     assert!(start.elapsed() < SAID, "said after {:?}", start.elapsed());
     rescue.client().set_param("/between", 2);
-    eventually("it is protected again", || {
+    eventually("rosrescue is protected again", || {
         said(rescue, "protected again") > 0 && status(&rescue.client())["unprotected"].is_null()
     });
     assert_refused(second());
@@ -84,7 +86,7 @@ fn kept(checkpoint: &Path, content: &[u8]) -> bool {
 }
 
 #[test]
-fn a_folder_that_is_renamed() {
+fn a_renamed_checkpoint_folder_is_noticed_and_nothing_is_lost() {
     assert_deed_survived(|checkpoint| {
         let folder = checkpoint.parent().unwrap();
         fs::rename(folder, folder.with_extension("old")).unwrap();
@@ -92,15 +94,15 @@ fn a_folder_that_is_renamed() {
 }
 
 #[test]
-fn a_lock_file_that_is_deleted() {
+fn a_deleted_lock_file_is_replaced_and_still_keeps_others_out() {
     assert_deed_survived(|checkpoint| {
         fs::remove_file(checkpoint.with_extension("yaml.lock")).unwrap();
     });
 }
 
-/// Whoever shares the folder and nothing else, as a container does, is refused too.
+/// A process that shares only the folder, as in another container, is refused too.
 #[test]
-fn a_lock_file_that_is_deleted_where_another_container_sees_it() {
+fn a_deleted_lock_file_still_keeps_another_container_out() {
     let scratch = Scratch::new();
     let mut rescue = robot(&scratch);
     let checkpoint = rescue.checkpoint();
@@ -119,7 +121,7 @@ fn a_lock_file_that_is_deleted_where_another_container_sees_it() {
 }
 
 #[test]
-fn a_file_that_is_truncated() {
+fn a_truncated_checkpoint_is_noticed_and_nothing_is_lost() {
     for length in [0, 200] {
         assert_deed_survived(|checkpoint| {
             let file = File::options().write(true).open(checkpoint).unwrap();
@@ -129,7 +131,7 @@ fn a_file_that_is_truncated() {
 }
 
 #[test]
-fn a_file_that_is_overwritten_in_place() {
+fn an_overwritten_checkpoint_is_noticed_and_nothing_is_lost() {
     assert_deed_survived(|checkpoint| {
         let file = File::options().write(true).open(checkpoint).unwrap();
         file.write_all_at(b"something else", 300).unwrap();
@@ -137,7 +139,7 @@ fn a_file_that_is_overwritten_in_place() {
 }
 
 #[test]
-fn another_file_in_its_place_is_kept() {
+fn a_file_that_replaces_the_checkpoint_is_kept() {
     const FOREIGN: &[u8] = b"use_sim_time: true\n";
     let scratch = Scratch::new();
     let mut rescue = robot(&scratch);
@@ -153,7 +155,7 @@ fn another_file_in_its_place_is_kept() {
 }
 
 #[test]
-fn a_file_system_that_is_unmounted() {
+fn an_unmounted_checkpoint_folder_is_noticed_and_nothing_is_lost() {
     let scratch = Scratch::new();
     let disk = SmallDisk::new(&scratch, "1m");
     let mut rescue = disk.rescue(&scratch);
@@ -166,6 +168,6 @@ fn a_file_system_that_is_unmounted() {
         assert_refused(second());
     };
     assert_survives(&mut rescue, deed, second);
-    // In the folder below the mount, which everybody sees.
+    // The file is in the folder below the mount, where every process sees it.
     assert!(checkpoint.is_file());
 }

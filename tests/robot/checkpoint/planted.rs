@@ -1,5 +1,5 @@
-//! What others have put beside the checkpoint, and a disk that hangs: no call waits for it, and no file elsewhere is
-//! changed.
+//! Files that other users have planted beside the checkpoint, and a disk that hangs: no call is delayed, and
+//! no file elsewhere is changed.
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -11,7 +11,7 @@ use crate::support::{
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::Signal;
 
-/// What rosrescue opens beside a checkpoint.
+/// The files that rosrescue opens beside a checkpoint.
 const FILES: [&str; 4] = [
     ".rosmaster-output.log",
     ".rosmaster-logging.conf",
@@ -19,7 +19,7 @@ const FILES: [&str; 4] = [
     ".lock",
 ];
 
-/// A folder that every user may write to, and the checkpoint in it.
+/// Makes a folder that every user may write to. Returns the path of a checkpoint in it.
 fn open_folder(scratch: &Scratch) -> PathBuf {
     let folder = scratch.path("open");
     fs::create_dir(&folder).unwrap();
@@ -31,7 +31,7 @@ fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     format!("{}{suffix}", checkpoint.display()).into()
 }
 
-/// Kills the master, and sees that calls are answered and another master comes.
+/// Kills the master, and checks that calls are answered and another master comes.
 #[track_caller]
 fn assert_rescued(rescue: &mut Rescue) {
     let client = rescue.client();
@@ -46,7 +46,7 @@ fn assert_rescued(rescue: &mut Rescue) {
 }
 
 #[test]
-fn links_that_were_planted_are_not_followed() {
+fn planted_symbolic_links_are_not_followed() {
     let scratch = Scratch::new();
     let checkpoint = open_folder(&scratch);
     let victim = scratch.path("victim");
@@ -57,15 +57,16 @@ fn links_that_were_planted_are_not_followed() {
     let mut rescue = Setup::core(&scratch, free_port())
         .at_checkpoint(checkpoint)
         .start();
-    rescue.wait_line("that others may write there", |line| {
-        line.contains("WARN") && line.contains("every user may write to it")
-    });
+    rescue.wait_line(
+        "the log says that other users may write to the folder",
+        |line| line.contains("WARN") && line.contains("every user may write to it"),
+    );
     assert_rescued(&mut rescue);
     assert_eq!(fs::read_to_string(&victim).unwrap(), "kept");
 }
 
 #[test]
-fn pipes_that_were_planted_stop_no_call() {
+fn planted_pipes_delay_no_call() {
     let scratch = Scratch::new();
     let checkpoint = open_folder(&scratch);
     for suffix in FILES {
@@ -78,9 +79,9 @@ fn pipes_that_were_planted_stop_no_call() {
     assert_rescued(&mut rescue);
 }
 
-/// Python evaluates a part of it.
+/// Python would execute parts of it.
 #[test]
-fn the_log_configuration_of_rosmaster_is_in_no_folder() {
+fn rosmasters_log_configuration_is_not_a_file_that_others_could_plant() {
     let scratch = Scratch::new();
     let checkpoint = open_folder(&scratch);
     let rescue = Setup::core(&scratch, free_port())
@@ -96,14 +97,14 @@ fn the_log_configuration_of_rosmaster_is_in_no_folder() {
     assert!(given.starts_with(b"/proc/self/fd/"));
     assert!(!beside(&checkpoint, ".rosmaster-logging.conf").exists());
     let log = || fs::read_to_string(scratch.log_dir().join("master.log")).unwrap_or_default();
-    eventually("rosmaster logs as usual", || {
+    eventually("rosmaster writes its log", || {
         log().contains("initialization complete")
     });
 }
 
-/// Files in the checkpoint's folder cannot be opened while the disk hangs.
+/// While the disk hangs, files in the checkpoint's folder cannot be opened.
 #[test]
-fn a_disk_that_hangs_delays_neither_calls_nor_the_next_master() {
+fn a_hung_disk_delays_neither_calls_nor_the_next_master() {
     let scratch = Scratch::new();
     let disk = FailingDisk::new(&scratch);
     let setup = Setup::core(&scratch, free_port()).at_checkpoint(open_folder(&scratch));
@@ -112,12 +113,12 @@ fn a_disk_that_hangs_delays_neither_calls_nor_the_next_master() {
     for _ in 0..2 {
         assert_rescued(&mut rescue);
     }
-    rescue.wait_line("what is missing", |line| {
+    rescue.wait_line("the log says which file is missing", |line| {
         line.contains("cannot create the file for a process's output")
     });
     disk.heal();
     assert_rescued(&mut rescue);
-    eventually("it is protected", || {
+    eventually("rosrescue is protected", || {
         status(&rescue.client())["unprotected"].is_null()
     });
 }

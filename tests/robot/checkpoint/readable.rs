@@ -1,5 +1,5 @@
-//! The checkpoint as other people's tools see it: after real traffic PyYAML reads the file and finds
-//! every parameter with the type, the text and the place that it has in the master.
+//! The checkpoint as other tools read it: after real traffic PyYAML finds every parameter in the file with
+//! the same type, text and place as in the master.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -12,7 +12,7 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// What the script says that compares `checkpoint` with the master at `uri`.
+/// The output of the script that compares `checkpoint` with the master at `uri`.
 fn compared(checkpoint: &Path, uri: &str) -> String {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/checkpoint.py");
     let output = Command::new("/usr/bin/python3")
@@ -20,13 +20,13 @@ fn compared(checkpoint: &Path, uri: &str) -> String {
         .arg(checkpoint)
         .arg(uri)
         .output()
-        .expect("the system's Python runs");
+        .expect("cannot run the system's Python");
     let said = [output.stdout, output.stderr].concat();
     String::from_utf8_lossy(&said).trim().to_owned()
 }
 
 #[test]
-fn pyyaml_reads_what_the_master_holds() {
+fn pyyaml_reads_the_same_parameters_as_the_master_has() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
@@ -42,7 +42,7 @@ fn pyyaml_reads_what_the_master_holds() {
     client.set_param("/big", vec!["x".repeat(10_000); 20]);
     client.ok("deleteParam", params!["/test", "/kinds/one"]);
     assert_eq!(compared(&checkpoint, &bare.uri()), "same");
-    // Many more calls than any journal keeps: the file stays whole while it is replaced.
+    // Far more calls than any journal keeps. The file stays whole while it is replaced.
     for i in 0..3000 {
         client.set_param(&format!("/many/p{}", i % 50), i);
         if i % 500 == 0 {
@@ -60,20 +60,20 @@ fn pyyaml_reads_what_the_master_holds() {
         0o600
     );
 
-    // The closing snapshot.
+    // Now the closing snapshot.
     assert_eq!(rescue.terminate().code(), Some(0));
     assert_eq!(compared(&checkpoint, &bare.uri()), "same");
 }
 
 #[test]
-fn a_person_finds_nodes_topics_and_services_in_it() {
+fn nodes_topics_and_services_are_readable_in_the_checkpoint() {
     let robot = Robot::start(Mode::Core);
     let _talker = robot.node(Library::Rospy, "talker", &[]);
     let node = FakeNode::start("/fake");
     node.offer(&robot.client(), "/fake/service");
     node.watch_param(&robot.client(), "/gains");
     let checkpoint = robot.rescue.checkpoint();
-    eventually("the file tells of everything", || {
+    eventually("the file has all nodes, topics and services", || {
         let text = fs::read_to_string(&checkpoint).unwrap_or_default();
         let facts = [
             "/talker",
@@ -90,13 +90,13 @@ fn a_person_finds_nodes_topics_and_services_in_it() {
     assert_eq!(compared(&checkpoint, &robot.bare().uri()), "same");
 }
 
-/// The parameters in the file are a tree that `rosparam load` takes.
+/// The parameters in the file are a tree that `rosparam load` accepts.
 #[test]
-fn rosparam_loads_the_parameters_of_a_checkpoint() {
+fn rosparam_can_load_the_parameters_of_a_checkpoint() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
-    // Not `a/b`, `~x` and the empty one as keys: rosparam itself resolves keys as names.
+    // The keys `a/b`, `~x` and the empty one are left out, because rosparam resolves keys as names.
     let robot = tree! {
         "texts" => vec!["no", "on", "1:30", "=", "1.0", "", " x ", "2024-01-31", "~", "a\nb\t\"c\"", "é\u{85}"],
         "numbers" => vec![i32::MIN, 0, i32::MAX],
@@ -118,13 +118,13 @@ fn rosparam_loads_the_parameters_of_a_checkpoint() {
     assert!(
         command
             .status()
-            .expect("the system's Python runs")
+            .expect("cannot run the system's Python")
             .success()
     );
     let arguments = ["load", parameters.to_str().unwrap(), "/copy"];
     let loaded = Tool::run(&scratch, master.port, "rosparam", &arguments);
     assert!(loaded.status.success(), "{loaded:?}");
-    // PyYAML writes keys in the order of the alphabet.
+    // PyYAML writes keys in alphabetical order.
     let copy = master.client().param("/copy/robot").expect("the copy");
     assert_eq!(sorted(&copy), sorted(&robot));
 }

@@ -1,5 +1,5 @@
-//! A checkpoint that cannot be read at the start: its previous generation is restored, and what was at the
-//! path is kept, whatever it is.
+//! A checkpoint that cannot be read at the start. Its previous generation is restored, and whatever was at
+//! the path is kept.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -9,7 +9,8 @@ use crate::support::{Rescue, Scratch, Setup, eventually, free_port, signal, stat
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::process::Signal;
 
-/// One that has died with its master and left the parameter `/kept` in both generations, and its folder.
+/// A rosrescue that has died with its master, with the parameter `/kept` in both generations of its
+/// checkpoint; also the checkpoint's folder.
 fn dead(scratch: &Scratch) -> (Rescue, PathBuf) {
     let folder = scratch.path("robot");
     fs::create_dir(&folder).unwrap();
@@ -18,7 +19,7 @@ fn dead(scratch: &Scratch) -> (Rescue, PathBuf) {
         .start();
     rescue.client().set_param("/kept", 1);
     kill(&mut rescue);
-    // Its first generation makes that one the previous.
+    // The first generation of the second start makes the old one the previous generation.
     rescue.start_again();
     rescue.wait_serving();
     kill(&mut rescue);
@@ -37,18 +38,19 @@ fn unprotected(rescue: &Rescue) -> bool {
 }
 
 fn assert_restored(rescue: &mut Rescue) {
-    rescue.wait_line("what cannot be read", |line| {
+    rescue.wait_line("the log says which file cannot be read", |line| {
         line.contains("cannot read") && line.contains("chkpt.yaml")
     });
-    rescue.wait_line("what is used instead", |line| {
+    rescue.wait_line("the log says which file is used instead", |line| {
         line.contains("chkpt.yaml.previous` is used")
     });
     rescue.wait_serving();
     assert_eq!(rescue.client().param("/kept"), Some(1.into()));
-    eventually("it is protected", || !unprotected(rescue));
+    eventually("rosrescue is protected", || !unprotected(rescue));
 }
 
-/// Everything goes on from there, and the old thing is still beside it.
+/// Checks that everything continues from the previous generation, and that the unreadable file is still
+/// there.
 fn assert_restored_and_kept(spoil: impl FnOnce(&Path)) {
     let scratch = Scratch::new();
     let (mut rescue, folder) = dead(&scratch);
@@ -72,7 +74,7 @@ fn assert_restored_and_kept(spoil: impl FnOnce(&Path)) {
 }
 
 #[test]
-fn a_folder() {
+fn a_folder_at_the_path_is_kept_and_the_previous_generation_restored() {
     assert_restored_and_kept(|path| {
         fs::remove_file(path).unwrap();
         fs::create_dir_all(path.join("within")).unwrap();
@@ -80,7 +82,7 @@ fn a_folder() {
 }
 
 #[test]
-fn a_pipe() {
+fn a_pipe_at_the_path_is_kept_and_the_previous_generation_restored() {
     assert_restored_and_kept(|path| {
         fs::remove_file(path).unwrap();
         assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
@@ -88,16 +90,16 @@ fn a_pipe() {
 }
 
 #[test]
-fn a_file_beyond_all_measure() {
+fn an_oversized_file_is_kept_and_the_previous_generation_restored() {
     assert_restored_and_kept(|path| {
         let file = File::options().write(true).open(path).unwrap();
         file.set_len((1 << 30) + 1).unwrap();
     });
 }
 
-/// A disk that gives an error, and later the file.
+/// The disk gives an error first, and later the file.
 #[test]
-fn a_good_file_that_could_not_be_read_at_the_start() {
+fn a_good_file_that_was_unreadable_at_the_start_is_kept() {
     let scratch = Scratch::new();
     let (rescue, folder) = dead(&scratch);
     let path = folder.join("chkpt.yaml");
@@ -119,9 +121,9 @@ fn a_good_file_that_could_not_be_read_at_the_start() {
     assert_eq!(fs::read(aside).unwrap(), good);
 }
 
-/// Nothing can be read at the start, so a new session begins; what turns up later is not its to replace.
+/// Nothing can be read at the start, so a new session begins. It must not destroy a file that appears later.
 #[test]
-fn a_good_file_that_turns_up_later() {
+fn a_good_file_that_appears_later_is_kept() {
     let scratch = Scratch::new();
     let (mut rescue, folder) = dead(&scratch);
     let path = folder.join("chkpt.yaml");
@@ -135,7 +137,7 @@ fn a_good_file_that_turns_up_later() {
     assert!(unprotected(&rescue));
     assert_eq!(rescue.client().param("/kept"), None);
     renameat_with(CWD, &elsewhere, CWD, &path, RenameFlags::EXCHANGE).unwrap();
-    eventually("it is protected", || !unprotected(&rescue));
+    eventually("rosrescue is protected", || !unprotected(&rescue));
     rescue.client().set_param("/new", 1);
     kill(&mut rescue);
     rescue.start_again();

@@ -1,5 +1,5 @@
-//! Connections: how long they live, what may be in pieces, at once, large, zipped or slow, over IPv4 and
-//! IPv6.
+//! Connections of clients: how long they live, requests in pieces, many at once, large, compressed or slow,
+//! over IPv4 and IPv6.
 
 use std::thread;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Reply, Value};
 
 #[test]
-fn connections_live_as_long_as_the_masters() {
+fn connections_are_kept_as_long_as_a_bare_master_keeps_them() {
     let twins = Twins::start();
     let body = encode_call("hasParam", params!["/c", "/x"]);
     let cases: [(&str, &[&str], bool); 5] = [
@@ -92,16 +92,16 @@ fn a_request_may_come_in_any_pieces() {
     }
     assert_eq!(wire.response().unwrap().code, 200);
     assert_eq!(twins.behind.param("/slow"), Some("value".into()));
-    // The client may close its half behind the request.
+    // The client may close its half of the connection after the request.
     let mut wire = twins.through.connect().unwrap();
     wire.send(&bytes).unwrap();
     wire.finish().unwrap();
     assert_eq!(wire.response().unwrap().code, 200);
 }
 
-/// rosmaster sends its `100 Continue` too, but only together with the answer.
+/// rosmaster sends `100 Continue` too, but only together with the answer.
 #[test]
-fn expect_100_continue_is_answered_before_the_body() {
+fn expect_100_continue_is_answered_before_the_body_is_sent() {
     let twins = Twins::start();
     let body = encode_call("setParam", params!["/c", "/expected", 1]);
     let whole = request("POST /RPC2 HTTP/1.1", &["Expect: 100-continue"], &body);
@@ -114,7 +114,7 @@ fn expect_100_continue_is_answered_before_the_body() {
     assert_eq!(response.code, 200);
     assert_form(&response, "Expect: 100-continue");
     assert_eq!(twins.behind.param("/expected"), Some(1.into()));
-    // Who does not wait gets the answer as well.
+    // A client that does not wait for it gets the answer as well.
     wire.send(&whole).unwrap();
     let mut response = wire.response().unwrap();
     if response.code == 100 {
@@ -123,21 +123,21 @@ fn expect_100_continue_is_answered_before_the_body() {
     assert_eq!(response.code, 200);
 }
 
-/// The default of `--max-body`.
+/// The default limit of `--max-body`.
 #[test]
-fn a_body_of_64_mib_passes_and_one_byte_more_does_not() {
+fn a_body_of_64_mib_is_accepted_and_a_larger_one_refused() {
     let twins = Twins::start();
     let text = "<0123456789abcdef>".repeat((8 << 20) / 18);
     twins.through.set_param("/large", text.as_str());
     assert_eq!(twins.through.param("/large"), Some(Value::String(text)));
-    // What the master does with these takes no time: it knows no such method.
+    // The master answers these at once, because it has no such method.
     let around = encode_call("noSuchMethod", params![""]).len();
     let of_length =
         |length: usize| encode_call("noSuchMethod", params!["x".repeat(length - around)]);
     let small = twins.bare.call("noSuchMethod", params![]).unwrap();
     let answer = twins.through.exchange(&http_request(&of_length(64 << 20)));
     assert_eq!(answer.unwrap().reply(), small);
-    // The head alone is enough: it says how long the body is.
+    // The head alone is enough, because it says how long the body is.
     let body = of_length((64 << 20) + 1);
     let request = http_request(&body);
     let mut wire = twins.through.connect().unwrap();
@@ -147,7 +147,7 @@ fn a_body_of_64_mib_passes_and_one_byte_more_does_not() {
 }
 
 #[test]
-fn gzip_passes_both_ways() {
+fn compressed_requests_are_accepted() {
     let twins = Twins::start();
     let body = encode_call("setParam", params!["/c", "/zipped", "z".repeat(5000)]);
     let zipped = gzip(&body);
@@ -157,7 +157,7 @@ fn gzip_passes_both_ways() {
         &zipped,
     ));
     assert_eq!(twins.behind.param("/zipped"), Some("z".repeat(5000).into()));
-    // A client that would take gzip gets an answer that it can read; an unzipped one is one.
+    // A client that accepts gzip gets an answer that it can read. An uncompressed one is readable too.
     let body = encode_call("getParam", params!["/c", "/zipped"]);
     let response = twins
         .through
@@ -174,7 +174,7 @@ fn gzip_passes_both_ways() {
         assert_eq!(response.header("content-encoding"), Some("gzip"));
         assert!(response.body.starts_with(&[0x1f, 0x8b]));
     }
-    // What is no gzip is the master's to refuse.
+    // The master must refuse a body that is not gzip.
     let broken = request(
         "POST /RPC2 HTTP/1.1",
         &["Content-Encoding: gzip"],
@@ -189,7 +189,7 @@ fn gzip_passes_both_ways() {
 }
 
 #[test]
-fn a_slow_client_does_not_hold_up_the_others() {
+fn a_slow_client_does_not_delay_others() {
     let twins = Twins::start();
     let whole = http_request(&encode_call("setParam", params!["/c", "/half", 1]));
     let half: Vec<_> = (0..50)
@@ -200,7 +200,7 @@ fn a_slow_client_does_not_hold_up_the_others() {
             wire
         })
         .collect();
-    // A node that takes a publisherUpdate and does not answer holds up nobody else either.
+    // A node that accepts a publisherUpdate and does not answer delays no other node.
     let stuck = FakeNode::start("/stuck");
     stuck.subscribe(&twins.through, "/topic", "std_msgs/String");
     stuck.hold();
@@ -216,7 +216,7 @@ fn a_slow_client_does_not_hold_up_the_others() {
 }
 
 #[test]
-fn ipv6_on_both_sides() {
+fn clients_and_the_master_may_use_ipv6() {
     let scratch = Scratch::new();
     let port = free_port();
     let _master = Rosmaster::start_with(&scratch, port, |command| {
@@ -225,7 +225,7 @@ fn ipv6_on_both_sides() {
     let uri = format!("http://[::1]:{port}");
     let bare = Client::at("[::1]", port);
 
-    // All addresses, unless it is told otherwise.
+    // rosrescue listens at all addresses by default.
     let listen = free_port();
     let mut rescue = Setup::bare(&scratch, ["proxy", "--master", &uri])
         .env("ROS_MASTER_URI", format!("http://localhost:{listen}"))

@@ -1,15 +1,14 @@
-//! Forwarding: the same raw request to a bare rosmaster and to one behind rosrescue gets the same
-//! answer, whatever HTTP and XML-RPC allow or forbid; and the form of every answer is one that all
-//! clients understand.
+//! Forwarding: a bare rosmaster and one behind rosrescue give the same answer to the same raw request,
+//! whatever HTTP and XML-RPC allow or forbid, and in a form that all clients understand.
 
 use crate::support::{Twins, encode_call, http_request, params, request, tree};
 use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
-fn calls_are_answered_with_the_masters_bytes() {
+fn calls_are_answered_with_the_same_bytes_as_by_a_bare_master() {
     let twins = Twins::start();
     let api = "http://127.0.0.1:1/";
-    // One of a kind; `tests/differential` has calls without end.
+    // One call of each kind. `tests/differential` makes any number of them.
     let calls = [
         (
             "setParam",
@@ -50,7 +49,7 @@ fn calls_are_answered_with_the_masters_bytes() {
 }
 
 #[test]
-fn xml_of_every_kind_gets_the_masters_own_verdict() {
+fn every_kind_of_xml_is_answered_as_by_a_bare_master() {
     let twins = Twins::start();
     let call = |params: &str| {
         format!(
@@ -63,7 +62,7 @@ fn xml_of_every_kind_gets_the_masters_own_verdict() {
              <param><value>{value}</value></param></params>"
         ))
     };
-    // One of a kind; `tests/codec` has documents without end.
+    // One document of each kind. `tests/codec` tries any number of them.
     let bodies = [
         String::new(),
         "garbage".to_owned(),
@@ -97,7 +96,7 @@ fn xml_of_every_kind_gets_the_masters_own_verdict() {
 }
 
 #[test]
-fn paths_methods_and_versions() {
+fn http_paths_methods_and_versions_are_treated_as_by_a_bare_master() {
     let twins = Twins::start();
     let body = encode_call("hasParam", params!["/c", "/x"]);
     let mut differences = Vec::new();
@@ -125,7 +124,7 @@ fn paths_methods_and_versions() {
 }
 
 #[test]
-fn get_uri_is_the_address_of_rosrescue() {
+fn get_uri_returns_the_address_of_rosrescue() {
     let twins = Twins::start();
     assert_eq!(
         twins.through.ok("getUri", params!["/c"]),
@@ -141,7 +140,7 @@ fn get_uri_is_the_address_of_rosrescue() {
         !format!("{response:?}").contains(&twins.behind.uri()),
         "{response:?}"
     );
-    // What is wrong about the call is the master's to say.
+    // What is wrong with a call is for the master to say.
     twins.same_call("getUri", params![]);
     twins.same_call("getUri", params!["/c", 1]);
 }

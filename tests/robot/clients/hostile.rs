@@ -1,5 +1,6 @@
-//! What clients should not send: bytes that are no HTTP, XML made to hurt, requests that stop half-way,
-//! web pages. Each gets a refusal or the master's own answer; the others are served all the while.
+//! Requests that clients should not send: bytes that are not HTTP, malicious XML, incomplete requests, and
+//! requests from web pages. Each is refused or gets the master's own answer, and other clients are served all
+//! the time.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +11,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
 #[test]
-fn garbage_from_clients() {
+fn bytes_that_are_not_http_are_refused_and_other_clients_served() {
     let robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/kept", 1);
@@ -40,7 +41,7 @@ fn garbage_from_clients() {
         format!("POST / HTTP/1.1\r\nX: {}\r\n\r\n", "a".repeat(1_000_000)).into(),
         format!("POST / HTTP/1.1\r\n{}\r\n", "X: y\r\n".repeat(100_000)).into(),
     ];
-    // A whole request that is cut short anywhere.
+    // A whole request, cut short at different places.
     let whole = http_request(&body);
     for end in (1..whole.len()).step_by(17) {
         cases.push(whole[..end].to_vec());
@@ -48,7 +49,7 @@ fn garbage_from_clients() {
     for bytes in &cases {
         let mut wire = client.connect().unwrap();
         wire.set_patience(PATIENCE);
-        // It may be refused before it is read to the end.
+        // It may be refused before it has been read completely.
         let _ = wire.send(bytes);
         let _ = wire.finish();
         if let Ok(response) = wire.response() {
@@ -61,9 +62,9 @@ fn garbage_from_clients() {
     robot.rescue.assert_no_panic();
 }
 
-/// Deep or endless XML costs neither the stack nor the memory.
+/// Deep or endless XML exhausts neither the stack nor the memory.
 #[test]
-fn hostile_xml_from_clients() {
+fn malicious_xml_is_refused_and_other_clients_are_served() {
     let robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/kept", 1);
@@ -101,7 +102,7 @@ fn hostile_xml_from_clients() {
     for body in bodies {
         let mut wire = client.connect().unwrap();
         let _ = wire.send(&http_request(body.as_bytes()));
-        // The master's own verdict, whatever it is, or the end of the connection.
+        // The master's own answer, whatever it is, or the end of the connection.
         let _ = wire.response();
         assert_eq!(client.param("/kept"), Some(1.into()), "{:.60}", body);
     }
@@ -109,7 +110,7 @@ fn hostile_xml_from_clients() {
 }
 
 #[test]
-fn a_request_that_stops_half_way_is_ended() {
+fn an_incomplete_request_is_ended_after_a_time_limit() {
     let robot = Robot::start(Mode::Proxy);
     let whole = http_request(&encode_call("setParam", params!["/c", "/half", 1]));
     let head = whole
@@ -128,16 +129,17 @@ fn a_request_that_stops_half_way_is_ended() {
             Err(error) => assert_ne!(
                 error.kind(),
                 std::io::ErrorKind::WouldBlock,
-                "a request of {end} bytes is waited for longer than {PATIENCE:?}"
+                "a request of {end} bytes has still not been ended after {PATIENCE:?}"
             ),
         }
     }
     assert_eq!(robot.bare().param("/half"), None);
 }
 
-/// Whoever announces much and sends little, or nothing, takes nobody's room, and is not waited for.
+/// A client that announces a large body and sends little or nothing takes no memory from others and is
+/// dropped.
 #[test]
-fn announced_bodies_take_no_room() {
+fn a_body_that_is_only_announced_takes_no_memory_from_others() {
     let robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let head = "POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 67108864\r\n\r\n";
@@ -164,17 +166,20 @@ fn announced_bodies_take_no_room() {
         robot.bare().param("/large"),
         Some("z".repeat(1 << 20).into())
     );
-    // They are given up after 10 s.
+    // rosrescue gives these requests up after 10 s.
     assert!(took < Duration::from_secs(8), "{took:?}");
     for mut wire in wires {
-        assert!(wire.closes(PATIENCE), "it is still waited for");
+        assert!(
+            wire.closes(PATIENCE),
+            "rosrescue has not closed the connection"
+        );
     }
 }
 
-/// There is room for four bodies of the largest size. More than that, each half sent, do not wait for
-/// each other for ever.
+/// There is room for four bodies of the largest size. When there are more, and each one has been half sent,
+/// they must not wait for each other forever.
 #[test]
-fn more_large_bodies_than_there_is_room_for_are_taken_in_turn() {
+fn more_large_bodies_than_fit_into_memory_are_accepted_in_turn() {
     let robot = Robot::start_with(Mode::Proxy, &["--max-body", "1"]);
     let client = robot.client();
     let requests: Vec<_> = (0..24)
@@ -194,7 +199,7 @@ fn more_large_bodies_than_there_is_room_for_are_taken_in_turn() {
                 let mut wire = client.connect().unwrap();
                 let (first, second) = request.split_at(request.len() / 2);
                 wire.send(first).unwrap();
-                // By then each has sent a half.
+                // By now each of them has sent one half.
                 halves.wait();
                 wire.send(second).unwrap();
                 assert_eq!(wire.response().unwrap().code, 200);
@@ -205,10 +210,10 @@ fn more_large_bodies_than_there_is_room_for_are_taken_in_turn() {
     assert_eq!(tree.as_struct().unwrap().len(), requests.len());
 }
 
-/// rosmaster does not read the body behind a head that it refuses; what is left in that connection must
-/// not become somebody else's request.
+/// rosmaster does not read the body after a head that it refuses. The rest in that connection must not become
+/// part of another request.
 #[test]
-fn a_refused_request_spoils_no_other_call() {
+fn a_refused_request_does_not_affect_other_calls() {
     let robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/kept", 1);
@@ -229,7 +234,7 @@ fn a_refused_request_spoils_no_other_call() {
     }
 }
 
-/// A page in a browser that somebody on the robot's network opens must not set parameters.
+/// A page that someone on the robot's network opens in a browser must not be able to set parameters.
 #[test]
 fn a_web_page_cannot_change_anything() {
     let robot = Robot::start(Mode::Proxy);
@@ -244,7 +249,7 @@ fn a_web_page_cannot_change_anything() {
             "Host: evil.example\r\nContent-Type: {kind}\r\n{more}"
         ))
     };
-    // As `fetch(url, {method: 'POST', mode: 'no-cors', body: new Uint8Array(...)})` sends it.
+    // As sent by `fetch(url, {method: 'POST', mode: 'no-cors', body: new Uint8Array(...)})`.
     let address = format!("Host: 127.0.0.1:{}\r\n", robot.port());
     let untyped = |origin: &str| post(&format!("{address}Origin: {origin}\r\n"));
     for bytes in [
@@ -266,11 +271,11 @@ fn a_web_page_cannot_change_anything() {
     assert_eq!(robot.bare().param("/evil"), None);
     let fine = [
         request("POST / HTTP/1.1", &[], &body),
-        // Clients that are no browser: without a type, and under a name that we do not know.
+        // Clients that are not browsers: without a content type, and with a host name unknown to us.
         post(&address).into_bytes(),
         post("Host: robot.example:11311\r\nContent-Type: text/xml\r\n").into_bytes(),
         post("").into_bytes(),
-        // A page of our own.
+        // A page that rosrescue itself has served.
         untyped(&format!("http://127.0.0.1:{}", robot.port())).into_bytes(),
     ];
     for bytes in &fine {
@@ -280,10 +285,10 @@ fn a_web_page_cannot_change_anything() {
     }
 }
 
-/// `curl $ROS_MASTER_URI`, whatever of its computer's names stands there; but no page that gave its own
-/// name our address.
+/// `curl $ROS_MASTER_URI` must work with any name of the robot, but a page whose own host name was pointed at
+/// our address must not be able to read it.
 #[test]
-fn the_status_page_is_shown_under_every_name_of_its_computer() {
+fn the_status_page_is_served_under_every_name_of_the_computer() {
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).env("ROS_HOSTNAME", "unit7.robots.example");
     let rescue = setup.start();
@@ -309,16 +314,16 @@ fn the_status_page_is_shown_under_every_name_of_its_computer() {
     }
 }
 
-/// Every form in which rosmaster understands a `shutdown`: whatever rosrescue cannot read is not taken
-/// from another computer.
+/// Tries every form of `shutdown` that rosmaster understands. From another computer, rosrescue does not
+/// forward what it cannot read.
 #[test]
-fn no_other_computer_shuts_the_master_down() {
+fn no_other_computer_can_shut_the_master_down() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
     let rescue = setup.start();
     let here = rescue.client();
-    // A connection to an address of ours comes from that address, which is not loopback.
+    // A connection to one of our own addresses comes from that address, which is not loopback.
     let elsewhere = Client::at(&net.near(), rescue.port());
     let plain = encode_call("shutdown", params!["/evil", "because"]);
     let text = String::from_utf8(plain.clone()).unwrap();
@@ -381,17 +386,17 @@ fn no_other_computer_shuts_the_master_down() {
             }
         }
     }
-    // A master tells a node whose name is taken to shut down: here, rosrescue.
+    // A master tells a node whose name is taken to shut down. Here that node's address is rosrescue's.
     for api in [rescue.client().uri().as_str(), "http://127.0.0.1:1/"] {
         let node = params!["/evil", "/t", "std_msgs/String", api];
         elsewhere.ok("registerPublisher", node);
     }
-    eventually("the master has tried", || {
+    eventually("the master has tried to shut rosrescue down", || {
         let log = rescue.output();
         log.iter()
             .any(|line| line.contains("registered at our address"))
     });
-    // And everything else passes.
+    // All other calls pass.
     let body = encode_call("setParam", params!["/far", "/far", 1]);
     for header in [
         "Content-Encoding: IDENTITY",
@@ -401,7 +406,7 @@ fn no_other_computer_shuts_the_master_down() {
     }
     assert_eq!(elsewhere.param("/far"), Some(1.into()));
     assert_eq!(here.master_pid(), Some(master));
-    // From its own computer it may come as it likes.
+    // From its own computer it may have any form.
     here.exchange(&requests[8]).unwrap();
     eventually(
         "the master has been shut down, and there is another",

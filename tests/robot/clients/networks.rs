@@ -1,4 +1,4 @@
-//! `--allow` and `--allow-write`: who may call, and who may change something, over IPv4 and IPv6.
+//! `--allow` and `--allow-write`: who may make calls, and who may change anything, over IPv4 and IPv6.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use crate::support::{
     Client, Library, Netns, Process, Scratch, Setup, eventually, free_port, status,
 };
 
-/// Prints the HTTP status of each of these requests.
+/// Prints the HTTP status of the answer to each of these requests.
 const ASK: &str = r#"
 import http.client, sys
 from xmlrpc.client import dumps
@@ -31,7 +31,7 @@ const NOTHING: &str = "403 403 403 403 403 403 403";
 const READS: &str = "200 200 403 200 403 403 403";
 const ALL: &str = "200 200 200 200 200 200 200";
 
-/// What `host` of the other computer gets.
+/// The statuses that `host` of the other computer gets.
 #[track_caller]
 fn asked(scratch: &Scratch, net: &Netns, near: &str, port: u16, far: &str) -> String {
     let mut ask = Command::new("/usr/bin/python3");
@@ -43,11 +43,11 @@ fn asked(scratch: &Scratch, net: &Netns, near: &str, port: u16, far: &str) -> St
 }
 
 #[test]
-fn networks_say_who_may_call_and_who_may_change() {
+fn allow_and_allow_write_decide_who_may_call_and_who_may_change() {
     let net = Netns::new();
     net.add_ipv6();
     let scratch = Scratch::new();
-    // An IPv4 network may be written as IPv6; a bare address is a network, too.
+    // An IPv4 network may be written as IPv6, and a bare address counts as a network.
     let mut rescue = Setup::core(&scratch, free_port())
         .env("ROS_IP", net.near())
         .env(
@@ -61,7 +61,7 @@ fn networks_say_who_may_call_and_who_may_change() {
         ])
         .start();
     let port = rescue.port();
-    // This computer, by each of its addresses.
+    // This computer, under each of its addresses.
     for host in [
         "127.0.0.1",
         "[::1]",
@@ -79,14 +79,14 @@ fn networks_say_who_may_call_and_who_may_change() {
         assert_eq!(found, expected, "{}", net.far6(host));
     }
     assert_eq!(rescue.client().param("/there"), Some(1.into()));
-    // The last request of those who may change is refused by another rule.
+    // One request of those who may change is refused by another rule.
     let refused = 2 * 7 + 3 * 4 + 2;
     assert_eq!(
         status(&rescue.client())["counters"]["requests_refused"],
         refused
     );
-    // One line for each address, however often it asks.
-    rescue.wait_line("who may", |line| {
+    // There is one log line per address, however often it asks.
+    rescue.wait_line("the log says who may change anything", |line| {
         line.contains("only these may change: this computer")
     });
     for host in [net.far(2), net.far(5), net.far6(2), net.far6(5)] {
@@ -98,9 +98,9 @@ fn networks_say_who_may_call_and_who_may_change() {
     }
 }
 
-/// A refusal costs a node nothing but time.
+/// A refusal delays a node but does no other harm.
 #[test]
-fn nodes_that_were_refused_go_on_when_they_are_let_in() {
+fn refused_nodes_continue_as_soon_as_they_are_allowed() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let port = free_port();
@@ -119,14 +119,14 @@ fn nodes_that_were_refused_go_on_when_they_are_let_in() {
     let mut rescue = core("192.0.2.0/24");
     let nodes = [Library::Rospy, Library::Roscpp].map(|library| {
         let mut command = library.command(&scratch, port, "talker");
-        // A namesake would be shut down.
+        // Another node of the same name would shut it down.
         command.arg(format!("__name:={library:?}"));
         command.env("ROS_MASTER_URI", Client::at(&net.near(), port).uri());
         command.env("ROS_IP", net.far(2));
         Process::start(format!("{library:?}"), &mut net.inside(&command))
     });
     let refused = |count: u64| {
-        eventually("they call again", || {
+        eventually("the nodes call again", || {
             let refused = status(&Client::new(port))["counters"]["requests_refused"].as_u64();
             refused.is_some_and(|refused| refused >= count)
         });
@@ -142,7 +142,7 @@ fn nodes_that_were_refused_go_on_when_they_are_let_in() {
 }
 
 #[test]
-fn what_is_no_network_is_a_usage_error() {
+fn a_malformed_network_is_a_usage_error() {
     let scratch = Scratch::new();
     for given in ["robot", "10.0.0.0/33", ""] {
         let setup = Setup::bare(&scratch, ["core", "--allow-write", given]);

@@ -10,8 +10,8 @@ const WRITERS: usize = 6;
 const READERS: usize = 4;
 const ROUNDS: i32 = 300;
 
-/// Whichever connection it came on, and however large the answer is.
-fn a_read_shows_every_write_that_was_acknowledged(mode: Mode) {
+/// This holds for any connection and any size of the answer.
+fn a_read_returns_every_acknowledged_write(mode: Mode) {
     let robot = Robot::start_with(mode, &["--reads", "mirror"]);
     for bytes in [10, 200_000] {
         robot
@@ -62,20 +62,20 @@ fn write_and_read(robot: &Robot) {
 }
 
 #[test]
-fn a_core_answers_reads_though_its_master_hangs() {
+fn a_core_answers_reads_while_its_master_hangs() {
     let robot = Robot::start(Mode::Core);
     let client = robot.client();
     client.set_param("/gain", 7);
     let before = robot.counter("calls_from_mirror");
     crate::support::stop(robot.master_pid());
     assert_eq!(client.param("/gain"), Some(7.into()));
-    // rosout may read, too.
+    // rosout may read as well.
     assert!(robot.counter("calls_from_mirror") > before);
 }
 
-/// As for a proxy, where somebody may write past it.
+/// With this option a core forwards reads like a proxy, behind which others may write directly to the master.
 #[test]
-fn a_core_forwards_reads_if_it_is_told_to() {
+fn a_core_forwards_reads_if_asked_to() {
     let robot = Robot::start_with(Mode::Core, &["--reads", "master"]);
     let client = robot.client();
     client.set_param("/gain", 7);
@@ -85,4 +85,4 @@ fn a_core_forwards_reads_if_it_is_told_to() {
     assert_eq!(robot.counter("calls_from_mirror"), 0);
 }
 
-crate::support::in_both_modes!(a_read_shows_every_write_that_was_acknowledged);
+crate::support::in_both_modes!(a_read_returns_every_acknowledged_write);

@@ -1,4 +1,5 @@
-//! Large answers that nobody reads take a bounded part of the memory, and keep nobody else from theirs.
+//! Large answers that clients do not read take a limited part of the memory and do not delay answers to
+//! others.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -7,16 +8,17 @@ use crate::support::{
     Mode, Robot, Wire, encode_call, eventually_some, http_request, in_both_modes, params,
 };
 
-/// Bytes of the answer.
+/// Size of the answer in bytes.
 const LARGE: usize = 5_000_000;
-/// Their answers take more than three times the room that there is.
+/// Number of clients. Their answers take more than three times the memory that is available.
 const CLIENTS: usize = 90;
-/// Most MB that they may cost: the room of 128 MB, and what the answers being made take. It was 240 MB.
+/// Maximum memory that they may take, in MB: the 128 MB reserved for answers, plus the answers that are being
+/// made. It once was 240 MB.
 const COST: u64 = (CLIENTS * LARGE / 1_000_000) as u64 * 2 / 3;
 
-in_both_modes!(large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way);
+in_both_modes!(large_answers_that_are_not_read_take_limited_memory_and_delay_no_other);
 
-fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
+fn large_answers_that_are_not_read_take_limited_memory_and_delay_no_other(mode: Mode) {
     let robot = Robot::start(mode);
     let client = robot.client();
     client.set_param("/large", "x".repeat(LARGE));
@@ -24,7 +26,7 @@ fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
     client.set_param("/small", 1);
     let memory = |name| robot.rescue.kib(name) / 1000;
     let before = memory("VmRSS");
-    // In turn, since equal answers in a row share their bytes.
+    // Two answers in turn, because equal answers in a row share their bytes.
     let questions = ["/large", "/other"]
         .map(|key| http_request(&encode_call("getParam", params!["/hostile", key])));
     let ask = |number: usize| {
@@ -34,13 +36,13 @@ fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
     };
     let start = Instant::now();
     let wires: Vec<Wire> = (0..CLIENTS).map(ask).collect();
-    // Beside them: a small call, and the same answer for somebody who reads it.
+    // Beside them: a small call, and the same large answer for a client that reads it.
     let read = || {
         let start = Instant::now();
         assert_eq!(client.param("/small"), Some(1.into()));
         let small = start.elapsed();
-        // Called again after a lost connection, as ROS clients do. That they get it is what counts: how soon
-        // depends on how fast this build makes the answers for the others.
+        // The call is repeated after a lost connection, as ROS clients do. What counts is that the answer
+        // arrives; how soon depends on how fast this build makes the answers for the others.
         let answer = eventually_some("a large answer", || client.param("/large"));
         assert_eq!(answer.as_str().map(str::len), Some(LARGE));
         (small, start.elapsed())
@@ -53,13 +55,16 @@ fn large_answers_that_nobody_reads_are_bounded_and_in_nobody_s_way(mode: Mode) {
         "{mode:?}: {before} MB before, {now} MB while {CLIENTS} do not read, {peak} MB at most; \
          others have got their answers (a small one, then a large one) after {at_once:?} and {later:?}"
     );
-    assert!(peak < before + COST, "{before} MB, then {peak} MB");
+    assert!(
+        peak < before + COST,
+        "memory grew from {before} MB to {peak} MB"
+    );
     drop(wires);
 }
 
-/// Who reads slowly is not cut off while there is room.
+/// A client that reads slowly is not disconnected while there is memory.
 #[test]
-fn a_slow_reader_gets_all_of_its_answer() {
+fn a_slow_reader_gets_its_complete_answer() {
     let robot = Robot::start(Mode::Core);
     let client = robot.client();
     client.set_param("/large", "x".repeat(LARGE));

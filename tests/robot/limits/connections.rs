@@ -1,5 +1,5 @@
-//! What others can take of rosrescue is bounded: places for connections, file descriptors. Whoever has a call is
-//! served all the while.
+//! Clients can take only a limited number of connections and file descriptors of rosrescue. A client that
+//! makes a call is served all the time.
 
 use std::fs;
 use std::process::Command;
@@ -12,14 +12,14 @@ use crate::support::{
 };
 use rustix::process::{Pid, Resource, Rlimit, Signal, prlimit};
 
-/// Open file descriptors.
+/// Number of open file descriptors.
 fn files(process: &Process) -> usize {
     fs::read_dir(format!("/proc/{}/fd", process.pid()))
         .unwrap()
         .count()
 }
 
-/// Processor time so far, in hundredths of a second.
+/// Processor time used so far, in hundredths of a second.
 fn ticks(process: &Process) -> u64 {
     let stat = fs::read_to_string(format!("/proc/{}/stat", process.pid())).unwrap();
     let fields: Vec<_> = stat
@@ -34,7 +34,7 @@ fn ticks(process: &Process) -> u64 {
         .sum()
 }
 
-/// While `span` lasts, less than a fifth of a core is used.
+/// Panics if the process uses more than a fifth of a core during `span`.
 #[track_caller]
 fn assert_calm(process: &Process, span: Duration) {
     let before = ticks(process);
@@ -47,7 +47,7 @@ fn question() -> Vec<u8> {
     http_request(&encode_call("hasParam", params!["/c", "/x"]))
 }
 
-/// A connection that has been used and is kept.
+/// A connection that has been used and is kept open.
 fn used(client: &Client) -> Wire {
     let mut wire = client.connect().unwrap();
     wire.send(&question()).unwrap();
@@ -55,7 +55,7 @@ fn used(client: &Client) -> Wire {
     wire
 }
 
-/// `count` connections without a request, some of them used before.
+/// `count` connections without a pending request. Some of them have been used before.
 fn idle(client: &Client, count: usize) -> Vec<Wire> {
     let wire = |number| match number % 3 {
         0 => used(client),
@@ -65,7 +65,7 @@ fn idle(client: &Client, count: usize) -> Vec<Wire> {
 }
 
 #[test]
-fn idle_connections_give_way_and_their_clients_are_served_again() {
+fn idle_connections_are_closed_to_make_room_and_their_clients_served_again() {
     let robot = Robot::start_with(Mode::Proxy, &["--max-connections", "40"]);
     let client = robot.client();
     let mut wires = idle(&client, 200);
@@ -73,11 +73,11 @@ fn idle_connections_give_way_and_their_clients_are_served_again() {
     client.set_param("/x", 1);
     let took = start.elapsed();
     assert!(took < Duration::from_secs(10), "{took:?}");
-    // The oldest had to go, the youngest had not.
+    // The oldest one had to be closed, the newest one did not.
     assert!(wires[0].closes(PATIENCE));
     wires[199].send(&question()).unwrap();
     assert_eq!(wires[199].response().unwrap().code, 200);
-    // Python's client, which all of rospy uses, does not notice.
+    // Python's client, which rospy uses, does not notice.
     const NODE: &str = "
 import os, select, socket, xmlrpc.client
 master = xmlrpc.client.ServerProxy(os.environ['ROS_MASTER_URI'])
@@ -94,7 +94,7 @@ print(master.setParam('/c', '/x', 2))
     assert_eq!(robot.bare().param("/x"), Some(2.into()));
 }
 
-/// However many there are by default.
+/// With the default limit of connections.
 #[test]
 fn two_thousand_idle_connections_take_little_memory() {
     let robot = Robot::start(Mode::Proxy);
@@ -116,7 +116,7 @@ fn core_with_files(scratch: &Scratch, limit: usize) -> Rescue {
         behind(shell, own)
     });
     let rescue = setup.start();
-    eventually("rosout is at work", || {
+    eventually("rosout is running", || {
         let node = params!["/c", "/rosout"];
         rescue.client().ask("lookupNode", node).is_some()
     });
@@ -124,7 +124,7 @@ fn core_with_files(scratch: &Scratch, limit: usize) -> Rescue {
 }
 
 #[test]
-fn with_few_files_calls_are_served_recorded_and_recovered_under_idle_connections() {
+fn with_few_file_descriptors_calls_are_served_and_recorded_beside_idle_connections() {
     for limit in [64, 128, 200, 1024] {
         let scratch = Scratch::new();
         let mut rescue = core_with_files(&scratch, limit);
@@ -139,26 +139,28 @@ fn with_few_files_calls_are_served_recorded_and_recovered_under_idle_connections
         let took = start.elapsed();
         assert!(took < Duration::from_secs(20), "{limit} files: {took:?}");
         assert_calm(&rescue, Duration::from_secs(1));
-        // The master dies meanwhile.
+        // The master dies in the meantime.
         let dead = client.master_pid().unwrap();
         signal(dead, Signal::KILL);
-        eventually("there is another master", || {
+        eventually("another master is there", || {
             client.master_pid().is_some_and(|pid| pid != dead)
                 && client.ask("setParam", params!["/c", "/y", 2]).is_some()
         });
         assert_eq!(client.param("/x"), Some(19.into()));
         drop(wires);
-        eventually("the files are given back", || files(&rescue) <= before);
-        // It was all recorded.
+        eventually("the file descriptors are closed again", || {
+            files(&rescue) <= before
+        });
+        // All of it was recorded.
         rescue.kill();
         let text = fs::read_to_string(rescue.checkpoint()).unwrap();
         assert!(text.contains("/y"), "{text}");
     }
 }
 
-/// Heads that are never ended hold all places for a while, and who waits for one costs nothing.
+/// Incomplete request heads hold all connections for a while. Clients that wait for one must cost nothing.
 #[test]
-fn without_places_or_files_it_waits_calmly() {
+fn without_free_connections_or_file_descriptors_rosrescue_waits_without_busy_looping() {
     let scratch = Scratch::new();
     let rescue = core_with_files(&scratch, 1000);
     let client = rescue.client();
@@ -173,12 +175,14 @@ fn without_places_or_files_it_waits_calmly() {
     };
     let before = files(&rescue);
     let wires = begun(900);
-    eventually("the places are taken", || files(&rescue) > 650);
+    eventually("all connections are taken", || files(&rescue) > 650);
     assert_calm(&rescue, Duration::from_secs(2));
     drop(wires);
     client.set_param("/x", 2);
-    eventually("the files are given back", || files(&rescue) <= before);
-    // Somebody takes the files away.
+    eventually("the file descriptors are closed again", || {
+        files(&rescue) <= before
+    });
+    // Another process lowers the limit of file descriptors.
     let pid = Pid::from_raw(i32::try_from(rescue.pid()).unwrap());
     let limit = |current| {
         let limit = Rlimit {
@@ -195,11 +199,13 @@ fn without_places_or_files_it_waits_calmly() {
             .filter(|line| line.contains("cannot accept"))
             .count()
     };
-    eventually("it is said", || says() > 0);
+    eventually("the log reports it", || says() > 0);
     assert_calm(&rescue, Duration::from_secs(2));
-    assert!(says() <= 2, "once for each address");
+    assert!(says() <= 2, "it must be logged once per address");
     limit(Some(1000));
     client.set_param("/x", 3);
     drop(wires);
-    eventually("the files are given back", || files(&rescue) <= before);
+    eventually("the file descriptors are closed again", || {
+        files(&rescue) <= before
+    });
 }

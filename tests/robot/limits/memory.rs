@@ -1,15 +1,15 @@
-//! However often the master of a large robot dies, rosrescue stays small.
+//! However often the master of a large robot dies, rosrescue needs little memory.
 
 use crate::support::{Client, FakeMaster, Mode, Robot, eventually, params};
 use rosrescue::xmlrpc::{Call, Reply, Struct, Value, decode_call};
 
-/// Nodes, each with two publishers and two subscribers.
+/// Number of nodes, each with two publishers and two subscribers.
 const NODES: usize = 1_000;
 const PARAMS: usize = 2_000;
-/// What may be in memory at any time, in KiB.
+/// Maximum memory use at any time, in KiB.
 const LIMIT: u64 = 64 << 10;
 
-/// One server that answers for all nodes: it is alive, and nobody can ask what it publishes.
+/// One server that answers for all nodes: they count as alive, but do not say what they publish.
 fn nodes_server() -> FakeMaster {
     FakeMaster::start(|body| {
         let call = decode_call(body).expect("a call");
@@ -18,10 +18,10 @@ fn nodes_server() -> FakeMaster {
     })
 }
 
-/// Registers the nodes, all publishers first: no subscriber is to be told.
+/// Registers the nodes, all publishers first, so that no subscriber is notified.
 fn register(client: &Client, port: u16) {
     let call = |method: &str, node: usize, topic: String| {
-        // The path tells the nodes from each other.
+        // The nodes have one port and differ in the path.
         let api = format!("http://127.0.0.1:{port}/{node}/");
         let name = format!("/robot/node_{node:04}");
         Call::new(method, params![name, topic, "std_msgs/String", api])
@@ -43,12 +43,12 @@ fn a_thousand_nodes_take_less_than_64_mib_through_three_recoveries() {
     let mut robot = Robot::start(Mode::Core);
     let client = robot.client();
     register(&client, server.port());
-    // The most at a time.
+    // The maximum so far.
     let peak = |robot: &Robot| robot.rescue.kib("VmHWM");
     let mut peaks = vec![peak(&robot)];
     for _ in 0..3 {
         robot.crash_master();
-        eventually("the health check is over", || {
+        eventually("the health check has finished", || {
             let status = robot.status().expect("a status page");
             status["last_recovery"]["health_check_ms"].is_number()
         });
@@ -56,12 +56,12 @@ fn a_thousand_nodes_take_less_than_64_mib_through_three_recoveries() {
         let (report, state) = (&status["last_recovery"], &status["state"]);
         assert_eq!(report["outcome"], "injected");
         assert_eq!(report["removed"].as_array().map(Vec::len), Some(0));
-        // rosout is one of the nodes, and has one of each.
+        // rosout is one more node, with one of each.
         for (what, count) in [("nodes", NODES), ("publishers", 2 * NODES)] {
             assert_eq!(state[what].as_u64(), Some(count as u64 + 1), "{what}");
         }
         peaks.push(peak(&robot));
     }
-    println!("KiB, at first and after each recovery: {peaks:?}");
+    println!("maximum KiB at first and after each recovery: {peaks:?}");
     assert!(peaks.iter().all(|peak| *peak < LIMIT), "{peaks:?}");
 }

@@ -1,4 +1,4 @@
-//! Whoever registers names cannot have rosrescue flood the host that they point to.
+//! Registering names must not make rosrescue flood the host to which they point.
 
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -48,13 +48,13 @@ impl Host {
         }
     }
 
-    /// The connections since `start`.
+    /// Number of connections since `start`.
     fn since(&self, start: Instant) -> usize {
         let connections = self.connections.lock().unwrap();
         connections.iter().filter(|at| **at >= start).count()
     }
 
-    /// Registers so many names, each with an address of its own, their ports taken in turn.
+    /// Registers `count` names, each with an address of its own. They use the ports in turn.
     fn register(&self, client: &Client, count: usize) {
         let call = |(name, port): (usize, &u16)| {
             let api = format!("http://127.0.0.1:{port}/{name}/");
@@ -77,8 +77,8 @@ impl Drop for Host {
     }
 }
 
-/// Registers `count` names at the ports of `host`, and crashes the master after 5 s. Returns the connections
-/// before, and for each of `windows` those within so many seconds after the recovery.
+/// Registers `count` names at the ports of `host`, and kills the master after 5 s. Returns the number of
+/// connections before that, and for each of `windows` the number within so many seconds after the recovery.
 fn connections<const N: usize>(
     robot: &mut Robot,
     host: &Host,
@@ -105,22 +105,23 @@ fn names_at_one_port_share_a_visit() {
     let mut robot = Robot::start(Mode::Core);
     let host = Host::with_ports(1);
     let (before, after) = connections(&mut robot, &host, 2000, [2, 12]);
-    // A question for those who came together; a visit after the recovery, and again after 1, 3 and 7 s.
+    // One question for names that register together, one visit after the recovery, and further ones after 1,
+    // 3 and 7 s.
     assert!(before <= 20, "{before}");
     assert!(after[0] <= 4 && after[1] <= 10, "{after:?}");
     let unreachable = names(&robot.status().unwrap()["unreachable"]).len();
     assert_eq!(unreachable, 2000);
-    // One refusal is for all.
+    // One refused connection counts for all names.
     drop(host);
-    eventually("the dead are taken out", || {
+    eventually("the dead nodes are unregistered", || {
         let nodes = robot.status().unwrap()["state"]["nodes"].as_u64();
         nodes < Some(10)
     });
 }
 
-/// 400 at once, and 100 a second.
+/// Each host gets 400 visits at once and then 100 per second.
 #[test]
-fn the_ports_of_a_host_share_a_rate() {
+fn all_ports_of_a_host_share_one_rate_limit() {
     let mut robot = Robot::start(Mode::Core);
     let host = Host::with_ports(1200);
     let (before, after) = connections(&mut robot, &host, 1200, [2]);

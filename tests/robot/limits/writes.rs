@@ -1,4 +1,4 @@
-//! One client's writes do not keep the others' waiting.
+//! One client's writes do not delay those of others.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -23,7 +23,7 @@ fn results(client: &Client, calls: impl IntoIterator<Item = Call>) -> Vec<Value>
     }
 }
 
-/// How long each `setParam` takes while `load` runs, and how long that does.
+/// How long each `setParam` takes while `load` runs, and how long `load` takes.
 fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, Duration) {
     thread::scope(|scope| {
         let start = Instant::now();
@@ -34,7 +34,7 @@ fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, 
         let mut waits = Vec::new();
         while !load.is_finished() {
             let sent = Instant::now();
-            // One that changes nothing is not kept waiting.
+            // A value that does not change would not have to wait.
             client.set_param("/mine", i32::try_from(waits.len()).unwrap());
             waits.push(sent.elapsed());
         }
@@ -43,7 +43,7 @@ fn waits_beside(client: &Client, load: impl FnOnce() + Send) -> (Vec<Duration>, 
 }
 
 #[test]
-fn writes_pass_a_long_multicall() {
+fn other_writes_are_not_delayed_by_a_long_multicall() {
     let robot = Robot::start(Mode::Core);
     let client = robot.client();
     let Call { method, params } = Call::multicall(sets("long", 20_000));
@@ -57,7 +57,7 @@ fn writes_pass_a_long_multicall() {
 }
 
 #[test]
-fn the_answer_to_a_long_multicall_is_the_masters_own() {
+fn a_long_multicall_is_answered_as_by_a_bare_master() {
     let twins = Twins::start();
     let of = |method: &str, params: Vec<Value>| Call::new(method, params);
     let mixed = |i: i32| {
@@ -88,7 +88,7 @@ fn the_answer_to_a_long_multicall_is_the_masters_own() {
         panic!("no list")
     };
     assert_eq!(results.len(), calls.len());
-    // Some whose entries decide about each other.
+    // Entries whose results depend on each other.
     let read = of("getParam", params!["/test", "/long"]);
     let unknown = of("no_such_method", params![]);
     let nested = Call::multicall([unknown.clone()]);
@@ -105,9 +105,9 @@ fn the_answer_to_a_long_multicall_is_the_masters_own() {
     assert_eq!(whole(&twins.behind), whole(&twins.bare));
 }
 
-/// What the dead master has answered is kept, the rest is made up for.
+/// What the dead master has answered is kept, and the rest is answered by the mirror.
 #[test]
-fn a_long_multicall_outlives_the_master() {
+fn a_long_multicall_survives_the_death_of_the_master() {
     const COUNT: i32 = 5_000;
     let mut robot = Robot::start(Mode::Core);
     let client = robot.client();
@@ -115,7 +115,7 @@ fn a_long_multicall_outlives_the_master() {
     let results = thread::scope(|scope| {
         let long = scope.spawn(|| results(&client, sets("long", COUNT)));
         let bare = robot.bare();
-        eventually("a part has run", || {
+        eventually("a part of the multicall has run", || {
             bare.param("/long/p1000").is_some() || long.is_finished()
         });
         robot.kill_master_at_once(dead);
@@ -133,9 +133,9 @@ fn a_long_multicall_outlives_the_master() {
     assert_eq!(long.len(), COUNT as usize);
 }
 
-/// rosrescue must read the master's state before it answers such a call: they share that.
+/// rosrescue must read the master's state before it answers such calls. They share that read.
 #[test]
-fn writes_pass_calls_that_only_the_master_understands() {
+fn other_writes_are_not_delayed_by_calls_that_only_the_master_understands() {
     const CALLS: i32 = 40;
     let robot = Robot::start(Mode::Core);
     let client = robot.client();

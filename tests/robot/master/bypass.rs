@@ -1,11 +1,11 @@
-//! Nodes that talk to the master of `proxy` past rosrescue.
+//! Nodes that talk directly to the master of `proxy`, bypassing rosrescue.
 
 use crate::support::{
     Library, Node, Rosmaster, Scratch, Setup, Tool, eventually, names, page, signal, status,
 };
 
 #[test]
-fn what_goes_past_rosrescue_is_named_until_it_ends() {
+fn a_node_that_bypasses_rosrescue_is_named_until_it_ends() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let rescue = Setup::proxy(&scratch, master.port).start();
@@ -21,7 +21,7 @@ fn what_goes_past_rosrescue_is_named_until_it_ends() {
         said.map(|it| it["what"].as_str().unwrap().to_owned())
             .collect::<Vec<_>>()
     };
-    // rosmaster listens at loopback only, by its ROS_IP.
+    // Because of its ROS_IP, rosmaster listens at loopback only.
     assert_eq!(check(), Vec::<String>::new());
     assert_eq!(status(&client)["master_is_open"], false);
 
@@ -33,8 +33,8 @@ fn what_goes_past_rosrescue_is_named_until_it_ends() {
         &["__name:=direct"],
     );
     let who = format!("talker (process {})", node.pid());
-    // roscpp keeps its connection for 30 s.
-    eventually("it is named", || bypassing() == [who.clone()]);
+    // roscpp keeps its connection to the master for 30 s.
+    eventually("the status names the node", || bypassing() == [who.clone()]);
     let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(1);
     let said = format!("1 client talks to the master directly, unprotected: {who}.");
     assert!(
@@ -58,20 +58,22 @@ fn what_goes_past_rosrescue_is_named_until_it_ends() {
     assert!(rescue.log().contains("goes past rosrescue"));
 
     signal(node.pid(), rustix::process::Signal::KILL);
-    eventually("it has ended", || bypassing().is_empty());
+    eventually("the status no longer names the node", || {
+        bypassing().is_empty()
+    });
     assert_eq!(check(), Vec::<String>::new());
 }
 
 #[test]
-fn a_master_that_others_can_reach_is_told() {
+fn a_master_that_other_computers_can_reach_is_reported() {
     let scratch = Scratch::new();
     let port = crate::support::free_port();
     let master = Rosmaster::start_with(&scratch, port, |command| {
-        // It binds all addresses then.
+        // Without ROS_IP rosmaster listens at all addresses.
         command.env_remove("ROS_IP");
     });
     let rescue = Setup::proxy(&scratch, master.port).start();
-    eventually("the status says so", || {
+    eventually("the status reports it", || {
         status(&rescue.client())["master_is_open"] == true
     });
     let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(0);

@@ -1,5 +1,5 @@
-//! A real rosmaster that dies again and again is no outage: the mirror answers all the while, the rate of
-//! restarts is bounded, the status says so, and when the cause is gone the state is whole.
+//! A real rosmaster that dies again and again causes no outage: the mirror answers all the time, restarts are
+//! limited, the status reports it, and the state is complete when the cause is gone.
 
 use std::ops::{Deref, DerefMut};
 use std::thread;
@@ -10,10 +10,10 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// By then a call is answered, on a busy computer.
+/// Maximum time for a call on a busy computer.
 const SOON: Duration = Duration::from_secs(5);
 
-/// rosrescue core with a rosmaster that can be made to fail, and a state.
+/// rosrescue core with some state and a rosmaster that can be made to fail.
 struct Robot {
     failing: Failing,
     nodes: Vec<FakeNode>,
@@ -61,7 +61,7 @@ impl Robot {
         }
     }
 
-    /// Makes masters die of this, beginning with the next, which begins now.
+    /// Makes masters die for the reasons in `lines`, starting with the next one, which starts now.
     fn fail_with(&self, lines: &str) {
         self.failures.set(lines);
         self.kill_master();
@@ -79,7 +79,7 @@ impl Robot {
         assert_eq!(word, crash_loop);
     }
 
-    /// Waits until the real master's state is `wanted` and calls pass.
+    /// Waits until the real master's state is `wanted` and calls pass to it.
     #[track_caller]
     fn await_state(&self, wanted: &State, when: &str) {
         let client = self.client();
@@ -100,23 +100,23 @@ impl Robot {
         }
     }
 
-    /// How many calls each node has got, once all that was to be told has been told.
+    /// Number of calls that each node has received, once all pending notifications have been sent.
     fn heard(&self) -> Vec<usize> {
         let heard = || {
             let nodes = self.nodes.iter();
             nodes.map(|node| node.calls().len()).collect::<Vec<_>>()
         };
-        eventually("what was still to be told has been told", || {
+        eventually("all pending notifications have been sent", || {
             let before = heard();
             holds(Duration::from_millis(500), || heard() == before)
         });
         heard()
     }
 
-    /// Panics if a master has called a node since it had `heard` so much, or rosrescue has told a node
-    /// anything but how things are and were before.
+    /// Panics if a master has called a node after it had `heard` so many calls, or if rosrescue has told a
+    /// node anything but the present state, which has not changed.
     #[track_caller]
-    fn assert_nobody_disturbed(&self, heard: &[usize]) {
+    fn assert_no_node_disturbed(&self, heard: &[usize]) {
         for (node, heard) in self.nodes.iter().zip(heard) {
             let calls = node.calls();
             let (before, since) = calls.split_at(*heard);
@@ -126,34 +126,34 @@ impl Robot {
                 let mut earlier = before.iter().rev().filter(|it| it.method == call.method);
                 let earlier = earlier.find(|it| it.params[1] == call.params[1]);
                 let earlier = earlier.map(|it| &it.params);
-                // What nobody has told before is what `registerSubscriber` answered.
+                // The list may also be the one that the answer to `registerSubscriber` contained.
                 assert!(earlier.is_none_or(|it| *it == call.params), "{call:?}");
             }
         }
     }
 }
 
-/// Whether it is what the health check asks.
+/// Whether the call is a question of the health check.
 fn is_question(call: &Heard) -> bool {
     ["getPid", "getPublications", "getSubscriptions"].contains(&call.method.as_str())
 }
 
 #[test]
-fn a_master_that_dies_at_once() {
+fn calls_are_answered_while_every_master_dies_at_once() {
     let mut robot = Robot::new(&[]);
     let before = robot.failures.starts().len();
     robot.fail_with("at once");
     robot.await_crash_loop(true);
-    // Reads are answered all the while.
+    // Reads are answered all the time.
     assert_eq!(robot.client().param("/robot/name"), Some("r2".into()));
-    // And so are writes.
+    // Writes are answered too.
     for i in 0..60 {
         let start = Instant::now();
         robot.client().set_param("/last", i);
         assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
         thread::sleep(Duration::from_millis(100));
     }
-    // Five at once, then after 0.5, 1, 2, 4 and 8 s.
+    // Five restarts at once, then after pauses of 0.5, 1, 2, 4 and 8 s.
     let starts = robot.failures.starts().split_off(before);
     let first_ten = starts.iter().filter(|at| **at - starts[0] < 10.0).count();
     assert!((6..=10).contains(&first_ten), "{starts:?}");
@@ -161,28 +161,34 @@ fn a_master_that_dies_at_once() {
     assert_eq!(robot.client().param("/last"), Some(59.into()));
     robot.client().ok("deleteParam", params!["/test", "/last"]);
     robot.await_state(&robot.before, "after the crash loop");
-    assert_eq!(status(&robot.client())["crash_loop"], true, "not yet over");
+    assert_eq!(
+        status(&robot.client())["crash_loop"],
+        true,
+        "the crash loop is not over yet"
+    );
     robot.await_crash_loop(false);
-    robot.rescue.wait_line("the crash loop", |line| {
-        line.contains("crash loop: the master has died")
-    });
     robot
         .rescue
-        .wait_line("its end", |line| line.contains("the crash loop is over"));
+        .wait_line("the log reports the crash loop", |line| {
+            line.contains("crash loop: the master has died")
+        });
+    robot.rescue.wait_line("the log reports its end", |line| {
+        line.contains("the crash loop is over")
+    });
 }
 
 #[test]
-fn a_master_that_dies_after_two_seconds() {
+fn calls_are_answered_while_every_master_dies_after_two_seconds() {
     let robot = Robot::new(&["--hold", "1"]);
     let client = robot.client();
     robot.fail_with("after 2");
     robot.await_crash_loop(true);
-    // Between two deaths it is whole, and yet it is a crash loop.
+    // Each master serves calls between two deaths, but it is a crash loop nevertheless.
     eventually("a master serves in between", || {
         let status = status(&client);
         status["open"] == true && status["crash_loop"] == true
     });
-    // Nobody notices, in a life of a master or after it.
+    // Clients notice nothing, while a master lives or after its death.
     let (start, mut number) = (Instant::now(), 0);
     while start.elapsed() < Duration::from_secs(6) {
         let start = Instant::now();
@@ -192,9 +198,9 @@ fn a_master_that_dies_after_two_seconds() {
         assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
         thread::sleep(Duration::from_millis(20));
     }
-    // But for what only a master understands: that is held for as long as it should be in the longer
-    // pauses, and not answered falsely.
-    eventually("a call is given back when its time is over", || {
+    // Only calls that just a master understands are affected: during the longer pauses they are held for as
+    // long as they should be, and never answered wrongly.
+    eventually("a held call ends after its time limit", || {
         let start = Instant::now();
         let given_back = client.exchange(&unreadable("/late", 0)).is_err();
         assert!(
@@ -212,12 +218,12 @@ fn a_master_that_dies_after_two_seconds() {
 }
 
 #[test]
-fn a_master_that_hangs_while_it_is_given_the_state() {
+fn a_master_that_hangs_during_the_injection_is_replaced() {
     let probes = ["--probe-interval", "100", "--probe-timeout", "500"];
     let robot = Robot::new(&probes);
     robot.fail_with("hang 9\ntimes 1");
     let begin = Instant::now();
-    // It is not replaced only when a whole injection takes too long.
+    // rosrescue must not wait until a whole injection would take too long.
     let soon = Duration::from_secs(20);
     eventually("a master hangs", || robot.failures.deaths().len() == 1);
     eventually("another one serves", || {
@@ -227,9 +233,9 @@ fn a_master_that_hangs_while_it_is_given_the_state() {
     robot.await_state(&robot.before, "after a hang");
 }
 
-/// No master can take it, and no node notices until somebody takes it back.
+/// This record kills every master that gets it. No node notices, until a client removes it.
 #[test]
-fn a_record_that_kills_masters_is_nobodys_outage() {
+fn a_record_that_kills_masters_causes_no_outage() {
     for name in ["/robot/arm/gain", "/topic0"] {
         let robot = Robot::new(&[]);
         let client = robot.client();
@@ -240,7 +246,7 @@ fn a_record_that_kills_masters_is_nobodys_outage() {
         away(&robot.before);
         client.set_param("/while/it/dies", 1);
         client.ok("deleteParam", params!["/test", "/while"]);
-        robot.assert_nobody_disturbed(&heard);
+        robot.assert_no_node_disturbed(&heard);
         let after = match name {
             "/topic0" => {
                 robot.nodes[0].unpublish(&client, name);
@@ -254,7 +260,7 @@ fn a_record_that_kills_masters_is_nobodys_outage() {
         };
         away(&after);
         robot.failures.clear();
-        robot.await_state(&after, "when it is cured");
+        robot.await_state(&after, "after the record was removed");
         robot.rescue.assert_no_panic();
         assert!(
             robot

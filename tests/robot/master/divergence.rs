@@ -1,5 +1,5 @@
-//! What the mirror learns when it is not what the master is: from answers that differ, from replies that
-//! were lost, from calls that it cannot read, and from looks at the master.
+//! How the mirror notices that it differs from the master: by answers that differ, lost replies, calls that
+//! it cannot read, and by reading the master's state.
 
 use crate::support::{
     FakeNode, Mode, Relay, Robot, Rosmaster, Scratch, State, eventually, eventually_some, params,
@@ -19,7 +19,7 @@ fn divergences(client: &crate::support::Client) -> u64 {
     divergences.as_u64().expect("a number")
 }
 
-/// The code of an answer.
+/// The status code of an answer.
 fn code(reply: &Reply) -> Option<i32> {
     match reply {
         Reply::Value(Value::Array(answer)) => answer.first()?.as_int(),
@@ -28,31 +28,33 @@ fn code(reply: &Reply) -> Option<i32> {
 }
 
 #[test]
-fn a_refusal_that_the_mirror_did_not_expect_is_believed() {
+fn an_unexpected_refusal_by_the_master_corrects_the_mirror() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/a", 1);
     client.set_param("/b", 2);
-    // Past the proxy: one that it is going to ask for, and one that it is not.
+    // Deleted directly at the master: one parameter that the client will ask for, and another one.
     for key in ["/a", "/b"] {
         robot.bare().ok("deleteParam", params!["/x", key]);
     }
     let reply = client.call("deleteParam", params!["/n", "/a"]).unwrap();
     assert_eq!(code(&reply), Some(-1));
     assert_eq!(divergences(&client), 1);
-    eventually("the mirror is made anew", || mirrored(&client) == 0);
+    eventually("the mirror has been read again from the master", || {
+        mirrored(&client) == 0
+    });
     robot.crash_master();
     assert_eq!(client.param("/a"), None);
     assert_eq!(client.param("/b"), None);
 }
 
-/// Once for each method, with what both said, but no parameter's value.
+/// The log has one line per method, with both replies but no parameter values.
 #[test]
-fn a_divergence_is_logged_once_for_each_method_with_both_replies() {
+fn a_divergence_is_logged_once_per_method_with_both_replies() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let api = "http://127.0.0.1:1/";
-    // The master may be looked at in between because of the one before: then it is tried again.
+    // Because of an earlier divergence the master's state may be read in between. Then it is tried again.
     for topic in ["/t1", "/t2"] {
         let before = divergences(&client);
         eventually("an unregistration diverges", || {
@@ -73,8 +75,8 @@ fn a_divergence_is_logged_once_for_each_method_with_both_replies() {
     }
     let mut said = |method: &str| {
         let wanted = |line: &str| line.contains(&format!("method=\"{method}\""));
-        let line = robot.rescue.wait_line("what differs", wanted);
-        // Both rounds are over: what had been said twice would be there.
+        let line = robot.rescue.wait_line("the log says what differs", wanted);
+        // Both rounds are over, so a repeated line would be there by now.
         let lines = robot.rescue.output();
         assert_eq!(lines.iter().filter(|line| wanted(line)).count(), 1);
         line
@@ -99,7 +101,7 @@ fn a_divergence_is_logged_once_for_each_method_with_both_replies() {
 }
 
 #[test]
-fn what_was_written_past_the_proxy_is_found_at_the_interval() {
+fn writes_that_bypass_the_proxy_are_found_at_the_resync_interval() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--resync-interval", "0.2"]);
     let client = robot.client();
     robot.bare().set_param("/a", 1);
@@ -110,14 +112,14 @@ fn what_was_written_past_the_proxy_is_found_at_the_interval() {
 }
 
 #[test]
-fn a_node_past_the_proxy_is_in_the_mirror_once_a_client_has_listed_it() {
+fn a_node_that_bypassed_the_proxy_is_known_once_a_client_lists_the_nodes() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);
     let client = robot.client();
     let [known, past] = ["/known", "/past"].map(FakeNode::start);
     known.publish(&client, "/topic", "std_msgs/String");
     past.publish(&robot.bare(), "/topic", "std_msgs/String");
     let wanted = robot.settled_state();
-    eventually("the mirror has the node that was listed", || {
+    eventually("the mirror has the node", || {
         client.ok("getSystemState", params!["/rosnode"]);
         status(&client)["state"]["nodes"] == 2
     });
@@ -126,9 +128,9 @@ fn a_node_past_the_proxy_is_in_the_mirror_once_a_client_has_listed_it() {
     wanted.assert_same(&State::read(&client), "without a master");
 }
 
-/// What the master did is answered as done, although the connection ended before it said so.
+/// A write is answered as done if the master did it, even though the connection ended before the reply.
 #[test]
-fn a_call_whose_reply_was_lost_is_answered_as_done() {
+fn a_write_whose_reply_was_lost_is_answered_as_done() {
     let scratch = Scratch::new();
     let (master, relay, rescue) = Relay::between(&scratch);
     let client = rescue.client();
@@ -145,7 +147,7 @@ fn a_call_whose_reply_was_lost_is_answered_as_done() {
         ("unregisterService", params![name, "/service", service_api]),
     ] {
         eventually("calls pass", || status(&client)["open"] == true);
-        // What a living node says of itself counts.
+        // rosrescue believes what a living node reports about itself.
         match method {
             "unregisterPublisher" => node.claim_publication("/topic", None),
             "unregisterSubscriber" => node.claim_subscription("/topic", None),
@@ -153,7 +155,11 @@ fn a_call_whose_reply_was_lost_is_answered_as_done() {
         }
         relay.swallow(method, 1);
         let answer = client.status(method, params).unwrap();
-        assert_eq!((relay.hunger(), answer.0), (0, 1), "{method}: {answer:?}");
+        assert_eq!(
+            (relay.to_swallow(), answer.0),
+            (0, 1),
+            "{method}: {answer:?}"
+        );
     }
     eventually("calls pass", || status(&client)["open"] == true);
     let state = State::read(&master.client());
@@ -164,9 +170,9 @@ fn a_call_whose_reply_was_lost_is_answered_as_done() {
     state.assert_same(&State::read(&client), "through rosrescue");
 }
 
-/// It is what was recovered all the same, and nodes that died in the outage are taken out.
+/// The recovery counts as successful nevertheless, and nodes that died during the outage are unregistered.
 #[test]
-fn an_injection_whose_reply_was_lost_is_a_recovery() {
+fn an_injection_whose_reply_was_lost_counts_as_a_recovery() {
     let scratch = Scratch::new();
     let (mut master, relay, rescue) = Relay::between(&scratch);
     let client = rescue.client();
@@ -177,9 +183,9 @@ fn an_injection_whose_reply_was_lost_is_a_recovery() {
     eventually("the gate is shut", || status(&client)["open"] == false);
     relay.swallow("swallowed", 1);
     let master = Rosmaster::start_at(&scratch, port);
-    eventually("the dead node is taken out", || {
+    eventually("the dead node is unregistered", || {
         let known = master.client().ok("getSystemState", params!["/x"]);
-        relay.hunger() == 0 && !format!("{known:?}").contains("/dead")
+        relay.to_swallow() == 0 && !format!("{known:?}").contains("/dead")
     });
     assert_eq!(client.param("/swallowed"), Some(1.into()));
     let report = eventually_some("a report", || {

@@ -1,5 +1,5 @@
-//! A master on another computer: connections to it that have become dead ends, and its name, hold up
-//! nobody for long.
+//! A master on another computer: neither dead connections to it nor a failing name server delay calls for
+//! long.
 
 use std::process::Command;
 use std::thread;
@@ -11,9 +11,9 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// Where the master is, on the other side.
+/// The address of the master on the other side.
 const HOST: u8 = 2;
-/// Options with which a connection that is silent for three seconds has ended.
+/// Options that end a connection after three seconds without an answer.
 const PROBES: [&str; 6] = [
     "--probe-interval",
     "100",
@@ -22,11 +22,11 @@ const PROBES: [&str; 6] = [
     "--probe-count",
     "2",
 ];
-/// That time, and more for a busy computer. TCP itself takes longer.
+/// Those three seconds, and more for a busy computer. TCP's own limits are longer.
 const SILENCE: Duration = Duration::from_secs(10);
 const SOON: Duration = Duration::from_secs(4);
 
-/// A rosmaster on the other side of `net`, which answers.
+/// A rosmaster on the other side of `net` that answers calls.
 #[track_caller]
 fn rosmaster(scratch: &Scratch, net: &Netns, port: u16) -> (Process, Client) {
     let mut command = Command::new(find_program("rosmaster"));
@@ -41,7 +41,7 @@ fn rosmaster(scratch: &Scratch, net: &Netns, port: u16) -> (Process, Client) {
     (process, client)
 }
 
-/// A rosrescue before the master at `host`.
+/// A rosrescue in front of the master at `host`.
 fn proxy(scratch: &Scratch, host: &str, master_port: u16) -> Setup {
     let port = free_port();
     let master = format!("http://{host}:{master_port}");
@@ -55,10 +55,10 @@ fn is_open(client: &Client) -> bool {
     status(client)["open"] == true
 }
 
-/// What was on its way when the link went is answered by the mirror, and brought to the master when the link is
-/// back, without waiting until TCP tries again.
+/// Calls that were under way when the link was cut are answered by the mirror, and delivered to the master as
+/// soon as the link is back, without waiting for TCP's next attempt.
 #[test]
-fn a_cut_link_is_stood_in_for_and_writes_pass_as_soon_as_it_is_back() {
+fn the_mirror_stands_in_while_the_link_is_cut_and_writes_pass_as_soon_as_it_is_back() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let port = free_port();
@@ -91,9 +91,9 @@ fn a_cut_link_is_stood_in_for_and_writes_pass_as_soon_as_it_is_back() {
     }
 }
 
-/// The connections lead nowhere, and all that is connected anew is well.
+/// All existing connections are dead, and new ones work.
 #[test]
-fn a_change_of_the_own_address_costs_one_short_wait() {
+fn a_change_of_our_own_address_causes_one_short_delay() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let port = free_port();
@@ -124,9 +124,9 @@ fn a_change_of_the_own_address_costs_one_short_wait() {
     }
 }
 
-/// It is looked up again for each connection; what it meant before must do.
+/// The master's name is looked up for each connection. If that fails, the last known address must do.
 #[test]
-fn a_name_server_that_fails_takes_no_master_away() {
+fn a_failing_name_server_does_not_disconnect_the_master() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let names = NameServer::silent(&scratch);
@@ -145,13 +145,13 @@ fn a_name_server_that_fails_takes_no_master_away() {
         is_open(&client)
     };
     assert!(holds(Duration::from_secs(5), all_is_well));
-    // Nor does it prevent a recovery at the same place.
+    // Nor does it prevent a recovery at the same address.
     master.kill();
     let (_master, far) = rosmaster(&scratch, &net, port);
     eventually("the master is restored", || {
         far.param("/kept") == Some(Value::Int(1)) && is_open(&client)
     });
-    // A master that has another address is found, even if that is told too late for each probe.
+    // A master at another address is found, even if the name server answers too late for every probe.
     net.cut(HOST);
     eventually("the gate is shut", || !is_open(&client));
     names.say(
@@ -163,21 +163,23 @@ fn a_name_server_that_fails_takes_no_master_away() {
 }
 
 #[test]
-fn a_stop_does_not_wait_for_the_name_of_the_master() {
+fn stopping_does_not_wait_for_the_lookup_of_the_masters_name() {
     let scratch = Scratch::new();
     let names = NameServer::silent(&scratch);
     let setup = proxy(&scratch, "master.test", free_port());
     let mut rescue = setup.wrapped(|own| names.serving(own)).spawn();
-    rescue.wait_line("that it waits", |line| line.contains("cannot reach"));
+    rescue.wait_line("the log says that it waits for the master", |line| {
+        line.contains("cannot reach")
+    });
     let start = Instant::now();
     assert_eq!(rescue.terminate().code(), Some(0));
     let took = start.elapsed();
     assert!(took < SOON, "{took:?}");
 }
 
-/// After a boot it is asked whether the nodes of the session are on other computers.
+/// After a reboot rosrescue asks whether nodes of the session are alive on other computers.
 #[test]
-fn a_stop_does_not_wait_for_the_names_of_nodes() {
+fn stopping_does_not_wait_for_the_lookup_of_node_names() {
     let scratch = Scratch::new();
     let names = NameServer::silent(&scratch);
     let port = free_port();

@@ -1,6 +1,6 @@
-//! A master that answers garbage: the client gets the master's own
-//! bytes where they are HTTP. A master whose answer is not HTTP, or breaks off, counts as away: the mirror
-//! answers, and the next master that can takes what it has answered.
+//! A master that answers garbage. If the answer is HTTP, the client gets the master's own bytes. A master
+//! whose answer is not HTTP, or is incomplete, counts as away: the mirror answers, and the next working
+//! master is given those writes.
 
 use std::fs;
 use std::sync::{Arc, Mutex};
@@ -11,9 +11,9 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
-/// A master that is real but for calls that mention a word: those get the answer that is given.
+/// A real master, except that calls which mention a certain word get a given answer.
 struct Garbled {
-    // The order is that of the drops.
+    // Fields are dropped in this order.
     rescue: Rescue,
     _fake: FakeMaster,
     real: Rosmaster,
@@ -22,7 +22,7 @@ struct Garbled {
 }
 
 impl Garbled {
-    /// Calls that mention `/garbled` get `answer`. `reads`: who answers them.
+    /// Starts a master that gives `answer` to calls which mention `/garbled`. `reads` is who answers reads.
     fn start(answer: Vec<u8>, reads: &str) -> Self {
         let scratch = Scratch::new();
         let real = Rosmaster::start(&scratch);
@@ -41,8 +41,8 @@ impl Garbled {
         });
         let rescue = Setup::proxy(&scratch, fake.port())
             .args(["--hold", "2", "--probe-interval", "100", "--reads", reads])
-            // On a busy computer a probe may take long. It must not shut the gate: what the mirror would
-            // answer then, this master could never be given.
+            // A probe may take long on a busy computer. It must not shut the gate, because this master could
+            // never be given what the mirror answers then.
             .args(["--probe-timeout", "30000"])
             .start();
         Self {
@@ -54,12 +54,12 @@ impl Garbled {
         }
     }
 
-    /// From now on calls that mention `word` get `answer`.
+    /// Gives `answer` to calls that mention `word` from now on.
     fn say(&self, word: &'static [u8], answer: &[u8]) {
         *self.answer.lock().unwrap() = (word, answer.to_vec());
     }
 
-    /// The others are served, and nothing that was no success is recorded as one.
+    /// Checks that other calls are served, and that nothing is recorded as a success which was none.
     fn assert_sound(&self, case: &str, round: i32) {
         let client = self.rescue.client();
         eventually("other calls pass", || {
@@ -86,9 +86,9 @@ fn with_status(status: &str, body: &[u8]) -> Vec<u8> {
     [head.as_bytes(), body].concat()
 }
 
-/// Calls of `/c` that change a master's state, and calls that do not, all of them garbled. (`subscribeParam`
-/// is not among them: if its reply is whole and cannot be read it is recorded as predicted, because no look
-/// shows what became of it.)
+/// Calls of `/c` that change a master's state, and calls that do not, all of them garbled. `subscribeParam`
+/// is left out: if its reply is complete but unreadable, it is recorded as predicted, because no read shows
+/// what became of it.
 fn garbled_calls(node: &FakeNode) -> [Vec<(&'static str, Vec<Value>)>; 2] {
     let (api, service) = (node.api.as_str(), node.service_api());
     let set = || Call::new("setParam", params!["/c", "/garbled", "and more"]);
@@ -112,7 +112,7 @@ fn garbled_calls(node: &FakeNode) -> [Vec<(&'static str, Vec<Value>)>; 2] {
 }
 
 #[test]
-fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
+fn garbage_in_valid_http_is_forwarded_and_never_recorded_as_a_success() {
     let whole = |status: &str, body: &[u8]| {
         let code: u16 = status.split(' ').next().unwrap().parse().unwrap();
         (with_status(status, body), (code, body.to_vec()))
@@ -122,7 +122,7 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
                 </param></params></methodResponse>";
     let number = "<methodResponse><params><param><value><int>1</int></value></param></params>\
                   </methodResponse>";
-    // What the master says, and status and body that the client must get.
+    // What the master answers, and the status and body that the client must get.
     let cases = [
         whole("200 OK", b""),
         whole("200 OK", b"not xml"),
@@ -142,11 +142,11 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
         garbled.say(b"/garbled", &answer);
         for (method, params) in &[changes.clone(), reads.clone()].concat() {
             if params == &several.1 && answer.ends_with(FAULT.as_bytes()) {
-                continue; // Below.
+                continue; // Tested below.
             }
             let case = format!("case {number}, {method}");
             let request = http_request(&encode_call(method, params.clone()));
-            // The mirror may answer what changes nothing if this computer is busy.
+            // The mirror may answer a write that changes nothing if this computer is busy.
             let response = eventually_some(&case, || {
                 let response = client.exchange(&request).expect(&case);
                 (response.code == code && response.body == body).then_some(response)
@@ -157,26 +157,26 @@ fn garbage_in_http_is_the_masters_own_answer_and_no_success() {
         let round = i32::try_from(number).unwrap();
         garbled.assert_sound(&format!("case {number}"), round);
     }
-    // A multicall that rosmaster faults as a whole may have been run in part. What it has run is
-    // recorded, until the look that follows has shown that it was nothing.
+    // A multicall that fails as a whole may have been run in part. That part counts as recorded until the
+    // state has been read from the master and shows that nothing was run.
     garbled.say(b"/garbled", &with_status("200 OK", FAULT.as_bytes()));
     let request = http_request(&encode_call("system.multicall", several.1));
     assert_eq!(client.exchange(&request).unwrap().text(), FAULT);
     client.set_param("/kept", 99);
-    eventually("the checkpoint is sound", || {
+    eventually("the checkpoint has no garbled write", || {
         let checkpoint = fs::read_to_string(garbled.rescue.checkpoint()).unwrap();
         !checkpoint.contains("garbled") && checkpoint.contains("99")
     });
     assert_eq!(status(&client)["state"]["params"], 1);
 }
 
-/// Nor is it forgotten that the master must be read because other calls pass in between. Until then it
-/// answers reads itself.
+/// It is also not forgotten when other calls pass in the meantime. Until it succeeds, the master answers
+/// reads itself.
 #[test]
-fn a_look_that_fails_is_taken_again() {
+fn reading_the_masters_state_is_repeated_until_it_succeeds() {
     let garbled = Garbled::start(Vec::new(), "mirror");
     let client = garbled.rescue.client();
-    // Of the call, and of each look that follows.
+    // The answer to the call, and to each attempt to read the state.
     garbled.say(b"getTopicTypes", &with_status("200 OK", FAULT.as_bytes()));
     let set = Call::new("setParam", params!["/c", "/garbled", 1]);
     let types = Call::new("getTopicTypes", params!["/c"]);
@@ -189,14 +189,15 @@ fn a_look_that_fails_is_taken_again() {
     assert_eq!(client.param("/garbled"), None);
     assert_eq!(status(&client)["state"]["params"], 2);
     garbled.say(b"/no call says this", b"");
-    eventually("the mirror is as the master", || {
+    eventually("the mirror equals the master", || {
         status(&client)["state"]["params"] == 1
     });
 }
 
-/// Each answer is to the byte that of a master that is well, and is true as soon as this one is well again.
+/// Each answer is byte for byte that of a healthy master, and is true as soon as this master is healthy
+/// again.
 #[test]
-fn a_master_whose_answers_are_no_http_counts_as_away() {
+fn a_master_whose_answers_are_not_http_counts_as_away() {
     let broken = |head: &str, body: &str| format!("{head}\r\n\r\n{body}").into_bytes();
     let fine = "<methodResponse/>";
     let cases = [
@@ -231,7 +232,7 @@ fn a_master_whose_answers_are_no_http_counts_as_away() {
         }
         assert_eq!(status(&client)["open"], false, "case {number}");
         assert_eq!(real.param("/garbled"), None, "case {number}");
-        garbled.say(b"nobody says this", b"");
+        garbled.say(b"no call mentions this", b"");
         eventually("the gate is open", || status(&client)["open"] == true);
         let right = State::read(&well);
         right.assert_same(&State::read(&real), &format!("after case {number}"));
@@ -247,9 +248,9 @@ fn a_master_whose_answers_are_no_http_counts_as_away() {
     garbled.rescue.assert_no_panic();
 }
 
-/// Such as a master that is out of memory.
+/// As from a master that is out of memory.
 #[test]
-fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
+fn a_master_that_answers_only_faults_for_a_while_counts_as_away() {
     let garbled = Garbled::start(Vec::new(), "master");
     let client = garbled.rescue.client();
     client.set_param("/kept", 1);
@@ -262,7 +263,7 @@ fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
     };
     let is_success = |text: &str| text.contains("parameter /garbled set");
     eventually("the gate is shut", || {
-        // Until then it is the master's own answer.
+        // Until the gate is shut, the master's own answer is forwarded.
         let text = set().expect("an answer").text();
         assert!(text == FAULT || is_success(&text) && !is_open(), "{text}");
         !is_open()
@@ -272,7 +273,7 @@ fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
     assert_eq!(garbled.real.client().param("/garbled"), None);
     assert_eq!(client.param("/kept"), Some(1.into()));
     assert_eq!(client.param("/garbled"), Some(1.into()));
-    garbled.say(b"nobody says this", b"");
+    garbled.say(b"no call mentions this", b"");
     eventually("the gate is open", is_open);
     for key in ["/kept", "/garbled"] {
         assert_eq!(garbled.real.client().param(key), Some(1.into()), "{key}");
@@ -280,9 +281,9 @@ fn a_master_that_answers_every_call_with_a_fault_for_a_while() {
     garbled.rescue.assert_no_panic();
 }
 
-/// What is HTTP and a success arrives, in whatever form the master sends it.
+/// An answer that is a success in valid HTTP is accepted, whatever form the master sends it in.
 #[test]
-fn unusual_but_right_answers_of_the_master() {
+fn unusual_but_valid_answers_of_the_master_are_accepted() {
     let reply = Reply::Value(Value::Array(vec![1.into(), "unusual".into(), 0.into()]));
     let body = String::from_utf8(rosrescue::xmlrpc::encode_reply(&reply)).unwrap();
     let (left, right) = body.split_at(body.len() / 2);
@@ -325,7 +326,7 @@ fn unusual_but_right_answers_of_the_master() {
 }
 
 #[test]
-fn something_that_is_no_master_at_all() {
+fn a_server_that_is_not_a_master_is_reported_and_asked_seldom() {
     let scratch = Scratch::new();
     for (number, answer) in [
         &b"SSH-2.0-OpenSSH_9.2\r\n"[..],
@@ -342,13 +343,13 @@ fn something_that_is_no_master_at_all() {
             .args(["--hold", "1"])
             .at_checkpoint(scratch.path(format!("{number}.yaml")))
             .spawn();
-        rescue.wait_line("something of its master", |line| {
+        rescue.wait_line("the log says that this is not a master", |line| {
             line.contains(&fake.port().to_string())
         });
         let client = rescue.client();
-        eventually("it listens", || client.connect().is_ok());
+        eventually("rosrescue listens", || client.connect().is_ok());
         assert!(client.ask("setParam", params!["/c", "/x", 1]).is_none());
-        // It does not spin: it asks with pauses.
+        // rosrescue asks with pauses and does not busy-loop.
         assert!(
             rescue.output().len() < 100,
             "{} lines",

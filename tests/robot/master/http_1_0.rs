@@ -1,5 +1,6 @@
-//! A master that speaks HTTP/1.0, as every rosmaster before 1.14 and later ones on a kernel before 4.16: it closes
-//! each connection after one answer. `ROSRESCUE_HTTP_1_0=1` makes those of all other tests do so.
+//! A master that speaks HTTP/1.0, and so closes each connection after one answer: every rosmaster before
+//! 1.14, and later ones on a kernel before 4.16. With `ROSRESCUE_HTTP_1_0=1` the masters of all other tests
+//! do so too.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -15,11 +16,11 @@ use rustix::process::Signal;
 const PROGRAM: &str = "http10_rosmaster.py";
 
 in_both_modes!(
-    a_healthy_master_is_left_alone,
-    it_outlives_deaths_and_a_hang,
+    a_healthy_http_1_0_master_is_left_alone,
+    the_state_survives_deaths_and_a_hang_of_such_a_master,
 );
 
-/// Calls of each kind and the answers to them are those of the master itself.
+/// Checks that calls of each kind are answered as by the master itself.
 fn assert_exact(client: &Client, bare: &Client) {
     let value = tree! { "list" => vec![Value::from(1), Value::from(2.5)], "text" => "<&>" };
     let calls = [
@@ -58,8 +59,8 @@ fn assert_exact(client: &Client, bare: &Client) {
     assert_eq!(client.param("/unreadable"), Some(Value::Int(5)));
 }
 
-/// `core` gives a master 30 s to become one that can be served.
-fn a_healthy_master_is_left_alone(mode: Mode) {
+/// `core` gives a master 30 s to become usable.
+fn a_healthy_http_1_0_master_is_left_alone(mode: Mode) {
     let robot = Robot::start_under(mode, PROGRAM, &[]);
     let pid = robot.master_pid();
     assert_exact(&robot.client(), &robot.bare());
@@ -85,7 +86,7 @@ fn a_healthy_master_is_left_alone(mode: Mode) {
     );
 }
 
-fn it_outlives_deaths_and_a_hang(mode: Mode) {
+fn the_state_survives_deaths_and_a_hang_of_such_a_master(mode: Mode) {
     let mut robot = Robot::start_under(mode, PROGRAM, &[]);
     robot.stay_away();
     let client = robot.client();
@@ -94,7 +95,7 @@ fn it_outlives_deaths_and_a_hang(mode: Mode) {
     node.watch_param(&client, "/gain");
     client.set_param("/gain", 1);
 
-    // New nodes come while there is no master.
+    // New nodes start while there is no master.
     let dead = robot.master_pid();
     robot.take_master_away();
     let coming = FakeNode::start("/coming");
@@ -105,7 +106,7 @@ fn it_outlives_deaths_and_a_hang(mode: Mode) {
     robot.await_recovery(dead);
     robot.await_state(&wanted, "after the master's death");
 
-    // The worker alone: the same master goes on.
+    // The worker alone dies: the same master stays in use.
     let pid = robot.master_pid();
     robot.rescue.kill();
     robot.rescue.start_again();
@@ -115,7 +116,7 @@ fn it_outlives_deaths_and_a_hang(mode: Mode) {
     client.set_param("/gain", 3);
     let wanted = robot.state();
 
-    // Both.
+    // Both die.
     robot.rescue.kill();
     robot.kill_master();
     robot.rescue.start_again();
@@ -123,7 +124,7 @@ fn it_outlives_deaths_and_a_hang(mode: Mode) {
     robot.await_recovery(pid);
     robot.await_state(&wanted, "after the death of both");
 
-    // A hang: a write is under way, and another one is made without the master.
+    // The master hangs: one write is under way, and another one is answered without the master.
     let pid = robot.master_pid();
     stop(pid);
     let flying = thread::spawn({
@@ -145,9 +146,10 @@ fn it_outlives_deaths_and_a_hang(mode: Mode) {
     State::read(&client).assert_same(&state, "through rosrescue");
 }
 
-/// Behind a tunnel the sentinel proves nothing: the token does. The tunnel turns to an empty master under writes.
+/// Behind a tunnel the sentinel proves nothing, but the token does. The tunnel is switched to an empty master
+/// while writes are under way.
 #[test]
-fn behind_a_tunnel_no_answer_of_another_master_counts() {
+fn behind_a_tunnel_the_answer_of_another_master_is_never_accepted() {
     let scratch = Scratch::new();
     let program = format!("{NODES}/{PROGRAM}");
     let start = |port| {
@@ -173,13 +175,13 @@ fn behind_a_tunnel_no_answer_of_another_master_counts() {
             client.set_param("/number", number);
             assert_eq!(client.param("/number"), Some(Value::Int(number)));
         }
-        eventually("rosrescue lets calls pass", || {
+        eventually("calls pass to the master", || {
             status(&client)["open"] == true && master.client().param("/number").is_some()
         });
         let now = master.client().param("/number");
         assert_eq!(now, Some(Value::Int(number)), "turn {turn}");
-        // The health check may take the dead node out between the two reads.
-        eventually("rosrescue says what the master says", || {
+        // The health check may unregister the dead node between the two reads.
+        eventually("rosrescue and the master report the same state", || {
             let states = [&master.client(), &client].map(|of| State::try_read(of).ok());
             states[0].is_some() && states[0] == states[1]
         });

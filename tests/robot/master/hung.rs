@@ -1,6 +1,6 @@
-//! A master that hangs, and one that is only slow: the one is found by probes, stood in for, replaced by `core`
-//! and waited for by `proxy`, and if it goes on it is given what was written meanwhile; the other is left
-//! alone.
+//! A master that hangs, and one that is only slow. Probes find the hung one; the mirror stands in, `core`
+//! replaces it, `proxy` waits for it, and if it continues it is given everything that was written in the
+//! meantime. The slow one is left alone.
 
 use std::fs;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +13,7 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Options with which a master that does not answer for a second counts as hung.
+/// Options that make a master count as hung when it has not answered for a second.
 const PROBES: [&str; 8] = [
     "--stand-in-after",
     "100",
@@ -25,7 +25,7 @@ const PROBES: [&str; 8] = [
     "2",
 ];
 
-/// The values that a node was told of a parameter, as they came, and whether rosrescue told it.
+/// The values of a parameter that a node was told, in order, and whether rosrescue told it.
 fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
     let calls = node.calls().into_iter();
     let updates = calls.filter(|call| call.method == "paramUpdate");
@@ -38,11 +38,11 @@ fn told(node: &FakeNode, key: &str) -> Vec<(i32, bool)> {
         .collect()
 }
 
-/// The gate shuts, the mirror answers and nodes are notified; the same master, when it goes on, is given what
-/// it missed, and tells nobody.
+/// The gate shuts, the mirror answers and nodes are notified. When the same master continues, it is given
+/// everything that it missed, and it notifies no node of that.
 #[test]
-fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
-    // Three seconds for what happens before the verdict.
+fn a_proxy_stands_in_for_a_hung_master_and_later_gives_it_the_missed_writes() {
+    // Three seconds for what happens before the master counts as hung.
     let probes = [
         "--stand-in-after",
         "100",
@@ -66,12 +66,12 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     let injections = robot.counter("masters_restored");
 
     crate::support::stop(pid);
-    // It is under way in the master, which has not run it.
+    // This call is under way in the master, which has not run it.
     let flying = thread::spawn({
         let client = client.clone();
         move || client.set_param("/flying", 1)
     });
-    // Nobody waits for the verdict.
+    // Clients do not wait until the master counts as hung.
     assert_eq!(client.param("/gain"), Some(Value::Int(7)));
     client.set_param("/gain", 7);
     node.watch_param(&client, "/standing");
@@ -106,18 +106,18 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     eventually("the node is told of every value", || {
         told(&node, "/standing") == every
     });
-    // With the verdict: until then the master may tell it.
-    eventually("the node is told of what was under way", || {
+    // Only when the master counts as hung: until then it may notify the node itself.
+    eventually("the node is told of the write that was under way", || {
         told(&node, "/flying").contains(&(1, true))
     });
 
     crate::support::signal(pid, Signal::CONT);
     robot.await_gate();
-    assert_eq!(robot.master_pid(), pid, "the same master goes on");
+    assert_eq!(robot.master_pid(), pid, "the same master stays in use");
     assert_eq!(robot.counter("masters_restored"), injections + 1);
-    after.assert_same(&robot.state(), "in the master that goes on");
+    after.assert_same(&robot.state(), "in the master that continues");
     after.assert_same(&State::read(&client), "through rosrescue");
-    // Never of an older value, and never of a part of the publishers.
+    // The node is never told an older value, and never a part of the publishers.
     assert!(holds(Duration::from_secs(1), || {
         let standing = told(&node, "/standing");
         standing[..3] == every && standing[3..].iter().all(|(value, _)| *value == 3)
@@ -129,7 +129,7 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
         updates[first..].iter().all(|uris| *uris == both),
         "{updates:?}"
     );
-    // It serves its parameters' subscribers as before.
+    // The master notifies the subscribers of its parameters as before.
     client.set_param("/standing", 4);
     eventually("the node is told by the master", || {
         told(&node, "/standing").contains(&(4, false))
@@ -139,7 +139,7 @@ fn a_proxy_stands_in_for_a_hung_master_which_then_knows_everything() {
     }
 }
 
-/// Many hangs, too short to be noticed or long enough, with writes under way all the time.
+/// Many hangs, some too short to be noticed and some long enough, with writes under way all the time.
 #[test]
 fn ten_hangs_under_writes_lose_nothing() {
     let robot = Robot::start_with(Mode::Proxy, &PROBES);
@@ -162,7 +162,7 @@ fn ten_hangs_under_writes_lose_nothing() {
                 let mut number = 0;
                 while !done.load(Ordering::Relaxed) {
                     number += 1;
-                    // Panics if it is answered with anything but success, or not at all.
+                    // This panics if the call is answered with anything but success, or not at all.
                     client.set_param(key, number);
                     thread::sleep(Duration::from_millis(5));
                 }
@@ -179,7 +179,7 @@ fn ten_hangs_under_writes_lose_nothing() {
         let mut shut = 0;
         for round in 0..10 {
             crate::support::stop(pid);
-            // The faults themselves take a time, by dice. A master that hangs for a second is noticed.
+            // The length of the hang is random. A master that hangs for a second is noticed.
             let length = match round % 3 {
                 0 => 1800 + roll(800),
                 _ => 10 + roll(700),
@@ -195,19 +195,19 @@ fn ten_hangs_under_writes_lose_nothing() {
         drop(finish);
         (writers.map(|it| it.join().unwrap()), shut)
     });
-    assert_eq!(robot.master_pid(), pid, "the same master goes on");
-    // Once after each hang that was noticed, however often the gate was found shut besides.
+    assert_eq!(robot.master_pid(), pid, "the same master stays in use");
+    // Once after each hang that was noticed, however often the gate was shut for other reasons.
     assert!(robot.counter("masters_restored") >= injections + shut);
     for (key, written) in keys.into_iter().zip(written) {
         assert_eq!(robot.bare().param(key), Some(Value::Int(written)), "{key}");
-        // rosrescue leaves out what is already out of date. The last value may come from it before the one
-        // before it comes from the master; it is told again then.
-        eventually("the node is told the last value at the end", || {
+        // rosrescue leaves out outdated values. The last value may come from it before the master tells the
+        // value before that; then it is told again.
+        eventually("the last value that the node is told is the newest", || {
             told(&watcher, key)
                 .last()
                 .is_some_and(|(value, _)| *value == written)
         });
-        // Those from the master once and in order.
+        // The master tells each value once and in order.
         let told = told(&watcher, key);
         let by_master: Vec<_> = told.iter().filter(|(_, ours)| !ours).collect();
         assert!(by_master.is_sorted_by(|a, b| a.0 < b.0), "{key}: {told:?}");
@@ -217,10 +217,10 @@ fn ten_hangs_under_writes_lose_nothing() {
     assert_eq!(watcher.heard("shutdown"), Vec::<Vec<Value>>::new());
 }
 
-/// It is under way in the master when that hangs, and answered by the mirror: the next master, if the one that
-/// hangs dies of it, does not know the node either.
+/// The call is under way in the master when that hangs, and the mirror answers it. If the hung master dies of
+/// it, the next one does not know the node either.
 #[test]
-fn an_unregistration_that_a_hung_master_took_with_it_is_not_forgotten() {
+fn an_unregistration_under_way_in_a_hung_master_is_not_forgotten() {
     let mut robot = Robot::start_with(Mode::Proxy, &PROBES);
     let client = robot.client();
     let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
@@ -239,7 +239,7 @@ fn an_unregistration_that_a_hung_master_took_with_it_is_not_forgotten() {
     after.assert_same(&State::read(&client), "through rosrescue");
 }
 
-/// `core` asks, decides, kills and replaces; the streams of its nodes go on.
+/// `core` notices, decides, kills and replaces. The streams of its nodes continue.
 #[test]
 fn a_core_replaces_a_hung_master_under_its_nodes() {
     let robot = Robot::start_with(Mode::Core, &PROBES);
@@ -254,12 +254,19 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
         let client = client.clone();
         move || client.status("setParam", params!["/test", "/waits", 1])
     });
-    eventually("the mirror reads while nobody else does", || {
+    eventually("the mirror answers reads while the master does not", || {
         !robot.is_open() && State::read(&client).knows("/talker")
     });
     robot.await_recovery(hung);
-    assert!(!alive(hung), "the master that hangs is ended");
-    assert_eq!(waiting.join().unwrap().expect("the call is answered").0, 1);
+    assert!(!alive(hung), "the hung master is still running");
+    assert_eq!(
+        waiting
+            .join()
+            .unwrap()
+            .expect("the call was not answered")
+            .0,
+        1
+    );
     client.ok("deleteParam", params!["/test", "/waits"]);
     before.assert_same(&robot.state(), "after the hung master was replaced");
     let status = robot.status().unwrap();
@@ -273,9 +280,9 @@ fn a_core_replaces_a_hung_master_under_its_nodes() {
     talker.assert_no_link_lost();
 }
 
-/// Up to two seconds a call are no reason to end a master that is given three, and twenty seconds are.
+/// Two seconds per call are no reason to end a master that has three, but twenty seconds are.
 #[test]
-fn a_slow_master_is_left_alone_below_the_threshold() {
+fn a_slow_master_is_left_alone_if_it_answers_within_the_time_limit() {
     let program = format!("{NODES}/slow_rosmaster.py");
     let options = [
         "--rosmaster",
@@ -287,7 +294,7 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
         "1500",
         "--probe-count",
         "2",
-        // Who writes waits for it here.
+        // Writes wait for the master here.
         "--stand-in-after",
         "60000",
     ];
@@ -297,7 +304,7 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
     let pid = robot.master_pid();
     let slow = robot.scratch.path("slow");
 
-    // The second one takes almost as long as a probe may, and the third longer than one may.
+    // The second value is almost as long as a probe may take, and the third one is longer.
     for (number, seconds) in (1..).zip(["0.3", "1.2", "2"]) {
         fs::write(&slow, seconds).unwrap();
         let start = Instant::now();
@@ -305,15 +312,15 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
         let delay = Duration::from_secs_f64(seconds.parse().unwrap());
         assert!(
             start.elapsed() >= delay,
-            "it was not slow: {:?}",
+            "the master was not slow: {:?}",
             start.elapsed()
         );
-        // Who reads need not wait so long, unless the computer itself is slow.
+        // Reads do not have to wait so long, unless the computer itself is slow.
         let delay = delay.max(Duration::from_secs(1));
         let start = Instant::now();
         assert_eq!(client.param("/kept"), Some(Value::Int(number)));
         assert!(start.elapsed() < delay, "{:?}", start.elapsed());
-        // So many probes have met it.
+        // Several probes have run in this time.
         let probes = Duration::from_millis(3500);
         assert!(holds(probes, || robot.is_open()), "{seconds} s a call");
     }
@@ -330,9 +337,9 @@ fn a_slow_master_is_left_alone_below_the_threshold() {
 
     fs::write(&slow, "20").unwrap();
     eventually("the gate is shut", || !robot.is_open());
-    // On a busy computer one that sleeps looks starved.
+    // On a busy computer a sleeping process could look starved, so it is stopped.
     let _ = kill_process(Pid::from_raw(pid.cast_signed()).unwrap(), Signal::STOP);
-    eventually("it is ended", || !alive(pid));
+    eventually("the master is ended", || !alive(pid));
     fs::remove_file(&slow).unwrap();
     robot.await_recovery(pid);
     assert_eq!(robot.bare().param("/kept"), Some(Value::Int(3)));

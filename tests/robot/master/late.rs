@@ -1,5 +1,5 @@
-//! A master that does not answer for a while: writers do not wait for the verdict on it, it is given what it
-//! missed, and it is ended only if its process shows that it hangs.
+//! A master that does not answer for a while. Writers do not wait until it counts as hung, it is given the
+//! writes that it missed, and it is ended only if its process shows that it hangs.
 
 use std::fs::{self, Permissions};
 use std::os::unix::fs::PermissionsExt;
@@ -13,10 +13,10 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// With these a master is never found to hang within a test.
+/// With these options a master never counts as hung within a test.
 const NO_VERDICT: [&str; 4] = ["--stand-in-after", "100", "--probe-count", "1000"];
 
-/// The values that a node was told of a parameter, as they came, and whether rosrescue told it.
+/// The values of a parameter that a node was told, in order, and whether rosrescue told it.
 fn told(node: &FakeNode) -> Vec<(i32, bool)> {
     let calls = node.calls().into_iter();
     let updates = calls.filter(|call| call.method == "paramUpdate");
@@ -25,10 +25,10 @@ fn told(node: &FakeNode) -> Vec<(i32, bool)> {
         .collect()
 }
 
-/// Who sets parameters, registers and unregisters waits for the patience once. The master that goes on is the same
-/// and has everything.
+/// Clients that set parameters, register and unregister wait only once, for `--stand-in-after`. The same
+/// master continues and has everything.
 #[test]
-fn writers_do_not_wait_for_the_verdict_on_a_stopped_master() {
+fn writers_do_not_wait_until_a_stopped_master_counts_as_hung() {
     for mode in [Mode::Proxy, Mode::Core] {
         let robot = Robot::start_with(mode, &NO_VERDICT);
         let client = robot.client();
@@ -50,19 +50,19 @@ fn writers_do_not_wait_for_the_verdict_on_a_stopped_master() {
         assert_eq!(client.param("/pass"), Some(Value::Int(20)));
         signal(pid, Signal::CONT);
         robot.await_gate();
-        assert_eq!(robot.master_pid(), pid, "the same master goes on");
+        assert_eq!(robot.master_pid(), pid, "the same master stays in use");
         assert_eq!(robot.bare().param("/pass"), Some(Value::Int(20)));
-        robot.await_state(&after, "in the master that goes on");
-        // It would be told twice of the topic that came and went, and so it was injected.
+        robot.await_state(&after, "in the master that continues");
+        // A node would be notified twice of the topic that came and went, so the state was injected.
         assert_eq!(robot.counter("masters_restored"), restored + 1);
         assert_eq!(status(&client)["deaths"], 0);
         robot.rescue.assert_no_panic();
     }
 }
 
-/// It runs what it missed, and nothing else is done to it.
+/// The master runs the writes that it missed, and nothing else is done to it.
 #[test]
-fn a_master_that_was_merely_late_is_not_injected() {
+fn a_master_that_was_only_late_is_not_injected() {
     for mode in [Mode::Proxy, Mode::Core] {
         let robot = Robot::start_with(mode, &NO_VERDICT);
         let client = robot.client();
@@ -74,9 +74,9 @@ fn a_master_that_was_merely_late_is_not_injected() {
         for number in 1..=12 {
             let restored = robot.counter("masters_restored");
             stop(pid);
-            // Under way in the master.
+            // This write is under way in the master.
             client.set_param("/late", number);
-            // It misses these.
+            // The master misses these writes.
             client.set_param("/missed", number);
             client.set_param("/watched", number);
             match number % 2 {
@@ -91,11 +91,11 @@ fn a_master_that_was_merely_late_is_not_injected() {
                 assert_eq!(robot.bare().param(key), Some(Value::Int(number)), "{key}");
             }
             after.assert_same(&robot.state(), "in the master");
-            // On a very busy computer it takes too long to catch up, and is injected.
+            // On a very busy computer the master takes too long to catch up, and is injected instead.
             if robot.counter("masters_restored") == restored {
                 caught_up += 1;
-                // A master that is stopped before it notifies does so when it goes on.
-                eventually("the master tells", || {
+                // A master that is stopped before it notifies does so when it continues.
+                eventually("the master notifies the node", || {
                     told(&watcher).contains(&(number, false))
                 });
             }
@@ -103,7 +103,10 @@ fn a_master_that_was_merely_late_is_not_injected() {
                 break;
             }
         }
-        assert_eq!(caught_up, 3, "it is injected each time");
+        assert_eq!(
+            caught_up, 3,
+            "the master was injected instead of catching up"
+        );
         assert_eq!(robot.master_pid(), pid);
         eventually("the watcher knows the publishers", || {
             let publishers = robot.state().publishers_of("/topic").len();
@@ -113,13 +116,15 @@ fn a_master_that_was_merely_late_is_not_injected() {
         let values = told(&watcher);
         assert!(values.is_sorted_by_key(|(value, _)| *value), "{values:?}");
         assert_eq!(status(&client)["counters"]["divergences"], 0);
-        // It notifies nodes itself, as before.
+        // The master notifies nodes itself, as before.
         client.set_param("/watched", 99);
-        eventually("the master tells", || told(&watcher).contains(&(99, false)));
+        eventually("the master notifies the node", || {
+            told(&watcher).contains(&(99, false))
+        });
     }
 }
 
-/// It gets five parts in a hundred of its time.
+/// The master gets five percent of the processor time that it wants.
 #[test]
 fn a_starved_master_is_not_killed() {
     let probes = [
@@ -164,15 +169,15 @@ fn a_starved_master_is_not_killed() {
         "no probe was missed: {}",
         robot.rescue.log()
     );
-    // One that hangs is.
+    // A master that really hangs is killed.
     stop(pid);
     robot.await_recovery(pid);
     assert!(!alive(pid));
 }
 
-/// It works for longer than it may take to listen.
+/// The master is busy for longer than it may take to listen.
 #[test]
-fn a_master_that_starts_slowly_is_started_once() {
+fn a_master_that_starts_slowly_is_started_only_once() {
     let scratch = Scratch::new();
     let [program, starts] = ["slow_to_start", "starts"].map(|name| scratch.path(name));
     let script = format!(

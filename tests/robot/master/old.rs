@@ -1,13 +1,13 @@
-//! A master as rosmaster 1.14.3 and before: it also tells a node of the parameter that this node has set itself. While
-//! it is away rosrescue does the same.
+//! A master that behaves like rosmaster 1.14.3 and before: it also notifies the node that has set a parameter
+//! itself. While it is away, rosrescue does the same.
 
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, in_both_modes, params};
 use rosrescue::xmlrpc::Value;
 use std::time::Duration;
 
-in_both_modes!(who_sets_a_parameter_is_told_as_by_the_master);
+in_both_modes!(a_node_that_sets_a_parameter_is_notified_as_by_the_old_master);
 
-fn who_sets_a_parameter_is_told_as_by_the_master(mode: Mode) {
+fn a_node_that_sets_a_parameter_is_notified_as_by_the_old_master(mode: Mode) {
     for (program, is_old) in [("old_rosmaster.py", true), ("waiting_rosmaster.py", false)] {
         let mut robot = Robot::start_under(mode, program, &[]);
         robot.stay_away();

@@ -1,5 +1,5 @@
-//! A master whose dictionaries have no order of their own, as those of Python 2. The order is no difference, and
-//! answers that show it are the master's.
+//! A master whose dictionaries have no order, as on Python 2. A different order is no divergence, and answers
+//! that show it are the master's own.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-in_both_modes!(the_order_of_dictionaries_is_no_difference);
+in_both_modes!(the_order_of_dictionaries_is_no_divergence);
 
-fn the_order_of_dictionaries_is_no_difference(mode: Mode) {
-    // A probe that is late on a busy computer is no difference either.
+fn the_order_of_dictionaries_is_no_divergence(mode: Mode) {
+    // A late probe on a busy computer must not count as a difference.
     let patient = ["--probe-timeout", "30000"];
     let options = ["--resync-interval", "0.2", "--no-rosout"];
     let options = match mode {
@@ -37,7 +37,7 @@ fn the_order_of_dictionaries_is_no_difference(mode: Mode) {
     }
     assert_eq!(robot.bare().param("/tree2/m/k"), Some(Value::Int(3)));
     assert_exact(&robot);
-    // Some looks, each of which might tell a difference.
+    // The state is read several times, and each time a difference could be reported.
     assert!(holds(Duration::from_secs(2), || robot.is_open()));
     assert_exact(&robot);
     assert_eq!(robot.counter("divergences"), 0);
@@ -47,7 +47,7 @@ fn the_order_of_dictionaries_is_no_difference(mode: Mode) {
     }
 }
 
-/// Reads are answered with the master's own bytes.
+/// Checks that reads are answered with the master's own bytes.
 fn assert_exact(robot: &Robot) {
     for (method, params) in [
         ("getSystemState", params!["/n"]),
@@ -61,7 +61,7 @@ fn assert_exact(robot: &Robot) {
     ] {
         let request = http_request(&encode_call(method, params));
         let answer = |client: Client| client.exchange(&request).unwrap().text();
-        // On a busy computer the mirror may answer once for a master that is late.
+        // On a busy computer the mirror may answer once for a late master.
         eventually(&format!("{method} has the master's bytes"), || {
             answer(robot.client()) == answer(robot.bare())
         });

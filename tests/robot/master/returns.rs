@@ -1,5 +1,6 @@
-//! The same master comes back, or an older one: rosrescue was killed and started again, a hang or a cut
-//! ended, an address moved. Whatever was acknowledged is in the master and in the mirror afterwards.
+//! The same master comes back, or an older one: after rosrescue was killed and started again, after a hang or
+//! a cut link, or after an address has moved. Everything that was acknowledged is then in the master and in
+//! the mirror.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -11,7 +12,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Struct, Value};
 use rustix::process::Signal;
 
-/// Options with which a master that does not answer for 0.3 s counts as hung.
+/// Options that make a master count as hung when it has not answered for 0.3 s.
 const PROBES: [&str; 6] = [
     "--probe-interval",
     "100",
@@ -21,7 +22,7 @@ const PROBES: [&str; 6] = [
     "2",
 ];
 
-/// Waits until the master equals the mirror and holds what `check` asks for.
+/// Waits until the master equals the mirror and its state passes `check`.
 #[track_caller]
 fn settles(master: &Client, rescue: &Rescue, check: impl Fn(&State) -> bool) {
     let client = rescue.client();
@@ -33,9 +34,10 @@ fn settles(master: &Client, rescue: &Rescue, check: impl Fn(&State) -> bool) {
     assert_eq!(status(&client)["counters"]["divergences"], 0);
 }
 
-/// A service is withdrawn while the master is stopped, and rosrescue is killed before it goes on.
+/// A service is unregistered while the master is stopped, and rosrescue is killed before the master
+/// continues.
 #[test]
-fn a_service_withdrawn_in_a_hang_stays_withdrawn_when_rosrescue_is_killed() {
+fn a_service_unregistered_during_a_hang_stays_unregistered_if_rosrescue_is_killed() {
     for killed_at_its_start in [false, true] {
         let mut robot = Robot::start_with(Mode::Proxy, &PROBES);
         let client = robot.client();
@@ -50,7 +52,8 @@ fn a_service_withdrawn_in_a_hang_stays_withdrawn_when_rosrescue_is_killed() {
             robot.rescue.kill();
             robot.rescue.start_again();
         }
-        // Answered by the mirror: once the hang is noticed, or as soon as the checkpoint has been read.
+        // The mirror answers, either because the hang has been noticed, or as soon as the checkpoint has been
+        // read.
         eventually("rosrescue answers", || client.master_pid().is_some());
         leaving.withdraw(&client, "/leaving/service");
         leaving.unpublish(&client, "/topic");
@@ -62,7 +65,7 @@ fn a_service_withdrawn_in_a_hang_stays_withdrawn_when_rosrescue_is_killed() {
         settles(&robot.bare(), &robot.rescue, |state| {
             !state.knows("/leaving") && state.publishers_of("/topic") == ["/staying"]
         });
-        assert_eq!(robot.master_pid(), pid, "the same master goes on");
+        assert_eq!(robot.master_pid(), pid, "the same master stays in use");
         assert_eq!(robot.bare().param("/set"), Some(Value::Int(7)));
         assert_eq!(staying.heard("shutdown"), Vec::<Vec<Value>>::new());
     }
@@ -70,7 +73,7 @@ fn a_service_withdrawn_in_a_hang_stays_withdrawn_when_rosrescue_is_killed() {
 
 /// A topic is registered with another type while the master is stopped.
 #[test]
-fn a_type_that_changed_in_a_hang_is_the_masters_afterwards() {
+fn a_topic_type_changed_during_a_hang_is_given_to_the_master_afterwards() {
     let robot = Robot::start_with(Mode::Proxy, &PROBES);
     let client = robot.client();
     let [node, other] = ["/node", "/other"].map(FakeNode::start);
@@ -93,10 +96,10 @@ fn a_type_that_changed_in_a_hang_is_the_masters_afterwards() {
     });
 }
 
-/// A call of the rosrescue that was killed is still running in the master when the next one is told a
-/// newer value.
+/// A call of the killed rosrescue is still running in the master when the next rosrescue is given a newer
+/// value.
 #[test]
-fn a_newer_value_outlives_a_long_call_of_a_rosrescue_that_was_killed() {
+fn a_newer_value_wins_over_a_long_call_of_a_killed_rosrescue() {
     const KEYS: i32 = 60_000;
     let long: Struct = (0..KEYS)
         .map(|key| (format!("k{key}"), Value::Int(1)))
@@ -133,10 +136,10 @@ fn a_newer_value_outlives_a_long_call_of_a_rosrescue_that_was_killed() {
     }
 }
 
-/// One address, two masters: the first, an empty second that is given the state and changes, and the
-/// first again, with its old state.
+/// One address with two masters in turn: the first one, an empty second one that is given the state and then
+/// changes, and the first one again with its old state.
 #[test]
-fn a_master_that_was_left_behind_is_not_believed() {
+fn the_old_state_of_a_superseded_master_is_not_adopted() {
     let scratch = Scratch::new();
     let [first, second] = [Rosmaster::start(&scratch), Rosmaster::start(&scratch)];
     let relay = Relay::to(first.port);
@@ -170,7 +173,7 @@ fn a_master_that_was_left_behind_is_not_believed() {
     }
     for node in [&staying, &coming] {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
-        // Whatever a list says, it is no part of the truth.
+        // Whatever the lists are, none lacks the publisher that stays.
         let updates = node.updates("/topic");
         assert!(
             updates.iter().all(|uris| uris.contains(&staying.api)),
@@ -179,10 +182,10 @@ fn a_master_that_was_left_behind_is_not_believed() {
     }
 }
 
-/// What others wrote to the master while rosrescue could not reach it is kept, but where rosrescue has
-/// acknowledged something newer.
+/// Writes by others while rosrescue could not reach the master are kept, unless rosrescue has acknowledged
+/// something newer.
 #[test]
-fn what_was_written_past_rosrescue_is_found_and_kept() {
+fn writes_that_bypassed_rosrescue_are_found_and_kept() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let relay = Relay::to(master.port);
@@ -191,8 +194,8 @@ fn what_was_written_past_rosrescue_is_found_and_kept() {
     for key in ["/both", "/theirs", "/ours"] {
         client.set_param(key, 1);
     }
-    let nobody = free_port();
-    relay.turn_to(nobody);
+    let unused_port = free_port();
+    relay.turn_to(unused_port);
     client.set_param("/both", 2);
     client.set_param("/ours", 2);
     let past_us = FakeNode::start("/past_us");
@@ -208,7 +211,7 @@ fn what_was_written_past_rosrescue_is_found_and_kept() {
     });
     assert!(is("/new", 3));
 
-    // After a restart, too: the checkpoint may be older than the master.
+    // The same holds after a restart, when the checkpoint may be older than the master.
     rescue.kill();
     bare.set_param("/both", 4);
     bare.set_param("/newer", 4);
@@ -220,14 +223,14 @@ fn what_was_written_past_rosrescue_is_found_and_kept() {
     assert_eq!(past_us.heard("shutdown"), Vec::<Vec<Value>>::new());
 }
 
-/// How often the random test plays; more by `ROSRESCUE_RETURNS`.
+/// Number of rounds of the random test. `ROSRESCUE_RETURNS` asks for more.
 fn rounds() -> u64 {
     let given = std::env::var("ROSRESCUE_RETURNS").ok();
     given.map_or(12, |rounds| rounds.parse().expect("ROSRESCUE_RETURNS"))
 }
 
-/// The same incarnation comes back after 1, 10 or 100 writes, one of them in flight when it went away.
-/// It equals a master that was there all the time.
+/// The same incarnation comes back after 1, 10 or 100 writes, one of which was under way when it went away.
+/// It then equals a master that was there all the time.
 #[test]
 fn the_same_master_returns_after_any_number_of_pending_writes() {
     let seed = u64::from(std::process::id());
@@ -245,7 +248,7 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
     let rescue = Setup::proxy(&scratch, master.port).args(PROBES).start();
     let (client, bare, model) = (rescue.client(), master.client(), model.client());
     let nodes: Vec<_> = (0..4).map(|n| FakeNode::start(&format!("/n{n}"))).collect();
-    // What they say of themselves would count for more than what is registered for them here.
+    // If the nodes answered, their reports would count for more than the registrations made here.
     nodes.iter().for_each(FakeNode::hold);
     let mut write = || {
         let node = &nodes[roll(nodes.len())];
@@ -285,7 +288,7 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
         stop(master.pid());
         let count = [1, 10, 100][usize::try_from(round % 3).unwrap()];
         for number in 0..count {
-            // The first one is on its way to the master when that stops to answer.
+            // The first write is on its way to the master when that stops answering.
             let (method, params) = write();
             let expected = model.call(method, params.clone()).unwrap();
             let answer = client.call(method, params.clone()).unwrap();
@@ -295,7 +298,9 @@ fn the_same_master_returns_after_any_number_of_pending_writes() {
             );
         }
         signal(master.pid(), Signal::CONT);
-        eventually("the master goes on", || status(&client)["open"] == true);
+        eventually("the master serves calls again", || {
+            status(&client)["open"] == true
+        });
         let wanted = State::read(&model);
         wanted.assert_same(&State::read(&client), &format!("round {round}, the mirror"));
         wanted.assert_same(&State::read(&bare), &format!("round {round}, the master"));

@@ -1,5 +1,5 @@
-//! Another program takes the port of our rosmaster before that can listen. It is given nothing, and rosmaster is
-//! started at another port at once.
+//! Another program takes the port of our rosmaster before that can listen. That program receives no call, and
+//! rosmaster is started at another port at once.
 
 use std::fs;
 use std::io::Read;
@@ -16,12 +16,12 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// Takes the port of the next rosmaster. Returns the port, and later how many bytes came to it.
+/// Takes the port of the next rosmaster. Returns the port, and the number of bytes that it has received.
 fn rob(scratch: &Scratch) -> impl FnOnce() -> (u16, Arc<AtomicUsize>) + use<> {
     let (rob, port) = (scratch.path("rob"), scratch.path("port"));
     fs::write(&rob, "").unwrap();
     move || {
-        let taken = eventually_some("rosmaster says its port", || {
+        let taken = eventually_some("rosmaster reports its port", || {
             fs::read_to_string(&port).ok()?.parse().ok()
         });
         fs::remove_file(&rob).unwrap();
@@ -46,7 +46,7 @@ fn rob(scratch: &Scratch) -> impl FnOnce() -> (u16, Arc<AtomicUsize>) + use<> {
 }
 
 #[test]
-fn a_stranger_at_the_port_of_our_master_is_given_nothing() {
+fn another_program_at_the_port_of_our_master_receives_no_call() {
     let scratch = Scratch::new();
     let port = free_port();
     let robbed = Path::new(NODES).join("robbed_rosmaster.py");
@@ -66,7 +66,11 @@ fn a_stranger_at_the_port_of_our_master_is_given_nothing() {
     let at_start = start.elapsed();
     let client: Client = rescue.client();
     client.set_param("/kept", 7);
-    assert_eq!(bytes.load(Ordering::Relaxed), 0, "the stranger was called");
+    assert_eq!(
+        bytes.load(Ordering::Relaxed),
+        0,
+        "the other program was called"
+    );
 
     let dead = client.master_pid().unwrap();
     let take = rob(&scratch);
@@ -77,11 +81,15 @@ fn a_stranger_at_the_port_of_our_master_is_given_nothing() {
         client.master_pid().is_some_and(|pid| pid != dead)
             && crate::support::status(&client)["open"] == true
     });
-    // Not after the 30 s that a rosmaster has for its start.
+    // It must not wait for the 30 s that a rosmaster has for its start.
     for took in [at_start, start.elapsed()] {
         assert!(took < Duration::from_secs(25), "{took:?}");
     }
     assert_ne!(first, second);
     assert_eq!(client.param("/kept"), Some(Value::Int(7)));
-    assert_eq!(bytes.load(Ordering::Relaxed), 0, "the stranger was called");
+    assert_eq!(
+        bytes.load(Ordering::Relaxed),
+        0,
+        "the other program was called"
+    );
 }

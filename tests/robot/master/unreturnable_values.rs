@@ -1,14 +1,14 @@
-//! Values that a master takes and that spoil its answers, or that XML changes on their way: rosrescue
-//! serves such a master, and knows what else it holds.
+//! Values that a master accepts and that break its answers, or that XML changes on the way: rosrescue serves
+//! such a master, and knows everything else that it holds.
 
 use crate::support::{
     FakeNode, Mode, Robot, Rosmaster, Scratch, Setup, eventually, http_request, params, tree,
 };
 use rosrescue::xmlrpc::{Call, Reply, Value};
 
-/// CPython writes a carriage return as it is, and whoever reads that as XML gets a line feed.
+/// CPython writes a carriage return unescaped, which XML readers read as a line feed.
 #[test]
-fn carriage_returns_outlive_master_and_rosrescue() {
+fn carriage_returns_survive_the_death_of_master_and_rosrescue() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     master.client().set_param("/before", "a\r\nb\rc");
@@ -34,15 +34,15 @@ fn carriage_returns_outlive_master_and_rosrescue() {
     });
 }
 
-/// CPython does not escape a date's text, so that whatever holds this one is answered with no XML.
+/// A date that makes every answer with it invalid XML, because CPython does not escape its text.
 fn broken_date() -> Value {
     Value::DateTime("a<b & ]]>".to_owned())
 }
 
-/// As deep as rosmaster returns a value with the whole tree in a multicall, which is how it is brought
-/// back and compared, it outlives the master; what is deeper is left out, by name.
+/// A value nested as deep as rosmaster can return it together with the whole tree, which is how it is read
+/// back, survives the death of the master. A deeper one is left out and named.
 #[test]
-fn a_value_nested_as_deep_as_the_master_bears_outlives_it() {
+fn a_value_nested_as_deep_as_rosmaster_can_return_survives_its_death() {
     let in_array = |value| Value::Array(vec![value]);
     let in_struct = |value| tree! { "k" => value };
     let wraps: [fn(Value) -> Value; 2] = [in_array, in_struct];
@@ -61,7 +61,7 @@ fn a_value_nested_as_deep_as_the_master_bears_outlives_it() {
         };
         let depth = (470..520).take_while(borne).last();
         bare.ok("deleteParam", params!["/test", "/deep"]);
-        depth.expect("rosmaster bears 470 levels")
+        depth.expect("rosmaster must be able to return 470 levels")
     });
     let mut rescue = Setup::proxy(&scratch, master.port).start();
     let client = rescue.client();
@@ -78,13 +78,13 @@ fn a_value_nested_as_deep_as_the_master_bears_outlives_it() {
         assert!(found == Some(nested(depth, *wrap)), "{name} of {depth}");
     }
     for name in ["array", "struct"] {
-        rescue.wait_line("what was left out", |line| {
+        rescue.wait_line("the log names the parameter that was left out", |line| {
             line.contains(&format!("the parameter `/deeper_{name}"))
         });
     }
 }
 
-/// What came through rosrescue itself is kept, and left out where it would spoil a new master.
+/// A value that came through rosrescue is kept, and left out where it would break a new master.
 #[test]
 fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
     let scratch = Scratch::new();
@@ -98,15 +98,15 @@ fn a_date_that_breaks_answers_is_left_out_of_an_injection() {
     let after = master.client();
     eventually("the state is back", || after.param("/good").is_some());
     assert_eq!(after.param("/"), Some(tree! { "good" => 1 }));
-    rescue.wait_line("what was left out", |line| {
+    rescue.wait_line("the log names the parameter that was left out", |line| {
         line.contains("the parameter `/bad`")
     });
 }
 
-/// While the master holds what it cannot return, none of its parameters can be read: those that rosrescue
-/// knows are kept, and it says so.
+/// While the master holds a value that it cannot return, none of its parameters can be read. rosrescue keeps
+/// those that it knows, and reports it.
 #[test]
-fn parameters_that_cannot_be_read_back_are_kept_as_they_are_known() {
+fn parameters_that_the_master_cannot_return_are_kept_as_known() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.port).args(["--resync-interval", "0.1"]);
@@ -114,12 +114,15 @@ fn parameters_that_cannot_be_read_back_are_kept_as_they_are_known() {
     let client = rescue.client();
     client.set_param("/ns/huge", Value::BigInt("1099511627776".to_owned()));
     client.set_param("/ns/known", 1);
-    rescue.wait_line("what it cannot read", |line| {
+    rescue.wait_line("the log says that parameters cannot be read", |line| {
         line.contains("a parameter that it can never return")
     });
     let past = FakeNode::start("/past");
     past.publish(&master.client(), "/topic", "std_msgs/String");
-    rescue.wait_line("what it can read", |line| line.contains("`/past`"));
+    rescue.wait_line(
+        "the log names the node that was read from the master",
+        |line| line.contains("`/past`"),
+    );
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
     let after = master.client();
@@ -128,14 +131,14 @@ fn parameters_that_cannot_be_read_back_are_kept_as_they_are_known() {
         after.param("/"),
         Some(tree! { "ns" => tree! { "known" => 1 } })
     );
-    rescue.wait_line("what was left out", |line| {
+    rescue.wait_line("the log names the parameter that was left out", |line| {
         line.contains("the parameter `/ns/huge`")
     });
 }
 
-/// rosmaster takes them, rosrescue cannot decode them, and no client can read them.
+/// rosmaster accepts them, rosrescue cannot decode them, and no client can read them.
 #[test]
-fn what_nobody_can_read_is_deleted_without_a_divergence() {
+fn deleting_an_unreadable_parameter_causes_no_divergence() {
     let robot = Robot::start(Mode::Proxy);
     let (client, bare) = (robot.client(), robot.bare());
     let nil = "<array><data><value><nil/></value></data></array>";
@@ -144,7 +147,7 @@ fn what_nobody_can_read_is_deleted_without_a_divergence() {
         ("", "<bigdecimal>1.5</bigdecimal>"),
         ("<!DOCTYPE methodCall>", nil),
         ("<!DOCTYPE methodCall>", "<i8>99999999999</i8>"),
-        // A dictionary with a number for a key.
+        // A dictionary with a number as a key.
         ("", numbered),
     ] {
         let document = format!(
@@ -164,7 +167,7 @@ fn what_nobody_can_read_is_deleted_without_a_divergence() {
     }
 }
 
-/// rosmaster takes a date for a type if it reads `*`, and gives it back as a date.
+/// rosmaster accepts a date as a type if its text is `*`, and returns it as a date.
 #[test]
 fn a_type_that_is_a_date_does_not_hide_the_master() {
     let scratch = Scratch::new();
@@ -174,7 +177,7 @@ fn a_type_that_is_a_date_does_not_hide_the_master() {
     let params = vec!["/p".into(), "/t".into(), star, api.into()];
     master.client().ok("registerPublisher", params);
     let rescue = Setup::proxy(&scratch, master.port).start();
-    // The node is dead and soon gone, its type stays.
+    // The node is dead and soon unregistered, but its type stays.
     let types = rescue.client().ok("getTopicTypes", params!["/n"]);
     assert_eq!(types.as_array().unwrap().len(), 1);
 }

@@ -1,5 +1,5 @@
-//! The example robot (`examples/robot`): ten deaths of its master and three of rosrescue's worker, and no node of
-//! it notices.
+//! The example robot (`examples/robot`) lives through ten deaths of its master and three of rosrescue's
+//! worker, and none of its nodes notices.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,7 +16,8 @@ use crate::support::{
 };
 
 const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/robot");
-/// Deaths of the master between two of the worker: a sixth within a minute would be a crash loop.
+/// Number of deaths of the master between two deaths of the worker. A sixth death within a minute would be a
+/// crash loop.
 const DEATHS: [usize; 4] = [3, 3, 2, 2];
 /// Sets a parameter as rqt_reconfigure does.
 const RECONFIGURE: &str = "
@@ -43,7 +44,10 @@ impl Example {
             .arg(folder.join("robot_example_cpp"))
             .status()
             .unwrap();
-        assert!(built.success(), "`tests/run.sh` installs what is missing");
+        assert!(
+            built.success(),
+            "cannot build the robot: `tests/run.sh` installs what it needs"
+        );
         let master_port = free_port();
         let rosmaster = Path::new(NODES).join("waiting_rosmaster.py");
         let rescue = Setup::core(&scratch, master_port)
@@ -62,7 +66,7 @@ impl Example {
             master_port,
             _launch: launch,
         };
-        eventually("the robot has driven", || {
+        eventually("the robot has finished a drive", || {
             example.param("/mission/arrived").is_some()
         });
         example.at_work();
@@ -91,14 +95,14 @@ impl Example {
 
     fn revive_master(&self, dead: u32) {
         fs::remove_file(self.scratch.path("away")).unwrap();
-        eventually("there is another master", || {
+        eventually("another master is there", || {
             self.master().master_pid().is_some_and(|pid| pid != dead) && self.is_open()
         });
     }
 
     fn kill_worker(&self) {
         let worker = |dead| {
-            eventually_some("there is a worker", || {
+            eventually_some("another worker is there", || {
                 let mut pids = self.scratch.survivors().into_iter().map(|(pid, _)| pid);
                 pids.find(|&pid| {
                     let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
@@ -113,7 +117,7 @@ impl Example {
         eventually("calls pass again", || self.is_open());
     }
 
-    /// Waits until messages come on every topic that is watched, and transforms and diagnostics are fresh.
+    /// Waits until messages arrive on every watched topic, and transforms and diagnostics are fresh.
     #[track_caller]
     fn at_work(&self) {
         let heard = || -> BTreeMap<String, u64> {
@@ -122,25 +126,25 @@ impl Example {
                 .map_or_else(BTreeMap::new, |said| serde_json::from_str(said).unwrap())
         };
         let (before, diagnosed) = (heard(), self.witness.said("diagnostics").len());
-        eventually("messages come on every topic", || {
+        eventually("messages arrive on every topic", || {
             let now = heard();
             now.len() == 8
                 && now
                     .iter()
                     .all(|(topic, count)| count > before.get(topic).unwrap_or(&0))
         });
-        eventually("the whole tree of transforms is there and fresh", || {
+        eventually("the tree of transforms is complete and fresh", || {
             let age = self.witness.said("transforms").pop();
             age.is_some_and(|age| age.parse::<f64>().unwrap() < 3.0)
         });
-        eventually("everything is diagnosed", || {
+        eventually("every part of the robot has diagnostics", || {
             let said = self.witness.said("diagnostics").split_off(diagnosed);
             said.last()
                 .is_some_and(|said| said == "/Base /Cameras /Computer /Power")
         });
     }
 
-    /// Who is registered, and the parameters without what the mission counts.
+    /// The registered nodes and the parameters, without the parameters that the mission keeps changing.
     fn state(&self) -> State {
         let mut state = State::read(&self.master());
         if let Value::Struct(params) = &mut state.params
@@ -151,7 +155,7 @@ impl Example {
         state
     }
 
-    /// The process behind each name.
+    /// The process id of each node, by name.
     fn processes(&self) -> BTreeMap<String, u32> {
         let nodes = self.state().nodes.into_iter().map(|(name, api)| {
             let port = api.trim_end_matches('/').rsplit(':').next().unwrap();
@@ -187,18 +191,18 @@ fn wall() -> f64 {
 }
 
 #[test]
-fn a_realistic_robot_notices_nothing() {
+fn the_nodes_of_a_realistic_robot_do_not_notice_deaths_of_master_and_worker() {
     let robot = Example::start();
     let (mut before, processes) = (robot.state(), robot.processes());
     assert!(processes.len() >= 28, "{processes:?}");
-    // A link that is made while the robot starts may be made twice, by two notifications in a row.
+    // While the robot starts, a link may be made twice because of two notifications in a row.
     let at_the_start = robot.witness.said("gap");
     let (first_death, start) = (wall(), Instant::now());
     for (round, deaths) in DEATHS.into_iter().enumerate() {
         for death in 0..deaths {
             if death == 0 {
                 // A goal that is under way when the master dies.
-                eventually("it drives", || {
+                eventually("the robot drives", || {
                     robot
                         .drives()
                         .last()
@@ -219,7 +223,7 @@ fn a_realistic_robot_notices_nothing() {
     }
     println!("the deaths took {:?}", start.elapsed());
     let drives = robot.drives().len();
-    eventually("it has arrived again", || {
+    eventually("the robot has finished another drive", || {
         robot
             .drives()
             .iter()
@@ -233,7 +237,7 @@ fn a_realistic_robot_notices_nothing() {
     assert_eq!(robot.witness.said("gap"), at_the_start);
     let lost = |drive: &String| !drive.starts_with("driving to ") && !drive.starts_with("at ");
     assert!(!robot.drives().iter().any(lost), "{:?}", robot.drives());
-    // What was set during outages is kept, and nothing else has changed.
+    // Parameters that were set during outages are kept, and nothing else has changed.
     for (node, key, value) in [
         ("camera/rear/driver", "brightness", Value::Int(200)),
         ("camera/front/preview", "update_rate", Value::Double(3.0)),
@@ -256,7 +260,7 @@ fn a_realistic_robot_notices_nothing() {
     let bag = robot.scratch.path("robot.bag");
     eventually("the bag is closed", || bag.exists());
     let mut read = Library::Rospy.command(&robot.scratch, robot.rescue.port(), "witness");
-    let mut read = Process::start("the bag's reader", read.arg("bag").arg(&bag));
+    let mut read = Process::start("the reader of the bag", read.arg("bag").arg(&bag));
     assert!(read.wait_output().success(), "{}", read.log());
     let said = read.stdout();
     assert!(!said.iter().any(|line| line.starts_with("gap")), "{said:?}");

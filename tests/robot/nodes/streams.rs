@@ -1,20 +1,21 @@
-//! Live streams of rospy and roscpp, several publishers on a topic at 200 Hz, while the master is killed again and
-//! again, and rosrescue too: no message is lost and no connection is made anew. Service clients that look the
-//! service up for every call see no failure while masters die, and cached parameters follow.
+//! Live streams between rospy and roscpp nodes, with several publishers on a topic at 200 Hz, while the
+//! master is killed again and again, and rosrescue too. No message is lost and no connection is replaced.
+//! Service clients that look the service up for every call see no failure while masters die, and cached
+//! parameters stay up to date.
 //!
-//! `ROSRESCUE_KILLS` says how often the master dies in each test (20 if it is not set).
+//! `ROSRESCUE_KILLS` sets how often the master dies in each test (20 by default).
 
 use crate::support::{LIBRARIES, Library, Mode, Node, Robot, State, Streams, alive, eventually};
 use rosrescue::xmlrpc::Value;
 
-/// Deaths of the master for each of rosrescue.
+/// Number of deaths of the master for each death of rosrescue.
 const KILLS_EACH: usize = 5;
-/// Pace of every talker.
+/// Rate of every talker, in Hz.
 const HZ: &str = "200";
-/// Every fiftieth message is said, and every gap.
+/// Listeners print every fiftieth message, and every gap.
 const EVERY: &str = "50";
 
-/// Waits until rosrescue has examined a master since it had examined `recoveries`, and calls pass.
+/// Waits until rosrescue has examined more than `recoveries` masters and calls pass.
 fn await_open(robot: &Robot, recoveries: u64) {
     eventually("the gate is open again", || {
         robot.status().is_some_and(|status| {
@@ -23,7 +24,7 @@ fn await_open(robot: &Robot, recoveries: u64) {
     });
 }
 
-/// Kills the master and waits until its successor holds the whole state.
+/// Kills the master and waits until its successor has the whole state.
 fn kill_master(robot: &mut Robot, before: &State, when: &str) {
     let recoveries = robot.status().unwrap()["recoveries"].as_u64().unwrap();
     robot.kill_master();
@@ -32,7 +33,7 @@ fn kill_master(robot: &mut Robot, before: &State, when: &str) {
     before.assert_same(&registrations(robot), when);
 }
 
-/// The state without its parameters, which the tests change.
+/// The state without parameters, because the tests change them.
 fn registrations(robot: &Robot) -> State {
     let mut state = robot.state();
     state.params = Value::Array(Vec::new());
@@ -40,12 +41,12 @@ fn registrations(robot: &Robot) -> State {
     state
 }
 
-/// Sets a parameter and waits until the nodes that keep it in their caches have heard of it.
+/// Sets a parameter and waits until the nodes that cache it know the new value.
 fn set_speed(robot: &Robot, users: &[Node], speed: usize) {
     let speed = i32::try_from(speed).unwrap();
     robot.client().set_param("/speed", speed);
     for user in users {
-        eventually("the cache follows", || {
+        eventually("the cached parameter has the new value", || {
             user.said("value").last() == Some(&speed.to_string())
         });
     }
@@ -58,7 +59,7 @@ fn failures(clients: &[Node]) -> Vec<String> {
         .collect()
 }
 
-/// Waits until each client has got a few more answers.
+/// Waits until each client has received some more answers.
 fn answered(clients: &[Node]) {
     for client in clients {
         let before = client.said("reply").len();
@@ -66,14 +67,14 @@ fn answered(clients: &[Node]) {
     }
 }
 
-/// Deaths of the master, a multiple of [`KILLS_EACH`].
+/// Number of deaths of the master, a multiple of [`KILLS_EACH`].
 fn kills() -> usize {
     let kills = std::env::var("ROSRESCUE_KILLS");
     kills.map_or(20, |text| text.parse().unwrap())
 }
 
 #[test]
-fn nothing_is_lost_when_the_master_of_others_is_killed_again_and_again() {
+fn no_message_is_lost_when_a_master_behind_proxy_is_killed_again_and_again() {
     let kills = kills();
     let mut robot = Robot::start(Mode::Proxy);
     robot.client().set_param("/speed", 0);
@@ -121,8 +122,9 @@ fn nothing_is_lost_when_the_master_of_others_is_killed_again_and_again() {
     }
     streams.assert_whole(&robot);
 
-    // Who looks for a service, or reads, while rosrescue is not there finds nobody: that is no part of this.
-    // By SIGKILL: a rospy node that is told to end while it is in a call waits for its own lock for ever.
+    // While rosrescue itself is away, service lookups and reads fail, which is not what this test is about.
+    // The clients are killed, because a rospy node that is told to end during a call waits forever for its
+    // own lock.
     for client in clients.iter_mut().chain(&mut readers) {
         client.kill();
     }
@@ -136,9 +138,9 @@ fn nothing_is_lost_when_the_master_of_others_is_killed_again_and_again() {
     streams.assert_whole(&robot);
 }
 
-/// A sixth death within a minute is answered with a pause: each rosrescue lives through five.
+/// rosrescue pauses after the sixth death within a minute, so each rosrescue lives through only five.
 #[test]
-fn nothing_is_lost_when_the_own_master_and_rosrescue_are_killed_again_and_again() {
+fn no_message_is_lost_when_core_and_its_master_are_killed_again_and_again() {
     let restarts = kills() / KILLS_EACH;
     let mut robot = Robot::start(Mode::Core);
     robot.client().set_param("/speed", 0);
@@ -150,7 +152,7 @@ fn nothing_is_lost_when_the_own_master_and_rosrescue_are_killed_again_and_again(
     robot.settled_state();
     let before = registrations(&robot);
     for round in 1..=restarts {
-        // What it asked when rosrescue was away does not count.
+        // Failures while rosrescue was away do not count.
         answered(&clients);
         let failed = failures(&clients).len();
         for kill in 1..=KILLS_EACH {
@@ -172,7 +174,7 @@ fn nothing_is_lost_when_the_own_master_and_rosrescue_are_killed_again_and_again(
         robot.rescue.start_again();
         robot.rescue.wait_serving();
         robot.await_gate();
-        assert!(alive(master), "the living master is adopted");
+        assert!(alive(master), "the living master was not adopted");
     }
     assert_eq!(users[0].said("failed"), Vec::<String>::new());
     streams.assert_whole(&robot);

@@ -1,5 +1,5 @@
-//! The tools of ROS through rosrescue: after a crash of the master they print what they print at a bare one, and
-//! roslaunch brings a whole robot up.
+//! The tools of ROS used through rosrescue: after a crash of the master they print the same as with a bare
+//! master, and roslaunch can bring up a whole robot.
 
 use std::fs;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// A small robot: what the tools look at.
+/// A small robot for the tools to look at.
 struct Cast {
     _talker: Node,
     _listener: Node,
@@ -24,7 +24,7 @@ impl Cast {
     fn start(scratch: &Scratch, port: u16) -> Self {
         let node = |library, name, arguments: &[&str]| {
             let node = Node::start(scratch, library, port, name, arguments);
-            // One after the other: the order of the lists is the order of the registrations.
+            // One after another, because the order of lists is the order of registrations.
             node
         };
         let cast = Self {
@@ -42,7 +42,7 @@ impl Cast {
     }
 }
 
-/// Every tool once, in order, with its status and what it printed.
+/// Runs every tool once, in order. Returns its status and output.
 fn session(scratch: &Scratch, port: u16) -> Vec<String> {
     let yaml = scratch.path("load.yaml");
     fs::write(
@@ -87,7 +87,7 @@ fn session(scratch: &Scratch, port: u16) -> Vec<String> {
     said
 }
 
-/// Without what differs from run to run: ports, process ids, times, the number of a message.
+/// The text without everything that differs from run to run: ports, process ids, times, message numbers.
 fn normalised(text: &str, scratch: &Scratch) -> String {
     let text = text.replace(scratch.path("").to_str().unwrap(), "SCRATCH/");
     let mut out = String::new();
@@ -120,7 +120,7 @@ fn without_ports(line: &str) -> String {
 }
 
 #[test]
-fn tools_print_the_same_as_at_a_bare_master() {
+fn tools_print_the_same_as_with_a_bare_master() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let _bare_cast = Cast::start(&scratch, master.port);
@@ -144,25 +144,25 @@ fn tools_print_the_same_as_at_a_bare_master() {
     }
 }
 
-/// `rosnode cleanup` asks at the terminal, so it is answered there.
+/// `rosnode cleanup` asks a question, so it runs with an answer on its input.
 #[test]
-fn rosnode_cleanup_removes_the_dead_node_for_good() {
+fn rosnode_cleanup_removes_a_dead_node_permanently() {
     let mut robot = Robot::start(Mode::Proxy);
     let mut cast = Cast::start(&robot.scratch, robot.port());
     let before = robot.settled_state();
     let after = before.without_node("/dead");
     cast.dead.kill();
-    before.assert_same(&robot.state(), "as long as nobody cleans up");
+    before.assert_same(&robot.state(), "before the cleanup");
     let mut command = ros_command(&robot.scratch, "sh", robot.port());
     command.args(["-c", "echo y | rosnode cleanup"]);
     let mut cleanup = Process::start("rosnode cleanup", &mut command);
     assert_eq!(cleanup.wait().code(), Some(0));
-    robot.await_state(&after, "when the dead node was cleaned up");
+    robot.await_state(&after, "after the cleanup");
     robot.crash_master();
     after.assert_same(&robot.state(), "after the crash");
 }
 
-/// A launch file with a dozen parameters of all kinds and nodes of both libraries.
+/// A launch file with a dozen parameters of all kinds, and nodes of both client libraries.
 const LAUNCH: &str = r#"
 <launch>
   <arg name="ns" default="first"/>
@@ -218,10 +218,10 @@ fn launch(robot: &Robot, file: &str, namespace: &str) -> Process {
     Process::start(format!("roslaunch {namespace}"), &mut command)
 }
 
-/// Waits until what `launch` brings up is up, as `master` says.
+/// Waits until `master` shows that everything which `launch` brings up is running.
 fn await_launched(master: &Client, launch: &mut Process, namespace: &str) {
     let nodes = ["talker", "cpp_listener", "py_listener", "server", "client"];
-    eventually(&format!("the nodes of {namespace} are up"), || {
+    eventually(&format!("the nodes of {namespace} are running"), || {
         assert!(launch.exited().is_none(), "roslaunch ended");
         State::try_read(master).is_ok_and(|state| {
             let mut nodes = nodes.iter();
@@ -249,9 +249,9 @@ fn await_launched(master: &Client, launch: &mut Process, namespace: &str) {
     assert_eq!(master.param("/use_sim_time"), Some(Value::Bool(false)));
 }
 
-in_both_modes!(roslaunch_before_and_after_a_crash);
+in_both_modes!(roslaunch_works_before_and_after_a_crash_of_the_master);
 
-fn roslaunch_before_and_after_a_crash(mode: Mode) {
+fn roslaunch_works_before_and_after_a_crash_of_the_master(mode: Mode) {
     let mut robot = Robot::start(mode);
     let file = robot.scratch.path("robot.launch");
     fs::write(&file, LAUNCH).unwrap();
@@ -271,7 +271,7 @@ fn roslaunch_before_and_after_a_crash(mode: Mode) {
         "the first launch ended"
     );
 
-    // roslaunch takes its nodes down in good order: through rosrescue, to the new master.
+    // roslaunch ends its nodes cleanly: through rosrescue, at the new master.
     for launch in [&mut first, &mut second] {
         launch.signal(Signal::INT);
         assert_eq!(launch.wait().code(), Some(0));
@@ -282,7 +282,7 @@ fn roslaunch_before_and_after_a_crash(mode: Mode) {
     assert_no_complaint(&second);
 }
 
-/// Panics if roslaunch or a node of it complains.
+/// Panics if roslaunch or one of its nodes prints an error.
 #[track_caller]
 fn assert_no_complaint(launched: &Process) {
     for line in launched.output() {
@@ -295,7 +295,7 @@ fn assert_no_complaint(launched: &Process) {
     }
 }
 
-/// The nodes that are registered beside those of `empty`, once that does not change any more.
+/// The nodes that are registered in addition to those of `empty`, once their number no longer changes.
 fn eventually_only(robot: &Robot, empty: &State) -> Vec<String> {
     let others = |state: &State| -> Vec<String> {
         let nodes = state.nodes.iter().map(|(name, _)| name.clone());
@@ -304,9 +304,9 @@ fn eventually_only(robot: &Robot, empty: &State) -> Vec<String> {
     others(&robot.settled_state())
 }
 
-/// It comes up and goes down while there is no master; the next one knows it in between.
+/// The nodes start and end while there is no master; in between the next master knows them.
 #[test]
-fn roslaunch_brings_nodes_up_and_down_without_a_master() {
+fn roslaunch_starts_and_stops_nodes_without_a_master() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);
     let file = robot.scratch.path("robot.launch");
     fs::write(&file, LAUNCH).unwrap();
@@ -331,14 +331,14 @@ fn roslaunch_brings_nodes_up_and_down_without_a_master() {
     assert_no_complaint(&launched);
 }
 
-/// By then a tool that was interrupted has ended: it does not wait for a master.
+/// Maximum time for an interrupted tool to end. It must not wait for a master.
 const ENDED: Duration = Duration::from_secs(10);
 
-in_both_modes!(tools_that_are_started_without_a_master_end_at_ctrl_c);
+in_both_modes!(tools_started_without_a_master_end_at_ctrl_c);
 
-fn tools_that_are_started_without_a_master_end_at_ctrl_c(mode: Mode) {
+fn tools_started_without_a_master_end_at_ctrl_c(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
-    let nobody = robot.settled_state().nodes;
+    let without_tools = robot.settled_state().nodes;
     robot.take_master_away();
     let client = robot.client();
     let runs: [(&[&str], &str); 5] = [
@@ -346,14 +346,14 @@ fn tools_that_are_started_without_a_master_end_at_ctrl_c(mode: Mode) {
         (&["hz", "/chatter"], "average rate"),
         (&["pub", "-r", "20", "/chatter", "std_msgs/String", "x"], ""),
         (&["pub", "/latched", "std_msgs/String", "x"], "latching"),
-        // Of a type that nobody publishes: it waits.
+        // Nothing publishes a topic of this type, so the tool waits.
         (&["echo", "/nobody"], ""),
     ];
     let mut tools = runs.map(|(arguments, _)| {
         let mut command = ros_command(&robot.scratch, "rostopic", robot.port());
         Process::start(format!("rostopic {arguments:?}"), command.args(arguments))
     });
-    eventually("the two that publish are known", || {
+    eventually("the two publishing tools are registered", || {
         let state = State::read(&client);
         state.publishers_of("/chatter").len() == 1 && state.publishers_of("/latched").len() == 1
     });
@@ -372,5 +372,7 @@ fn tools_that_are_started_without_a_master_end_at_ctrl_c(mode: Mode) {
         let log = tool.output().join("\n");
         assert!(!log.contains("Unable to communicate"), "{log}");
     }
-    eventually("nobody is left", || State::read(&client).nodes == nobody);
+    eventually("no tool is registered any more", || {
+        State::read(&client).nodes == without_tools
+    });
 }

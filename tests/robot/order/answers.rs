@@ -1,5 +1,5 @@
-//! The answer to a node's own call is at the node before it is notified of something later. Raw requests: what
-//! one call changes and another call asks for are sent within 2 ms.
+//! A node has the answer to its own call before it is notified of anything later. These tests send raw
+//! requests: a call that changes something and a call that asks for it, within 2 ms of each other.
 
 use std::collections::BTreeMap;
 use std::io::{self, BufReader, Write};
@@ -18,26 +18,26 @@ use crate::support::{
     read_request,
 };
 
-/// How far apart the two calls are at most, in microseconds: one of these.
+/// Maximum time between the two calls, in microseconds. One of these is chosen.
 const APART: [u64; 4] = [50, 200, 500, 2_000];
-/// How long each kind of pairs is tried; each takes some 5 to 20 ms.
+/// How long each kind of pair is tried. Each pair takes some 5 to 20 ms.
 const TIME: Duration = Duration::from_millis(1_200);
-/// At the same time, after each kind alone.
+/// Number of pairs at the same time, after each kind was tried alone.
 const PAIRS: usize = 6;
 const TYPE: &str = "std_msgs/String";
-/// `MSG_PEEK | MSG_DONTWAIT` of Linux: look at what has arrived, and do not wait for it.
+/// `MSG_PEEK | MSG_DONTWAIT` of Linux: looks at what has arrived without waiting.
 const LOOK: i32 = 0x02 | 0x40;
 
-/// What one node asks and another one changes.
+/// The subject about which one node asks and which another node changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Subject {
-    /// `registerSubscriber`, and a publisher that comes.
+    /// `registerSubscriber`, while a publisher registers.
     Comes,
-    /// `registerSubscriber`, and a publisher that goes.
+    /// `registerSubscriber`, while a publisher unregisters.
     Goes,
-    /// `subscribeParam` and `setParam`.
+    /// `subscribeParam`, while the parameter is set.
     Param,
-    /// `registerSubscriber`, and a namesake of the subscriber.
+    /// `registerSubscriber`, while another node of the same name registers.
     Namesake,
 }
 
@@ -120,19 +120,20 @@ fn no_notification_overtakes_an_answer(master: &Client) {
     );
 }
 
-/// What has come to the node that asks.
+/// Everything that has arrived at the node that asks.
 #[derive(Debug, Default)]
 struct Inbox {
-    /// What it is about to be told, and the connection of its answer, while that has not come.
+    /// The subject about which an answer is expected, and the connection of that answer. `None` after it has
+    /// arrived.
     waits: Option<(String, TcpStream)>,
-    /// When it was first notified of a subject, and whether that was before its answer.
+    /// For each subject, the time of the first notification, and whether that came before the answer.
     heard: BTreeMap<String, (Instant, bool)>,
-    /// The topics that its nodes have subscribed to.
+    /// The topics to which its nodes have subscribed.
     topics: Vec<String>,
 }
 
 impl Inbox {
-    /// Whether the answer that is waited for has not arrived at the socket yet.
+    /// Whether the expected answer has not arrived at the socket yet.
     fn is_early(&self) -> bool {
         let Some((_, stream)) = &self.waits else {
             return false;
@@ -143,7 +144,7 @@ impl Inbox {
     }
 }
 
-/// What a notification is about: a topic, a parameter, or the name of a node.
+/// The subject of a notification: a topic, a parameter, or the name of a node.
 fn subject_of(call: &Call) -> Option<String> {
     let text = call.params.get(1)?.as_str()?;
     let text = match call.method.as_str() {
@@ -157,10 +158,10 @@ fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
     inbox.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Threads that wait for a connection to the asking node: none is made when one comes.
+/// Number of threads that wait for connections to the asking node, so that none has to be started first.
 const THREADS: usize = 3;
 
-/// A thread that takes one connection.
+/// Runs a thread that accepts one connection.
 fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
     let (listener, inbox) = (Arc::clone(listener), Arc::clone(inbox));
     thread::spawn(move || {
@@ -171,10 +172,10 @@ fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
         let mut first = true;
         while let Some((_, body)) = read_request(&mut stream) {
             let mut held = lock(&inbox);
-            // Before anything else: the answer may come at any moment.
+            // This must be read first, because the answer may arrive at any moment.
             let (early, at) = (held.is_early(), Instant::now());
             let call = xmlrpc::decode_call(&body).unwrap();
-            // A displaced node is asked who it is while there is no master.
+            // While there is no master, a displaced node is asked which node it is.
             let answer = match call.method.as_str() {
                 "getPublications" => Value::Array(Vec::new()),
                 "getSubscriptions" => {
@@ -208,7 +209,7 @@ fn take_one(listener: &Arc<TcpListener>, inbox: &Arc<Mutex<Inbox>>) {
     });
 }
 
-/// A node asked, was answered, and the answer does not say what another node changed at about the same time.
+/// A node has asked and was answered, and the answer does not yet show the other node's change.
 struct Asked {
     subject: String,
     /// When the answer arrived.
@@ -216,7 +217,7 @@ struct Asked {
     text: String,
 }
 
-/// Two nodes: one that asks, and one that changes.
+/// Two nodes, one that asks and one that changes.
 struct Pair {
     master: Client,
     name: String,
@@ -243,7 +244,7 @@ impl Pair {
         }
     }
 
-    /// One subject, asked for and changed at about the same time.
+    /// Asks for one subject and changes it at about the same time.
     fn round(&mut self, subject: Subject, nth: usize, dice: &mut Dice) -> Option<Asked> {
         let topic = format!("/order/{}/{nth}", self.name);
         let names = ["asks", "changes"].map(|name| match subject {
@@ -269,7 +270,7 @@ impl Pair {
                 request("setParam", params![changer, topic, 7]),
                 Value::Int(7),
             ),
-            // It publishes something else.
+            // The other node of the same name publishes another topic.
             Subject::Namesake => {
                 let params = params![changer, format!("{topic}/else"), kind, other];
                 (
@@ -300,7 +301,7 @@ impl Pair {
             }
             wire.send(request).unwrap();
         }
-        // It has arrived, and is taken only when the inbox knows that.
+        // The answer has arrived. It is read only after the inbox knows that.
         self.asks.stream().peek(&mut [0]).unwrap();
         let arrived = Instant::now();
         lock(&self.inbox).waits = None;
@@ -308,12 +309,12 @@ impl Pair {
         value(&self.changes.response().unwrap().reply());
         let first = if asks_first { "asked" } else { "changed" };
         let is_news = match subject {
-            // If the one that asked came second, it has displaced the other one.
+            // If the node that asked came second, it has displaced the other one.
             Subject::Namesake => {
                 let node = params!["/test", asker];
                 self.master.ask("lookupNode", node) == Some(other.into())
             }
-            // That the answer says so, too, is no news.
+            // If the answer already shows the change, there is nothing new to hear.
             _ => answer != last,
         };
         let asked = is_news.then(|| Asked {
@@ -324,7 +325,7 @@ impl Pair {
                 arrived - begin
             ),
         });
-        // While there is no master, a displaced node is not told if another one is at its address by then.
+        // While there is no master, a displaced node is not told if by then another node is at its address.
         match (subject, &asked) {
             (Subject::Namesake, Some(asked)) => self.await_heard(asked),
             (Subject::Namesake, None) => {
@@ -342,7 +343,7 @@ impl Pair {
         });
     }
 
-    /// How long after each answer its node was notified of what it did not say; `Err` if that was before.
+    /// How long after each answer its node was notified of the change. `Err` if the notification came first.
     fn judge(&self, asked: Vec<Asked>) -> Vec<Result<Duration, String>> {
         let judge = |asked: Asked| {
             self.await_heard(&asked);
@@ -364,7 +365,7 @@ fn exchange(wire: &mut Wire, request: &[u8]) {
     value(&wire.response().unwrap().reply());
 }
 
-/// The value of an answer that is a success, or says that there was nothing to do.
+/// The value of an answer that reports success, or that there was nothing to do.
 #[track_caller]
 fn value(reply: &Reply) -> Value {
     match reply {

@@ -1,10 +1,10 @@
-//! Every start makes every link: real nodes that start at the same moment. `cargo bench --bench links` has the long
-//! run, and says what happens here.
+//! Real nodes that start at the same moment make every link between them. `cargo bench --bench links` runs
+//! this for longer and describes what happens.
 
 use crate::support::Library;
 use crate::support::links::{self, Place, Plan};
 
-/// One start.
+/// Runs one start.
 #[track_caller]
 fn every_link_is_made(place: Place, library: Library) {
     let seed = u64::from(std::process::id());

@@ -1,5 +1,5 @@
-//! No value goes back: a node that is notified of one parameter again and again never hears an older value after a
-//! newer one, and hears the last one.
+//! No value goes back: a node that is notified of a parameter again and again never hears an older value
+//! after a newer one, and finally hears the last one.
 
 use std::thread;
 use std::time::Duration;
@@ -11,12 +11,12 @@ use crate::support::{
     writers::{Subscriber, WRITERS, key, topic, write},
 };
 
-/// Between two calls of a writer at most: some 600 calls a second of all.
+/// Maximum pause between two calls of a writer. All writers together make some 600 calls per second.
 const PAUSE: Duration = Duration::from_millis(18);
 const TIME: Duration = Duration::from_secs(6);
 
 #[test]
-fn no_value_goes_back_with_a_living_master() {
+fn no_value_goes_back_while_the_master_lives() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     no_value_goes_back(&robot.client(), || {});
 }
@@ -68,8 +68,8 @@ fn no_value_goes_back(master: &Client, meanwhile: impl FnOnce()) {
             eventually(
                 &format!("subscriber {number} hears the last publishers of {topic}"),
                 || {
-                    // Nobody listens where the writers say they are: a rescue's health check unregisters them, also
-                    // while the state is read.
+                    // No process listens at the addresses of the writers, so a rescue's health check
+                    // unregisters them, possibly while the state is read.
                     let Ok(state) = State::try_read(master) else {
                         return false;
                     };

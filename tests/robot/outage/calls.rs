@@ -1,5 +1,5 @@
-//! What happens around an outage beside the paper's cases: calls in the gap, parameter subscriptions
-//! and services of real nodes, and restarts that nobody saw.
+//! Calls during an outage beyond the cases of the paper: calls while there is no master, parameter
+//! subscriptions and services of real nodes, and restarts that rosrescue did not see.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use crate::support::{
 use rosrescue::xmlrpc::{Call, Value};
 
 #[test]
-fn calls_in_the_gap_get_what_their_senders_need() {
+fn calls_during_an_outage_are_answered_so_that_nodes_work_on() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     client.set_param("/gain", 7);
@@ -20,18 +20,18 @@ fn calls_in_the_gap_get_what_their_senders_need() {
     let dead = robot.master_pid();
     robot.kill_master();
 
-    // roslaunch waits five seconds for getPid, then it starts a master of its own on this port.
+    // roslaunch waits five seconds for getPid, and then starts a master of its own on this port.
     let start = Instant::now();
     assert_eq!(client.master_pid(), Some(dead));
     assert_eq!(
         client.ok("getUri", params!["/test"]),
         Value::from(client.uri())
     );
-    // A roscpp node whose getParam fails goes on with its default.
+    // A roscpp node whose getParam fails continues with its default value.
     assert_eq!(client.param("/gain"), Some(Value::Int(7)));
     let state = State::read(&client);
     assert_eq!(state.publishers_of("/topic"), ["/fake"]);
-    // rospy says these only once.
+    // rospy makes these calls only once.
     node.unpublish(&client, "/topic");
     assert!(!State::read(&client).knows("/fake"));
     assert!(
@@ -40,7 +40,7 @@ fn calls_in_the_gap_get_what_their_senders_need() {
         start.elapsed()
     );
 
-    // Nor does anybody wait who changes something.
+    // Calls that change something do not wait either.
     let watcher = FakeNode::start("/watcher");
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     watcher.watch_param(&client, "/last");
@@ -62,7 +62,7 @@ fn calls_in_the_gap_get_what_their_senders_need() {
     eventually("the subscriber is told of the publisher", || {
         watcher.updates("/topic") == [[coming.api.as_str()]]
     });
-    assert!(!robot.is_open(), "there was a master");
+    assert!(!robot.is_open(), "a master was there during the outage");
     let before = State::read(&client);
 
     robot.revive_master();
@@ -76,25 +76,25 @@ fn calls_in_the_gap_get_what_their_senders_need() {
     before.assert_same(&state, "in the next master");
 }
 
-/// The values that a node was told of a parameter, as they came.
+/// The values of a parameter that a node was told, in order.
 fn told(node: &FakeNode, key: &str) -> Vec<i32> {
     let updates = node.heard("paramUpdate").into_iter();
     let of_key = updates.filter(|update| update[1].as_str() == Some(&format!("{key}/")));
     of_key.map(|update| update[2].as_int().unwrap()).collect()
 }
 
-/// A request in UTF-16: only a master knows what it would answer.
+/// A request in UTF-16, for which only a master knows the answer.
 #[test]
-fn a_call_that_cannot_be_decoded_is_not_held_for_ever_and_never_answered_falsely() {
+fn an_undecodable_call_is_held_for_a_limited_time_and_never_answered_wrongly() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1.5"]);
     robot.kill_master();
     let start = Instant::now();
     let error = robot
         .client()
         .exchange(&unreadable("/late", 1))
-        .expect_err("no answer is right here");
+        .expect_err("the call must not be answered");
     let waited = start.elapsed();
-    // Closed without a byte: that is what nodes take for a lost connection and try again.
+    // The connection is closed without a byte. Nodes treat that as a lost connection and try again.
     assert!(error.to_string().contains("closed after []"), "{error}");
     assert!(
         waited >= Duration::from_millis(1400),
@@ -108,7 +108,7 @@ fn a_call_that_cannot_be_decoded_is_not_held_for_ever_and_never_answered_falsely
 }
 
 #[test]
-fn a_call_that_cannot_be_decoded_waits_for_the_next_master_and_gets_its_answer() {
+fn an_undecodable_call_waits_for_the_next_master_and_gets_its_answer() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "60"]);
     let client = robot.client();
     robot.kill_master();
@@ -125,10 +125,10 @@ fn a_call_that_cannot_be_decoded_waits_for_the_next_master_and_gets_its_answer()
     assert_eq!(answer, of_a_master);
 }
 
-/// Calls that no ROS node sends: tools, scanners, other libraries of XML-RPC. Each is answered at once, with the bytes
-/// of a rosmaster that nobody killed.
+/// Calls that no ROS node sends, but tools, scanners and other XML-RPC libraries do. Each is answered at
+/// once, with the bytes of a rosmaster that was never killed.
 #[test]
-fn foreign_calls_in_the_gap_get_the_bytes_of_a_rosmaster() {
+fn unusual_calls_during_an_outage_get_the_bytes_of_a_living_rosmaster() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--hold", "1"]);
     let bare = Rosmaster::start(&robot.scratch);
     robot.take_master_away();
@@ -226,9 +226,9 @@ fn foreign_calls_in_the_gap_get_the_bytes_of_a_rosmaster() {
     assert!(differences.is_empty(), "{}", differences.join("\n\n"));
 }
 
-in_both_modes!(parameters_of_every_kind_come_back);
+in_both_modes!(parameters_of_every_kind_are_restored);
 
-fn parameters_of_every_kind_come_back(mode: Mode) {
+fn parameters_of_every_kind_are_restored(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     client.set_param("/kinds", kinds());

@@ -1,5 +1,5 @@
-//! What an answer promises: that what it tells of was done, once, and is as safe as `--sync` says, also if
-//! rosrescue or the mirror had to find out first what was done.
+//! What an answer promises: the write was done once and is as safe as `--sync` says, even if rosrescue or the
+//! mirror had to find out first what was done.
 
 use std::fs;
 use std::thread::{self, JoinHandle};
@@ -12,14 +12,14 @@ use crate::support::{
 use rosrescue::xmlrpc::{Reply, Value};
 use rustix::process::Signal;
 
-/// Runs `work` while nothing is forced to `disk`, and sees that it ends only after that.
+/// Runs `work` while no sync of `disk` finishes, and checks that it ends only after that.
 #[track_caller]
 fn held_up<T: Send + 'static>(disk: &FailingDisk, work: impl FnOnce() -> T + Send + 'static) -> T {
     disk.begin(Trouble::HangsOnSync);
     let work = thread::spawn(work);
     let waits = holds(Duration::from_millis(700), || !work.is_finished());
     disk.heal();
-    assert!(waits, "it did not wait for the disk");
+    assert!(waits, "the answer did not wait for the disk");
     work.join().unwrap()
 }
 
@@ -30,23 +30,25 @@ fn assert_done(reply: &Reply) {
 }
 
 #[test]
-fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
+fn answers_wait_for_a_checkpoint_that_was_opened_late() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let disk = FailingDisk::new(&scratch);
-    // Where its folder is to be.
+    // A file where the checkpoint's folder is to be.
     let obstacle = scratch.path("obstacle");
     fs::write(&obstacle, "").unwrap();
     let setup =
         Setup::proxy(&scratch, master.port).at_checkpoint(obstacle.join("latest-chkpt.yaml"));
     let mut rescue = disk.under(setup.args(["--sync", "always"])).start();
     let client = rescue.client();
-    rescue.wait_line("that it has no checkpoint", |line| {
+    rescue.wait_line("the log says that there is no checkpoint", |line| {
         line.contains("a crash of rosrescue itself would lose")
     });
     client.set_param("/unprotected", 1);
     fs::remove_file(&obstacle).unwrap();
-    rescue.wait_line("that it has one", |line| line.contains("protected again"));
+    rescue.wait_line("the log says that there is a checkpoint", |line| {
+        line.contains("protected again")
+    });
     for value in 0..2 {
         let client = client.clone();
         held_up(&disk, move || client.set_param("/protected", value));
@@ -54,7 +56,7 @@ fn a_checkpoint_that_is_opened_late_is_waited_for_like_any_other() {
 }
 
 #[test]
-fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
+fn a_write_during_an_outage_is_on_the_disk_before_its_answer() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let disk = FailingDisk::new(&scratch);
@@ -67,7 +69,7 @@ fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
     eventually("the gate is shut", || status(&client)["open"] == false);
     let leaving = client.clone();
     held_up(&disk, move || node.unpublish(&leaving, "/topic"));
-    // What changes nothing is no safer than what made it so.
+    // A write that changes nothing is no safer than the write that made it so.
     held_up(&disk, move || {
         let first = thread::spawn({
             let client = client.clone();
@@ -81,9 +83,9 @@ fn a_write_in_an_outage_is_on_the_disk_before_its_answer() {
     .unwrap();
 }
 
-/// rosrescue and the master are killed when it has been answered.
+/// rosrescue and the master are killed after the call has been answered.
 #[test]
-fn what_a_call_did_that_cannot_be_read_is_in_the_file_before_its_answer() {
+fn the_effect_of_an_undecodable_call_is_on_the_disk_before_its_answer() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let disk = FailingDisk::new(&scratch);
@@ -104,9 +106,9 @@ fn what_a_call_did_that_cannot_be_read_is_in_the_file_before_its_answer() {
     }
 }
 
-/// Without a file to write to nobody waits for it.
+/// Without a checkpoint file, clients do not wait for it.
 #[test]
-fn a_call_that_cannot_be_read_is_answered_without_a_checkpoint() {
+fn an_undecodable_call_is_answered_without_a_checkpoint() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let obstacle = scratch.path("obstacle");
@@ -127,26 +129,30 @@ fn send_unreadable(client: &Client, key: &'static str) -> JoinHandle<Reply> {
     thread::spawn(move || client.exchange(&unreadable(key, 1)).unwrap().reply())
 }
 
-/// Both wait for a look, and the first two looks do not come back.
+/// Both calls wait until the state has been read from the master, and the first two attempts to read it are
+/// lost.
 #[test]
-fn calls_that_cannot_be_read_wait_together_for_a_look_that_shows_what_they_did() {
+fn undecodable_calls_share_the_read_of_the_master_that_shows_their_effect() {
     let scratch = Scratch::new();
     let (master, relay, rescue) = Relay::between(&scratch);
     relay.swallow("getSystemState", 2);
     let first = send_unreadable(&rescue.client(), "/first");
-    eventually("a look is lost", || relay.hunger() == 1);
+    eventually("one attempt to read the state is lost", || {
+        relay.to_swallow() == 1
+    });
     let second = send_unreadable(&rescue.client(), "/second");
     for call in [first, second] {
         assert_done(&call.join().unwrap());
     }
-    assert_eq!(relay.hunger(), 0);
+    assert_eq!(relay.to_swallow(), 0);
     assert_eq!(status(&rescue.client())["state"]["params"], 2);
     assert_eq!(master.client().param("/second"), Some(1.into()));
 }
 
-/// Not even a topic or a parameter is left in it by which it could be told from an empty one.
+/// Nothing is left in the master, not even a topic type or a parameter, that would distinguish it from an
+/// empty one.
 #[test]
-fn what_was_unregistered_in_a_hang_is_told_to_a_master_that_holds_nothing_else() {
+fn an_unregistration_during_a_hang_reaches_a_master_that_holds_nothing_else() {
     let probes = ["--probe-interval", "100", "--probe-timeout", "300"];
     let robot = Robot::start_with(Mode::Proxy, &probes);
     let client = robot.client();
@@ -163,9 +169,9 @@ fn what_was_unregistered_in_a_hang_is_told_to_a_master_that_holds_nothing_else()
     assert_eq!(robot.master_pid(), pid);
 }
 
-/// The master that goes on runs it itself.
+/// The master that continues runs the call itself.
 #[test]
-fn an_unsubscription_under_way_in_a_master_that_hangs_is_done_once_it_goes_on() {
+fn an_unsubscription_under_way_in_a_hung_master_takes_effect_when_it_continues() {
     let probes = ["--probe-interval", "100", "--probe-timeout", "300"];
     let robot = Robot::start_with(Mode::Proxy, &probes);
     let client = robot.client();
@@ -191,10 +197,10 @@ fn an_unsubscription_under_way_in_a_master_that_hangs_is_done_once_it_goes_on() 
     assert!(!log.contains("differs from what was injected"), "{log}");
 }
 
-/// The node is asked what it publishes while it does not, and before anything follows from that it does
-/// again: its registration, in the outage that has begun meanwhile, is the last word.
+/// The node is asked what it publishes while it publishes nothing, and publishes again before that has any
+/// effect. Its registration, during the outage that has begun in the meantime, wins.
 #[test]
-fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
+fn a_new_registration_is_not_removed_because_of_an_older_report_of_the_node() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let node = FakeNode::start("/node");
@@ -204,13 +210,15 @@ fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
     let subscriber = FakeNode::start("/subscriber");
     subscriber.subscribe(&client, "/topic", "std_msgs/String");
     let asked = |method: &str| node.heard(method).len();
-    eventually("it has been asked as a new node", || asked("getPid") == 1);
+    eventually("the node has been asked after it registered", || {
+        asked("getPid") == 1
+    });
     node.claim_publication("/topic", None);
     robot.crash_master();
-    // What it lacks is believed at the second time.
-    eventually("it is asked once", || asked("getSubscriptions") == 1);
+    // A topic that the node does not report is unregistered only after the second report.
+    eventually("the node is asked once", || asked("getSubscriptions") == 1);
     node.hold();
-    eventually("it is asked again", || asked("getPid") == 3);
+    eventually("the node is asked again", || asked("getPid") == 3);
     let dead = robot.master_pid();
     robot.kill_master_at_once(dead);
     eventually("the gate is shut", || !robot.is_open());
@@ -218,13 +226,13 @@ fn what_a_node_registers_anew_is_not_taken_from_it_by_an_older_answer() {
     let params = params!["/node", "/topic", "std_msgs/String", node.api.as_str()];
     client.ok("registerPublisher", params);
     node.release();
-    eventually("it has answered", || {
+    eventually("the node has answered", || {
         asked("getSubscriptions") == 2 && asked("getPublications") == 2
     });
     node.claim_publication("/topic", Some("std_msgs/String"));
     robot.revive_master();
     robot.await_recovery(dead);
-    eventually("the health check is over", || {
+    eventually("the health check has finished", || {
         let report = status(&client)["last_recovery"].clone();
         !report["health_check_ms"].is_null()
     });

@@ -1,4 +1,4 @@
-//! rosrescue answers before its rosmaster is up.
+//! rosrescue answers calls before its rosmaster has started.
 
 use std::fs;
 use std::net::TcpStream;
@@ -9,7 +9,7 @@ use crate::support::{
     free_port, params,
 };
 
-/// A core whose rosmaster waits until the file `away` is gone.
+/// A core whose rosmaster waits until the file `away` is removed.
 fn core(scratch: &Scratch, master_port: u16) -> Setup {
     fs::write(scratch.path("away"), "").unwrap();
     let waiting = Path::new(NODES).join("waiting_rosmaster.py");
@@ -19,7 +19,7 @@ fn core(scratch: &Scratch, master_port: u16) -> Setup {
 }
 
 #[test]
-fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
+fn a_core_answers_at_once_and_gives_its_master_all_writes_later() {
     for _ in 0..3 {
         let scratch = Scratch::new();
         let master_port = free_port();
@@ -45,7 +45,7 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
 
         fs::remove_file(scratch.path("away")).unwrap();
         rescue.wait_serving();
-        let state = eventually_some("rosout is at work", || {
+        let state = eventually_some("rosout is running", || {
             let state = State::try_read(&bare).ok()?;
             (state.subscribers_of("/rosout") == ["/rosout"]).then_some(state)
         });
@@ -55,10 +55,11 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
         assert_eq!(state.publishers_of("/chatter"), ["/early"]);
         assert_eq!(state.subscribers_of("/chatter"), ["/early_too"]);
         assert_eq!(bare.param("/early/gain"), Some(1.5.into()));
-        // The master knows the subscription of the parameter, which nobody can read.
+        // The master also has the parameter subscription, which cannot be read from it.
         client.set_param("/early/gain", 2.5);
         eventually("the parameter's subscriber is told", || {
-            // Twice if another node had not answered yet: rosrescue notifies beside the master then.
+            // Told twice if another node had not answered yet, because rosrescue then notifies beside the
+            // master.
             let heard = publisher.heard("paramUpdate");
             heard.last().is_some_and(|update| update[2] == 2.5.into())
         });
@@ -67,9 +68,9 @@ fn a_core_answers_at_once_and_its_master_gets_all_of_it() {
     }
 }
 
-/// The checkpoint of a session that goes on.
+/// The checkpoint is of a session that continues.
 #[test]
-fn a_core_that_has_a_checkpoint_answers_from_it_before_its_master_is_up() {
+fn a_core_answers_from_its_checkpoint_before_its_master_has_started() {
     let mut robot = Robot::start_for_outages(Mode::Core);
     let node = FakeNode::start("/known");
     node.publish(&robot.client(), "/chatter", "std_msgs/String");
@@ -77,7 +78,7 @@ fn a_core_that_has_a_checkpoint_answers_from_it_before_its_master_is_up() {
     let before = robot.settled_state();
     robot.kill_master();
     robot.rescue.kill();
-    // The master that it had begun to start ends with the test.
+    // The master that is being started ends with the test.
     robot.rescue.start_again();
     let client = robot.client();
     eventually("rosrescue answers", || client.param("/gain").is_some());
@@ -92,7 +93,7 @@ fn a_core_that_has_a_checkpoint_answers_from_it_before_its_master_is_up() {
     assert_eq!(known.nodes, before.nodes);
     assert_eq!(known.publishers, before.publishers);
     robot.revive_master();
-    eventually("the master has it", || {
+    eventually("the master has the state", || {
         State::try_read(&robot.bare()).is_ok_and(|state| {
             state.publishers_of("/chatter") == ["/known"]
                 && state.subscribers_of("/chatter") == ["/late"]

@@ -1,5 +1,5 @@
-//! Nodes that leave while there is no master: one that closes its port before it unregisters, as roslisp does, and
-//! one that dies.
+//! Nodes that end while there is no master: one that closes its port before it unregisters, as roslisp does,
+//! and one that dies.
 
 use std::time::Duration;
 
@@ -9,10 +9,11 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// Between the calls of a node that leaves: longer than it takes until a port that refused is asked again.
+/// Pause between the calls of a node that ends. It is longer than the time until rosrescue asks a refusing
+/// port again.
 const PAUSE: Duration = Duration::from_millis(1500);
 
-/// Unregistrations, one after the other.
+/// The unregistrations of a node, in order.
 type Calls = Vec<(&'static str, Vec<Value>)>;
 
 /// A node that is registered at both masters, and its unregistrations.
@@ -27,7 +28,7 @@ fn registered(masters: [&Client; 2]) -> (FakeNode, Calls) {
     let (name, api, service) = (node.name.as_str(), node.api.as_str(), node.service_api());
     let service = service.as_str();
     let calls = vec![
-        // It is notified of this one itself.
+        // The node is notified of this one itself.
         ("unregisterPublisher", params![name, "/topic", api]),
         ("unregisterService", params![name, "/service_a", service]),
         ("unregisterService", params![name, "/service_b", service]),
@@ -36,13 +37,13 @@ fn registered(masters: [&Client; 2]) -> (FakeNode, Calls) {
     (node, calls)
 }
 
-/// Whether the leaving node is registered.
+/// Whether the ending node is still registered.
 fn knows(master: &Client) -> bool {
     let params = params!["/test", "/leaving"];
     master.ask("lookupNode", params).is_some()
 }
 
-/// Makes `calls` after each other, each of which must be answered as by `bare`.
+/// Makes `calls` in order. Each must be answered as by `bare`.
 #[track_caller]
 fn leave(client: &Client, bare: &Client, calls: Calls, pause: Duration) {
     let count = calls.len();
@@ -67,14 +68,14 @@ fn a_node_that_closes_its_port_before_it_unregisters_is_answered_as_by_rosmaster
     robot.kill_master();
     drop(node);
     leave(&client, &bare.client(), calls, PAUSE);
-    assert!(!robot.is_open(), "there was a master");
+    assert!(!robot.is_open(), "a master was there during the outage");
     let log = robot.rescue.stderr().join("\n");
     assert!(!log.contains("answers again"), "{log}");
 }
 
-/// The health check after the recovery asks it between its calls.
+/// The health check after the recovery asks the node between its calls.
 #[test]
-fn a_node_that_unregisters_after_the_recovery_is_given_the_time() {
+fn a_node_that_unregisters_slowly_after_the_recovery_is_given_time() {
     let mut robot = Robot::start(Mode::Proxy);
     let bare = Rosmaster::start(&robot.scratch);
     let client = robot.client();
@@ -85,7 +86,7 @@ fn a_node_that_unregisters_after_the_recovery_is_given_the_time() {
 }
 
 #[test]
-fn a_node_that_dies_while_there_is_no_master_is_removed_after_the_recovery() {
+fn a_node_that_dies_during_an_outage_is_unregistered_after_the_recovery() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);
     let client = robot.client();
     let (dead, _) = registered([&client, &robot.bare()]);
@@ -94,15 +95,20 @@ fn a_node_that_dies_while_there_is_no_master_is_removed_after_the_recovery() {
     robot.kill_master();
     drop(dead);
     publisher.publish(&client, "/topic", "std_msgs/String");
-    eventually("it is unreachable", || {
+    eventually("the node is unreachable", || {
         names(&status(&client)["unreachable"]) == ["/leaving"]
     });
     let stays = || knows(&client);
-    assert!(holds(Duration::from_secs(4), stays), "it was removed");
+    assert!(
+        holds(Duration::from_secs(4), stays),
+        "the node was unregistered"
+    );
     robot.revive_master();
     robot.await_recovery(before);
-    eventually("it is removed from the master", || !knows(&robot.bare()));
-    eventually("nobody is unreachable any more", || {
+    eventually("the node is unregistered from the master", || {
+        !knows(&robot.bare())
+    });
+    eventually("no node is unreachable any more", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
 }

@@ -1,5 +1,5 @@
-//! The whole life of rospy and roscpp nodes while there is no master, which stays away for
-//! `ROSRESCUE_AWAY_SECONDS` at least.
+//! The whole life of rospy and roscpp nodes while there is no master. It stays away for at least
+//! `ROSRESCUE_AWAY_SECONDS`.
 
 use std::time::{Duration, Instant};
 
@@ -10,11 +10,11 @@ use crate::support::{
     in_both_modes,
 };
 
-/// Every talker's pace.
+/// Rate of every talker, in Hz.
 const HZ: &str = "50";
-/// Every twenty-fifth message is said, and every gap.
+/// Listeners print every twenty-fifth message, and every gap.
 const EVERY: &str = "25";
-/// Values that the cached parameter takes.
+/// Number of values that the cached parameter takes.
 const VALUES: i32 = 5;
 
 fn assert_no_failure(nodes: &[Node]) {
@@ -23,12 +23,12 @@ fn assert_no_failure(nodes: &[Node]) {
     }
 }
 
-in_both_modes!(nodes_live_without_a_master);
+in_both_modes!(nodes_start_work_and_end_normally_without_a_master);
 
-fn nodes_live_without_a_master(mode: Mode) {
+fn nodes_start_work_and_end_normally_without_a_master(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
     let before = Streams::start(&robot, "before", HZ, EVERY);
-    // It notices every call of a master or of rosrescue.
+    // This node records every call of a master or of rosrescue.
     let witness = FakeNode::start("/witness");
     witness.subscribe(&robot.client(), "/before", "std_msgs/String");
     robot.client().set_param("/speed", 0);
@@ -37,9 +37,9 @@ fn nodes_live_without_a_master(mode: Mode) {
     robot.take_master_away();
     let away = Instant::now();
 
-    // They start, find each other and exchange messages.
+    // Nodes start, find each other and exchange messages.
     let during = Streams::start(&robot, "during", HZ, EVERY);
-    // Services: each client's server is of the other library.
+    // Services: the server of each client is of the other library.
     let [py, cpp] = [(Library::Rospy, "py"), (Library::Roscpp, "cpp")];
     let pairs = [(py, cpp), (cpp, py)];
     let servers = pairs.map(|((library, suffix), _)| {
@@ -59,7 +59,7 @@ fn nodes_live_without_a_master(mode: Mode) {
             replies.len() >= 5 && replies.iter().all(|name| *name == server)
         });
     }
-    // Parameters, in the nodes' caches too, set by a tool.
+    // A tool sets a parameter, which nodes have cached.
     let users = LIBRARIES.map(|(library, suffix)| {
         let name = format!("__name:=user_{suffix}");
         robot.node(library, "param_user", &["/speed", &name])
@@ -70,14 +70,14 @@ fn nodes_live_without_a_master(mode: Mode) {
         let tool = Tool::run(&robot.scratch, robot.port(), "rosparam", &set);
         assert!(tool.status.success(), "{}", tool.stderr);
         for user in &users {
-            eventually("the cache follows", || {
+            eventually("the cached parameter has the new value", || {
                 user.said("value").last() == Some(&value)
             });
         }
     }
-    // Namesakes displace each other, within a library and across.
+    // Nodes of the same name displace each other, within a library and across.
     displace(&robot);
-    // Others end by themselves, and take their registrations with them.
+    // Other nodes end by themselves and unregister.
     end(&robot);
     let seconds = std::env::var("ROSRESCUE_AWAY_SECONDS").map_or(0, |text| text.parse().unwrap());
     let rest = Duration::from_secs(seconds).saturating_sub(away.elapsed());
@@ -94,13 +94,13 @@ fn nodes_live_without_a_master(mode: Mode) {
     during.assert_whole(&robot);
     let mirror = State::read(&robot.client());
 
-    // An empty master comes.
+    // An empty master appears.
     robot.revive_master();
     robot.await_recovery(dead);
     mirror.assert_same(&robot.state(), "in the new master");
     before.assert_whole(&robot);
     during.assert_whole(&robot);
-    // A health check and everything that a new master may say too much come within seconds.
+    // A health check, and anything that a new master might tell nodes wrongly, happens within seconds.
     assert!(holds(Duration::from_secs(5), || witness
         .heard("shutdown")
         .is_empty()));
@@ -118,7 +118,7 @@ fn nodes_live_without_a_master(mode: Mode) {
     }
 }
 
-/// The second of two namesakes stays, the first one ends.
+/// Checks that the second of two nodes of the same name stays, and the first one ends.
 fn displace(robot: &Robot) {
     for ((first, _), (second, name)) in [
         (LIBRARIES[0], LIBRARIES[0]),
@@ -145,16 +145,16 @@ fn displace(robot: &Robot) {
     assert_eq!(state.publishers_of("/twins"), Vec::<String>::new());
 }
 
-/// Nodes that are asked to end do so, and are no longer known.
+/// Checks that nodes which are asked to end do so, and are unregistered.
 fn end(robot: &Robot) {
-    // A rospy node that is told to end while it is in a call to the master waits for its own lock for ever, and it
-    // calls all the time for a parameter that is not set.
+    // A rospy node that is told to end during a call to the master waits forever for its own lock, and it
+    // makes such calls all the time for a parameter that is not set.
     robot.client().set_param("/leaving", 1);
     for (library, suffix) in LIBRARIES {
         for node in ["listener", "server", "param_user"] {
             let name = format!("leaving_{node}_{suffix}");
             let remap = format!("__name:={name}");
-            // None of them is to have a name in common with one that stays.
+            // None of them may have a topic or service in common with a node that stays.
             let arguments = ["/leaving", &remap, "chatter:=/leaving", "who:=/leaving"];
             let arguments = match node {
                 "param_user" => &arguments[..],

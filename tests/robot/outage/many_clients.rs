@@ -1,5 +1,5 @@
-//! Many clients at once, at the moment at which an outage begins: each gets the answer that is due to it, at
-//! once and in its order.
+//! Many clients that call at the moment at which an outage begins: each gets the right answers, at once and
+//! in order.
 
 use std::io;
 use std::sync::{Arc, Barrier};
@@ -11,10 +11,10 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::{Reply, Value};
 
-/// Clients that call at once; a multiple of four.
+/// Number of clients that call at once, a multiple of four.
 const CLIENTS: i32 = 200;
 
-/// The calls that each client of a kind makes, one behind the other on one connection without waiting for
+/// The calls that each client of a kind makes, one after another on one connection without waiting for
 /// answers.
 fn calls_of(client: i32, api: &str) -> Vec<(&'static str, Vec<Value>)> {
     let name = format!("/client{client}");
@@ -47,7 +47,7 @@ fn calls_of(client: i32, api: &str) -> Vec<(&'static str, Vec<Value>)> {
 /// Code and value of each answer.
 type Answers = io::Result<Vec<(i32, Value)>>;
 
-/// A client on a connection of its own, which makes its calls when the barrier falls.
+/// Starts a client with a connection of its own, which makes its calls when all clients are ready.
 fn start(
     client: &Client,
     calls: Vec<(&'static str, Vec<Value>)>,
@@ -78,14 +78,14 @@ fn say(wire: &mut Wire, calls: &[(&str, Vec<Value>)]) -> Answers {
     calls.iter().map(|_| answer(wire)).collect()
 }
 
-in_both_modes!(two_hundred_clients_call_when_the_outage_begins);
+in_both_modes!(two_hundred_clients_that_call_when_the_outage_begins_get_the_right_answers);
 
-fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
+fn two_hundred_clients_that_call_when_the_outage_begins_get_the_right_answers(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let present = FakeNode::start("/present");
     present.publish(&client, "/present/topic", "std_msgs/String");
-    // The health check asks the nodes whether they are alive.
+    // The nodes must answer the health check.
     let nodes: Vec<_> = (0..CLIENTS)
         .map(|number| FakeNode::start(&format!("/client{number}")))
         .collect();
@@ -115,7 +115,7 @@ fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
     barrier.wait();
     robot.kill_master_at_once(dead);
 
-    // Nobody waits for a master.
+    // No client waits for a master.
     for (thread, number) in callers.into_iter().zip(0..CLIENTS) {
         let (answers, took) = thread.join().unwrap();
         let answers = answers.unwrap_or_else(|error| panic!("client {number}: {error}"));
@@ -144,7 +144,7 @@ fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
     );
     robot.revive_master();
     robot.await_recovery(dead);
-    // No call was closed without an answer.
+    // No connection was closed without an answer.
     assert_eq!(robot.counter("calls_unanswered"), 0);
     let (bare, state) = (robot.bare(), robot.state());
     for number in 0..CLIENTS {
@@ -160,7 +160,7 @@ fn two_hundred_clients_call_when_the_outage_begins(mode: Mode) {
             3 => assert_eq!(
                 bare.param(&format!("{name}/last")),
                 Some(Value::Int(4)),
-                "the last of its calls counts"
+                "{name}: the last of its calls must win"
             ),
             _ => {}
         }

@@ -1,5 +1,5 @@
-//! What real nodes and tools meet while there is no master: those that read, those that begin and end
-//! meanwhile, and those that register and set all that there is.
+//! What real nodes and tools experience while there is no master: those that read, those that start and end
+//! in the meantime, and those that register and set everything there is.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,7 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// Starts a node of each library, named with its suffix, and does not wait for it.
+/// Starts a node of each library, named with the library's suffix, without waiting for it.
 fn spawn_both(robot: &Robot, node: &str, name: &str, arguments: &[&str]) -> [Node; 2] {
     LIBRARIES.map(|(library, suffix)| {
         let name = format!("__name:={name}_{suffix}");
@@ -24,10 +24,11 @@ fn await_ready(nodes: &mut [Node]) {
     }
 }
 
-in_both_modes!(whoever_reads_notices_nothing);
+in_both_modes!(nodes_and_tools_that_read_do_not_notice_an_outage);
 
-/// A node whose `getParam` fails goes on with its default, and a robot drives with the wrong gains.
-fn whoever_reads_notices_nothing(mode: Mode) {
+/// A node whose `getParam` failed would continue with its default value, and the robot would drive with wrong
+/// gains.
+fn nodes_and_tools_that_read_do_not_notice_an_outage(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
     let client = robot.client();
     client.set_param("/gain", 7);
@@ -39,7 +40,7 @@ fn whoever_reads_notices_nothing(mode: Mode) {
     let read_on = |nodes: &[Node], more: u64| {
         for node in nodes {
             let before: u64 = count(node);
-            eventually("a node reads on", || count(node) >= before + more);
+            eventually("a node reads more values", || count(node) >= before + more);
         }
     };
     let listings: [&[&str]; 3] = [
@@ -61,7 +62,7 @@ fn whoever_reads_notices_nothing(mode: Mode) {
 
     robot.kill_master();
     read_on(&readers, 50);
-    assert_eq!(listed, list(&robot), "what the tools say");
+    assert_eq!(listed, list(&robot), "the output of the tools has changed");
     let mut late = spawn_both(&robot, "reader", "late", &["/gain"]);
     await_ready(&mut late);
     read_on(&late, 20);
@@ -69,7 +70,7 @@ fn whoever_reads_notices_nothing(mode: Mode) {
     let mut setting = Process::start("rosparam set", command.args(["set", "/gain", "8"]));
     assert_eq!(setting.wait().code(), Some(0));
     read_on(&readers, 50);
-    assert!(!robot.is_open(), "there was a master");
+    assert!(!robot.is_open(), "a master was there during the outage");
 
     robot.revive_master();
     robot.await_recovery(dead);
@@ -86,10 +87,10 @@ fn whoever_reads_notices_nothing(mode: Mode) {
     assert_eq!(before.services, now.services);
 }
 
-in_both_modes!(nodes_that_start_and_end_without_a_master_leave_nothing);
+in_both_modes!(nodes_that_start_and_end_during_an_outage_leave_no_registrations);
 
-/// Nodes that start, end and die while there is no master are registered as long as they live.
-fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
+/// Nodes that start, end or die while there is no master are registered only as long as they live.
+fn nodes_that_start_and_end_during_an_outage_leave_no_registrations(mode: Mode) {
     let mut robot = Robot::start_for_outages(mode);
     let mut leaving = spawn_both(&robot, "talker", "leaving", &[]);
     let mut staying = spawn_both(&robot, "listener", "staying", &[]);
@@ -107,7 +108,7 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
     robot.kill_master();
     eventually("the gate is shut", || !robot.is_open());
 
-    // A node that is there and ends says so at once, and is believed.
+    // A node from before the outage that ends unregisters, and rosrescue believes it.
     for node in &mut leaving {
         end(node, Signal::INT);
     }
@@ -117,7 +118,7 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
         "{now}"
     );
 
-    // Nodes that start meanwhile, find each other, and are killed, or asked to end.
+    // Nodes that start in the meantime find each other, and are then killed or asked to end.
     let mut brief = [
         spawn_both(&robot, "talker", "killed", &[]),
         spawn_both(&robot, "talker", "ended", &[]),
@@ -138,23 +139,24 @@ fn nodes_that_start_and_end_without_a_master_leave_nothing(mode: Mode) {
     }
     let now = State::read(&robot.client());
     assert!(!now.knows("/ended_py") && !now.knows("/ended_cpp"), "{now}");
-    assert!(!robot.is_open(), "there was a master");
+    assert!(!robot.is_open(), "a master was there during the outage");
     robot.revive_master();
     robot.await_recovery(dead);
     let mut last = None;
-    eventually("the killed ones are taken out", || {
+    eventually("the killed nodes are unregistered", || {
         last = State::try_read(&robot.bare()).ok();
         last.as_ref()
             .is_some_and(|now| names.iter().all(|name| !now.knows(name)))
     });
-    after_types(&after, &robot).assert_same(&last.unwrap(), "when all have ended");
+    after_types(&after, &robot).assert_same(&last.unwrap(), "after all nodes have ended");
     assert!(holds(Duration::from_secs(2), || {
         let now = robot.state();
         names.iter().all(|name| !now.knows(name))
     }));
 }
 
-/// `state` with the topic types that the master holds now: a node that ended may have left one.
+/// `state` with the topic types that the master has now, because a node that ended may have left a type
+/// behind.
 fn after_types(state: &State, robot: &Robot) -> State {
     State {
         topic_types: robot.state().topic_types,
@@ -162,7 +164,7 @@ fn after_types(state: &State, robot: &Robot) -> State {
     }
 }
 
-/// Ends a node, which must not wait for the master.
+/// Ends a node, which must not have to wait for the master.
 fn end(node: &mut Node, signal: Signal) {
     let start = Instant::now();
     node.signal(signal);

@@ -1,4 +1,5 @@
-//! What nodes are told while there is no master: the same as by a master. `tests/timing/notifications.rs` has how soon.
+//! Notifications while there is no master: nodes are told the same as by a master.
+//! `tests/timing/notifications.rs` tests how soon.
 
 use std::time::Duration;
 
@@ -7,7 +8,7 @@ use rosrescue::xmlrpc::Value;
 use crate::support::{FakeNode, Mode, Robot, eventually, holds, params, tree};
 
 #[test]
-fn a_subscriber_is_told_all_publishers_whenever_they_change() {
+fn a_subscriber_is_told_the_publishers_whenever_they_change() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);
     let client = robot.client();
     let publishers = ["/one", "/two", "/three"].map(FakeNode::start);
@@ -30,16 +31,20 @@ fn a_subscriber_is_told_all_publishers_whenever_they_change() {
         apis.collect::<Vec<_>>()
     });
     for node in [&subscriber, &late] {
-        // The master may have told the first subscriber of the first publisher before, or rosrescue of what
-        // that may have owed.
-        eventually("every list has come", || {
+        // The master may have told the first subscriber about the first publisher before, or rosrescue may
+        // have repeated what the master may have owed.
+        eventually("every list has arrived", || {
             node.updates("/chatter").ends_with(&wanted)
         });
     }
-    assert_eq!(late.updates("/chatter"), wanted, "and nothing else");
+    assert_eq!(
+        late.updates("/chatter"),
+        wanted,
+        "other lists were sent as well"
+    );
     robot.revive_master();
     robot.await_recovery(dead);
-    // What may be repeated then is the present list.
+    // Anything that is repeated later is the present list.
     assert!(holds(Duration::from_secs(2), || {
         let repeated = late.updates("/chatter").split_off(wanted.len());
         repeated.iter().all(Vec::is_empty)

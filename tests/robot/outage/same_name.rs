@@ -1,4 +1,4 @@
-//! Two nodes of one name, and a master that dies before it has told the first of them to shut down.
+//! Two nodes of the same name, and a master that dies before it has told the first one to shut down.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use crate::support::{
     params, port_of,
 };
 
-/// A master's words to a node whose name another one has taken.
+/// The parameters of the call by which a master shuts down a node whose name was taken.
 fn goodbye(name: &str) -> Vec<Value> {
     let reason = format!("[{name}] Reason: new node registered with same name");
     params!["/master", reason.as_str()]
@@ -19,26 +19,26 @@ fn twin(robot: &Robot) -> Node {
     robot.spawn_node(Library::Rospy, "talker", &["__name:=twin"])
 }
 
-/// Waits until /twin is not at `port` any more, and kills the master at once.
+/// Waits until /twin has left `port`, and kills the master at once.
 fn kill_when_taken(robot: &mut Robot, master: u32, port: u16) {
     let client = robot.client();
-    eventually_some("the second one takes the name", || {
+    eventually_some("the second node takes the name", || {
         (port_of(&client, "/twin") != port).then_some(())
     });
     robot.kill_master_at_once(master);
 }
 
 in_both_modes!(
-    a_displaced_node_ends_though_its_master_died_before_it_said_so,
-    a_displaced_node_ends_though_its_master_never_said_so,
+    a_displaced_node_ends_although_the_master_died_before_telling_it,
+    a_displaced_node_ends_although_the_master_never_tells_nodes,
 );
 
-fn a_displaced_node_ends_though_its_master_died_before_it_said_so(mode: Mode) {
+fn a_displaced_node_ends_although_the_master_died_before_telling_it(mode: Mode) {
     a_displaced_node_ends(Robot::start(mode));
 }
 
-/// With a master of which it is certain that it has told nobody.
-fn a_displaced_node_ends_though_its_master_never_said_so(mode: Mode) {
+/// With a master that certainly told no node.
+fn a_displaced_node_ends_although_the_master_never_tells_nodes(mode: Mode) {
     a_displaced_node_ends(Robot::start_under(mode, "silent_rosmaster.py", &[]));
 }
 
@@ -51,11 +51,12 @@ fn a_displaced_node_ends(mut robot: Robot) {
     kill_when_taken(&mut robot, master, port);
     robot.revive_master();
     second.wait_line("`ready`", |line| line.starts_with("ready "));
-    eventually("one of them ends", || {
+    eventually("one of the two nodes ends", || {
         first.exited().is_some() || second.exited().is_some()
     });
     robot.await_recovery(master);
-    // A node that logs something before it is told takes its name back, at every master: by subscribeParam.
+    // A node that logs something before it is told takes its name back by calling subscribeParam, with any
+    // master.
     let taken_back = first.exited().is_none();
     assert!(
         !taken_back || first.log().contains("[WARN]"),
@@ -71,9 +72,9 @@ fn a_displaced_node_ends(mut robot: Robot) {
     assert_eq!(port_of(&robot.bare(), "/twin") == port, taken_back);
 }
 
-/// The port of a displaced node belongs to another one by the time at which it is told.
+/// The port of a displaced node belongs to another node by the time at which it would be told.
 #[test]
-fn who_has_the_port_of_a_displaced_node_by_now_is_not_told() {
+fn a_node_that_now_has_the_port_of_a_displaced_node_is_not_shut_down() {
     for (mode, is_registered) in [(Mode::Core, false), (Mode::Proxy, true)] {
         let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
         let mut first = twin(&robot);
@@ -91,9 +92,9 @@ fn who_has_the_port_of_a_displaced_node_by_now_is_not_told() {
     }
 }
 
-/// As above, when it is rosrescue that tells while there is no master.
+/// Like the test above, when rosrescue itself tells nodes because there is no master.
 #[test]
-fn who_has_the_port_of_a_node_that_is_displaced_without_a_master_is_not_told() {
+fn a_node_that_now_has_the_port_is_not_shut_down_during_an_outage_either() {
     for is_registered in [false, true] {
         let mut robot = Robot::start_for_outages(Mode::Proxy);
         let mut first = twin(&robot);
@@ -135,12 +136,12 @@ in_both_modes!(
     a_displaced_node_is_told_by_the_next_worker_if_the_master_lives,
 );
 
-/// The master had told no node, and the worker died with it.
+/// The master had told no node, and the worker died together with it.
 fn a_displaced_node_is_told_by_the_next_worker_if_master_and_worker_died(mode: Mode) {
     displaced_before_the_worker_dies(mode, true);
 }
 
-/// The master that goes on is not the one that owed it, perhaps.
+/// The worker may die before the master has told the node, and the master lives on.
 fn a_displaced_node_is_told_by_the_next_worker_if_the_master_lives(mode: Mode) {
     displaced_before_the_worker_dies(mode, false);
 }
@@ -148,7 +149,7 @@ fn a_displaced_node_is_told_by_the_next_worker_if_the_master_lives(mode: Mode) {
 fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
     let mut robot = Robot::start_under(mode, "silent_rosmaster.py", &[]);
     let client = robot.client();
-    // The name of the last two is its first holder's again.
+    // For the last two registrations, the first node takes its name back.
     let nodes = ["/twin", "/twin", "/back", "/back"].map(FakeNode::start);
     let [first, second, owner, taker] = &nodes;
     for node in [owner, taker, owner, first, second] {
@@ -179,7 +180,9 @@ fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
         none(),
         vec![goodbye("/back")],
     ];
-    eventually("the displaced ones are told", || heard() == wanted);
+    eventually("the displaced nodes are told to shut down", || {
+        heard() == wanted
+    });
     assert!(
         holds(Duration::from_secs(1), || heard() == wanted),
         "{:?}",
@@ -193,9 +196,9 @@ fn displaced_before_the_worker_dies(mode: Mode, master_dies: bool) {
     }
 }
 
-/// Exactly once, and in a master's words.
+/// The node is told exactly once, in the words of a master.
 #[test]
-fn a_node_that_is_displaced_without_a_master_is_told_once() {
+fn a_node_displaced_during_an_outage_is_told_exactly_once() {
     let mut robot = Robot::start_for_outages(Mode::Proxy);
     let client = robot.client();
     let first = FakeNode::start("/twin");
@@ -205,7 +208,7 @@ fn a_node_that_is_displaced_without_a_master_is_told_once() {
     robot.take_master_away();
     let second = FakeNode::start("/twin");
     second.publish(&client, "/chatter", "std_msgs/String");
-    eventually("the first one is told", || {
+    eventually("the first node is told to shut down", || {
         !first.heard("shutdown").is_empty()
     });
     robot.revive_master();

@@ -1,5 +1,5 @@
 //! The paper's case 2 at every point: the master dies after it has changed its state, before or while it
-//! tells the subscribers. All of them get to know the full list from rosrescue, once or once more.
+//! notifies the subscribers. rosrescue then tells all of them the full list, once or twice.
 
 use std::ops::RangeInclusive;
 use std::thread;
@@ -11,15 +11,15 @@ use rosrescue::xmlrpc::Value;
 
 const TOPIC: &str = "/chatter";
 
-/// What the master dies of.
+/// The change during which the master dies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Change {
     Registration,
-    /// As in the paper: a publisher that leaves.
+    /// A publisher unregisters, as in the paper.
     Unregistration,
 }
 
-/// The subscribers: four fakes, and a real node of each library. So there are six callbacks.
+/// The subscribers: four fake nodes and a real node of each library, which makes six callbacks.
 struct Audience {
     fakes: Vec<FakeNode>,
     real: [Node; 2],
@@ -38,7 +38,7 @@ impl Audience {
         Self { fakes, real }
     }
 
-    /// Whether the last list that each of them got is `all`.
+    /// Whether the last list that each of them was told is `all`.
     fn knows(&self, all: &[String]) -> bool {
         let fakes = self.fakes.iter().map(|fake| fake.updates(TOPIC));
         let real = self.real.iter().map(|node| node.updates(TOPIC));
@@ -60,8 +60,8 @@ fn lists(calls: &[Heard]) -> Vec<(Vec<&str>, bool)> {
     lists.collect()
 }
 
-/// With 0 the master dies before any callback, with N as the Nth is about to be sent; `workers` are its
-/// threads for callbacks.
+/// Makes the master die at each of `points`: 0 is before any callback, N is when the Nth callback is about to
+/// be sent. `workers` is the number of its threads for callbacks.
 fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeInclusive<usize>) {
     let mut robot = Robot::start_under(mode, "fragile_master.py", &["-w", workers]);
     let client = robot.client();
@@ -70,7 +70,7 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
     let mut coming: Vec<_> = names.map(|name| FakeNode::start(&name)).collect();
     let mut there = Vec::new();
     if change == Change::Unregistration {
-        // The last one that leaves leaves an empty list.
+        // When the last publisher leaves, the list is empty.
         for publisher in coming.drain(..) {
             publisher.publish(&client, TOPIC, "std_msgs/String");
             there.push(publisher);
@@ -86,7 +86,10 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
     let mut once = 0;
     for point in points {
         let before = all(&there);
-        eventually("all know the publishers before", || audience.knows(&before));
+        eventually(
+            "all subscribers know the publishers before the change",
+            || audience.knows(&before),
+        );
         let heard: Vec<_> = audience.fakes.iter().map(|it| it.calls().len()).collect();
         let dead = robot.master_pid();
         let file = robot.scratch.path("die-at");
@@ -116,9 +119,10 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
             Change::Unregistration => gone.push(publisher),
         }
         let now = all(&there);
-        eventually(&format!("all know the publishers, point {point}"), || {
-            audience.knows(&now)
-        });
+        eventually(
+            &format!("all subscribers know the publishers, point {point}"),
+            || audience.knows(&now),
+        );
         let mut check_ms = None;
         eventually("the recovery is complete", || {
             let status = status(&client);
@@ -126,35 +130,35 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
             check_ms = report["health_check_ms"].as_f64();
             report["master_pid"] != dead && check_ms.is_some()
         });
-        // Everything that was sent to a fake because of this change.
+        // Everything that a fake node was sent because of this change.
         for (fake, heard) in audience.fakes.iter().zip(heard) {
             let calls = &fake.calls()[heard..];
             let mut lists = lists(calls);
-            // The list before the change, told once more before it.
+            // The list before the change may be repeated first.
             let again = lists
                 .iter()
                 .take_while(|(list, ours)| *ours && *list == before);
             lists.drain(..again.count());
             let full = |(list, _): &&(Vec<&str>, bool)| *list == now;
-            // Never a part of the list, and never an old one again.
+            // No list may be incomplete, and none may be outdated.
             assert!(
                 lists.iter().all(|list| full(&list)),
                 "{lists:?}, not {now:?}"
             );
             let ours = lists.iter().filter(|(_, ours)| *ours).count();
-            // One from the master that died, and one from the next, if the call travelled again because
-            // its reply was lost. No master tells a node twice.
+            // One list may come from the master that died, and one from the next master if the call was sent
+            // again because its reply was lost. No master tells a node twice.
             assert!(lists.len() - ours <= 2, "{lists:?}");
             assert!(ours >= 1, "{lists:?}");
-            // Who has not answered 300 ms after the change may hold up the master: then we tell it again.
-            // What the dead master may have told at the same time is told once more, too.
+            // A node that has not answered 300 ms after the change may hold up the master, so rosrescue tells
+            // the nodes again. Whatever the dead master may have sent at the same time is repeated too.
             if check_ms.is_some_and(|ms| ms < 250.0) {
                 assert!(ours <= 2, "point {point}: {lists:?}");
                 once += 1;
             }
         }
     }
-    println!("{once} fakes were told once");
+    println!("{once} fake nodes were told without a repeat");
     let nodes = audience.fakes.iter().chain(&there).chain(&gone);
     for node in nodes {
         assert_eq!(node.heard("shutdown"), Vec::<Vec<Value>>::new());
@@ -163,24 +167,27 @@ fn the_master_dies_at(mode: Mode, change: Change, workers: &str, points: RangeIn
     robot.kill_master();
 }
 
-in_both_modes!(a_publisher_comes, a_publisher_leaves);
+in_both_modes!(
+    subscribers_hear_of_a_new_publisher_although_the_master_dies,
+    subscribers_hear_that_a_publisher_left_although_the_master_dies
+);
 
-fn a_publisher_comes(mode: Mode) {
+fn subscribers_hear_of_a_new_publisher_although_the_master_dies(mode: Mode) {
     at_every_callback(mode, Change::Registration, "3");
 }
 
 /// As in the paper.
-fn a_publisher_leaves(mode: Mode) {
+fn subscribers_hear_that_a_publisher_left_although_the_master_dies(mode: Mode) {
     at_every_callback(mode, Change::Unregistration, "3");
 }
 
 #[test]
-fn with_more_threads_than_callbacks() {
+fn the_same_with_more_threads_than_callbacks() {
     at_every_callback(Mode::Core, Change::Registration, "16");
     at_every_callback(Mode::Core, Change::Unregistration, "16");
 }
 
-/// A core restarts its master at once for the first five deaths within a minute: there are two of them.
+/// A core restarts its master at once for the first five deaths within a minute, so there are two cores.
 fn at_every_callback(mode: Mode, change: Change, workers: &str) {
     for points in [0..=3, 4..=6] {
         the_master_dies_at(mode, change, workers, points);

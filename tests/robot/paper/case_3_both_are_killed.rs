@@ -1,8 +1,8 @@
-//! The paper's case 3: rosrescue, the master or both are killed again and again at any instant, while
-//! the checkpoint is written too, under a stream of calls. What was acknowledged is there afterwards,
-//! nothing that was deleted comes back, and a rospy or roscpp pair notices nothing.
+//! The paper's case 3: rosrescue, the master or both are killed again and again at random moments under a
+//! stream of calls, also while the checkpoint is written. Afterwards everything acknowledged is there,
+//! nothing deleted comes back, and a pair of rospy or roscpp nodes notices nothing.
 //!
-//! `ROSRESCUE_TEST_SECONDS` says how long each test goes on (10 if it is not set).
+//! `ROSRESCUE_TEST_SECONDS` sets how long each test runs (10 by default).
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -72,7 +72,7 @@ fn nothing_acknowledged_is_lost(library: Library, mode: Mode) {
     }
 }
 
-/// Kills one of them or both at any instant of the next 60 ms, and says whom.
+/// Kills one of them or both at a random moment within the next 60 ms. Returns which.
 fn kill(robot: &mut Robot, master: u32, dice: &mut Dice) -> &'static str {
     thread::sleep(Duration::from_micros(dice.below(60_000)));
     let gap = Duration::from_micros(dice.below(5_000));
@@ -100,11 +100,11 @@ fn kill(robot: &mut Robot, master: u32, dice: &mut Dice) -> &'static str {
     }
 }
 
-/// What has been acknowledged.
+/// Everything that has been acknowledged.
 #[derive(Clone, Debug, Default)]
 struct Ledger {
     params: Struct,
-    /// Topics that [`NODE`] publishes, in the order of their registration.
+    /// Topics that [`NODE`] publishes, in the order of registration.
     topics: Vec<String>,
     services: Vec<String>,
 }
@@ -125,7 +125,7 @@ fn assert_ledger(ledger: &Ledger, state: &State, when: &str) {
             "lost {when}: /ledger/{key} is {is}, not {was}"
         );
     }
-    // A master without an order is read in that of the alphabet.
+    // Lists of an unordered master are read in alphabetical order.
     let in_order = |names: Vec<String>| match unordered() {
         true => names
             .into_iter()
@@ -136,7 +136,7 @@ fn assert_ledger(ledger: &Ledger, state: &State, when: &str) {
     };
     let keys: Vec<_> = params.keys().cloned().collect();
     let wanted = in_order(ledger.params.keys().cloned().collect());
-    assert_eq!(keys, wanted, "what was deleted, or the order, {when}");
+    assert_eq!(keys, wanted, "the keys or their order differ {when}");
     let of_node = |table: &[(String, Vec<String>)]| -> Vec<String> {
         let own = table
             .iter()
@@ -152,7 +152,7 @@ fn assert_ledger(ledger: &Ledger, state: &State, when: &str) {
     assert_eq!(of_node(&state.services), services, "services {when}");
 }
 
-/// A small generator (xorshift): the instants must differ, nothing more.
+/// A small random number generator (xorshift). It only has to make the moments differ.
 struct Dice(u64);
 
 impl Dice {
@@ -164,7 +164,7 @@ impl Dice {
     }
 }
 
-/// Calls that change the master's state as fast as they are answered, one after the other.
+/// Makes calls that change the master's state, one after another, as fast as they are answered.
 struct Writer {
     client: Client,
     node: FakeNode,
@@ -174,7 +174,7 @@ struct Writer {
 }
 
 impl Writer {
-    /// Writes until it is told to `stop` and its last call is acknowledged.
+    /// Makes calls until `stop` is set and the last call has been acknowledged.
     fn write(&mut self, stop: &AtomicBool) {
         while !stop.load(Ordering::Relaxed) {
             self.count += 1;
@@ -182,7 +182,7 @@ impl Writer {
         }
     }
 
-    /// One call, said again until it is answered as nodes do, and entered in the ledger.
+    /// Makes one call, repeated until it is answered as nodes do, and records it.
     fn one_call(&mut self) {
         let (name, api, count) = (NODE, self.node.api.clone(), self.count);
         let key = format!("k{}", self.dice.below(40));
@@ -194,7 +194,7 @@ impl Writer {
                 self.ledger.params.shift_remove(&key);
             }
             1 => {
-                // So large that it is written in pieces.
+                // So large that it is written in several pieces.
                 let value = Value::String(format!("{count} {}", "x".repeat(200_000)));
                 self.insist("setParam", params![name, "/ledger/ballast", value.clone()]);
                 self.ledger.params.insert("ballast".to_owned(), value);
@@ -226,7 +226,7 @@ impl Writer {
         }
     }
 
-    /// Sends a call until it is answered. Any answer of the master is a success here, but for the second
+    /// Repeats a call until it is answered. Any answer of the master counts as success, except for the second
     /// deletion of a parameter: the first one may have been done and its answer lost.
     fn insist(&self, method: &str, params: Vec<Value>) {
         let start = Instant::now();

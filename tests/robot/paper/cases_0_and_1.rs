@@ -1,5 +1,6 @@
-//! Cases 0 and 1 of the paper: nothing changes in the outage, or nodes end in it. Each with a rospy and a roscpp
-//! pair of nodes, with a master that rosrescue restarts and with one that somebody else restarts.
+//! Cases 0 and 1 of the paper: nothing changes during the outage, or nodes end in it. Each case has a pair of
+//! rospy and a pair of roscpp nodes, with a master that rosrescue restarts and with one that is restarted by
+//! others.
 
 use crate::support::{
     FakeNode, Library, Mode, Node, Robot, Rosmaster, Scratch, State, eventually, everywhere,
@@ -13,10 +14,10 @@ everywhere!(
     case_1_nodes_leave_in_the_outage,
 );
 
-/// What the product is for: without it a master that comes back knows nothing, and nobody finds the
-/// old publisher. The other tests of this file would fail in the same way.
+/// Why rosrescue exists: without it, a master that comes back knows nothing, and no node finds the old
+/// publisher. The other tests in this file would fail in the same way.
 #[test]
-fn a_bare_master_forgets_everything() {
+fn a_restarted_bare_master_has_forgotten_everything() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let port = master.port;
@@ -59,7 +60,7 @@ fn case_0_nothing_changes(library: Library, mode: Mode) {
 
     robot.crash_master();
 
-    before.assert_same(&robot.state(), "at the master after its death");
+    before.assert_same(&robot.state(), "in the next master");
     before.assert_same(
         &State::read(&client),
         "through rosrescue after the master's death",
@@ -75,12 +76,12 @@ fn case_0_nothing_changes(library: Library, mode: Mode) {
     robot.await_state(&before, "when the late subscriber has gone again");
 }
 
-/// A publisher, a subscriber and a service die with the master, and their ports with them.
+/// A publisher, a subscriber and a service die together with the master, and their ports are closed.
 fn case_1_nodes_die_in_the_outage(library: Library, mode: Mode) {
     nodes_end_in_the_outage(library, mode, Signal::KILL);
 }
 
-/// The same nodes end in good order: what they unregister nobody hears, and they never say it again.
+/// The same nodes end cleanly. No master hears their unregistrations, and they do not repeat them.
 fn case_1_nodes_leave_in_the_outage(library: Library, mode: Mode) {
     nodes_end_in_the_outage(library, mode, Signal::INT);
 }
@@ -119,21 +120,21 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
     robot.revive_master();
     robot.await_recovery(dead);
 
-    robot.await_state(&after, "when the nodes that ended have been found");
+    robot.await_state(&after, "after the nodes that ended have been unregistered");
     if how == Signal::KILL {
         let rescue = &mut robot.rescue;
-        rescue.wait_line("each phase of the recovery", |line| {
+        rescue.wait_line("the log has each phase of the recovery", |line| {
             let parts = ["cause=\"", "absence_ms=", "inspection_ms=", "injection_ms="];
             line.contains("calls pass to the master: ")
                 && parts.iter().all(|part| line.contains(part))
         });
-        rescue.wait_line("what the health check has found", |line| {
+        rescue.wait_line("the log has the result of the health check", |line| {
             let parts = ["health_check_ms=", "removed=["];
             line.contains("the rescue is complete") && parts.iter().all(|part| line.contains(part))
         });
-        // On a busy computer one of them may be found out a little later.
+        // On a busy computer one of them may be found a little later.
         for name in ["/gone_listener", "/gone_server", "/gone_talker"] {
-            rescue.wait_line("who was removed", |line| {
+            rescue.wait_line("the log names the node that was unregistered", |line| {
                 let removed = line.split("removed=[").nth(1);
                 removed.is_some_and(|names| names.split(']').next().unwrap().contains(name))
             });
@@ -152,7 +153,7 @@ fn nodes_end_in_the_outage(library: Library, mode: Mode, how: Signal) {
     listener.wait_messages("/talker", 20);
     assert_eq!(before_end, listener.messages("/gone_talker"));
     listener.assert_no_message_lost("/talker");
-    // The link to the node that ended is gone, and only that one.
+    // The link to the node that ended is gone, and no other link.
     assert_eq!(listener.links().last(), Some(&1), "{:?}", listener.links());
     assert_eq!(talker.links().last(), Some(&1), "{:?}", talker.links());
     after.assert_same(&robot.state(), "at the end");

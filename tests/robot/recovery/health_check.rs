@@ -1,5 +1,5 @@
-//! Which nodes are taken out after an outage and which are kept: the dead, the ones whose port another
-//! node has, and the ones that do not answer.
+//! Which nodes are unregistered after an outage, and which are kept: nodes that died, nodes whose port
+//! another node has, and nodes that do not answer.
 
 use std::fs;
 use std::thread;
@@ -11,7 +11,8 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// Waits for the report of a recovery whose health check is over, and checks what every report has.
+/// Waits for the report of a recovery whose health check has finished, and checks what every report must
+/// have.
 #[track_caller]
 fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) {
     let mut last = serde_json::Value::Null;
@@ -19,7 +20,7 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
         last = status(&robot.client())["last_recovery"].clone();
         !wanted(&last)
     });
-    assert!(!found, "the report never says {what}: {last:#}");
+    assert!(!found, "the report does not have {what}: {last:#}");
     for field in [
         "cause",
         "outcome",
@@ -36,9 +37,9 @@ fn report(robot: &Robot, what: &str, wanted: impl Fn(&serde_json::Value) -> bool
     }
 }
 
-in_both_modes!(a_node_whose_port_refuses_is_taken_out_and_others_are_told);
+in_both_modes!(a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told);
 
-fn a_node_whose_port_refuses_is_taken_out_and_others_are_told(mode: Mode) {
+fn a_node_whose_port_refuses_connections_is_unregistered_and_others_are_told(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let dead = FakeNode::start("/dead");
@@ -54,11 +55,11 @@ fn a_node_whose_port_refuses_is_taken_out_and_others_are_told(mode: Mode) {
     let after = robot.settled_state().without_node("/dead");
     drop(dead);
     robot.crash_master();
-    robot.await_state(&after, "when the dead node has been taken out");
+    robot.await_state(&after, "after the dead node was unregistered");
     eventually("the subscriber is told", || {
         subscriber.updates("/topic").last() == Some(&vec![living.api.clone()])
     });
-    report(&robot, "who was removed", |report| {
+    report(&robot, "the removed node", |report| {
         names(&report["removed"]) == ["/dead"]
     });
     for node in [&living, &subscriber] {
@@ -66,21 +67,21 @@ fn a_node_whose_port_refuses_is_taken_out_and_others_are_told(mode: Mode) {
     }
 }
 
-/// Both were asked for their process ids soon after they had registered.
+/// Both nodes were asked for their process ids soon after they had registered.
 #[test]
-fn another_process_at_the_port_is_another_node() {
+fn another_process_at_the_port_counts_as_another_node() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let [old, same] = [("/old", 4001), ("/same", 4002)].map(|(name, pid)| {
         let node = FakeNode::start(name);
         node.claim_pid(pid);
-        // Topics that all nodes have tell nothing.
+        // Topics that all nodes have prove nothing.
         node.publish(&client, "/rosout", "rosgraph_msgs/Log");
         node.offer(&client, &format!("{name}/service"));
         node
     });
     for node in [&old, &same] {
-        eventually("it is asked for its process id", || {
+        eventually("the node is asked for its process id", || {
             !node.heard("getPid").is_empty()
         });
     }
@@ -89,24 +90,24 @@ fn another_process_at_the_port_is_another_node() {
     taker.claim_pid(4003);
     taker.claim_publication("/rosout", Some("rosgraph_msgs/Log"));
     robot.crash_master();
-    robot.await_state(&after, "when the old node has been taken out");
-    report(&robot, "who was removed", |report| {
+    robot.await_state(&after, "after the old node was unregistered");
+    report(&robot, "the removed node", |report| {
         names(&report["removed"]) == ["/old"]
     });
     assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
     assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
 }
 
-/// Such as that of a node library that makes it up.
+/// As with a client library that makes up process ids.
 #[test]
-fn topics_that_match_outweigh_a_process_id_that_changes() {
+fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let node = FakeNode::start("/restless");
     node.claim_restless_pid();
     node.publish(&client, "/topic", "std_msgs/String");
     node.offer(&client, "/service");
-    eventually("it is asked for its process id", || {
+    eventually("the node is asked for its process id", || {
         !node.heard("getPid").is_empty()
     });
     let before = robot.settled_state();
@@ -115,20 +116,20 @@ fn topics_that_match_outweigh_a_process_id_that_changes() {
     }
 }
 
-/// Crashes the master: its state is `before` again, also after the health check.
+/// Kills the master, and checks that the next one has the state `before`, even after the health check.
 #[track_caller]
 fn assert_kept(robot: &mut Robot, before: &State) {
     let dead = robot.master_pid();
     robot.crash_master();
-    report(robot, "that the health check is over", |report| {
+    report(robot, "the time of the health check", |report| {
         report["master_pid"] != dead && report["health_check_ms"].is_number()
     });
     before.assert_same(&robot.state(), "after the health check");
 }
 
-/// Its answers to `getPublications` and `getSubscriptions` are empty lists.
+/// The node answers `getPublications` and `getSubscriptions` with empty lists.
 #[test]
-fn a_node_that_cannot_list_its_topics_keeps_them() {
+fn a_node_that_cannot_list_its_topics_keeps_its_registrations() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let stub = FakeNode::start("/stub");
@@ -140,9 +141,9 @@ fn a_node_that_cannot_list_its_topics_keeps_them() {
     assert_kept(&mut robot, &before);
 }
 
-/// Nobody has asked the old one for its process id.
+/// The old node has never been asked for its process id.
 #[test]
-fn other_topics_at_the_port_are_another_node() {
+fn different_topics_at_the_port_count_as_another_node() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let old = FakeNode::start("/old");
@@ -157,12 +158,12 @@ fn other_topics_at_the_port_are_another_node() {
     taker.publish(&client, "/taker/topic", "std_msgs/String");
     let after = robot.settled_state().without_node("/old");
     robot.crash_master();
-    robot.await_state(&after, "when the old node has been taken out");
+    robot.await_state(&after, "after the old node was unregistered");
     assert_eq!(taker.heard("shutdown"), Vec::<Vec<_>>::new());
     assert_eq!(same.heard("shutdown"), Vec::<Vec<_>>::new());
 }
 
-/// Ends `node` and starts another one at its port.
+/// Ends `node` and starts another node at its port.
 fn take_port(node: FakeNode, name: &str) -> FakeNode {
     let port = node.port();
     drop(node);
@@ -170,7 +171,7 @@ fn take_port(node: FakeNode, name: &str) -> FakeNode {
 }
 
 #[test]
-fn a_node_that_does_not_answer_is_unreachable_and_comes_back_by_itself() {
+fn a_node_that_does_not_answer_is_unreachable_until_it_answers_again() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
@@ -181,28 +182,28 @@ fn a_node_that_does_not_answer_is_unreachable_and_comes_back_by_itself() {
     silent.hold();
     robot.crash_master();
     let unreachable = || names(&status(&client)["unreachable"]);
-    eventually("it is unreachable", || unreachable() == ["/silent"]);
-    report(&robot, "who is unreachable", |report| {
+    eventually("the node is unreachable", || unreachable() == ["/silent"]);
+    report(&robot, "the unreachable node", |report| {
         names(&report["unreachable"]) == ["/silent"]
     });
-    before.assert_same(&robot.state(), "an unreachable node is kept");
-    // The master has tried in vain, or is still trying, to tell it of this.
+    before.assert_same(&robot.state(), "while the node is unreachable");
+    // The master has tried to tell the node of this, or is still trying.
     let late = FakeNode::start("/late");
     late.publish(&client, "/topic", "std_msgs/String");
     client.set_param("/gain", 2);
     silent.release();
-    eventually("it is reachable again", || unreachable().is_empty());
-    eventually("it knows the publisher", || {
+    eventually("the node is reachable again", || unreachable().is_empty());
+    eventually("the node knows the publisher", || {
         silent.updates("/topic").last() == Some(&vec![late.api.clone()])
     });
-    eventually("it knows the parameter", || {
+    eventually("the node knows the parameter", || {
         let told = silent.heard("paramUpdate");
         told.last().is_some_and(|told| told[2] == 2.into())
     });
 }
 
 #[test]
-fn an_unreachable_node_that_dies_is_taken_out() {
+fn an_unreachable_node_that_dies_is_unregistered() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "300"]);
     let client = robot.client();
     let silent = FakeNode::start("/silent");
@@ -210,19 +211,19 @@ fn an_unreachable_node_that_dies_is_taken_out() {
     let after = robot.settled_state().without_node("/silent");
     silent.hold();
     robot.crash_master();
-    eventually("it is unreachable", || {
+    eventually("the node is unreachable", || {
         names(&status(&client)["unreachable"]) == ["/silent"]
     });
     drop(silent);
-    robot.await_state(&after, "when the unreachable one has died");
-    eventually("nobody is unreachable", || {
+    robot.await_state(&after, "after the unreachable node has died");
+    eventually("no node is unreachable", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
 }
 
-/// Without an outage.
+/// This happens without an outage.
 #[test]
-fn a_standing_health_check_takes_dead_nodes_out_and_is_off_by_default() {
+fn reap_dead_nodes_unregisters_dead_nodes_and_is_off_by_default() {
     let robot = Robot::start_with(Mode::Core, &["--reap-dead-nodes", "0.5"]);
     let client = robot.client();
     let mut talker = robot.node(Library::Rospy, "talker", &[]);
@@ -252,10 +253,10 @@ fn a_standing_health_check_takes_dead_nodes_out_and_is_off_by_default() {
     drop((client, after));
 }
 
-/// roscpp holds its list of subscriptions while it registers one, and whatever asks for that list holds its
-/// only thread for calls. The health check after a recovery waits for what came during the injection.
+/// roscpp locks its list of subscriptions while it registers one, and a request for that list then blocks its
+/// only thread for calls. The health check after a recovery waits for calls that came during the injection.
 #[test]
-fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_unreachable() {
+fn a_roscpp_node_during_a_slow_registration_counts_as_reachable() {
     // The injection takes longer than `--hold`.
     let options = ["--hold", "1", "--node-timeout", "1500"];
     let mut robot = Robot::start_under_with(Mode::Proxy, "slow_rosmaster.py", &[], &options);
@@ -282,14 +283,14 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_unreachable() {
     let dead = robot.master_pid();
     robot.kill_master();
     eventually("the gate is shut", || !robot.is_open());
-    // The injection takes some time, and so does the registration in the new master: longer than a node
-    // has time to answer.
+    // The injection takes some time, and so does the registration in the new master: longer than a node has
+    // time to answer.
     fs::write(robot.scratch.path("slow"), "3 registerSubscriber").unwrap();
     robot.revive_master();
     let mut value = 0;
     let held = eventually_some("a write waits for the end of the injection", || {
         let client = client.clone();
-        // What changes nothing does not wait.
+        // A write that changes nothing would not wait.
         value += 1;
         let setting = thread::spawn(move || client.set_param("/held", value));
         holds(Duration::from_millis(300), || !setting.is_finished()).then_some(setting)
@@ -297,22 +298,22 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_unreachable() {
     client.set_param("/gain", 7);
     assert!(
         !held.is_finished(),
-        "what changes nothing waited for the injection"
+        "a write that changes nothing waited for the injection"
     );
     node.signal(Signal::USR1);
-    eventually("it cannot answer", || !answers("getSubscriptions"));
+    eventually("the node cannot answer", || !answers("getSubscriptions"));
     assert!(!answers("getPid"));
     assert!(!node.said("done").contains(&"subscribe".to_owned()));
     robot.await_recovery(dead);
     held.join().unwrap();
-    report(&robot, "that the health check is over", |report| {
+    report(&robot, "the time of the health check", |report| {
         report["master_pid"] != dead && report["health_check_ms"].is_number()
     });
     let last = status(&client)["last_recovery"].clone();
     assert_eq!(names(&last["removed"]), Vec::<String>::new());
     assert_eq!(names(&last["unreachable"]), Vec::<String>::new());
     assert!(answers("getPid"));
-    eventually("everything has got through", || {
+    eventually("all calls have been answered", || {
         let mut done = node.said("done");
         done.sort();
         done == ["offer", "publish", "read", "set", "subscribe"]
@@ -323,9 +324,9 @@ fn a_roscpp_node_in_a_slow_registration_is_neither_dead_nor_unreachable() {
     assert_eq!(state.nodes, before.nodes);
 }
 
-/// A node that does not answer, such as a busy one, waits for nobody when it registers.
+/// A node that does not answer, for example because it is busy, does not have to wait when it registers.
 #[test]
-fn a_silent_node_registers_at_once_in_an_outage_and_is_kept() {
+fn a_node_that_does_not_answer_can_register_at_once_during_an_outage() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let node = FakeNode::start("/node");
@@ -334,7 +335,7 @@ fn a_silent_node_registers_at_once_in_an_outage_and_is_kept() {
     robot.kill_master();
     node.hold();
     node.subscribe(&client, "/more", "std_msgs/String");
-    assert!(!robot.is_open(), "there was a master");
+    assert!(!robot.is_open(), "a master was there during the outage");
     robot.revive_master();
     robot.await_recovery(dead);
     node.release();

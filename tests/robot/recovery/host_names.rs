@@ -1,5 +1,5 @@
-//! Nodes that are registered under names of hosts: names that resolve slowly or not at all delay nobody, and
-//! a node is found where its name leads now.
+//! Nodes that are registered under host names. Names that resolve slowly or not at all delay no other node,
+//! and a node is found at the address that its name has now.
 
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
@@ -9,10 +9,10 @@ use crate::support::{
     names, params, status,
 };
 
-/// By then a living subscriber knows a new publisher. One question to a name server that is waited for takes 5 s.
+/// Maximum time until a living subscriber knows a new publisher. Waiting for one lookup would take 5 s.
 const SOON: Duration = Duration::from_millis(4_500);
 
-/// `rosrescue core` that asks `server` and no other, and so does its master.
+/// A `rosrescue core` that uses only the name server `server`, as does its master.
 fn core(server: &NameServer, scratch: &Scratch, master_port: u16) -> Rescue {
     let setup = Setup::core(scratch, master_port);
     setup.wrapped(|own| server.serving(own)).start()
@@ -24,7 +24,7 @@ fn kill_master(client: &Client) -> u32 {
     dead
 }
 
-/// Waits for the report of the recovery after the death of `dead`, with its health check.
+/// Waits for the report of the recovery from the death of `dead`, including its health check.
 fn report(client: &Client, dead: u32) -> serde_json::Value {
     let mut last = serde_json::Value::Null;
     eventually("the recovery is complete", || {
@@ -35,7 +35,7 @@ fn report(client: &Client, dead: u32) -> serde_json::Value {
 }
 
 #[test]
-fn names_that_resolve_slowly_delay_nobody() {
+fn host_names_that_resolve_slowly_delay_no_other_node() {
     let scratch = Scratch::new();
     let server = NameServer::silent(&scratch);
     let rescue = core(&server, &scratch, free_port());
@@ -48,7 +48,7 @@ fn names_that_resolve_slowly_delay_nobody() {
         );
     }
     let living = FakeNode::start("/living");
-    // By a name that the computer knows itself.
+    // Under a name that the computer knows without a name server.
     let api = format!("http://localhost:{}/", living.port());
     living.claim_subscription("/chatter", Some("std_msgs/String"));
     client.ok(
@@ -68,13 +68,13 @@ fn names_that_resolve_slowly_delay_nobody() {
     println!("registration {registered:?}, told {told:?} later");
     assert!(registered < SOON, "{registered:?}");
     assert!(told < SOON, "{told:?}");
-    // While the lookups are under way: calls pass, and so do new publishers.
+    // While the lookups are under way, calls pass, and new publishers register.
     for i in 0..50 {
         let start = Instant::now();
         client.set_param("/n", i);
         assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     }
-    eventually("the slow ones are unreachable, and only they", || {
+    eventually("exactly the nodes with slow names are unreachable", || {
         names(&status(&client)["unreachable"]).len() == 40
     });
     let second = FakeNode::start("/second");
@@ -88,7 +88,7 @@ fn names_that_resolve_slowly_delay_nobody() {
     });
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     assert_eq!(living.heard("shutdown").len(), 0);
-    // Nobody waits for a name server at the end either.
+    // Stopping does not wait for a name server either.
     let mut rescue = rescue;
     let start = Instant::now();
     rescue.terminate();
@@ -99,20 +99,20 @@ fn names_that_resolve_slowly_delay_nobody() {
     );
 }
 
-/// A name that does not exist may exist tomorrow: its node is unreachable, and kept.
+/// A name that does not exist now may exist later, so its node counts as unreachable and is kept.
 #[test]
-fn names_that_do_not_exist_are_unreachable_and_delay_nobody() {
+fn nodes_whose_host_names_do_not_exist_are_unreachable_and_delay_no_other_node() {
     const COUNT: usize = 20;
     let scratch = Scratch::new();
     let server = NameServer::of_hosts(&scratch);
     let port = free_port();
     let rescue = core(&server, &scratch, port);
     let client = rescue.client();
-    let nobody: Vec<_> = (0..COUNT)
-        .map(|i| FakeNode::start(&format!("/nobody{i}")).at_host(&format!("nobody{i}.test")))
+    let unresolvable: Vec<_> = (0..COUNT)
+        .map(|i| FakeNode::start(&format!("/unresolvable{i}")).at_host(&format!("nobody{i}.test")))
         .collect();
     let living = FakeNode::start("/living");
-    for node in nobody.iter().chain([&living]) {
+    for node in unresolvable.iter().chain([&living]) {
         node.subscribe(&client, "/chatter", "std_msgs/String");
     }
     let dead = kill_master(&client);
@@ -132,32 +132,32 @@ fn names_that_do_not_exist_are_unreachable_and_delay_nobody() {
     assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
     let report = report(&client, dead);
     assert_eq!(names(&report["removed"]), Vec::<String>::new());
-    let mut unreachable: Vec<_> = nobody.iter().map(|node| node.name.clone()).collect();
+    let mut unreachable: Vec<_> = unresolvable.iter().map(|node| node.name.clone()).collect();
     unreachable.sort();
     assert_eq!(names(&report["unreachable"]), unreachable);
     assert_eq!(names(&status(&client)["unreachable"]), unreachable);
     let state = State::read(&Client::new(port));
     assert_eq!(state.subscribers_of("/chatter").len(), COUNT + 1);
 
-    // The name that begins to exist leads to a node that is whole.
-    let found = &nobody[0];
+    // When a name begins to exist, its node is told everything.
+    let found = &unresolvable[0];
     assert!(found.calls().is_empty(), "{:?}", found.calls());
     server.set("nobody0.test", Ipv4Addr::LOCALHOST);
-    eventually("it is found", || {
+    eventually("the node is found", || {
         found.updates("/chatter").last() == Some(&all)
     });
-    eventually("it is reachable again, and the others are", || {
+    eventually("only this node is reachable again", || {
         let unreachable = names(&status(&client)["unreachable"]);
         unreachable.len() == COUNT - 1 && !unreachable.contains(&found.name)
     });
-    for node in nobody.iter().chain([&living]) {
+    for node in unresolvable.iter().chain([&living]) {
         assert_eq!(node.heard("shutdown").len(), 0);
     }
 }
 
-/// A node's host gets another address, and the node's address stays the same text.
+/// The host of a node gets another address, while the node's registered address stays the same text.
 #[test]
-fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
+fn a_node_is_found_again_when_its_host_name_gets_another_address() {
     let scratch = Scratch::new();
     let server = NameServer::of_hosts(&scratch);
     let master_port = free_port();
@@ -174,7 +174,8 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
         state.subscribers_of("/chatter") == ["/mover"]
     };
 
-    // It moves during an outage. At the old address the port refuses: that would be death.
+    // The host moves during an outage. At the old address the port refuses, which would mean that the node is
+    // dead.
     let second = start(2);
     second.claim_subscription("/chatter", Some("std_msgs/String"));
     server.set("mover.test", host(2));
@@ -186,23 +187,23 @@ fn a_node_whose_name_changes_its_address_is_found_at_the_new_one() {
     assert_eq!(names(&recovered["removed"]), Vec::<String>::new());
     assert_eq!(names(&recovered["unreachable"]), Vec::<String>::new());
     let all = vec![publisher.api.clone()];
-    eventually("it is told at the new address", || {
+    eventually("the node is told at the new address", || {
         second.updates("/chatter").last() == Some(&all)
     });
     let asked = second.calls().into_iter().any(|call| call.from_rosrescue);
     assert!(asked && kept());
 
-    // It moves while it is unreachable.
+    // The host moves while the node is unreachable.
     second.hold();
     let dead = kill_master(&client);
     assert_eq!(names(&report(&client, dead)["unreachable"]), ["/mover"]);
     let third = start(3);
     third.claim_subscription("/chatter", Some("std_msgs/String"));
     server.set("mover.test", host(3));
-    eventually("it is reachable again", || {
+    eventually("the node is reachable again", || {
         names(&status(&client)["unreachable"]).is_empty()
     });
-    eventually("it is told all at the new address", || {
+    eventually("the node is told everything at the new address", || {
         third.updates("/chatter").last() == Some(&all)
     });
     assert!(kept());

@@ -1,5 +1,5 @@
-//! The new master dies at every single call of the injection, alone or in the middle of more deaths.
-//! The one that lives has the exact state, whatever came before, and no node notices.
+//! The new master dies at every single call of the injection, alone or among more deaths. The one that
+//! finally lives has the exact state, whatever happened before, and no node notices.
 
 use std::collections::BTreeMap;
 use std::thread;
@@ -11,10 +11,10 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// Calls that a master gets before the injection: the look.
+/// Number of calls that a master gets before the injection, to read its state.
 const LOOK: usize = 5;
 
-/// rosrescue proxy before masters that this test starts.
+/// rosrescue proxy in front of masters that this test starts.
 struct Proxied {
     rescue: Rescue,
     forkserver: Forkserver,
@@ -50,21 +50,21 @@ impl Proxied {
         });
     }
 
-    /// A master that has the state when this returns.
+    /// Starts a master that lives. Returns when it has the state.
     fn live(&mut self) -> u32 {
         let pid = self.forkserver.start(self.port, "");
         self.await_open(pid);
         pid
     }
 
-    /// A master that dies of this.
+    /// Starts a master that dies for the reasons in `failures`.
     fn die(&mut self, failures: &str) {
         let pid = self.forkserver.start(self.port, failures);
         self.forkserver.wait(pid);
     }
 }
 
-/// A state for which an injection takes some 80 calls, of nodes that a master or rosrescue can call.
+/// Makes a state for which an injection takes some 80 calls, with nodes that can be called.
 fn fill(client: &Client) -> Vec<FakeNode> {
     let nodes: Vec<_> = (0..3).map(|i| FakeNode::start(&format!("/n{i}"))).collect();
     for i in 0..10 {
@@ -87,7 +87,7 @@ fn fill(client: &Client) -> Vec<FakeNode> {
     nodes
 }
 
-/// rosrescue with a state, the state, and its nodes.
+/// A rosrescue with a state, that state, and its nodes.
 fn proxied_with_state() -> (Proxied, State, Nodes) {
     let proxied = Proxied::new();
     let nodes = fill(&proxied.rescue.client());
@@ -96,7 +96,7 @@ fn proxied_with_state() -> (Proxied, State, Nodes) {
     (proxied, before, nodes)
 }
 
-/// The nodes, what a living master last told them, and what they may be told.
+/// The nodes, the last lists that a living master told them, and the lists that they may be told.
 struct Nodes {
     all: Vec<FakeNode>,
     heard: Vec<usize>,
@@ -106,7 +106,7 @@ struct Nodes {
 }
 
 impl Nodes {
-    /// Waits until the master has told them everything.
+    /// Waits until the master has told the nodes everything.
     fn new(all: Vec<FakeNode>, state: &State) -> Self {
         let api = |name: &String| {
             let found = state.nodes.iter().find(|(node, _)| node == name);
@@ -123,7 +123,7 @@ impl Nodes {
                 .map(|node| node.calls().len())
                 .collect::<Vec<_>>()
         };
-        eventually("what was still to be told has been told", || {
+        eventually("all pending notifications have been sent", || {
             let before = calls();
             holds(Duration::from_millis(500), || calls() == before)
         });
@@ -136,11 +136,11 @@ impl Nodes {
         }
     }
 
-    /// G6: no node is told to shut down, no master calls a node at all, and whatever rosrescue tells is
-    /// the whole truth. That must not happen later either: idle threads of a master look every 100 ms
-    /// whether there is something to tell.
+    /// G6: no node is told to shut down, no master calls a node at all, and rosrescue tells only complete and
+    /// present lists. This is checked for a while, because idle threads of a master look only every 100 ms
+    /// whether there is anything to tell.
     #[track_caller]
-    fn assert_nobody_disturbed(&self) {
+    fn assert_no_node_disturbed(&self) {
         self.look();
         thread::sleep(Duration::from_millis(250));
         self.look();
@@ -170,7 +170,7 @@ impl Nodes {
 }
 
 #[test]
-fn at_every_call() {
+fn a_new_master_may_die_at_every_call_of_the_injection() {
     let (mut proxied, before, nodes) = proxied_with_state();
     let mut pid = proxied.bare().master_pid().unwrap();
     let mut number = LOOK;
@@ -197,7 +197,7 @@ fn at_every_call() {
         let when = format!("after a death at call {number}");
         before.assert_same(&State::read(&proxied.bare()), &when);
         if number.is_multiple_of(10) {
-            nodes.assert_nobody_disturbed();
+            nodes.assert_no_node_disturbed();
         }
     }
     proxied.live();
@@ -208,16 +208,16 @@ fn at_every_call() {
         "the injection had only {} calls",
         number - LOOK
     );
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
 #[test]
-fn many_times_in_a_row() {
+fn new_masters_may_die_in_the_injection_many_times_in_a_row() {
     let (mut proxied, before, nodes) = proxied_with_state();
     let mut pid = proxied.bare().master_pid().unwrap();
     for (number, deaths) in (LOOK + 1..90).step_by(8).zip((3..=7).cycle()) {
         proxied.forkserver.kill(pid);
-        // At the same call, or at another one each time.
+        // Die at the same call each time, or at another one.
         for death in 0..deaths {
             let call = match deaths % 2 {
                 0 => number,
@@ -228,14 +228,14 @@ fn many_times_in_a_row() {
         pid = proxied.live();
         let when = format!("after {deaths} deaths about call {number}");
         before.assert_same(&State::read(&proxied.bare()), &when);
-        nodes.assert_nobody_disturbed();
+        nodes.assert_no_node_disturbed();
     }
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
-/// Somebody else starts the masters: their crash loop is said too.
+/// A crash loop of masters that rosrescue did not start is reported too.
 #[test]
-fn the_crash_loop_of_somebody_elses_master() {
+fn a_crash_loop_of_masters_started_by_others_is_reported() {
     let (mut proxied, before, nodes) = proxied_with_state();
     let client = proxied.rescue.client();
     let mut pid = proxied.bare().master_pid().unwrap();
@@ -246,19 +246,23 @@ fn the_crash_loop_of_somebody_elses_master() {
     eventually("the status says crash loop", || {
         status(&client)["crash_loop"] == true
     });
-    proxied.rescue.wait_line("the crash loop", |line| {
-        line.contains("crash loop: the master has died")
-    });
+    proxied
+        .rescue
+        .wait_line("the log reports the crash loop", |line| {
+            line.contains("crash loop: the master has died")
+        });
     before.assert_same(&State::read(&proxied.bare()), "in the crash loop");
-    eventually("it is over", || status(&client)["crash_loop"] == false);
+    eventually("the crash loop is over", || {
+        status(&client)["crash_loop"] == false
+    });
     assert_eq!(status(&client)["open"], true);
-    nodes.assert_nobody_disturbed();
+    nodes.assert_no_node_disturbed();
 }
 
-/// A small state, because a core restarts its masters at once for the first five deaths within a minute:
-/// two of four deaths to a core are in the injection.
+/// The state is small, because a core restarts its masters at once only for the first five deaths within a
+/// minute. Of four deaths per core, two are in the injection.
 #[test]
-fn at_every_call_in_core_mode() {
+fn a_new_master_of_core_may_die_at_every_call_of_the_injection() {
     let mut number = 0;
     loop {
         let robot = Failing::core(&[]);
@@ -268,7 +272,7 @@ fn at_every_call_in_core_mode() {
         for node in &all {
             node.publish(&client, "/topic", "a/B");
             node.offer(&client, &format!("{}/service", node.name));
-            // The second publisher is news to the first subscriber, which every recovery tells again.
+            // The second publisher is news for the first subscriber, and every recovery repeats it.
             node.subscribe(&client, "/topic", "a/B");
             node.watch_param(&client, "/p0");
         }
@@ -284,14 +288,14 @@ fn at_every_call_in_core_mode() {
                 let status = status(&client);
                 let now = u32::try_from(status["last_recovery"]["master_pid"].as_u64()?).ok()?;
                 let died = robot.failures.deaths().len() == deaths;
-                // In this order: what lives after the death is not the one that dies.
+                // Read in this order, so that the master that lives is not the one that dies.
                 let open = status["open"] == true && now != pid && crate::support::alive(now);
                 open.then_some(!died)
             });
-            nodes.assert_nobody_disturbed();
+            nodes.assert_no_node_disturbed();
             if survived {
                 println!("{} calls in an injection", number - 1);
-                // Parameters, two of each kind of registration, what is read back, and the mark.
+                // Parameters, two registrations of each kind, what is read back, and the token.
                 assert!(number > 10, "the injection had only {number} calls");
                 return;
             }

@@ -1,12 +1,12 @@
-//! The status says which nodes are dead, long before a rescue or `--reap-dead-nodes` takes them out.
+//! The status reports dead nodes, long before a rescue or `--reap-dead-nodes` unregisters them.
 
 use crate::support::{
     FakeNode, Library, Mode, Robot, Tool, eventually, free_port, in_both_modes, names, page, params,
 };
 
-in_both_modes!(nodes_that_are_killed_are_dead_in_the_status_and_stay_registered);
+in_both_modes!(killed_nodes_are_reported_as_dead_and_stay_registered);
 
-fn nodes_that_are_killed_are_dead_in_the_status_and_stay_registered(mode: Mode) {
+fn killed_nodes_are_reported_as_dead_and_stay_registered(mode: Mode) {
     let robot = Robot::start_with(mode, &["--node-timeout", "300"]);
     let client = robot.client();
     let mut talker = robot.node(Library::Roscpp, "talker", &[]);
@@ -15,12 +15,12 @@ fn nodes_that_are_killed_are_dead_in_the_status_and_stay_registered(mode: Mode) 
     for node in &fakes {
         node.publish(&client, "/topic", "std_msgs/String");
     }
-    // Nobody can be asked there.
+    // This host name does not exist, so the node cannot be asked.
     let lost = "http://nobody.invalid:4711/";
     client.ok("registerSubscriber", params!["/lost", "/topic", "*", lost]);
     let status = || robot.status().unwrap_or_default();
     let unchecked = || names(&status()["unchecked_nodes"]);
-    eventually("all others are known to live", || {
+    eventually("all other nodes are known to be alive", || {
         let all = status()["state"]["nodes"].as_u64();
         unchecked() == ["/lost"] && status()["alive_nodes"].as_u64().map(|alive| alive + 1) == all
     });
@@ -29,10 +29,14 @@ fn nodes_that_are_killed_are_dead_in_the_status_and_stay_registered(mode: Mode) 
 
     talker.kill();
     listener.kill();
-    eventually("the killed ones are dead", || {
+    eventually("the killed nodes are reported as dead", || {
         names(&status()["dead_nodes"]) == ["/listener", "/talker"]
     });
-    assert_eq!(status()["state"]["nodes"], nodes, "they stay registered");
+    assert_eq!(
+        status()["state"]["nodes"],
+        nodes,
+        "the dead nodes must stay registered"
+    );
     assert_eq!(status()["unreachable"], serde_json::json!([]));
     let shown = Tool::rosrescue(&robot.scratch, robot.port(), &["status"]).ended(0);
     assert!(
@@ -58,25 +62,27 @@ fn nodes_that_are_killed_are_dead_in_the_status_and_stay_registered(mode: Mode) 
         (&node("/lost")["health"], &node("/lost")["checked_at"]),
         (&"unchecked".into(), &serde_json::Value::Null)
     );
-    // For its process id, when it was new.
+    // Each node was asked at most once, for its process id when it was new.
     assert!(fakes[0].calls().len() <= 1, "{:?}", fakes[0].calls());
 
     let _again = robot.node(Library::Roscpp, "talker", &[]);
-    eventually("one is started again", || {
+    eventually("the restarted node is alive", || {
         names(&status()["dead_nodes"]) == ["/listener"]
     });
 }
 
-/// Also one that was never there.
+/// Even a node that was never there.
 #[test]
-fn a_node_at_a_port_where_nobody_listens_is_dead() {
+fn a_node_whose_port_has_no_listener_is_reported_as_dead() {
     let robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
     let api = format!("http://127.0.0.1:{}/", free_port());
     let call = params!["/dead", "/a", "std_msgs/String", api.as_str()];
     robot.client().ok("registerPublisher", call);
-    eventually("it is dead", || {
+    eventually("the node is reported as dead", || {
         names(&robot.status().unwrap_or_default()["dead_nodes"]) == ["/dead"]
     });
     let said = |line: &String| line.contains("a registered node is dead") && line.contains("/dead");
-    eventually("the log says so", || robot.rescue.output().iter().any(said));
+    eventually("the log reports it", || {
+        robot.rescue.output().iter().any(said)
+    });
 }

@@ -1,5 +1,5 @@
-//! No node is ever told to shut down that a master which never died would have let live: neither a
-//! node that came back under its name at another address, nor one that has the old address now.
+//! No node is ever told to shut down that would live on with a master that never dies: neither a node that
+//! came back under its name at another address, nor a node that now has the old address.
 
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::time::{Duration, Instant};
@@ -11,8 +11,8 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-/// How often each thing is done. `ROSRESCUE_TEST_ROUNDS` says otherwise. A core restarts a master at
-/// once for the first five deaths within a minute only.
+/// How often each scenario is run. `ROSRESCUE_TEST_ROUNDS` overrides it. A core restarts its master at once
+/// only for the first five deaths within a minute.
 fn rounds(mode: Mode, usual: usize) -> usize {
     let rounds = std::env::var("ROSRESCUE_TEST_ROUNDS");
     match mode {
@@ -31,8 +31,8 @@ fn assert_not_shut_down(node: &FakeNode, round: usize) {
     );
 }
 
-/// Hears of a parameter from the master, whose threads take what it has to tell in order: what was to be
-/// told before has been told, or is being told.
+/// A node that is told of a parameter by the master. The threads of the master send notifications in order,
+/// so anything before has been sent or is being sent by then.
 struct Witness(FakeNode);
 
 impl Witness {
@@ -47,14 +47,14 @@ impl Witness {
         let before = self.0.heard("paramUpdate").len();
         let number = i32::try_from(before).unwrap() + 1_000_000;
         client.set_param("/round", number);
-        eventually("the master tells its news", || {
+        eventually("the master notifies the witness", || {
             let heard = self.0.heard("paramUpdate");
             heard.iter().any(|told| told[2] == Value::Int(number))
         });
     }
 }
 
-/// The master calls beside everything else: long enough for it to have done so.
+/// Checks for a while that no node is shut down: the master makes its calls beside everything else.
 #[track_caller]
 fn assert_none_shut_down(nodes: &[FakeNode]) {
     let spared = |node: &FakeNode| node.heard("shutdown").is_empty();
@@ -64,7 +64,7 @@ fn assert_none_shut_down(nodes: &[FakeNode]) {
     assert!(all, "told to shut down: {names:?}");
 }
 
-/// Makes the node a process of its own, and registers this and that.
+/// Gives the node a process id of its own, and makes some registrations.
 fn claim(node: &FakeNode, client: &Client) {
     static PIDS: AtomicI32 = AtomicI32::new(1_000_000);
     node.claim_pid(PIDS.fetch_add(1, Ordering::Relaxed));
@@ -73,14 +73,14 @@ fn claim(node: &FakeNode, client: &Client) {
     node.offer(client, &format!("{}/service", node.name));
 }
 
-/// Takes back what [`claim`] registered.
+/// Undoes the registrations that [`claim`] made.
 fn give_up(node: &FakeNode, client: &Client) {
     node.unpublish(client, &format!("{}/topic", node.name));
     node.unsubscribe(client, "/shared");
     node.withdraw(client, &format!("{}/service", node.name));
 }
 
-/// The master's death, with what `meanwhile` does to the nodes until the new master is there.
+/// Kills the master, and runs `meanwhile` before the next one is there.
 fn outage<T>(robot: &mut Robot, meanwhile: impl FnOnce(&Client) -> T) -> T {
     let dead = robot.master_pid();
     robot.kill_master();
@@ -90,9 +90,9 @@ fn outage<T>(robot: &mut Robot, meanwhile: impl FnOnce(&Client) -> T) -> T {
     result
 }
 
-in_both_modes!(a_node_that_came_back_under_its_name_in_the_outage_stays);
+in_both_modes!(a_node_restarted_during_an_outage_is_not_shut_down);
 
-fn a_node_that_came_back_under_its_name_in_the_outage_stays(mode: Mode) {
+fn a_node_restarted_during_an_outage_is_not_shut_down(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let witness = Witness::start(&client);
@@ -102,9 +102,9 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays(mode: Mode) {
     let mut node = FakeNode::start("/phoenix");
     claim(&node, &client);
     for round in 0..rounds(mode, 15) {
-        // What came late of the round before.
+        // The previous round may have had a late effect.
         assert_not_shut_down(&node, round);
-        // The old one is dead, or still there: then it is told to make way, as ever.
+        // The old node is dead or still there. If it is there, it is told to shut down as usual.
         let old = (round % 2 == 1).then_some(node);
         node = outage(&mut robot, |client| {
             let new = FakeNode::start("/phoenix");
@@ -115,7 +115,7 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays(mode: Mode) {
         let api = node.api.clone();
         assert_eq!(api_of(&robot, &node.name), Some(api), "round {round}");
         if let Some(old) = old {
-            eventually("the old one is told to make way", || {
+            eventually("the old node is told to shut down", || {
                 old.heard("shutdown").len() == 1
             });
         }
@@ -123,7 +123,7 @@ fn a_node_that_came_back_under_its_name_in_the_outage_stays(mode: Mode) {
         assert_eq!(state.publishers_of("/phoenix/topic"), ["/phoenix"]);
         witness.hear(&client);
     }
-    eventually("the witness knows the last one", || {
+    eventually("the witness knows the last node", || {
         witness.0.updates("/phoenix/topic").last() == Some(&vec![node.api.clone()])
     });
     assert_none_shut_down(&[node, witness.0]);
@@ -134,11 +134,11 @@ fn api_of(robot: &Robot, node: &str) -> Option<String> {
     api.as_str().map(str::to_owned)
 }
 
-/// A node dies and comes back at another port, and its old port goes to somebody else, in either order: all in
-/// one outage. Whoever tells the node at the old port to shut down must see that it is another one. Where the
-/// port was taken first even a master that never died shuts down its new owner; rosrescue need not.
+/// During one outage a node dies and comes back at another port, and its old port goes to another node, in
+/// either order. Whoever tells the node at the old port to shut down must notice that it is another one. If
+/// the port was taken first, even a master that never dies shuts down its new owner; rosrescue must not.
 #[test]
-fn who_has_the_port_of_a_node_that_moved_on_stays() {
+fn a_node_that_has_the_old_port_of_a_moved_node_is_not_shut_down() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let witness = Witness::start(&client);
@@ -171,10 +171,10 @@ fn who_has_the_port_of_a_node_that_moved_on_stays() {
     assert_none_shut_down(&stay);
 }
 
-in_both_modes!(who_has_the_port_of_a_dead_node_stays);
+in_both_modes!(a_node_that_has_the_port_of_a_dead_node_is_not_shut_down);
 
-/// A node dies and its port goes to another one; nobody comes back.
-fn who_has_the_port_of_a_dead_node_stays(mode: Mode) {
+/// A node dies and its port goes to another node. The dead node does not come back.
+fn a_node_that_has_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let witness = Witness::start(&client);
@@ -191,14 +191,14 @@ fn who_has_the_port_of_a_dead_node_stays(mode: Mode) {
             claim(&node, client);
             node
         });
-        eventually("the dead one is taken out", || {
+        eventually("the dead node is unregistered", || {
             State::try_read(&robot.bare()).is_ok_and(|state| !state.knows(&name))
         });
         assert_not_shut_down(&node, round);
         witness.hear(&client);
         assert!(robot.state().knows(&heir), "round {round}");
-        // A node is told from the next one at its port by its process id, which is asked for now.
-        eventually("the health check is over", || {
+        // Two nodes at the same port are distinguished by their process ids, for which they are asked now.
+        eventually("the health check has finished", || {
             let report = status(&client)["last_recovery"].clone();
             report["health_check_ms"].is_number()
         });
@@ -206,9 +206,9 @@ fn who_has_the_port_of_a_dead_node_stays(mode: Mode) {
     assert_none_shut_down(&[node]);
 }
 
-/// A master that is back already knows a newer node of a name when rosrescue comes to look.
+/// When rosrescue examines a master that has come back, it already knows a newer node of the same name.
 #[test]
-fn what_the_new_master_knows_already_wins() {
+fn a_newer_node_that_the_new_master_knows_is_not_shut_down() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let witness = Witness::start(&client);
@@ -232,9 +232,9 @@ fn what_the_new_master_knows_already_wins() {
     assert_none_shut_down(&[old]);
 }
 
-/// Real nodes that are killed and started again under their names while there is no master.
+/// Real nodes are killed and started again under the same names while there is no master.
 #[test]
-fn real_nodes_that_are_restarted_in_the_outage_stay() {
+fn real_nodes_restarted_during_an_outage_are_not_shut_down() {
     for library in [Library::Rospy, Library::Roscpp] {
         let mut robot = Robot::start(Mode::Core);
         let mut talker = robot.node(library, "talker", &[]);

@@ -1,5 +1,6 @@
-//! After an outage the registrations are what the living nodes say, and everybody has heard of every
-//! change. `paper/case_2_not_yet_told.rs` has a master that dies at every point of its work on one.
+//! After an outage the registrations are what living nodes report, and all subscribers have been told of
+//! every change. `paper/case_2_not_yet_told.rs` has a master that dies at every point while it notifies
+//! nodes.
 
 use std::path::Path;
 use std::time::Duration;
@@ -10,9 +11,9 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::{Reply, Value};
 
-/// The master dies before it tells anybody, and rosrescue with it.
+/// The master dies before it has told any node, and rosrescue dies with it.
 #[test]
-fn both_die_between_the_change_and_its_news() {
+fn subscribers_hear_of_a_change_although_master_and_rosrescue_die() {
     let program = Path::new(NODES).join("fragile_master.py");
     let mut robot = Robot::start_with(
         Mode::Core,
@@ -39,22 +40,28 @@ fn both_die_between_the_change_and_its_news() {
         robot.rescue.start_again();
         robot.rescue.wait_serving();
         robot.await_gate();
-        eventually(&format!("all know the publishers, point {point}"), || {
-            let mut lists = fakes.iter().map(|fake| fake.updates("/chatter"));
-            lists.all(|updates| updates.last() == Some(&all))
-        });
-        eventually(&format!("all know the parameter, point {point}"), || {
-            let mut told = fakes.iter().map(|fake| fake.heard("paramUpdate"));
-            told.all(|told| told.last().is_some_and(|told| told[2] == point.into()))
-        });
-        // Where rosrescue was faster, the master lives.
+        eventually(
+            &format!("all subscribers know the publishers, point {point}"),
+            || {
+                let mut lists = fakes.iter().map(|fake| fake.updates("/chatter"));
+                lists.all(|updates| updates.last() == Some(&all))
+            },
+        );
+        eventually(
+            &format!("all subscribers know the parameter, point {point}"),
+            || {
+                let mut told = fakes.iter().map(|fake| fake.heard("paramUpdate"));
+                told.all(|told| told.last().is_some_and(|told| told[2] == point.into()))
+            },
+        );
+        // If rosrescue was faster, the master is still alive.
         let _ = std::fs::remove_file(&file);
     }
 }
 
-/// The same for parameters: who has cached one is told of a change that the dead master still owed.
+/// The same for parameters: nodes that have cached one are told of a change that the dead master still owed.
 #[test]
-fn the_master_dies_at_every_callback_of_a_parameter() {
+fn subscribers_hear_of_a_parameter_although_the_master_dies_at_any_callback() {
     let program = Path::new(NODES).join("fragile_master.py");
     let robot = Robot::start_with(
         Mode::Core,
@@ -77,28 +84,31 @@ fn the_master_dies_at_every_callback_of_a_parameter() {
         client.set_param("/gain", point);
         robot.await_recovery(dead);
         assert!(!file.exists(), "the master did not die at point {point}");
-        eventually(&format!("all know the parameter, point {point}"), || {
-            let told = fakes.iter().all(|fake| {
-                let heard = fake.heard("paramUpdate");
-                heard.last().is_some_and(|told| {
-                    told[1] == Value::from("/gain/") && told[2] == Value::Int(point)
-                })
-            });
-            let value = point.to_string();
-            told && real
-                .iter()
-                .all(|node| node.said("value").last() == Some(&value))
-        });
+        eventually(
+            &format!("all subscribers know the parameter, point {point}"),
+            || {
+                let told = fakes.iter().all(|fake| {
+                    let heard = fake.heard("paramUpdate");
+                    heard.last().is_some_and(|told| {
+                        told[1] == Value::from("/gain/") && told[2] == Value::Int(point)
+                    })
+                });
+                let value = point.to_string();
+                told && real
+                    .iter()
+                    .all(|node| node.said("value").last() == Some(&value))
+            },
+        );
     }
     for node in &real {
         assert_eq!(node.said("failed"), Vec::<String>::new());
     }
 }
 
-/// A registration that the master lost, and one whose end it never heard of. A node of roscpp cannot say which
-/// master it has, so that nothing is added for it.
+/// One registration that the master has lost, and one whose end it has not heard of. A roscpp node cannot
+/// report which master it has, so nothing is added for it.
 #[test]
-fn what_living_nodes_say_is_mended() {
+fn registrations_are_corrected_by_what_living_nodes_report() {
     for library in [Library::Rospy, Library::Roscpp] {
         let mut robot = Robot::start(Mode::Proxy);
         let client = robot.client();
@@ -106,10 +116,10 @@ fn what_living_nodes_say_is_mended() {
         let listener = robot.node(library, "listener", &[]);
         let server = robot.node(library, "server", &[]);
         listener.wait_messages("/talker", 5);
-        // The health check of this one gets to know who is who.
+        // The health check of this crash finds out the process ids of the nodes.
         robot.crash_master();
         let before = robot.settled_state();
-        eventually("the health check is over", || {
+        eventually("the health check has finished", || {
             status(&client)["last_recovery"]["health_check_ms"].is_number()
         });
         let api = |node: &str| {
@@ -117,7 +127,7 @@ fn what_living_nodes_say_is_mended() {
             api.as_str().unwrap().to_owned()
         };
         let (talks, listens) = (api("/talker"), api("/listener"));
-        // In this order: a listener that is told of no publisher rightly drops its link.
+        // In this order, because a listener that is told of no publisher rightly drops its link.
         client.ok(
             "unregisterSubscriber",
             params!["/listener", "/chatter", listens.as_str()],
@@ -141,17 +151,17 @@ fn what_living_nodes_say_is_mended() {
             Library::Rospy => &reconciled[..],
             Library::Roscpp => &reconciled[2..],
         };
-        eventually("the report says so", || {
+        eventually("the report has the corrections", || {
             names(&status(&client)["last_recovery"]["reconciled"]) == reconciled
         });
         let after = robot.settled_state();
         assert_eq!(after.publishers_of("/ghost"), Vec::<String>::new());
         assert_eq!(after.subscribers_of("/haunted"), Vec::<String>::new());
-        // It lives until the links have been looked at.
+        // This node lives until the links have been checked.
         let late;
         if library == Library::Rospy {
             let after = after.without_type("/ghost").without_type("/haunted");
-            before.assert_same(&after, "when the registrations have been reconciled");
+            before.assert_same(&after, "after the registrations were reconciled");
             late = robot.node(library, "listener", &["__name:=late"]);
             late.wait_messages("/talker", 5);
         } else {
@@ -164,9 +174,9 @@ fn what_living_nodes_say_is_mended() {
     }
 }
 
-/// All say that they publish two topics, and the master knows one.
+/// All nodes report that they publish two topics. The master knows one of them.
 #[test]
-fn what_a_node_says_is_added_only_if_we_are_its_master_and_had_it() {
+fn a_reported_topic_is_registered_only_if_rosrescue_is_the_nodes_master_and_knew_it() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let nodes = ["/ours", "/foreign", "/cannot_say", "/never_told"].map(FakeNode::start);
@@ -186,7 +196,7 @@ fn what_a_node_says_is_added_only_if_we_are_its_master_and_had_it() {
     }
     let dead = robot.master_pid();
     robot.crash_master();
-    eventually("the health check is over", || {
+    eventually("the health check has finished", || {
         let report = status(&client)["last_recovery"].clone();
         report["master_pid"] != dead && report["health_check_ms"].is_number()
     });
@@ -199,9 +209,9 @@ fn what_a_node_says_is_added_only_if_we_are_its_master_and_had_it() {
     }
 }
 
-/// Nodes that cannot be asked, or answer nonsense, are left as they are.
+/// Nodes that cannot be asked, or give malformed answers, keep their registrations.
 #[test]
-fn nodes_that_answer_nonsense_are_left_alone() {
+fn nodes_with_malformed_answers_are_left_alone() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let answers = [
@@ -226,7 +236,7 @@ fn nodes_that_answer_nonsense_are_left_alone() {
         let params = params![name.as_str(), topic.as_str(), "std_msgs/String", api];
         client.ok("registerPublisher", params);
     }
-    // What is no HTTP may count as another program's port.
+    // An answer that is not HTTP may count as that of another program at the port.
     let garbage = format!("/odd{}", nodes.len() - 1);
     let before = robot.settled_state().without_node(&garbage);
     robot.crash_master();

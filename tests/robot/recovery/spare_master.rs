@@ -1,4 +1,4 @@
-//! With `--spare-master` the next rosmaster has been started before the first one dies.
+//! With `--spare-master`, the next rosmaster has already been started when the first one dies.
 
 use std::{fs, time::Duration};
 
@@ -9,7 +9,7 @@ use crate::support::{
     signal, stop,
 };
 
-/// The processes that rosrescue has started and that could be a master, but for `master`.
+/// Processes started by rosrescue that could be a spare master: all possible ones except `master`.
 fn spares(rescue: u32, master: u32) -> Vec<u32> {
     let children = fs::read_dir(format!("/proc/{rescue}/task"))
         .unwrap()
@@ -33,14 +33,14 @@ fn spares(rescue: u32, master: u32) -> Vec<u32> {
 #[track_caller]
 fn spare(robot: &Robot) -> u32 {
     let (rescue, master) = (robot.rescue.pid(), robot.master_pid());
-    eventually_some("there is a spare", || spares(rescue, master).pop())
+    eventually_some("a spare master is there", || spares(rescue, master).pop())
 }
 
 fn robot() -> Robot {
     Robot::start_with(Mode::Core, &["--spare-master"])
 }
 
-/// Kills the master. Returns the next one, which holds the same.
+/// Kills the master. Returns the next one, after checking that it has the same state.
 #[track_caller]
 fn kill_master(robot: &Robot) -> u32 {
     let (dead, before) = (robot.master_pid(), robot.settled_state());
@@ -51,7 +51,7 @@ fn kill_master(robot: &Robot) -> u32 {
 }
 
 #[test]
-fn each_death_is_followed_by_the_spare_and_that_by_another() {
+fn after_each_death_the_spare_takes_over_and_another_spare_is_started() {
     let robot = robot();
     let node = FakeNode::start("/known");
     node.publish(&robot.client(), "/chatter", "std_msgs/String");
@@ -61,41 +61,41 @@ fn each_death_is_followed_by_the_spare_and_that_by_another() {
     }
 }
 
-/// Killed, or it hangs: a new master is started.
+/// If the spare was killed or hangs, a new master is started.
 #[test]
-fn a_spare_that_is_of_no_use_is_replaced() {
+fn a_dead_or_hung_spare_is_replaced() {
     let robot = robot();
     let killed = spare(&robot);
     signal(killed, Signal::KILL);
-    eventually("the spare is dead", || !alive(killed));
+    eventually("the spare master is dead", || !alive(killed));
     assert_ne!(kill_master(&robot), killed);
     let hung = spare(&robot);
     stop(hung);
     assert_ne!(kill_master(&robot), hung);
-    eventually("the one that hung is dead", || !alive(hung));
+    eventually("the hung spare master is dead", || !alive(hung));
     assert_ne!(spare(&robot), hung);
 }
 
 #[test]
-fn a_spare_ends_with_rosrescue_and_is_no_orphan() {
+fn a_spare_ends_with_rosrescue_and_is_never_adopted() {
     let mut robot = robot();
     let (master, first) = (robot.master_pid(), spare(&robot));
     robot.rescue.kill();
-    eventually("the spare has ended", || !alive(first));
+    eventually("the spare master has ended", || !alive(first));
     robot.rescue.start_again();
     robot.rescue.wait_serving();
     assert_eq!(robot.master_pid(), master);
     let second = spare(&robot);
-    // In order, while it hangs.
+    // A clean stop, while the spare hangs.
     stop(second);
     signal(robot.rescue.pid(), Signal::TERM);
-    eventually("the spare and the master have ended", || {
+    eventually("the spare master and the master have ended", || {
         !alive(second) && !alive(master)
     });
 }
 
 #[test]
-fn another_program_has_no_spare() {
+fn a_program_other_than_rosmaster_has_no_spare() {
     let scratch = Scratch::new();
     let program = scratch.path("rosmaster.sh");
     fs::write(&program, "#!/bin/sh\nexec rosmaster \"$@\"\n").unwrap();
@@ -107,7 +107,7 @@ fn another_program_has_no_spare() {
     let setup =
         Setup::core(&scratch, free_port()).args(["--no-rosout", "--spare-master", "--rosmaster"]);
     let mut rescue = setup.arg(&program).start();
-    rescue.wait_line("that there is none", |line| {
+    rescue.wait_line("the log says that there is no spare master", |line| {
         line.contains("no spare rosmaster")
     });
     let (rescue, master) = (rescue.pid(), rescue.client().master_pid().unwrap());

@@ -1,5 +1,5 @@
-//! A dead node's port is another node's now: `--reap-dead-nodes` takes the dead one out before the master can
-//! mistake the other for it (ros_comm issue 2241).
+//! Another node now has a dead node's port. `--reap-dead-nodes` unregisters the dead node before the master
+//! can mistake the other one for it (ros_comm issue 2241).
 
 use std::time::Duration;
 
@@ -28,10 +28,10 @@ fn innocent(scratch: &Scratch, master: u16, port: u16) -> Node {
     Node::run(command.args(["-c", INNOCENT, &port.to_string()]))
 }
 
-/// A node with registrations of every kind, one of which another node has taken over, that dies. Returns its
+/// A node with registrations of every kind, one of them taken over by another node, that dies. Returns its
 /// port.
 fn dead_node(master: &Client, heir: &FakeNode) -> u16 {
-    // One that no other program on this computer gets meanwhile.
+    // No other program on this computer can get this port in the meantime.
     let node = FakeNode::start_at("/killed", free_port());
     node.publish(master, "/topic", "std_msgs/String");
     node.subscribe(master, "/other", "std_msgs/String");
@@ -42,7 +42,7 @@ fn dead_node(master: &Client, heir: &FakeNode) -> u16 {
     node.port()
 }
 
-/// The dead node is started again, at a port of its own.
+/// Starts the dead node again, at another port.
 fn started_again(master: &Client) -> FakeNode {
     let node = FakeNode::start("/killed");
     node.publish(master, "/topic", "std_msgs/String");
@@ -50,12 +50,12 @@ fn started_again(master: &Client) -> FakeNode {
 }
 
 fn options() -> [&'static str; 2] {
-    // The health check itself never comes to it.
+    // The health check itself would come much too late.
     ["--reap-dead-nodes", "3600"]
 }
 
 #[test]
-fn a_bare_master_shuts_the_innocent_node_down() {
+fn a_bare_master_shuts_down_the_wrong_node() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let client = master.client();
@@ -66,16 +66,16 @@ fn a_bare_master_shuts_the_innocent_node_down() {
     innocent.wait();
 }
 
-in_both_modes!(the_innocent_node_lives_on);
+in_both_modes!(a_node_that_took_the_port_of_a_dead_node_is_not_shut_down);
 
-fn the_innocent_node_lives_on(mode: Mode) {
+fn a_node_that_took_the_port_of_a_dead_node_is_not_shut_down(mode: Mode) {
     let mut robot = Robot::start_with(mode, &options());
     let client = robot.client();
     let [heir, watcher] = ["/heir", "/watcher"].map(FakeNode::start);
     watcher.subscribe(&client, "/topic", "std_msgs/String");
     let port = dead_node(&client, &heir);
     let mut innocent = innocent(&robot.scratch, robot.port(), port);
-    // What is gone is gone before the new node is there, and those who subscribe have heard of both.
+    // The dead node was unregistered before the new one was registered, and subscribers have heard of both.
     let state = robot.settled_state();
     assert!(!state.knows("/killed"), "{state}");
     assert_eq!(client.ask("lookupNode", params!["/test", "/killed"]), None);
@@ -85,11 +85,11 @@ fn the_innocent_node_lives_on(mode: Mode) {
         .iter()
         .find(|(name, _)| name == "/shared");
     assert_eq!(shared.unwrap().1, heir.service_api());
-    eventually("the subscriber has heard of both", || {
+    eventually("the subscriber has heard of both nodes", || {
         let updates = watcher.updates("/topic");
         updates.contains(&Vec::new()) && updates.last().is_some_and(|last| last.len() == 1)
     });
-    // It is in the journal.
+    // The unregistration is in the journal.
     robot.rescue.kill();
     robot.rescue.start_again();
     robot.rescue.wait_serving();
@@ -102,9 +102,9 @@ fn the_innocent_node_lives_on(mode: Mode) {
     assert_eq!(robot.counter("divergences"), 0);
 }
 
-in_both_modes!(while_the_mirror_stands_in_it_is_the_same);
+in_both_modes!(a_node_that_took_the_port_is_not_shut_down_during_an_outage_either);
 
-fn while_the_mirror_stands_in_it_is_the_same(mode: Mode) {
+fn a_node_that_took_the_port_is_not_shut_down_during_an_outage_either(mode: Mode) {
     let mut robot = Robot::start_under_with(mode, "waiting_rosmaster.py", &[], &options());
     let client = robot.client();
     let heir = FakeNode::start("/heir");
@@ -126,9 +126,9 @@ fn while_the_mirror_stands_in_it_is_the_same(mode: Mode) {
     assert!(innocent.exited().is_none());
 }
 
-/// Many at once, of which some take ports from others of the same batch, alone and in multicalls.
+/// Many nodes register at once, alone and in multicalls, and some take ports from others in the same batch.
 #[test]
-fn of_many_registrations_the_last_at_a_port_stays() {
+fn of_many_registrations_at_one_port_the_last_one_stays() {
     let robot = Robot::start_with(Mode::Core, &options());
     let register = |node: String, port: usize| {
         let api = format!("http://127.0.0.1:{}/", 1 + port);

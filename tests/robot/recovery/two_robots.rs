@@ -1,5 +1,5 @@
-//! Two robots whose masters are synchronised, as by multimaster_fkie (`tests/nodes/master_sync.py`): a rescue of one
-//! connects nothing that the sync's filters keep apart.
+//! Two robots whose masters are synchronised, as by multimaster_fkie (`tests/nodes/master_sync.py`). A rescue
+//! of one robot connects nothing that the filters of the synchronisation keep apart.
 
 use std::time::{Duration, Instant};
 
@@ -7,14 +7,14 @@ use crate::support::{
     Library, Mode, NODES, Node, Process, Robot, State, eventually, names, ros_command, status,
 };
 
-/// Topics that each robot keeps to itself: its drive commands above all.
+/// Topics that each robot keeps to itself, most of all its drive commands.
 const IGNORED: [&str; 2] = ["/cmd_vel", "/rosout"];
 const RESCUES: usize = 20;
-/// So many at least, however slow the computer.
+/// Minimum number of rescues, however slow the computer is.
 const FEWEST_RESCUES: usize = 6;
 const TIME: Duration = Duration::from_secs(60);
 
-/// A robot's nodes: one commands, one drives and watches the other robot, one talks.
+/// The nodes of a robot: one sends drive commands, one drives and watches the other robot, one publishes.
 fn nodes(robot: &Robot, own: &str, other: &str) -> [Node; 3] {
     let start = |library, program, name: &str, ends: &[String]| {
         let names = [format!("__ns:=/{own}"), format!("__name:={name}")];
@@ -35,7 +35,7 @@ fn nodes(robot: &Robot, own: &str, other: &str) -> [Node; 3] {
     ]
 }
 
-/// Registers what the nodes of `remote` do with the master of `own`.
+/// Registers the nodes of `remote` with the master of `own`, like multimaster_fkie.
 fn sync(own: &Robot, remote: &Robot, namespace: &str) -> Process {
     let mut command = ros_command(&own.scratch, "/usr/bin/python3", own.port());
     command
@@ -46,12 +46,12 @@ fn sync(own: &Robot, remote: &Robot, namespace: &str) -> Process {
     Process::start(format!("master_sync of {namespace}"), &mut command)
 }
 
-/// Waits for the end of the health check that follows the rescue from the death of `dead`, and checks that it
+/// Waits until the health check after the rescue from the death of `dead` has finished, and checks that it
 /// changed nothing.
 #[track_caller]
 fn assert_nothing_was_corrected(robot: &Robot, dead: u32) {
     let client = robot.client();
-    eventually("the health check is over", || {
+    eventually("the health check has finished", || {
         let report = status(&client)["last_recovery"].clone();
         report["master_pid"] != dead && report["health_check_ms"].is_number()
     });
@@ -62,7 +62,7 @@ fn assert_nothing_was_corrected(robot: &Robot, dead: u32) {
 }
 
 #[test]
-fn a_rescue_connects_no_robot_to_another() {
+fn a_rescue_does_not_connect_one_robot_to_another() {
     let mut robots = [(), ()].map(|()| Robot::start(Mode::Proxy));
     let [a, b] = &robots;
     let _nodes = [nodes(a, "a", "b"), nodes(b, "b", "a")];
@@ -100,7 +100,7 @@ fn a_rescue_connects_no_robot_to_another() {
         rescues += 1;
     }
     println!("{rescues} rescues in {:?}", start.elapsed());
-    // Sync goes on.
+    // The synchronisation still works.
     let [a, b] = &robots;
     let late = ["__ns:=/b", "__name:=late", "pub:/b/late"];
     let _late = b.node(Library::Rospy, "multi", &late);

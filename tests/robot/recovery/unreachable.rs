@@ -1,4 +1,5 @@
-//! Nodes that could not be reached are whole as soon as they can be. `tests/timing/unreachable.rs` has whom they delay.
+//! Nodes that could not be reached are told everything as soon as they can be reached.
+//! `tests/timing/unreachable.rs` tests which nodes they delay.
 
 use std::time::Duration;
 
@@ -7,9 +8,9 @@ use crate::support::{
     names, status,
 };
 
-/// Real nodes behind a cable that is cut during an outage, and mended later.
+/// Real nodes behind a cable that is cut during an outage and repaired later.
 #[test]
-fn a_node_that_can_be_reached_again_is_whole() {
+fn a_node_that_can_be_reached_again_is_told_everything() {
     let net = Netns::new();
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).env("ROS_IP", net.near());
@@ -33,27 +34,27 @@ fn a_node_that_can_be_reached_again_is_whole() {
     let publisher = FakeNode::start("/publisher");
     publisher.publish(&client, "/chatter", "std_msgs/String");
     let unreachable = || names(&status(&client)["unreachable"]);
-    eventually("both are unreachable", || {
+    eventually("both nodes are unreachable", || {
         unreachable() == ["/roscpp", "/rospy"]
     });
     let knows = |node: &Node| {
         let updates = node.updates("/chatter");
         updates.last() == Some(&vec![publisher.api.clone()])
     };
-    // Longer than the supervised rosmaster tries.
+    // Longer than the rosmaster in this test keeps trying.
     assert!(holds(Duration::from_secs(7), || !nodes.iter().any(knows)));
     for host in [2, 3] {
         net.mend(host);
     }
-    eventually("both know the publisher", || nodes.iter().all(knows));
-    eventually("nobody is unreachable any more", || {
+    eventually("both nodes know the publisher", || nodes.iter().all(knows));
+    eventually("no node is unreachable any more", || {
         unreachable().is_empty()
     });
 }
 
-/// As a node of rosnodejs, which answers everything else.
+/// As a node of rosnodejs, which answers all other calls.
 #[test]
-fn a_node_that_never_answers_a_parameter_update_hears_of_publishers() {
+fn a_node_that_never_answers_param_update_still_hears_of_publishers() {
     let mut robot = Robot::start_with(Mode::Proxy, &["--node-timeout", "2000"]);
     let client = robot.client();
     client.set_param("/gain", 0);
@@ -65,7 +66,7 @@ fn a_node_that_never_answers_a_parameter_update_hears_of_publishers() {
     let mut publishers = Vec::new();
     for value in 1..=3 {
         client.set_param("/gain", value);
-        eventually("it is told of the parameter", || {
+        eventually("the node is told of the parameter", || {
             let told = node.heard("paramUpdate");
             told.iter().any(|told| told[2] == value.into())
         });
@@ -77,7 +78,7 @@ fn a_node_that_never_answers_a_parameter_update_hears_of_publishers() {
             names(&status(&client)["unreachable"]).is_empty()
                 && node.updates("/topic").last() != Some(&all)
         });
-        assert!(!reachable, "it is not told of publisher {value}");
+        assert!(!reachable, "the node was not told of publisher {value}");
         let unreachable = names(&status(&client)["unreachable"]);
         assert_eq!(unreachable, Vec::<String>::new(), "publisher {value}");
     }

@@ -1,4 +1,4 @@
-//! The guardian: whatever becomes of the worker, the port stays open, and somebody serves it again.
+//! The guardian: whatever happens to the worker, the port stays open and a new worker serves it.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -16,10 +16,10 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// Between two calls of a client.
+/// Pause between two calls of a client.
 const PACE: Duration = Duration::from_millis(3);
 
-/// The one process that has this word in its environment since its start.
+/// The one process that has had this text in its environment since it started.
 fn process_with(scratch: &Scratch, word: &str) -> Option<u32> {
     let has = |pid: &u32| {
         let environment = fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
@@ -29,7 +29,7 @@ fn process_with(scratch: &Scratch, word: &str) -> Option<u32> {
     found.find(has)
 }
 
-/// The worker that is not `dead`.
+/// The worker, once there is one other than `dead`.
 #[track_caller]
 fn worker_after(scratch: &Scratch, dead: u32) -> u32 {
     eventually_some("there is a worker", || {
@@ -60,7 +60,7 @@ fn sockets(pid: u32) -> BTreeSet<PathBuf> {
         .collect()
 }
 
-/// `rosrescue core` with its guardian, once all is there that roscore has, too.
+/// `rosrescue core` with its guardian, once everything that roscore provides is there.
 #[track_caller]
 fn core(scratch: &Scratch) -> Rescue {
     let rescue = Setup::core(scratch, free_port()).guarded().start();
@@ -68,15 +68,15 @@ fn core(scratch: &Scratch) -> Rescue {
     eventually("roscore's parameters are set", || {
         client.param("/rosdistro").is_some() && client.param("/rosversion").is_some()
     });
-    // It subscribes last, and does nothing more in the master.
-    eventually("rosout is at work", || {
+    // It subscribes as its last step, and makes no further calls to the master.
+    eventually("rosout is running", || {
         State::try_read(&client).is_ok_and(|state| !state.subscribers_of("/rosout").is_empty())
     });
     rescue
 }
 
-/// Calls with a new connection each, one after the other, until `done`. Answers with the longest time
-/// that one took from its first connection to its answer; whoever is cut off tries again.
+/// Makes calls one after another, each with a new connection, until `done`. A call that is cut off is
+/// repeated. Returns the longest time from the first connection of a call to its answer.
 fn call_until(done: &AtomicBool, client: &Client) -> Duration {
     let mut longest = Duration::ZERO;
     while !done.load(Ordering::Relaxed) {
@@ -97,7 +97,7 @@ fn call_until(done: &AtomicBool, client: &Client) -> Duration {
 }
 
 #[test]
-fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
+fn a_killed_worker_costs_no_connection_and_no_state() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);
     let client = rescue.client();
@@ -128,7 +128,11 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
         longest.max().unwrap()
     });
     println!("the longest wait of a call: {longest:?}");
-    assert_eq!(client.master_pid(), Some(master), "it is adopted");
+    assert_eq!(
+        client.master_pid(),
+        Some(master),
+        "the master must be adopted"
+    );
     assert_eq!(process_of(&scratch, "rosout/rosout"), rosout);
     before.assert_same(&State::read(&client), "after five deaths");
     assert_eq!(node.heard("publisherUpdate").len(), 0);
@@ -136,19 +140,19 @@ fn a_worker_that_is_killed_costs_no_connection_and_no_state() {
     assert_eq!(said.matches("the worker has ended").count(), 5, "{said}");
 }
 
-/// It takes rosout some time to register: until then the next worker knows it by its process.
+/// rosout takes some time to register. Until then the next worker recognises it by its process.
 #[test]
-fn a_rosout_that_has_just_been_started_is_adopted() {
+fn a_rosout_that_was_just_started_is_adopted() {
     let scratch = Scratch::new();
     let mut rescue = Setup::core(&scratch, free_port()).guarded().start();
-    rescue.wait_line("that it starts rosout", |line| {
+    rescue.wait_line("the log says that rosout is started", |line| {
         line.contains("started rosout")
     });
     let dead = worker(&scratch);
     signal(dead, Signal::KILL);
     worker_after(&scratch, dead);
     let client = rescue.client();
-    eventually("rosout is at work", || {
+    eventually("rosout is running", || {
         State::try_read(&client).is_ok_and(|state| state.knows("/rosout"))
     });
     let said = rescue.stderr().join("\n");
@@ -158,7 +162,7 @@ fn a_rosout_that_has_just_been_started_is_adopted() {
 }
 
 #[test]
-fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
+fn a_guardian_needs_little_memory_and_passes_its_sockets_to_the_worker_only() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);
     let guardian = rescue.pid();
@@ -169,7 +173,7 @@ fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
             .collect();
         common.len()
     };
-    // IPv4 and, where there is one, IPv6.
+    // The sockets of IPv4 and, if there is one, IPv6.
     assert!(shared(worker(&scratch)) >= 1);
     assert_eq!(
         process_with(&scratch, "GLIBC_TUNABLES="),
@@ -188,7 +192,7 @@ fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
     let line = memory
         .lines()
         .find(|line| line.starts_with("Private_Dirty"));
-    println!("the guardian has {}", line.unwrap());
+    println!("memory of the guardian: {}", line.unwrap());
     let kib: u64 = line
         .unwrap()
         .split_whitespace()
@@ -196,12 +200,12 @@ fn a_guardian_is_small_and_what_it_passes_is_for_the_worker_alone() {
         .unwrap()
         .parse()
         .unwrap();
-    // Mostly what the linker left to be relocated: more in a debug build.
-    assert!(kib < 3072, "{kib} KiB");
+    // Mostly parts that the linker left to be relocated, which are larger in a debug build.
+    assert!(kib < 3072, "the guardian uses {kib} KiB");
 }
 
-/// A `rosrescue core` that has lost its rosmaster program and its worker, so that no worker gets as far as to serve. It
-/// comes with the program's path, once the guardian pauses.
+/// A `rosrescue core` that has lost its rosmaster program and its worker, so that no new worker gets far
+/// enough to serve calls. Returned together with the program's path as soon as the guardian pauses.
 #[track_caller]
 fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
     let program = scratch.path("rosmaster");
@@ -211,29 +215,31 @@ fn paused(scratch: &Scratch) -> (Rescue, PathBuf) {
     rescue.client().set_param("/kept", "yes");
     fs::remove_file(&program).unwrap();
     signal(worker(scratch), Signal::KILL);
-    rescue.wait_line("that it pauses", |line| line.contains("pause=500ms"));
+    rescue.wait_line("the log says that the guardian pauses", |line| {
+        line.contains("pause=500ms")
+    });
     (rescue, program)
 }
 
 #[test]
-fn workers_that_fail_before_they_serve_are_started_after_a_pause() {
+fn workers_that_fail_before_serving_are_restarted_after_a_pause() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
     symlink("/usr/bin/rosmaster", program).unwrap();
-    // Whoever calls in the pause waits for its end.
+    // A call during the pause waits for its end.
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     assert_eq!(rescue.terminate().code(), Some(0));
 }
 
 #[test]
-fn workers_that_have_served_are_started_again_at_once_however_many_die() {
+fn workers_that_have_served_are_always_restarted_at_once() {
     let scratch = Scratch::new();
     let rescue = core(&scratch);
     let client = rescue.client();
     let mut dead = 0;
     for _ in 0..8 {
         let next = worker_after(&scratch, dead);
-        eventually("it answers", || {
+        eventually("rosrescue answers", || {
             status(&client)["pid"].as_u64() == Some(next.into())
         });
         signal(next, Signal::KILL);
@@ -248,7 +254,7 @@ fn workers_that_have_served_are_started_again_at_once_however_many_die() {
 }
 
 #[test]
-fn a_stop_in_a_pause_ends_everything() {
+fn stopping_during_a_pause_ends_everything() {
     let scratch = Scratch::new();
     let (mut rescue, program) = paused(&scratch);
     symlink("/usr/bin/rosmaster", program).unwrap();
@@ -256,9 +262,9 @@ fn a_stop_in_a_pause_ends_everything() {
     assert_eq!(scratch.survivors(), vec![]);
 }
 
-/// Ctrl-Z in a terminal: the guardian is there and starts nothing.
+/// As with Ctrl-Z in a terminal: the guardian exists but does not start a worker.
 #[test]
-fn a_guardian_that_is_stopped_does_not_count_as_one() {
+fn a_guardian_stopped_by_ctrl_z_does_not_count_as_one() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.client().port());
@@ -267,17 +273,21 @@ fn a_guardian_that_is_stopped_does_not_count_as_one() {
     let by = || status(&client)["guarded_by"].as_str().unwrap().to_owned();
     assert!(by().contains("which nothing starts again"), "{}", by());
     crate::support::stop(rescue.pid());
-    rescue.wait_line("that it is stopped", |line| line.contains("unguarded"));
+    rescue.wait_line("the log says that the guardian is stopped", |line| {
+        line.contains("unguarded")
+    });
     assert_eq!(status(&client)["guarded"], false);
     assert!(by().contains("is stopped"), "{}", by());
     rescue.signal(Signal::CONT);
-    rescue.wait_line("that it goes on", |line| line.contains("runs again"));
+    rescue.wait_line("the log says that the guardian runs again", |line| {
+        line.contains("runs again")
+    });
     assert_eq!(status(&client)["guarded"], true);
 }
 
-/// Where the system permits it, the kernel ends nodes first when memory runs out.
+/// If the system permits it, the kernel ends nodes before the guardian when memory runs out.
 #[test]
-fn a_guardian_is_ended_last_when_memory_runs_out() {
+fn the_kernel_ends_the_guardian_last_when_memory_runs_out() {
     const SCORE: &str = "oom_score_adj";
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
@@ -290,16 +300,16 @@ fn a_guardian_is_ended_last_when_memory_runs_out() {
     let permitted = Command::new("sh").args(["-c", &script]).output().unwrap();
     let expected = String::from_utf8(permitted.stdout).unwrap();
     let score = fs::read_to_string(format!("/proc/{}/{SCORE}", rescue.pid())).unwrap();
-    assert_eq!(score, expected, "it was {own}");
+    assert_eq!(score, expected, "the test's own value was {own}");
 }
 
 #[test]
-fn an_orderly_stop_ends_everything() {
+fn a_clean_stop_ends_everything() {
     for signals in [
         &[Signal::TERM][..],
         &[Signal::INT],
         &[Signal::HUP],
-        // As by killall, which signals both processes.
+        // As with killall, which signals both processes.
         &[Signal::TERM, Signal::TERM],
     ] {
         let scratch = Scratch::new();
@@ -316,9 +326,9 @@ fn an_orderly_stop_ends_everything() {
     }
 }
 
-/// However far the next worker has come: it ends what the dead one has left.
+/// However far the next worker has got, it ends what the dead one left behind.
 #[test]
-fn a_stop_right_after_a_death_ends_everything() {
+fn stopping_right_after_a_death_of_the_worker_ends_everything() {
     for lines in [1, 2] {
         let scratch = Scratch::new();
         let mut rescue = core(&scratch);
@@ -330,7 +340,7 @@ fn a_stop_right_after_a_death_ends_everything() {
             let lines = lines.filter(|line| line.starts_with("ROS_MASTER_URI="));
             lines.count()
         };
-        eventually("it has come so far", || said() >= lines);
+        eventually("the worker has got this far", || said() >= lines);
         assert_eq!(rescue.terminate().code(), Some(0));
         assert_eq!(scratch.survivors(), vec![]);
     }
@@ -338,7 +348,7 @@ fn a_stop_right_after_a_death_ends_everything() {
 
 /// The worker is killed before it has done what the signal asks for.
 #[test]
-fn a_stop_and_a_death_at_once_end_everything() {
+fn stopping_while_the_worker_dies_ends_everything() {
     let scratch = Scratch::new();
     let mut rescue = core(&scratch);
     let dead = worker(&scratch);
@@ -355,12 +365,12 @@ fn a_stop_and_a_death_at_once_end_everything() {
 }
 
 #[test]
-fn a_second_signal_ends_both_at_once() {
+fn a_second_signal_ends_guardian_and_worker_at_once() {
     let scratch = Scratch::new();
     let mut rescue = core(&scratch);
-    // An orderly stop has to wait for this one.
+    // A clean stop would have to wait for this process.
     crate::support::stop(process_of(&scratch, "rosmaster --core"));
-    eventually("it has ended", || {
+    eventually("rosrescue has ended", || {
         rescue.signal(Signal::INT);
         rescue.exited().is_some()
     });
@@ -368,9 +378,9 @@ fn a_second_signal_ends_both_at_once() {
     assert_eq!(process_with(&scratch, "ROSRESCUE_GUARDIAN="), None);
 }
 
-/// Ctrl-\ in a terminal: the worker does not go on in secret.
+/// As with Ctrl-\ in a terminal: the worker must not keep running unnoticed.
 #[test]
-fn a_quit_ends_both() {
+fn sigquit_ends_guardian_and_worker() {
     let scratch = Scratch::new();
     let mut rescue = core(&scratch);
     rescue.signal(Signal::QUIT);
@@ -379,7 +389,7 @@ fn a_quit_ends_both() {
 }
 
 #[test]
-fn errors_of_the_start_are_said_once_and_end_it() {
+fn an_error_at_the_start_is_reported_once_and_ends_rosrescue() {
     let scratch = Scratch::new();
     let taken = std::net::TcpListener::bind("0.0.0.0:0").unwrap();
     let taken = taken.local_addr().unwrap().port().to_string();
@@ -406,7 +416,7 @@ fn errors_of_the_start_are_said_once_and_end_it() {
 }
 
 #[test]
-fn a_worker_outlives_its_guardian_and_says_so() {
+fn a_worker_survives_its_guardian_and_reports_it() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.client().port());
@@ -414,7 +424,7 @@ fn a_worker_outlives_its_guardian_and_says_so() {
     let client = rescue.client();
     let worker = worker(&scratch);
     rescue.kill();
-    eventually("it says so", || {
+    eventually("the status reports it", || {
         let lines = rescue.stderr().into_iter();
         let warned = lines.filter(|line| line.contains("unguarded")).count();
         warned == 1
@@ -424,14 +434,14 @@ fn a_worker_outlives_its_guardian_and_says_so() {
     assert_eq!(page["guarded"], false);
     assert!(page["guarded_by"].as_str().unwrap().contains("has ended"));
     signal(worker, Signal::TERM);
-    eventually("it ends", || !alive(worker));
-    eventually("that it has been closed in order", || {
+    eventually("the worker ends", || !alive(worker));
+    eventually("rosrescue was stopped cleanly", || {
         rescue.stderr().join("\n").contains("closed in order")
     });
 }
 
 #[test]
-fn both_killed_at_once_are_started_again_by_a_person() {
+fn after_a_kill_of_guardian_and_worker_a_new_start_restores_everything() {
     let scratch = Scratch::new();
     let mut rescue = core(&scratch);
     let client = rescue.client();
@@ -444,16 +454,16 @@ fn both_killed_at_once_are_started_again_by_a_person() {
     eventually("the worker is dead", || !alive(worker));
     rescue.start_again();
     rescue.wait_serving();
-    assert_eq!(client.master_pid(), master, "it is adopted");
+    assert_eq!(client.master_pid(), master, "the master must be adopted");
     before.assert_same(&State::read(&client), "after the death of both");
     assert_eq!(rescue.terminate().code(), Some(0));
     assert_eq!(scratch.survivors(), vec![]);
 }
 
-/// As the first process of a container the guardian becomes the parent of the master that a dead
-/// worker leaves: it is left behind all the same, and a zombie when it ends, unless it is waited for.
+/// As the first process of a container, the guardian becomes the parent of the master that a dead worker
+/// leaves behind. The master must still be recognised as left behind, and become no zombie when it ends.
 #[test]
-fn the_first_process_of_a_container_guards_as_any_other() {
+fn a_guardian_works_as_the_first_process_of_a_container() {
     let scratch = Scratch::new();
     let setup = Setup::core(&scratch, free_port()).guarded();
     let rescue = setup
@@ -473,8 +483,8 @@ fn the_first_process_of_a_container_guards_as_any_other() {
     let dead = worker(&scratch);
     signal(dead, Signal::KILL);
     worker_after(&scratch, dead);
-    // Until it is adopted, rosrescue answers with its own.
-    eventually("it is adopted", || client.master_pid() == named);
+    // Until the master is adopted, rosrescue answers with its own process id.
+    eventually("the master is adopted", || client.master_pid() == named);
     eventually("changes pass again", || {
         client
             .ask("setParam", params!["/test", "/again", 1])
@@ -486,14 +496,14 @@ fn the_first_process_of_a_container_guards_as_any_other() {
     eventually("no zombie is left", || {
         !Path::new(&format!("/proc/{master}")).exists()
     });
-    eventually("there is another master", || {
+    eventually("another master is there", || {
         client.master_pid().is_some_and(|pid| Some(pid) != named)
     });
     assert_eq!(client.param("/kept"), Some("yes".into()));
 }
 
 #[test]
-fn without_a_guardian_nobody_pretends_to_be_one() {
+fn without_a_guardian_the_status_does_not_claim_one() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.client().port()).guarded();

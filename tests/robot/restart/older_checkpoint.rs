@@ -1,5 +1,5 @@
-//! rosrescue is started again with a checkpoint that is older than the master that lives: the disk was full, or
-//! somebody has put a copy back. The master goes on with what it holds.
+//! rosrescue is started again with a checkpoint that is older than the living master, because the disk was
+//! full or a copy was restored. The master keeps the state that it holds.
 
 use std::fs;
 use std::path::Path;
@@ -11,11 +11,11 @@ use crate::support::{
 };
 use rosrescue::xmlrpc::Value;
 
-/// A robot that changes: nodes come, go and move, and so do parameters.
+/// The changing nodes of a robot: they start, end and move. Parameters change as well.
 struct Nodes {
     old: FakeNode,
     leaving: FakeNode,
-    /// Keeps its address.
+    /// A node that keeps its address.
     staying: FakeNode,
     moved: Option<FakeNode>,
 }
@@ -51,17 +51,21 @@ impl Nodes {
     }
 }
 
-/// Waits until calls pass to the master, which is the same, and holds what it held: `wanted`.
+/// Waits until calls pass to the same master, and checks that it still holds `wanted`.
 #[track_caller]
 fn assert_goes_on(rescue: &Rescue, bare: &Client, pid: u32, wanted: &State, nodes: &Nodes) {
     let client = rescue.client();
     eventually("calls pass to the master", || {
         status(&client)["open"] == true
     });
-    eventually("the health check is over", || {
+    eventually("the health check has finished", || {
         status(&client)["last_recovery"]["health_check_ms"].is_number()
     });
-    assert_eq!(bare.master_pid(), Some(pid), "the same master goes on");
+    assert_eq!(
+        bare.master_pid(),
+        Some(pid),
+        "the same master must stay in use"
+    );
     wanted.assert_same(&State::read(bare), "in the master");
     wanted.assert_same(&State::read(&client), "through rosrescue");
     let moved = nodes.moved.as_ref().unwrap();
@@ -74,15 +78,15 @@ fn is_unprotected(rescue: &Rescue) -> bool {
     !status(&rescue.client())["unprotected"].is_null()
 }
 
-/// The disk fills up while `rescue` serves a master at `bare`, and the robot changes. rosrescue ends by `end`
-/// while the disk is full, and is started again; and once more, after there is room.
+/// The disk fills up while `rescue` serves the master at `bare`, and the robot changes. rosrescue ends by
+/// `end` while the disk is full and is started again, and once more when there is room.
 fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn(&mut Rescue)) {
     let client = rescue.client();
     let mut nodes = Nodes::begin(&client);
     let pid = bare.master_pid().unwrap();
     let filler = disk.fill();
     let mut count = 0;
-    eventually("it is said to be unprotected", || {
+    eventually("rosrescue reports that it is unprotected", || {
         count += 1;
         client.set_param("/count", count);
         is_unprotected(&rescue)
@@ -94,7 +98,7 @@ fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn
     rescue.start_again();
     rescue.wait_serving();
     assert_goes_on(&rescue, bare, pid, &wanted, &nodes);
-    rescue.wait_line("that the master is newer", |line| {
+    rescue.wait_line("the log says that the master is newer", |line| {
         line.contains("the master holds a newer state than the checkpoint")
     });
     assert!(is_unprotected(&rescue));
@@ -106,11 +110,11 @@ fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn
     rescue.start_again();
     rescue.wait_serving();
     assert_goes_on(&rescue, bare, pid, &wanted, &nodes);
-    eventually("it is protected", || !is_unprotected(&rescue));
+    eventually("rosrescue is protected", || !is_unprotected(&rescue));
 }
 
 #[test]
-fn a_full_disk_and_a_core_that_is_killed() {
+fn the_master_of_a_killed_core_keeps_its_state_after_a_full_disk() {
     let scratch = Scratch::new();
     let disk = SmallDisk::new(&scratch, "1m");
     let port = free_port();
@@ -123,7 +127,7 @@ fn a_full_disk_and_a_core_that_is_killed() {
 }
 
 #[test]
-fn a_full_disk_and_a_proxy_that_is_stopped_in_order() {
+fn the_master_of_a_stopped_proxy_keeps_its_state_after_a_full_disk() {
     let scratch = Scratch::new();
     let disk = SmallDisk::new(&scratch, "1m");
     let master = Rosmaster::start(&scratch);
@@ -136,7 +140,7 @@ fn a_full_disk_and_a_proxy_that_is_stopped_in_order() {
     });
 }
 
-/// Puts `copy` back in place of the checkpoint at `path`, as from a backup or a snapshot of the file system.
+/// Restores `copy` in place of the checkpoint at `path`, as from a backup or a snapshot of the file system.
 fn put_back(copy: &[u8], path: &Path) {
     let folder = path.parent().unwrap();
     for entry in fs::read_dir(folder).unwrap().flatten() {
@@ -148,7 +152,7 @@ fn put_back(copy: &[u8], path: &Path) {
 }
 
 #[test]
-fn a_checkpoint_that_is_put_back_is_older_than_the_master() {
+fn a_master_keeps_its_state_although_an_older_checkpoint_was_restored() {
     for stopped in [false, true] {
         let scratch = Scratch::new();
         let master = Rosmaster::start(&scratch);
@@ -169,10 +173,10 @@ fn a_checkpoint_that_is_put_back_is_older_than_the_master() {
     }
 }
 
-/// The power fails at rosrescue's computer, and the disk loses what was not synced. The master is on another computer,
-/// as are nodes, and lives on.
+/// The power of rosrescue's computer fails, and the disk loses everything that was not synced. The master and
+/// some nodes are on another computer and live on.
 #[test]
-fn a_power_cut_beside_a_master_that_lives_on() {
+fn a_master_keeps_its_state_after_a_power_cut_of_rosrescues_computer() {
     let cases = [
         ("never", "auto"),
         ("never", "always"),
@@ -197,8 +201,8 @@ fn a_power_cut_beside_a_master_that_lives_on() {
         rescue.start_after_reboot(&another_boot(&scratch));
         rescue.wait_serving();
         assert_goes_on(&rescue, &master.client(), master.pid(), &wanted, &nodes);
-        // It is what the next start knows.
-        eventually("it is protected", || !is_unprotected(&rescue));
+        // The next start knows this state.
+        eventually("rosrescue is protected", || !is_unprotected(&rescue));
         rescue.kill();
         rescue.start_again();
         rescue.wait_serving();
@@ -206,16 +210,16 @@ fn a_power_cut_beside_a_master_that_lives_on() {
     }
 }
 
-/// The master has died since the copy was made, and the next one was given the state, in the next session.
+/// Since the copy was made the master has died, and the next master was given the state in the next session.
 #[test]
-fn a_checkpoint_of_an_earlier_session_and_an_earlier_master() {
+fn a_checkpoint_of_an_earlier_session_does_not_replace_the_masters_state() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();
     let client = rescue.client();
     client.set_param("/of_before", 1);
     let copy = fs::read(rescue.checkpoint()).unwrap();
-    // Nobody is alive.
+    // No node is alive.
     assert_eq!(rescue.terminate().code(), Some(0));
     rescue.start_again();
     rescue.wait_serving();
@@ -236,10 +240,10 @@ fn a_checkpoint_of_an_earlier_session_and_an_earlier_master() {
     assert_goes_on(&rescue, &master.client(), master.pid(), &wanted, &nodes);
 }
 
-/// What is answered before the master is looked at counts, also where it changes nothing in a checkpoint that is
-/// older.
+/// Writes that are answered before the master has been examined count, even if they change nothing in an
+/// older checkpoint.
 #[test]
-fn what_is_written_before_the_look_counts() {
+fn writes_answered_before_the_master_is_examined_are_kept() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let mut rescue = Setup::proxy(&scratch, master.port).start();

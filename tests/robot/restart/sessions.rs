@@ -1,7 +1,8 @@
-//! Whether a start goes on with the session before: after an orderly stop, a crash, a reboot.
+//! Whether a start continues the previous session: after a clean stop, a crash, a reboot.
 //!
-//! A reboot is a private mount that shows another boot id, and another computer is a network namespace;
-//! everything else is the real thing. What a crash and an orderly stop come to is in `worker.rs` too.
+//! A reboot is simulated by a private mount that shows another boot id, and another computer by a network
+//! namespace. Everything else is real. `worker.rs` also tests the consequences of a crash and of a clean
+//! stop.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -15,14 +16,14 @@ use crate::support::{
 };
 use rustix::process::Signal;
 
-/// The id of another boot, as the kernel shows it.
+/// A file with the id of another boot, as the kernel shows it.
 pub(super) fn another_boot(scratch: &Scratch) -> PathBuf {
     let file = scratch.path("boot_id");
     fs::write(&file, "01234567-89ab-4cde-8f01-23456789abcd\n").unwrap();
     file
 }
 
-/// SIGKILL to rosrescue and to its master, as a power cut does it.
+/// Sends SIGKILL to rosrescue and to its master, like a power cut.
 fn cut_power(robot: &mut Robot) {
     let master = robot.master_pid();
     robot.rescue.kill();
@@ -30,7 +31,7 @@ fn cut_power(robot: &mut Robot) {
     eventually("the master is dead", || !alive(master));
 }
 
-/// Files beside the checkpoint that hold `text`.
+/// Files beside the checkpoint that contain `text`.
 fn kept(robot: &Robot, text: &str) -> Vec<String> {
     let checkpoint = robot.rescue.checkpoint();
     let is_old = |path: &Path| path != checkpoint && path.to_string_lossy().contains("chkpt");
@@ -43,15 +44,15 @@ fn kept(robot: &Robot, text: &str) -> Vec<String> {
     names.collect()
 }
 
-in_both_modes!(after_a_reboot_without_nodes_the_robot_starts_afresh);
+in_both_modes!(after_a_reboot_without_living_nodes_a_new_session_begins);
 
-fn after_a_reboot_without_nodes_the_robot_starts_afresh(mode: Mode) {
+fn after_a_reboot_without_living_nodes_a_new_session_begins(mode: Mode) {
     let mut robot = Robot::start(mode);
     robot.client().set_param("/use_sim_time", true);
     let _talker = robot.node(Library::Rospy, "talker", &[]);
     robot.settled_state();
     cut_power(&mut robot);
-    // The nodes too, rosout among them.
+    // The nodes die too, including rosout.
     for pid in robot.processes() {
         signal(pid, Signal::KILL);
     }
@@ -67,13 +68,13 @@ fn after_a_reboot_without_nodes_the_robot_starts_afresh(mode: Mode) {
     assert_eq!(client.param("/use_sim_time"), None, "{mode:?}");
     assert!(!robot.settled_state().knows("/talker"), "{mode:?}");
     let names = kept(&robot, "use_sim_time");
-    // And the generation before it, if that had the parameter too.
+    // So is the previous generation, if it had the parameter too.
     let all_old = names.iter().all(|name| name.contains(".session-"));
     assert!(
         !names.is_empty() && all_old,
-        "the old file is kept: {names:?}"
+        "the old file is not kept: {names:?}"
     );
-    // The new session is one: a crash now restores it.
+    // The new session is a full one: a crash now restores it.
     client.set_param("/today", 1);
     robot.crash_master();
     assert_eq!(robot.client().param("/today"), Some(1.into()));
@@ -95,9 +96,9 @@ fn node_elsewhere(
     Node::run(&mut net.inside(&command))
 }
 
-in_both_modes!(after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on);
+in_both_modes!(after_a_reboot_with_nodes_alive_elsewhere_the_session_continues);
 
-fn after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on(mode: Mode) {
+fn after_a_reboot_with_nodes_alive_elsewhere_the_session_continues(mode: Mode) {
     let net = Netns::new();
     let scratch = Scratch::new();
     let (port, master_port) = (free_port(), free_port());
@@ -139,9 +140,10 @@ fn after_a_reboot_with_nodes_alive_elsewhere_the_session_goes_on(mode: Mode) {
     talker.assert_no_link_lost();
 }
 
-/// Nothing on this computer has survived: who answers where a node was is somebody else.
+/// Nothing on this computer has survived the reboot, so an answer from the address of a node comes from
+/// another program.
 #[test]
-fn after_a_reboot_a_stranger_at_a_nodes_port_is_no_node() {
+fn after_a_reboot_another_program_at_a_nodes_port_does_not_count_as_the_node() {
     let net = Netns::new();
     for host in ["127.0.0.1", "localhost", &net.near()] {
         let mut robot = Robot::start_with(Mode::Core, &["--no-rosout"]);
@@ -174,7 +176,7 @@ fn after_a_reboot_a_stranger_at_a_nodes_port_is_no_node() {
 }
 
 #[test]
-fn after_an_orderly_stop_living_nodes_keep_their_session() {
+fn after_a_clean_stop_living_nodes_keep_their_session() {
     let mut robot = Robot::start(Mode::Core);
     robot.client().set_param("/gain", 3);
     let talker = robot.node(Library::Rospy, "talker", &[]);
@@ -186,7 +188,7 @@ fn after_an_orderly_stop_living_nodes_keep_their_session() {
     robot.rescue.wait_serving();
     robot.await_gate();
     let now = robot.settled_state().without_node("/rosout");
-    before.assert_same(&now, "after an orderly stop and start with nodes alive");
+    before.assert_same(&now, "after a clean stop and a start with nodes alive");
     listener.assert_no_message_lost("/talker");
     talker.assert_no_link_lost();
 }

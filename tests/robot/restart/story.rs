@@ -1,12 +1,12 @@
-//! The death of rosrescue itself does not erase what the session has been through.
+//! The death of rosrescue itself does not erase the history of the session.
 
 use serde_json::Value;
 
 use crate::support::{FakeNode, Mode, Robot, Tool, eventually, in_both_modes};
 
-in_both_modes!(rescues_before_the_death_of_rosrescue_are_still_told);
+in_both_modes!(rescues_before_a_death_of_rosrescue_are_still_reported);
 
-fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
+fn rescues_before_a_death_of_rosrescue_are_still_reported(mode: Mode) {
     let mut robot = Robot::start_with(mode, &["--node-timeout", "300"]);
     let reports = |robot: &Robot| {
         let folder = robot.rescue.checkpoint().parent().unwrap().to_owned();
@@ -34,7 +34,9 @@ fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
         robot.rescue.start_again();
         robot.rescue.wait_serving();
         robot.await_gate();
-        eventually("its death has a report", || reports(&robot) == 1 + deaths);
+        eventually("the death of rosrescue has a report", || {
+            reports(&robot) == 1 + deaths
+        });
     }
     let after = robot.status().unwrap();
     assert_eq!(numbers(&after), [1, 2, 3]);
@@ -57,7 +59,7 @@ fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
         get.contains("\nrosrescue_worker_restarts_total 2\n"),
         "{get}"
     );
-    // What was taken out stays dead on the page.
+    // An unregistered dead node is still dead on the page.
     let state = crate::support::page(&robot.client(), "/state.json");
     assert!(
         state.contains(r#""name":"/dead","health":"dead""#),
@@ -65,7 +67,7 @@ fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
     );
 
     robot.crash_master();
-    eventually("the next one is kept", || reports(&robot) == 4);
+    eventually("the next report is kept", || reports(&robot) == 4);
     let rows = Tool::rosrescue(&robot.scratch, robot.port(), &["history", "--json"]).json(0);
     let rows = rows["kept"].as_array().unwrap().clone();
     let row = rows

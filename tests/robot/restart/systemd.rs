@@ -1,5 +1,5 @@
-//! rosrescue under systemd: sockets by `sd_listen_fds(3)`, its state by `sd_notify(3)`. The test
-//! speaks systemd's part.
+//! rosrescue under systemd: it gets sockets by `sd_listen_fds(3)` and reports its state by `sd_notify(3)`.
+//! The test plays the part of systemd.
 
 use std::fs;
 use std::net::TcpListener;
@@ -13,10 +13,10 @@ use crate::support::{
 use command_fds::{CommandFdExt, FdMapping};
 use rustix::process::Signal;
 
-/// `command` as a unit's process that is given `socket` as number 3.
+/// Runs `command` like a unit's process that is given `socket` as file descriptor 3.
 fn activated(command: &Command, socket: OwnedFd) -> Command {
     let mut shell = Command::new("sh");
-    // The process id is that of the shell, and then of what it becomes.
+    // The process id is that of the shell, which then becomes the program.
     shell.args(["-c", r#"LISTEN_PID=$$ exec "$0" "$@""#]);
     let mut command = behind(shell, command);
     let mapping = FdMapping {
@@ -28,7 +28,7 @@ fn activated(command: &Command, socket: OwnedFd) -> Command {
     command
 }
 
-/// systemd's end of a notification socket.
+/// systemd's side of a notification socket.
 struct Manager {
     socket: UnixDatagram,
     heard: Vec<String>,
@@ -42,7 +42,7 @@ impl Manager {
         Self { socket, heard }
     }
 
-    /// Waits until a line begins with `assignment`.
+    /// Waits for a line that starts with `assignment`.
     #[track_caller]
     fn wait(&mut self, assignment: &str) {
         let mut buffer = [0; 4096];
@@ -65,7 +65,7 @@ impl Manager {
 }
 
 #[test]
-fn a_socket_unit_takes_the_place_of_the_guardian() {
+fn with_a_socket_unit_systemd_replaces_the_guardian() {
     let scratch = Scratch::new();
     let mut manager = Manager::new(&scratch);
     let master_port = free_port();
@@ -97,7 +97,7 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
     master.kill();
     manager.wait("STATUS=standing in for the master: Nodes go on");
 
-    // A crash, and what systemd does then: the socket is the same.
+    // After a crash, systemd starts the program again with the same socket.
     rescue.kill();
     let waiting = Client::new(port).connect();
     assert!(waiting.is_ok(), "a connection is refused");
@@ -109,9 +109,9 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
     assert_eq!(rescue.wait().code(), Some(0));
 }
 
-/// A service without a socket unit: the guardian is its main process, the worker speaks for it.
+/// A service without a socket unit: the guardian is the main process, and the worker notifies systemd.
 #[test]
-fn the_worker_of_a_guardian_speaks_to_systemd() {
+fn the_worker_of_a_guardian_notifies_systemd() {
     let scratch = Scratch::new();
     let mut manager = Manager::new(&scratch);
     let rescue = Setup::core(&scratch, free_port())
@@ -134,9 +134,9 @@ fn the_worker_of_a_guardian_speaks_to_systemd() {
     assert_eq!(rescue.wait().code(), Some(0));
 }
 
-/// Its notification socket fills up. On one core rosrescue has one thread for all calls.
+/// The notification socket is full. On one core rosrescue has only one thread for all calls.
 #[test]
-fn a_systemd_that_reads_nothing_holds_nobody_up() {
+fn a_systemd_that_reads_no_notifications_delays_no_call() {
     let scratch = Scratch::new();
     let manager = Manager::new(&scratch);
     let mut rescue = Setup::core(&scratch, free_port())
@@ -165,7 +165,7 @@ fn a_systemd_that_reads_nothing_holds_nobody_up() {
 }
 
 #[test]
-fn what_is_no_listening_socket_is_refused() {
+fn a_descriptor_that_is_not_a_listening_socket_is_refused() {
     let scratch = Scratch::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let connected = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
@@ -179,9 +179,9 @@ fn what_is_no_listening_socket_is_refused() {
     }
 }
 
-/// Sockets for somebody else are left alone.
+/// Sockets meant for another process are left alone.
 #[test]
-fn the_sockets_of_others_are_not_taken() {
+fn sockets_for_another_process_are_not_used() {
     let scratch = Scratch::new();
     let master = Rosmaster::start(&scratch);
     let setup = Setup::proxy(&scratch, master.client().port())

@@ -1,5 +1,5 @@
-//! rosrescue's own restarts: it adopts a living master, fills an empty one, restores from the file what
-//! is worth restoring, and takes over a system that ran without it.
+//! Restarts of rosrescue itself: it adopts a living master, fills an empty one, restores from the file what
+//! still applies, and takes over a system that ran without it.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -15,9 +15,9 @@ use crate::support::{
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
-in_both_modes!(rosrescue_that_was_killed_adopts_the_living_master);
+in_both_modes!(a_killed_rosrescue_adopts_the_living_master_when_restarted);
 
-fn rosrescue_that_was_killed_adopts_the_living_master(mode: Mode) {
+fn a_killed_rosrescue_adopts_the_living_master_when_restarted(mode: Mode) {
     let mut robot = Robot::start(mode);
     let client = robot.client();
     let talker = robot.node(Library::Roscpp, "talker", &[]);
@@ -38,16 +38,16 @@ fn rosrescue_that_was_killed_adopts_the_living_master(mode: Mode) {
     assert_eq!(
         robot.master_pid(),
         master,
-        "the living master is adopted, not replaced"
+        "the living master was replaced instead of adopted"
     );
     before.assert_same(&robot.state(), "after rosrescue's own restart");
     assert_eq!(
         node.heard("publisherUpdate").len(),
         updates,
-        "nothing is injected"
+        "the living master was injected"
     );
 
-    // What it adopted it can restore; parameter subscriptions it knows from the checkpoint.
+    // It can restore everything that it adopted. It knows parameter subscriptions from the checkpoint.
     robot.crash_master();
     before.assert_same(&robot.state(), "after the master's crash that followed");
     client.set_param("/watched", 2);
@@ -62,10 +62,10 @@ fn rosrescue_that_was_killed_adopts_the_living_master(mode: Mode) {
     talker.assert_no_link_lost();
 }
 
-/// Between its first open port and its first look at the living master it knows only the checkpoint.
-/// What it acknowledges then must be true in the master that it adopts.
+/// Between opening its port and examining the living master, rosrescue knows only the checkpoint. Anything
+/// that it acknowledges then must also be true in the master that it adopts.
 #[test]
-fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() {
+fn unregistrations_while_rosrescue_starts_reach_the_adopted_master() {
     let mut robot = Robot::start(Mode::Proxy);
     let client = robot.client();
     let [leaving, staying] = ["/leaving", "/staying"].map(FakeNode::start);
@@ -83,12 +83,12 @@ fn what_is_unregistered_while_it_starts_is_unregistered_in_the_adopted_master() 
     signal(master, Signal::CONT);
     robot.rescue.wait_serving();
     robot.await_gate();
-    robot.await_state(&after, "at the adopted master");
+    robot.await_state(&after, "in the adopted master");
     after.assert_same(&State::read(&robot.client()), "through rosrescue");
 }
 
 #[test]
-fn yesterdays_parameters_do_not_wake_up_tomorrow() {
+fn parameters_of_a_stopped_session_are_not_restored_the_next_day() {
     let mut robot = Robot::start(Mode::Core);
     robot.client().set_param("/use_sim_time", true);
     let run_id = robot.client().param("/run_id").expect("a run id");
@@ -107,11 +107,11 @@ fn yesterdays_parameters_do_not_wake_up_tomorrow() {
         .filter(|entry| entry.path() != robot.rescue.checkpoint() && entry.path().is_file())
         .filter_map(|entry| fs::read_to_string(entry.path()).ok())
         .any(|text| text.contains("use_sim_time"));
-    assert!(kept, "the old checkpoint is kept under another name");
+    assert!(kept, "the old checkpoint was not kept under another name");
 }
 
 #[test]
-fn a_stopped_session_is_restored_when_told_so() {
+fn a_stopped_session_is_restored_if_asked_to() {
     let scratch = Scratch::new();
     let (port, master_port) = (free_port(), free_port());
     let start = |restore: &str| {
@@ -135,8 +135,8 @@ fn a_stopped_session_is_restored_when_told_so() {
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     rescue.kill();
     let mut rescue = start("never");
-    // With --restore never even the living master of the killed rosrescue is no reason to inject,
-    // but what that master holds is the truth.
+    // With `--restore never` even the living master of the killed rosrescue is not injected, but the state
+    // that it holds is adopted.
     assert_eq!(rescue.client().param("/kept"), Some("yes".into()));
     assert_eq!(rescue.terminate().code(), Some(0));
     let rescue = start("never");
@@ -144,7 +144,7 @@ fn a_stopped_session_is_restored_when_told_so() {
 }
 
 #[test]
-fn a_running_system_is_taken_over() {
+fn a_system_that_ran_without_rosrescue_is_taken_over() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let bare = master.client();
@@ -154,19 +154,19 @@ fn a_running_system_is_taken_over() {
     let _server = Node::start(&scratch, Library::Roscpp, master.port, "server", &[]);
     listener.wait_messages("/talker", 5);
     let mut before = State::read(&bare);
-    eventually("the state is at rest", || {
+    eventually("the state stops changing", || {
         thread::sleep(Duration::from_millis(300));
         let last = std::mem::replace(&mut before, State::read(&bare));
         last == before
     });
 
     let rescue = Setup::proxy(&scratch, master.port).start();
-    before.assert_same(&State::read(&rescue.client()), "when it was taken over");
+    before.assert_same(&State::read(&rescue.client()), "after it was taken over");
     let dead = master.pid();
     master.kill();
     let master = Rosmaster::start_at(&scratch, master.port);
     let client = rescue.client();
-    eventually("rosrescue names the new master", || {
+    eventually("rosrescue reports the new master", || {
         client.master_pid().is_some_and(|pid| pid != dead)
     });
     eventually("the state is back", || {
@@ -177,10 +177,10 @@ fn a_running_system_is_taken_over() {
     talker.assert_no_link_lost();
 }
 
-/// A parameter that rosmaster cannot return hides the others, from everybody: they are unknown until it
-/// is gone, which is said.
+/// A parameter that rosmaster cannot return makes all parameters unreadable. They are unknown until it is
+/// gone, and rosrescue reports that.
 #[test]
-fn a_system_with_a_parameter_that_hides_the_others_is_taken_over_without_them() {
+fn a_system_with_an_unreturnable_parameter_is_taken_over_without_parameters() {
     let scratch = Scratch::new();
     let mut master = Rosmaster::start(&scratch);
     let bare = master.client();
@@ -192,41 +192,45 @@ fn a_system_with_a_parameter_that_hides_the_others_is_taken_over_without_them() 
     let mut rescue = Setup::proxy(&scratch, master.port).start();
     let client = rescue.client();
     eventually("the master is served", || status(&client)["open"] == true);
-    rescue.wait_line("what is hidden is said", |line| {
+    rescue.wait_line("the log says that parameters cannot be read", |line| {
         line.contains("a parameter that it can never return")
     });
     client.set_param("/speed", 1.5);
     let dead = master.pid();
     master.kill();
     let _master = Rosmaster::start_at(&scratch, master.port);
-    eventually("rosrescue names the new master", || {
+    eventually("rosrescue reports the new master", || {
         client.master_pid().is_some_and(|pid| pid != dead)
     });
-    eventually("what was known is back", || {
+    eventually("the known state is restored", || {
         State::read(&client).publishers_of("/topic") == ["/node"]
             && client.param("/speed") == Some(1.5.into())
     });
     assert_eq!(client.param("/gain"), None);
 }
 
-/// `rosrescue core` whose rosmaster chooses its own port.
+/// `rosrescue core` whose rosmaster uses a port of its own choice.
 fn core(scratch: &Scratch) -> Rescue {
     let port = free_port();
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
     Setup::bare(scratch, arguments).at_port(port).start()
 }
 
-/// Process id and port of the rosmaster behind it.
+/// Process id and port of the rosmaster behind rosrescue.
 fn master_of(rescue: &Rescue) -> (u32, u16) {
     let client = rescue.client();
-    let pid = eventually_some("the master's process id", || client.master_pid());
+    let pid = eventually_some("the master reports its process id", || client.master_pid());
     let words = fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap();
     let mut words = words.split('\0');
-    assert!(words.any(|word| word == "-p"), "its port is in its command");
+    assert!(
+        words.any(|word| word == "-p"),
+        "the command of rosmaster has no port"
+    );
     (pid, words.next().unwrap().parse().unwrap())
 }
 
-/// A core that was killed with its master: it had set `/kept` to `value`. Gives the master's port, too.
+/// A core that was killed together with its master after it had set `/kept` to `value`; also the master's
+/// port.
 fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     let mut rescue = core(scratch);
     rescue.client().set_param("/kept", value);
@@ -234,13 +238,13 @@ fn killed_core(scratch: &Scratch, value: &str) -> (Rescue, u16) {
     rescue.kill();
     signal(master, Signal::KILL);
     eventually("the master is dead", || !alive(master));
-    eventually("its port is free", || {
+    eventually("the master's port is free", || {
         TcpListener::bind(("127.0.0.1", port)).is_ok()
     });
     (rescue, port)
 }
 
-/// What somebody else does with each connection to the port where our master was.
+/// Starts a server on the port where our master was. `what` is what it does with each connection.
 fn squat(port: u16, what: &'static str) {
     let listener = eventually_some("the port is free", || {
         TcpListener::bind(("127.0.0.1", port)).ok()
@@ -261,7 +265,7 @@ fn squat(port: u16, what: &'static str) {
 }
 
 #[test]
-fn a_core_starts_although_somebody_else_has_its_masters_port() {
+fn a_core_starts_although_another_program_has_its_masters_port() {
     for what in ["closes", "is silent", "answers nonsense"] {
         let scratch = Scratch::new();
         let (mut rescue, port) = killed_core(&scratch, what);
@@ -274,7 +278,7 @@ fn a_core_starts_although_somebody_else_has_its_masters_port() {
 }
 
 #[test]
-fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
+fn another_rosmaster_at_the_old_port_is_left_alone() {
     let scratch = Scratch::new();
     let (mut rescue, port) = killed_core(&scratch, "ours");
     let stranger = Rosmaster::start_at(&scratch, port);
@@ -285,25 +289,28 @@ fn a_rosmaster_of_others_at_the_old_port_is_left_alone() {
     assert_eq!(rescue.client().param("/theirs"), None);
     assert_eq!(stranger.client().param("/kept"), None);
     assert_eq!(rescue.terminate().code(), Some(0));
-    assert!(alive(stranger.pid()), "it is not ours to end");
+    assert!(
+        alive(stranger.pid()),
+        "another program's rosmaster was ended"
+    );
 }
 
 #[test]
-fn the_old_port_of_the_master_may_become_our_own() {
+fn the_old_port_of_the_master_can_become_rosrescues_own_port() {
     let scratch = Scratch::new();
-    // Not one of the kernel's choice: those go to anybody's connection.
+    // A port that the kernel does not give to outgoing connections.
     let port = free_port();
     let mut rescue = Setup::core(&scratch, port).arg("--no-rosout").start();
     rescue.client().set_param("/kept", "yes");
     let (master, _) = master_of(&rescue);
     rescue.kill();
     signal(master, Signal::KILL);
-    // Its last thread closes the port, after the process counts as dead.
+    // The last thread of the master closes the port, after the process already counts as dead.
     eventually("the master's port is free", || {
         !alive(master) && TcpListener::bind(("0.0.0.0", port)).is_ok()
     });
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
-    // By default each port has a checkpoint of its own.
+    // By default each port has its own checkpoint.
     let checkpoint = rescue.checkpoint();
     let setup = Setup::bare(&scratch, arguments).at_port(port);
     let rescue = setup.at_checkpoint(checkpoint).start();
@@ -311,7 +318,7 @@ fn the_old_port_of_the_master_may_become_our_own() {
 }
 
 #[test]
-fn a_master_that_was_left_hanging_is_replaced() {
+fn a_hung_master_that_was_left_behind_is_replaced() {
     let scratch = Scratch::new();
     let port = free_port();
     let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
@@ -326,18 +333,20 @@ fn a_master_that_was_left_hanging_is_replaced() {
     rescue.wait_serving();
     assert_eq!(rescue.client().param("/kept"), Some(1.into()));
     assert_ne!(master_of(&rescue).0, master);
-    eventually("the one that hung is gone", || !alive(master));
+    eventually("the hung master is gone", || !alive(master));
 }
 
-/// Killed right after it has started its rosmaster, which nobody has spoken to yet.
+/// rosrescue is killed right after it has started its rosmaster, before any call was made to it.
 #[test]
-fn a_master_that_was_left_empty_serves_or_is_ended() {
+fn an_empty_master_that_was_left_behind_is_used_or_ended() {
     for millis in [0, 60, 120, 180, 240] {
         let scratch = Scratch::new();
         let port = free_port();
         let arguments = ["core", "--no-rosout", "-p", &port.to_string()];
         let mut rescue = Setup::bare(&scratch, arguments).at_port(port).spawn();
-        rescue.wait_line("that it has one", |line| line.contains("started rosmaster"));
+        rescue.wait_line("the log says that rosmaster was started", |line| {
+            line.contains("started rosmaster")
+        });
         thread::sleep(Duration::from_millis(millis));
         rescue.kill();
         rescue.start_again();
@@ -355,15 +364,15 @@ fn a_master_that_was_left_empty_serves_or_is_ended() {
     }
 }
 
-/// How often `rescue` has said that it started a rosmaster.
+/// How often `rescue` has reported that it started a rosmaster.
 fn started(rescue: &Rescue) -> usize {
     let lines = rescue.stderr().into_iter();
     let lines = lines.filter(|line| line.contains("started rosmaster"));
     lines.count()
 }
 
-/// Kills the master of `rescue`, and then `rescue` itself, once it has started the next master and `after` has
-/// passed. Gives the process id of the one that died.
+/// Kills the master of `rescue`. When the next master was started and `after` has passed, kills `rescue` as
+/// well. Returns the process id of the killed master.
 #[track_caller]
 fn kill_master_and_rescue(rescue: &mut Rescue, after: Duration) -> u32 {
     let (dead, before) = (master_of(rescue).0, started(rescue));
@@ -374,7 +383,7 @@ fn kill_master_and_rescue(rescue: &mut Rescue, after: Duration) -> u32 {
     dead
 }
 
-/// The rosmaster that runs, if there is exactly one.
+/// The running rosmaster, if there is exactly one.
 fn only_master(scratch: &Scratch) -> Option<u32> {
     let all = scratch.survivors().into_iter();
     let mut all = all.filter(|(pid, words)| {
@@ -384,7 +393,7 @@ fn only_master(scratch: &Scratch) -> Option<u32> {
     all.next().is_none().then_some(pid)
 }
 
-/// Its masters do not listen while the file `away` is there.
+/// A core whose masters do not listen while the file `away` is there.
 fn core_that_waits(scratch: &Scratch) -> Rescue {
     let port = free_port();
     let waiting = Path::new(NODES).join("waiting_rosmaster.py");
@@ -393,9 +402,9 @@ fn core_that_waits(scratch: &Scratch) -> Rescue {
     setup.at_port(port).start()
 }
 
-/// Killed when the master that it has just started does not listen yet.
+/// rosrescue is killed when the master that it has just started does not listen yet.
 #[test]
-fn a_master_that_is_still_starting_is_adopted_and_calls_are_answered_meanwhile() {
+fn a_starting_master_that_was_left_behind_is_adopted_and_calls_are_answered_meanwhile() {
     let scratch = Scratch::new();
     let mut rescue = core_that_waits(&scratch);
     let client = rescue.client();
@@ -411,13 +420,17 @@ fn a_master_that_is_still_starting_is_adopted_and_calls_are_answered_meanwhile()
     assert_eq!(status(&client)["open"], false, "there is no master yet");
     fs::remove_file(scratch.path("away")).unwrap();
     rescue.wait_serving();
-    assert_eq!(client.master_pid(), Some(starting), "it is adopted");
+    assert_eq!(
+        client.master_pid(),
+        Some(starting),
+        "the starting master must be adopted"
+    );
     assert_eq!(only_master(&scratch), Some(starting));
     assert_eq!(started(&rescue), 0);
     let (_, at) = master_of(&rescue);
     assert_eq!(Client::new(at).param("/kept"), Some(2.into()));
 
-    // It is watched as a child would be.
+    // Its death is noticed like that of a child.
     signal(starting, Signal::KILL);
     eventually("another master serves", || {
         client.master_pid().is_some_and(|pid| pid != starting)
@@ -425,7 +438,7 @@ fn a_master_that_is_still_starting_is_adopted_and_calls_are_answered_meanwhile()
     assert_eq!(client.param("/kept"), Some(2.into()));
 }
 
-/// Master and rosrescue die within 200 ms: whatever the next master has come to by then, it is used.
+/// Master and rosrescue die within 200 ms of each other. However far the next master has got, it is used.
 #[test]
 fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
     let scratch = Scratch::new();
@@ -442,9 +455,9 @@ fn no_second_master_is_started_when_master_and_rosrescue_die_together() {
     }
 }
 
-/// Somebody else has taken the port: the master that was to listen there never will.
+/// Another program has taken the port, so the master can never listen there.
 #[test]
-fn a_master_that_is_still_starting_and_has_lost_its_port_is_ended() {
+fn a_starting_master_that_has_lost_its_port_is_ended() {
     let scratch = Scratch::new();
     let mut rescue = core_that_waits(&scratch);
     rescue.client().set_param("/kept", 1);
@@ -457,5 +470,5 @@ fn a_master_that_is_still_starting_and_has_lost_its_port_is_ended() {
     rescue.start_again();
     rescue.wait_serving();
     assert_eq!(rescue.client().param("/kept"), Some(1.into()));
-    eventually("it is ended", || !alive(starting));
+    eventually("the master is ended", || !alive(starting));
 }

@@ -1,4 +1,4 @@
-//! A service of a real systemd, which is process 1 of namespaces of its own. Needs root and systemd.
+//! A service of a real systemd that is process 1 in namespaces of its own. Needs root and systemd.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +9,7 @@ use crate::support::{Scratch, eventually};
 const BOOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/boot_systemd.sh");
 const PROGRAM: &str = "/opt/rosrescue/rosrescue";
 
-/// A computer that has been booted. It ends on drop.
+/// A simulated computer that has booted. It ends on drop.
 pub(super) struct Booted {
     unshare: Child,
     pid: String,
@@ -41,16 +41,18 @@ impl Booted {
         let id = unshare.id();
         let child =
             || fs::read_to_string(format!("/proc/{id}/task/{id}/children")).unwrap_or_default();
-        eventually("the first process", || !child().trim().is_empty());
+        eventually("the computer has a first process", || {
+            !child().trim().is_empty()
+        });
         let pid = child().trim().to_owned();
         let booted = Self {
             unshare,
             pid,
             scratch,
         };
-        // Before, its root is this computer's.
+        // Before that, its root is still this computer's.
         eventually(
-            "systemd as the first process, by root, with systemd-sysv and dbus (boot.log in the scratch folder says more)",
+            "systemd runs as the first process; this needs root, systemd-sysv and dbus (see boot.log in the scratch folder)",
             || {
                 let name = fs::read_to_string(format!("/proc/{}/comm", booted.pid));
                 name.is_ok_and(|name| name.trim() == "systemd")
@@ -101,7 +103,8 @@ impl Booted {
         self.try_run(script).unwrap_or_else(|said| panic!("{said}"))
     }
 
-    /// Copies `file` to it. Returns its name there: the file's own folder may be hidden, as /tmp is.
+    /// Copies `file` to the simulated computer. Returns its name there, because its own folder may be hidden,
+    /// like /tmp.
     pub(super) fn give(&self, file: &Path) -> String {
         let name = file.file_name().unwrap();
         fs::copy(file, self.scratch.path("given").join(name)).unwrap();
@@ -114,7 +117,7 @@ impl Booted {
         ));
     }
 
-    /// A call of the Master API at the robot's port, as Python prints its answer.
+    /// Makes a call of the Master API at the robot's port. Returns the answer as Python prints it.
     #[track_caller]
     pub(super) fn call(&self, call: &str) -> String {
         self.run(&format!(
@@ -136,7 +139,7 @@ impl Booted {
         });
     }
 
-    /// Every file where an installation could leave something.
+    /// Every file in folders where an installation could leave something.
     fn files(&self) -> String {
         self.run("find /etc /usr/local /usr/lib/systemd -path '/etc/.*' -prune -o -print | sort")
     }
@@ -149,7 +152,7 @@ impl Drop for Booted {
     }
 }
 
-/// A robot as it was before: a unit for roscore, and one of robot_upstart.
+/// A robot before the installation, with a unit for roscore and one from robot_upstart.
 fn with_units_of_old() -> Booted {
     let robot = Booted::new();
     robot.write(
@@ -171,7 +174,7 @@ fn with_units_of_old() -> Booted {
 }
 
 #[test]
-fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
+fn a_service_can_be_installed_survives_deaths_and_is_removed_without_a_trace() {
     let robot = with_units_of_old();
     let before = robot.files();
     let shown = robot.run(&format!("SUDO_USER=robot {PROGRAM} install --dry-run"));
@@ -209,7 +212,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
     ));
     assert!(again.contains("nothing to change"), "{again}");
 
-    // Dies, and hangs.
+    // The worker dies, and then it hangs.
     robot.write(
         "/etc/systemd/system/rosrescue.service.d/test.conf",
         "[Service]\nWatchdogSec=1",
@@ -219,7 +222,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
     for (signal, result) in [("KILL", "signal"), ("STOP", "watchdog")] {
         let worker = robot.property("MainPID");
         robot.run(&format!("kill -{signal} {worker}"));
-        // systemd holds the port: the call waits.
+        // systemd keeps the port open, so the call waits.
         assert!(
             robot
                 .call("getParam(\"/test\", \"/kept\")")
@@ -237,7 +240,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
         assert_eq!(
             robot.run("pgrep -x rosmaster"),
             master,
-            "{signal}: rosmaster is another one"
+            "{signal}: rosmaster was replaced"
         );
         robot.wait_protected();
     }
@@ -251,7 +254,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
             .ends_with(" 7]\n")
     );
 
-    // A new version of it.
+    // A new version of the unit.
     let worker = robot.property("MainPID");
     robot.run("sed -i 's/Written by/Written long ago by/' /etc/systemd/system/rosrescue.service");
     let refused = robot.output(&format!("SUDO_USER=robot {PROGRAM} install --yes"));
@@ -282,7 +285,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
 }
 
 #[test]
-fn a_user_has_a_service_without_root() {
+fn a_user_can_install_a_service_without_root() {
     let robot = Booted::new();
     robot.run("loginctl enable-linger robot");
     let as_user = |command: &str| {
@@ -291,7 +294,7 @@ fn a_user_has_a_service_without_root() {
              XDG_RUNTIME_DIR=/run/user/$(id -u robot) {command}"
         )
     };
-    eventually("the user's systemd", || {
+    eventually("the systemd of the user runs", || {
         robot
             .try_run(&as_user("systemctl --user is-system-running"))
             .is_ok()

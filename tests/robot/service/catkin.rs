@@ -11,7 +11,7 @@ use rustix::process::Signal;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// A workspace in which catkin has built and installed the package, with the program of this test.
+/// Makes a workspace in which catkin has built and installed the package, with the program under test.
 #[track_caller]
 fn workspace(scratch: &Scratch) {
     let source = scratch.path("src");
@@ -25,10 +25,11 @@ fn workspace(scratch: &Scratch) {
             &program,
             "install",
         ])
-        // catkin is for the system's Python.
+        // catkin works only with the system's Python.
         .env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin")
         .output();
-    let output = output.expect("catkin_make: tests/run.sh installs catkin and cmake");
+    let output =
+        output.expect("catkin_make is not installed: tests/run.sh installs catkin and cmake");
     assert!(output.status.success(), "{output:?}");
 }
 
@@ -43,7 +44,7 @@ fn ros(scratch: &Scratch, program: &str, port: u16) -> Command {
 }
 
 #[test]
-fn catkin_builds_a_package_for_rosrun_and_roslaunch() {
+fn catkin_builds_a_package_that_rosrun_and_roslaunch_can_use() {
     let scratch = Scratch::new();
     workspace(&scratch);
     let port = free_port();
@@ -63,7 +64,7 @@ fn catkin_builds_a_package_for_rosrun_and_roslaunch() {
     let master = Client::new(port);
     let is_launched =
         || master.param("/roslaunch/uris").is_some() && master.param("/rosrescue/pid").is_some();
-    eventually("roslaunch has a master", || {
+    eventually("roslaunch has found a master", || {
         assert!(roslaunch.exited().is_none(), "{}", roslaunch.log());
         master.connect().is_ok() && is_launched()
     });
@@ -84,13 +85,13 @@ fn catkin_builds_a_package_for_rosrun_and_roslaunch() {
         "{}",
         roslaunch.log()
     );
-    eventually("the end of rosrescue and its rosmaster", || {
+    eventually("rosrescue and its rosmaster have ended", || {
         master.connect().is_err() && !Path::new(&format!("/proc/{second}")).exists()
     });
 }
 
 #[test]
-fn a_launch_file_finds_the_master_that_is_there() {
+fn the_launch_file_uses_a_master_that_is_already_there() {
     let scratch = Scratch::new();
     workspace(&scratch);
     let master = crate::support::Rosmaster::start(&scratch);

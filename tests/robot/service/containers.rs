@@ -1,5 +1,5 @@
-//! The files for Docker and Kubernetes. Nothing here runs them: they are read as their tools would, and what they
-//! name has to exist.
+//! The files for Docker and Kubernetes. The test does not run them: it reads them as their tools would, and
+//! checks that everything they name exists.
 
 use std::process::Command;
 
@@ -9,7 +9,7 @@ const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 const READ: &str =
     "import json, sys, yaml; print(json.dumps(list(yaml.safe_load_all(open(sys.argv[1])))))";
 
-/// The documents of a YAML file.
+/// The documents in a YAML file.
 fn read(name: &str) -> Vec<Value> {
     let output = Command::new("/usr/bin/python3")
         .args(["-c", READ, &format!("{ROOT}/packaging/{name}")])
@@ -25,7 +25,7 @@ fn texts(list: &Value) -> Vec<&str> {
     list.map(|text| text.as_str().unwrap()).collect()
 }
 
-/// The program takes this command line.
+/// Checks that the program accepts this command line.
 #[track_caller]
 fn is_understood(command: &[&str]) {
     let ["rosrescue", arguments @ ..] = command else {
@@ -37,7 +37,7 @@ fn is_understood(command: &[&str]) {
     assert!(output.status.success(), "{command:?}: {errors}");
 }
 
-/// Hosts of `http://HOST:PORT` in a list of them, each maybe as `NAME=…`.
+/// The hosts in a list of `http://HOST:PORT`, each optionally as `NAME=…`.
 fn hosts(list: &str) -> Vec<&str> {
     let hosts = list.split(',').map(|url| {
         let (_, rest) = url.split_once("http://").expect(url);
@@ -47,12 +47,12 @@ fn hosts(list: &str) -> Vec<&str> {
 }
 
 #[test]
-fn services_of_the_compose_files_know_each_other() {
+fn services_in_the_compose_files_refer_to_existing_services() {
     for name in ["docker/compose.yaml", "docker/compose.cluster.yaml"] {
         let file = &read(name)[0];
         let services = file["services"].as_object().unwrap();
         for (service, of) in services {
-            // The network of the file knows a service by its name.
+            // The network of a compose file knows a service by its name.
             assert_eq!(of["hostname"], service.as_str(), "{name}");
             for other in texts(&of["depends_on"]) {
                 assert!(services.contains_key(other), "{name}: {other}");
@@ -80,7 +80,7 @@ fn services_of_the_compose_files_know_each_other() {
 }
 
 #[test]
-fn the_compose_file_of_several_computers_has_one_etcd_for_all() {
+fn the_compose_file_for_several_computers_names_the_same_etcd_everywhere() {
     let file = &read("docker/compose.cluster.yaml")[0];
     let services = file["services"].as_object().unwrap();
     let all = ["etcd-a", "etcd-b", "etcd-c"];
@@ -100,7 +100,7 @@ fn the_compose_file_of_several_computers_has_one_etcd_for_all() {
 }
 
 #[test]
-fn the_pods_of_kubernetes_have_one_etcd_for_all_and_are_asked_what_rosrescue_answers() {
+fn the_kubernetes_pods_share_one_etcd_and_have_working_probes() {
     let file = read("kubernetes/rosrescue.yaml");
     let kind = |kind: &str, name: &str| {
         let is_it = |of: &&Value| of["kind"] == kind && of["metadata"]["name"] == name;

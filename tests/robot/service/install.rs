@@ -1,4 +1,4 @@
-//! What `rosrescue install` says and refuses, without a systemd: nothing is started here.
+//! What `rosrescue install` prints and refuses, without a systemd: nothing is started here.
 
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -8,7 +8,7 @@ use crate::support::Scratch;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_rosrescue");
 
-/// `rosrescue ARGUMENTS` of a user whose home is in `scratch`.
+/// Runs `rosrescue ARGUMENTS` as a user whose home folder is in `scratch`.
 fn rosrescue(scratch: &Scratch, arguments: &[&str]) -> Output {
     let mut command = Command::new(PROGRAM);
     scratch.prepare(&mut command);
@@ -34,7 +34,7 @@ fn said(output: &Output, code: i32) -> String {
 }
 
 #[test]
-fn what_makes_no_sense_is_said_in_a_sentence() {
+fn impossible_options_are_explained_in_one_sentence() {
     let scratch = Scratch::new();
     let nobody = ["--run-as", "nobody-of-this-name"];
     for (arguments, sentence) in [
@@ -63,7 +63,7 @@ fn what_makes_no_sense_is_said_in_a_sentence() {
 }
 
 #[test]
-fn it_is_idempotent_and_leaves_foreign_files_alone() {
+fn install_is_idempotent_and_leaves_files_of_others_alone() {
     let scratch = Scratch::new();
     let install = ["install", "--user", "--yes"];
     let units = scratch.path(".config/systemd/user");
@@ -94,7 +94,7 @@ fn it_is_idempotent_and_leaves_foreign_files_alone() {
     assert_eq!(copy.metadata().unwrap().permissions().mode() & 0o777, 0o755);
     assert!(said(&rosrescue(&scratch, &install), 0).starts_with("nothing to change"));
 
-    // What is chosen stays chosen; what is changed by hand is nobody's to overwrite.
+    // Options that were chosen stay chosen. Manual changes are never overwritten.
     said(
         &rosrescue(
             &scratch,
@@ -176,7 +176,7 @@ fn units_that_start_a_master_are_found_and_the_plan_is_json() {
 
 /// sudo clears the environment of the commands that it runs.
 #[test]
-fn settings_of_whoever_calls_sudo_are_found() {
+fn settings_of_the_user_who_calls_sudo_are_found() {
     let scratch = Scratch::new();
     let sudo = scratch.path("sudo");
     fs::copy("/bin/sh", &sudo).unwrap();
@@ -195,7 +195,7 @@ fn settings_of_whoever_calls_sudo_are_found() {
 }
 
 #[test]
-fn completions_are_those_of_the_command_line() {
+fn installed_completions_match_the_command_line() {
     let scratch = Scratch::new();
     for shell in ["bash", "zsh", "fish"] {
         let script = said(&rosrescue(&scratch, &["completions", shell]), 0);

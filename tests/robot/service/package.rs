@@ -1,4 +1,4 @@
-//! The Debian package: in a Debian that debootstrap has just made, and under a systemd.
+//! The Debian package, in a Debian that debootstrap has just made, and under a systemd.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -9,7 +9,7 @@ use crate::support::eventually;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Two versions of the package, 0.2.0 and 0.2.1, made once. It takes two minutes where cargo-deb is missing.
+/// Two versions of the package, 0.2.0 and 0.2.1, made once. This takes two minutes if cargo-deb is missing.
 #[track_caller]
 fn packages() -> &'static [PathBuf; 2] {
     static PACKAGES: OnceLock<[PathBuf; 2]> = OnceLock::new();
@@ -55,7 +55,7 @@ fn name(package: &Path) -> &str {
 }
 
 #[test]
-fn a_package_is_installed_upgraded_removed_and_purged_without_a_trace() {
+fn the_package_can_be_installed_upgraded_removed_and_purged_without_a_trace() {
     let [old, new] = packages();
     let said = in_fresh_debian(&format!(
         r#"
@@ -93,7 +93,7 @@ fn a_package_is_installed_upgraded_removed_and_purged_without_a_trace() {
     for line in &lines[3..6] {
         assert!(!line.ends_with(":0"), "{said}");
     }
-    // The last line is that of /etc/default: nothing is left after the purge.
+    // The last line is that of /etc/default. Nothing is left after the purge.
     let last = [
         "/usr/lib/systemd/system/rosrescue.service",
         "/usr/lib/systemd/system/rosrescue.socket",
@@ -106,7 +106,7 @@ fn a_package_is_installed_upgraded_removed_and_purged_without_a_trace() {
 }
 
 #[test]
-fn a_running_robot_notices_nothing_of_an_upgrade_and_its_service_goes_with_the_package() {
+fn an_upgrade_does_not_disturb_a_running_robot_and_removal_ends_its_service() {
     let [old, new] = packages();
     let robot = Booted::new();
     let install = |package: &Path| robot.run(&format!("dpkg -i {}", robot.give(package)));
@@ -118,7 +118,7 @@ fn a_running_robot_notices_nothing_of_an_upgrade_and_its_service_goes_with_the_p
             .is_err()
     );
 
-    // The package's own unit.
+    // The unit that comes with the package.
     robot.run("systemctl enable --now rosrescue.socket rosrescue.service");
     robot.wait_protected();
     robot.run("pgrep -x rosmaster; test -s /var/lib/rosrescue/log/latest-chkpt.yaml");
@@ -142,7 +142,7 @@ fn a_running_robot_notices_nothing_of_an_upgrade_and_its_service_goes_with_the_p
     assert_eq!(robot.run("pgrep -x rosmaster"), master);
     robot.run("systemctl disable --now rosrescue.socket rosrescue.service");
 
-    // One of `rosrescue install` goes before it, and goes with it.
+    // A unit of `rosrescue install` takes precedence, and is removed with the package.
     robot.run("SUDO_USER=robot rosrescue install --yes");
     robot.wait_protected();
     robot.run("pgrep -x -u robot rosmaster");

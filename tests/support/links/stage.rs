@@ -1,4 +1,4 @@
-//! The masters at which nodes start.
+//! The masters at which the nodes start.
 
 use std::fs;
 use std::thread::sleep;
@@ -19,21 +19,21 @@ use super::Dice;
 /// Which master the nodes use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Place {
-    /// A rosmaster, nothing before it.
+    /// A rosmaster without rosrescue.
     Bare,
     /// `rosrescue core`.
     Core,
     /// `rosrescue proxy`.
     Proxy,
-    /// `rosrescue proxy` whose master is dead while the nodes start.
+    /// `rosrescue proxy` whose master is dead while the nodes start, so that the mirror stands in.
     StandingIn,
-    /// `rosrescue core`: its master and its worker are killed while the nodes start.
+    /// `rosrescue core` whose master and worker are killed while the nodes start.
     Kills,
-    /// The follower of two `rosrescue core --cluster`.
+    /// The follower of two computers that run `rosrescue core --cluster`.
     Follower,
 }
 
-/// A master that runs, in the order of the drops.
+/// A running master. The fields are in the order in which they must be dropped.
 #[derive(Debug)]
 pub(crate) enum Stage {
     Bare(Rosmaster, Scratch),
@@ -90,7 +90,7 @@ impl Stage {
             let leads = cluster["role"] == "leading" && status["open"] == true;
             (follows || leads).then_some(follows)
         };
-        let follower = eventually_some("one leads and one follows", || {
+        let follower = eventually_some("one leads and the other follows", || {
             let roles: Vec<_> = computers.iter().map(role).collect();
             let other = roles.contains(&Some(false));
             roles
@@ -123,7 +123,7 @@ impl Stage {
         Client::new(self.port())
     }
 
-    /// What has to be so before the nodes begin.
+    /// Prepares the master before the nodes begin.
     #[track_caller]
     pub(super) fn set(&mut self) {
         if let Self::Robot(robot, Place::StandingIn) = self {
@@ -131,7 +131,7 @@ impl Stage {
         }
     }
 
-    /// What happens while the nodes start.
+    /// Does to the master what happens to it while the nodes start.
     pub(super) fn disturb(&self, dice: &mut Dice) {
         let Self::Kills(rescue, master_port, _) = self else {
             return;
@@ -153,7 +153,7 @@ impl Stage {
     }
 }
 
-/// The child of `guardian` that is the same program.
+/// The child of `guardian` that runs the same program.
 fn worker_of(guardian: u32) -> Option<u32> {
     let program = |pid: u32| fs::read_link(format!("/proc/{pid}/exe")).ok();
     let children = fs::read_to_string(format!("/proc/{guardian}/task/{guardian}/children")).ok()?;

@@ -1,10 +1,10 @@
-//! What nodes were told of their topics, and when.
+//! What nodes were told about their topics, and when.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value as Json;
 
-/// Something that happened to a topic in a node.
+/// Something that a node was told about a topic.
 #[derive(Clone, Debug)]
 struct Event {
     at: f64,
@@ -12,11 +12,11 @@ struct Event {
     uris: BTreeSet<String>,
 }
 
-/// What rospy nodes have asked and were told, topic by topic.
+/// Everything that rospy nodes have asked and were told, topic by topic.
 #[derive(Debug)]
 pub(crate) struct Traces {
     begin: f64,
-    /// By topic and node.
+    /// Events by topic and node.
     events: BTreeMap<(String, String), Vec<Event>>,
     names: BTreeMap<String, String>,
 }
@@ -30,7 +30,7 @@ impl Traces {
         }
     }
 
-    /// Adds what a node has written.
+    /// Adds the events that a node has written.
     pub(super) fn add(&mut self, node: &str, api: &str, events: &Json) {
         self.names.insert(api.to_owned(), node.to_owned());
         for event in events.as_array().unwrap() {
@@ -46,7 +46,7 @@ impl Traces {
         }
     }
 
-    /// What happened to `topic` in `node` and in its publishers, a line an event.
+    /// Describes what happened to `topic` in `node` and in its publishers, one line per event.
     pub(super) fn of(&self, topic: &str, node: &str) -> String {
         let mut lines = Vec::new();
         for ((of, at), events) in &self.events {
@@ -71,8 +71,8 @@ impl Traces {
         )
     }
 
-    /// Lists of this source that lack a publisher which the node was told of before. Publishers do not go
-    /// while the nodes start, so such a list is older than the one before.
+    /// Lists from `source` that lack a publisher of which the node had been told before. No publisher goes
+    /// away while the nodes start, so such a list is older than the one before.
     pub(super) fn older(&self, source: &str) -> Vec<String> {
         let mut found = Vec::new();
         for ((topic, node), events) in &self.events {

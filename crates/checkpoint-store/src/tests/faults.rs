@@ -1,4 +1,4 @@
-//! Disks that fail, and jobs that come too late.
+//! Disks that fail, and jobs that finish too late.
 
 use super::*;
 
@@ -7,7 +7,7 @@ const ENOSPC: i32 = 28;
 const EROFS: i32 = 30;
 
 #[test]
-fn a_failing_disk_costs_only_what_was_said_to_be_unprotected() {
+fn a_failing_disk_loses_only_records_that_were_reported_as_unprotected() {
     let mut failures = 0;
     for errno in [ENOSPC, EIO, EROFS] {
         for fault in [Fault::Errno(errno), Fault::Once(errno), Fault::Short(errno)] {
@@ -17,7 +17,7 @@ fn a_failing_disk_costs_only_what_was_said_to_be_unprotected() {
                 let mut model = Model::default();
                 life(&fs, &mut model);
                 let context = format!("{fault:?} at operation {at}");
-                // A kill now: whatever had been acknowledged is there.
+                // Simulates a kill now: everything that was acknowledged is there.
                 let loaded = open(&fs.after_kill()).unwrap().1;
                 check(&model, loaded.as_ref(), model.acked, &context);
                 go_on(&fs.after_kill(), &context);
@@ -29,7 +29,7 @@ fn a_failing_disk_costs_only_what_was_said_to_be_unprotected() {
 }
 
 #[test]
-fn an_unprotected_store_says_so_and_can_be_rearmed() {
+fn an_unprotected_store_reports_it_and_can_be_rearmed() {
     for fault in [Fault::Errno(ENOSPC), Fault::Short(ENOSPC)] {
         let fs = SimFs::default();
         let mut model = Model::default();
@@ -40,14 +40,14 @@ fn an_unprotected_store_says_so_and_can_be_rearmed() {
         model.append(&mut store, 3);
         assert_eq!((model.acked, store.seq()), (2, 5));
         assert!(store.unprotected().unwrap().contains("latest-chkpt.yaml"));
-        // Nothing is tried on that file again, and a new one does not work either.
+        // The store does not try that file again, and a new file does not work either.
         model.append(&mut store, 1);
         assert!(store.sync_job().is_none() && !store.wants_compaction());
         assert!(store.rearm(&model.checkpoint(store.seq())).is_err());
         assert!(store.unprotected().is_some());
         fs.disarm();
 
-        // Beside traffic: what comes while the new file is written is in it.
+        // While calls go on, records that come while the new file is written are in it.
         let job = store
             .begin_compaction(model.checkpoint(store.seq()))
             .unwrap();
@@ -65,8 +65,8 @@ fn an_unprotected_store_says_so_and_can_be_rearmed() {
 }
 
 #[test]
-fn numbers_of_an_unprotected_time_are_never_used_again() {
-    // Else the previous generation's whole records of a batch that failed would pass for new ones.
+fn record_numbers_from_an_unprotected_time_are_never_used_again() {
+    // Otherwise the previous generation's whole records of a failed batch would pass for new ones.
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -85,7 +85,7 @@ fn numbers_of_an_unprotected_time_are_never_used_again() {
 }
 
 #[test]
-fn a_compaction_that_cannot_keep_up_is_given_up_in_bounded_memory() {
+fn a_compaction_that_cannot_keep_up_is_dropped_at_a_memory_limit() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -98,14 +98,14 @@ fn a_compaction_that_cannot_keep_up_is_given_up_in_bounded_memory() {
     }
     let error = store.finish_compaction(job.run()).unwrap_err();
     assert!(matches!(error, StoreError::Overtaken { .. }));
-    // Nothing is lost, and it is not tried again at once.
+    // No record is lost, and the compaction is not tried again at once.
     assert!(store.unprotected().is_none() && !store.wants_compaction());
     drop(store);
     assert_eq!(open(&fs).unwrap().1.unwrap().records.len(), 20);
 }
 
 #[test]
-fn a_job_that_was_superseded_or_lost_is_in_nobodys_way() {
+fn an_obsolete_or_lost_job_does_not_disturb_the_next_one() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -132,7 +132,7 @@ fn a_job_that_was_superseded_or_lost_is_in_nobodys_way() {
 }
 
 #[test]
-fn a_session_is_set_aside_whole_or_not_at_all() {
+fn a_session_is_set_aside_completely_or_not_at_all() {
     let run = |fs: &SimFs| {
         let Ok((mut store, loaded)) = open(fs) else {
             return;
@@ -192,9 +192,9 @@ fn a_session_is_set_aside_whole_or_not_at_all() {
     }
 }
 
-/// A larger file would never be read again.
+/// rosrescue would never read a larger file again.
 #[test]
-fn a_file_that_would_become_too_large_is_begun_anew() {
+fn a_file_that_would_become_too_large_is_rewritten() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -211,7 +211,7 @@ fn a_file_that_would_become_too_large_is_begun_anew() {
 
 /// The previous generation gives way, the present one does not.
 #[test]
-fn a_full_disk_has_room_for_what_replaces_the_previous_generation() {
+fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();
@@ -229,10 +229,10 @@ fn a_full_disk_has_room_for_what_replaces_the_previous_generation() {
     assert!(fs.read(&names.path, 1 << 20).is_ok());
 }
 
-/// A loss of power behind a compaction leaves some records in the previous generation alone; a start that
-/// is killed must not replace that before the next generation is there.
+/// A loss of power just after a compaction can leave some records only in the previous generation. A start
+/// that is killed must not replace that file before the next generation is there.
 #[test]
-fn what_the_previous_generation_alone_has_outlives_starts_that_are_killed() {
+fn records_only_in_the_previous_generation_survive_starts_that_are_killed() {
     let fs = SimFs::default();
     let mut model = Model::default();
     let (mut store, _) = open(&fs).unwrap();

@@ -1,4 +1,4 @@
-//! What somebody else does to the files while they are in use.
+//! What happens when another process changes the files while they are in use.
 
 use super::*;
 
@@ -8,7 +8,7 @@ fn path() -> &'static Path {
     Path::new(PATH)
 }
 
-/// As the checkpointer does every round.
+/// Runs the check that the checkpointer runs in each round.
 fn check(store: &mut Store<SimFs>) {
     if let Some(job) = store.check_job() {
         let _ = store.checked(job.run());
@@ -26,7 +26,8 @@ fn started() -> (SimFs, Model, Store<SimFs>) {
     (fs, model, store)
 }
 
-/// Checks every file system that a crash at operation `at` may leave. The next start leaves `kept` alone.
+/// Runs `check` on every disk that a crash at operation `at` may leave, and checks that the next start does
+/// not touch `kept`.
 fn at_each_image(fs: &SimFs, at: usize, kept: &[u8], check: impl Fn(&SimFs, &str)) {
     let mut images = fs.after_power_loss(4_096);
     images.push(fs.after_kill());
@@ -73,8 +74,8 @@ const CHANGES: [(&str, &str, Change); 7] = [
 ];
 
 #[test]
-fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
-    // In a quiet time, and in the middle of traffic.
+fn any_change_of_the_file_by_another_process_is_noticed_and_repaired() {
+    // Once while no calls come, and once while calls come.
     for ((what, word, change), traffic) in CHANGES.into_iter().flat_map(|it| [(it, 0), (it, 1)]) {
         let (fs, mut model, mut store) = started();
         change(&fs);
@@ -94,9 +95,9 @@ fn whatever_is_done_to_the_file_is_noticed_and_repaired() {
     }
 }
 
-/// Whoever looks between the two finds one of them.
+/// A process that looks at any moment finds one of the two.
 #[test]
-fn a_lock_file_is_there_again_before_the_locked_file_is_closed() {
+fn a_removed_lock_file_is_replaced_before_the_old_one_is_closed() {
     let (fs, _, mut store) = started();
     let lock = Names { path: PATH.into() }.lock();
     fs.take_away(&lock);
@@ -106,7 +107,7 @@ fn a_lock_file_is_there_again_before_the_locked_file_is_closed() {
 }
 
 #[test]
-fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
+fn no_record_is_acknowledged_after_another_processs_bytes() {
     let (fs, mut model, mut store) = started();
     fs.overwrite(path(), b"", true);
     model.append(&mut store, 1);
@@ -115,7 +116,7 @@ fn nothing_is_acknowledged_behind_somebody_elses_bytes() {
 }
 
 #[test]
-fn a_file_that_was_merely_touched_goes_on() {
+fn a_file_that_was_only_touched_stays_in_use() {
     let (fs, mut model, mut store) = started();
     let bytes = fs.read(path(), 1 << 20).unwrap();
     fs.overwrite(path(), &bytes, true);
@@ -126,7 +127,7 @@ fn a_file_that_was_merely_touched_goes_on() {
 }
 
 #[test]
-fn a_check_of_an_earlier_generation_says_nothing_of_this_one() {
+fn a_late_check_of_an_earlier_generation_is_ignored() {
     let (_, mut model, mut store) = started();
     let late = store.check_job().unwrap();
     model.begin(&mut store);
@@ -134,10 +135,10 @@ fn a_check_of_an_earlier_generation_says_nothing_of_this_one() {
     assert_eq!(store.unprotected(), None);
 }
 
-/// Whatever is found at the path is kept, even by a process that is killed in between or when the power
-/// fails, and the state is in a file at any moment from the first new generation on.
+/// A file found at the path is kept, even if the process is killed in between or the power fails, and from
+/// the first new generation on the state is in a file at any moment.
 #[test]
-fn what_is_found_at_the_path_is_kept_at_every_crash() {
+fn a_file_found_at_the_path_is_kept_whenever_a_crash_happens() {
     for at in 0.. {
         let (fs, mut model, mut store) = started();
         model.begin(&mut store);
@@ -163,7 +164,7 @@ fn what_is_found_at_the_path_is_kept_at_every_crash() {
 }
 
 #[test]
-fn a_state_that_comes_from_elsewhere_replaces_no_file() {
+fn storing_a_state_from_elsewhere_destroys_no_file() {
     let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);
@@ -195,7 +196,7 @@ fn a_state_that_comes_from_elsewhere_replaces_no_file() {
 }
 
 #[test]
-fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
+fn an_unreadable_file_is_kept_and_the_previous_generation_is_restored() {
     let (disk, mut model, mut store) = started();
     model.sync(&mut store);
     model.begin(&mut store);
@@ -225,9 +226,9 @@ fn what_cannot_be_read_is_kept_and_the_previous_generation_restored() {
     }
 }
 
-/// Without a fallback nothing is known, and nothing is touched.
+/// Without a fallback nothing is known about the state, so nothing is changed.
 #[test]
-fn what_cannot_be_read_stays_if_there_is_no_other() {
+fn an_unreadable_file_without_a_previous_generation_is_left_alone() {
     let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);
@@ -240,7 +241,7 @@ fn what_cannot_be_read_stays_if_there_is_no_other() {
 }
 
 #[test]
-fn a_previous_generation_that_cannot_be_read_is_kept() {
+fn an_unreadable_previous_generation_is_kept() {
     let (fs, mut model, mut store) = started();
     model.begin(&mut store);
     drop(store);

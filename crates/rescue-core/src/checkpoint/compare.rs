@@ -1,5 +1,5 @@
-//! How two masters' states differ, for people. The order of lists, which only a master's replies show, does not
-//! count.
+//! Describes how two states of a master differ. The order of lists, which only a master's replies show, is
+//! ignored.
 
 use std::collections::BTreeSet;
 
@@ -12,14 +12,14 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// What differs.
+/// The kind of thing that differs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum What {
     Node,
     Publisher,
     Subscriber,
-    /// A subscription of a parameter.
+    /// A subscription to a parameter.
     ParamSubscriber,
     Service,
     TopicType,
@@ -30,20 +30,20 @@ pub enum What {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Difference {
     pub what: What,
-    /// Of the node, topic, service or parameter.
+    /// Name of the node, topic, service or parameter.
     pub name: String,
-    /// The node that is registered, for publishers and subscribers.
+    /// For publishers and subscribers, the node that is registered.
     pub node: Option<String>,
-    /// In A: an address, a type or a value; none if it is not there.
+    /// The address, type or value in A. `None` if A does not have it.
     pub a: Option<String>,
-    /// The same in B.
+    /// The address, type or value in B. `None` if B does not have it.
     pub b: Option<String>,
-    /// What a node that is in only one of them is registered for.
+    /// For a node that only one state has, everything for which it is registered.
     pub registrations: Vec<String>,
 }
 
 impl Difference {
-    /// The difference in words, for states with these names.
+    /// Describes the difference. The arguments are what to call A and B.
     pub fn text(&self, [a, b]: [&str; 2]) -> String {
         let (name, node) = (&self.name, self.node.as_deref().unwrap_or_default());
         let (side, value) = match (&self.a, &self.b) {
@@ -51,7 +51,7 @@ impl Difference {
                 return match self.what {
                     What::Node => format!("node {name} is at {in_a} in {a} and at {in_b} in {b}"),
                     What::Service => {
-                        format!("service {name} is of {in_a} in {a} and of {in_b} in {b}")
+                        format!("service {name} is provided by {in_a} in {a} and by {in_b} in {b}")
                     }
                     What::TopicType => {
                         format!("topic {name} has the type {in_a} in {a} and {in_b} in {b}")
@@ -78,7 +78,7 @@ impl Difference {
     }
 }
 
-/// `publishes /a, /b; subscribes /c` from a list of its parts.
+/// Joins a list of registrations, as in `publishes /a, /b; subscribes /c`.
 fn grouped(registrations: &[String]) -> String {
     let (mut text, mut last) = (String::new(), "");
     for registration in registrations {
@@ -94,7 +94,7 @@ fn grouped(registrations: &[String]) -> String {
     text
 }
 
-/// Where `a` and `b` differ, without the values of parameters that are hidden.
+/// Lists where `a` and `b` differ. Values of hidden parameters are masked.
 pub fn compare(a: &Master, b: &Master, hide: &Hide) -> Vec<Difference> {
     let mut found = Comparison {
         a: a.snapshot(),
@@ -110,7 +110,7 @@ pub fn compare(a: &Master, b: &Master, hide: &Hide) -> Vec<Difference> {
     found.found
 }
 
-/// What a node is registered for, in words.
+/// Describes everything for which a node is registered, one registration per element.
 pub fn registrations(master: &Master, node: &str) -> Vec<String> {
     let services = master
         .services_of(node)
@@ -130,7 +130,7 @@ pub fn registrations(master: &Master, node: &str) -> Vec<String> {
         .collect()
 }
 
-/// The name of a parameter from the key under which it is subscribed.
+/// The name of a parameter, from the key under which it is subscribed.
 pub fn plain(key: &str) -> &str {
     match key {
         "/" => key,
@@ -177,7 +177,7 @@ impl Comparison<'_> {
         }
     }
 
-    /// Of the nodes that are in both.
+    /// Compares the registrations of nodes that are in both states.
     fn registrations(&mut self) {
         let both =
             |node: &String| self.a.nodes.contains_key(node) && self.b.nodes.contains_key(node);
@@ -229,7 +229,7 @@ impl Comparison<'_> {
             if entries[0] == entries[1] {
                 continue;
             }
-            // A node that is in only one of them has been named with its services.
+            // A node that is in only one state has already been listed with its services.
             let told = match entries {
                 [Some(entry), None] => !self.b.nodes.contains_key(&entry.node),
                 [None, Some(entry)] => !self.a.nodes.contains_key(&entry.node),
@@ -256,7 +256,7 @@ impl Comparison<'_> {
         for topic in topics {
             let [in_a, in_b] =
                 [&self.a, &self.b].map(|state| state.topic_types.get(&topic).cloned());
-            // A topic that is in use in only one of them has been named with its nodes.
+            // A topic that is in use in only one state has already been listed with its nodes.
             let used = |state: &Snapshot| {
                 state.publishers.contains_key(&topic) || state.subscribers.contains_key(&topic)
             };
@@ -285,7 +285,7 @@ impl Comparison<'_> {
             Some(_) => None,
         };
         match (a, b, members(a), members(b)) {
-            // A namespace, in one or both.
+            // It is a namespace in at least one state, and is empty or absent in the other.
             (.., Some(a), Some(b)) => self.params(name, &a, &b),
             _ if a.is_some_and(|a| b.is_some_and(|b| same(a, b))) => {}
             _ => {
@@ -297,7 +297,7 @@ impl Comparison<'_> {
     }
 }
 
-/// Whether both are equal, in whatever order the members of their structs are.
+/// Whether two values are equal, ignoring the order of struct members.
 fn same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Struct(a), Value::Struct(b)) => {

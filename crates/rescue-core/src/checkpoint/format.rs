@@ -1,13 +1,13 @@
-//! The checkpoint's text, to and from bytes. Pure; [`store`](crate::checkpoint::store) handles the file.
+//! Converts a checkpoint to and from text. Pure; [`store`](crate::checkpoint::store) handles the file.
 //!
 //! A checkpoint is one YAML document: a first line (a comment) with lengths and check sums, the snapshot in
-//! block style, and a last key `journal:` under which every appended line is one [`Record`] in flow style.
-//! `docs/checkpoint.md` describes the format for people.
+//! block style, and as its last key `journal:`, under which each appended line is one [`Record`] in flow
+//! style. `docs/checkpoint.md` describes the format for readers.
 //!
-//! * `emit`: values to YAML that YAML 1.1 and 1.2 readers read alike.
-//! * `yaml`: YAML to values, from the events of serde-saphyr's parser.
-//! * `frame`: the first line, check sums, and the whole parts of a damaged file.
-//! * `document`: which value stands under which key.
+//! * `emit` converts values to YAML that YAML 1.1 and YAML 1.2 readers read alike.
+//! * `yaml` converts YAML to values, from the events of serde-saphyr's parser.
+//! * `frame` handles the first line, the check sums, and finding the whole parts of a damaged file.
+//! * `document` defines which value stands under which key.
 
 mod document;
 mod emit;
@@ -28,38 +28,38 @@ pub use frame::{FORMAT_VERSION, Stamp, decode};
 pub use frame::{Framed, push_body, push_record, read_records, scan, seal};
 pub use rosparam::{for_rosparam, shown};
 
-/// Deepest nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512)
-/// below a parameter path of half as many names. rosmaster itself cannot return a value deeper than 492
-/// levels.
+/// Maximum nesting that can be written and read back: the deepest value of a call (`xmlrpc` accepts 512
+/// levels) below a parameter path of half as many names. rosmaster itself cannot return a value deeper than
+/// 492 levels.
 pub const DEPTH_MAX: usize = 768;
 
-/// What a restart needs to decide whether the session continues.
+/// Everything that a restart needs to decide whether the session continues.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Session {
-    /// Identifies the session; the `run_id` of roslaunch.
+    /// Identifies the session. Used as roslaunch's `run_id`.
     pub id: String,
-    /// The kernel's boot id when the session began.
+    /// The boot id of the kernel when the session began.
     pub boot_id: String,
-    /// Whether the session ended by an orderly stop.
+    /// Whether the session ended with a clean stop.
     pub closed: bool,
-    /// The session's part of the incarnation token: the `id` of the first session at this checkpoint; see
-    /// [`Token`](crate::replay::Token).
+    /// The part of the incarnation token that identifies the session: the `id` of the first session at this
+    /// checkpoint. See [`Token`](crate::replay::Token).
     pub mark: String,
-    /// The master's address, if there was one yet.
+    /// The master's address, if there has been a master.
     pub master_uri: Option<String>,
-    /// Wall clock time of the start as text, for people only.
+    /// Wall clock time of the start as text, for human readers only.
     pub started: String,
-    /// Number of the master's incarnation, as in its token.
+    /// The number of the master's incarnation, as in its token.
     pub incarnation: u64,
-    /// All pending writes up to this record have reached the master. A snapshot's pending writes have the
-    /// number of its last record.
+    /// All pending writes up to and including this record have reached the master. The pending writes in a
+    /// snapshot count as having the number of its last record.
     pub delivered: u64,
-    /// The port that nodes use; 0 if an earlier version wrote the session.
+    /// The port that nodes use. 0 if an earlier version wrote the session.
     pub port: u16,
-    /// The last term in which this computer led several; 0 if it never did.
+    /// The last term in which this computer was the leader of several. 0 if it never was.
     pub term: u64,
-    /// In that term: the number of the last record in the computers' journal in etcd whose effect this file
-    /// holds. Each call that follows has the next number. Smaller, if it is not known.
+    /// The number of the last record in the etcd journal of that term whose effect this file holds. Each call
+    /// that follows has the next number. Lower if it is not known.
     pub cluster_seq: u64,
 }
 
@@ -69,7 +69,7 @@ pub enum Entry {
     /// A write that was answered with success.
     Call {
         call: Call,
-        /// Whether the mirror answered it before a master had run it.
+        /// Whether the mirror answered the write before a master had run it.
         pending: bool,
     },
     /// Replaces the session.
@@ -77,7 +77,7 @@ pub enum Entry {
 }
 
 impl Entry {
-    /// A write that the master has run.
+    /// A write that a master has run.
     pub fn call(call: Call) -> Self {
         let pending = false;
         Self::Call { call, pending }
@@ -87,7 +87,7 @@ impl Entry {
 /// One line of the journal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// One more than the previous record's, across all generations of the file.
+    /// One more than the number of the previous record, across all generations of the file.
     pub seq: u64,
     pub entry: Entry,
 }
@@ -95,29 +95,29 @@ pub struct Record {
 /// A whole state and its place in the journal.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
-    /// Number of the last record whose effect `snapshot` contains; 0 if there was none.
+    /// The number of the last record whose effect `snapshot` contains. 0 if there was none.
     pub seq: u64,
     pub session: Session,
     pub snapshot: Snapshot,
     /// The writes in `snapshot` that no master has run yet, in order.
     pub pending: Vec<Call>,
-    /// Nodes that may not have been told to shut down.
+    /// Nodes that must shut down and may not have been told yet.
     pub displaced: Vec<Displaced>,
 }
 
-/// A checkpoint's text, and the stamp that its records must carry.
+/// The text of a checkpoint, and the stamp that its records must carry.
 #[derive(Debug)]
 pub struct Encoded {
     /// The whole file up to its first record.
     pub bytes: Vec<u8>,
-    /// Ties records to these bytes.
+    /// Ties the records that follow to these bytes.
     pub stamp: Stamp,
 }
 
-/// Why something cannot be encoded.
+/// Why a state or a record cannot be encoded.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum EncodeError {
-    /// A value that could not be read back.
+    /// A value is nested too deep to be read back.
     #[error("a parameter is nested deeper than {limit} levels; it cannot be kept in a checkpoint")]
     TooDeep {
         /// [`DEPTH_MAX`].
@@ -125,21 +125,21 @@ pub enum EncodeError {
     },
 }
 
-/// Why a file is not read.
+/// Why a file cannot be read.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum DecodeError {
-    /// Nothing in it belongs to a checkpoint.
+    /// No part of it belongs to a checkpoint.
     #[error("not a rosrescue checkpoint")]
     NotACheckpoint,
-    /// An intact file of a newer rosrescue.
+    /// An intact file that a newer rosrescue wrote.
     #[error("written in checkpoint format {version}; this rosrescue knows up to {known}", known = FORMAT_VERSION)]
     NewerVersion {
-        /// The format in its first line.
+        /// The format version in its first line.
         version: u32,
     },
 }
 
-/// Why a snapshot cannot be used.
+/// Why the snapshot of a file cannot be used.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
     /// The first line is damaged.
@@ -148,22 +148,22 @@ pub enum SnapshotError {
     /// The file ends inside the snapshot.
     #[error("the snapshot ends after {found} of {expected} bytes")]
     Truncated {
-        /// Bytes according to the first line.
+        /// Number of bytes according to the first line.
         expected: u64,
         found: u64,
     },
     /// The content differs from what was written.
     #[error("the snapshot's check sum is {found:08x}, not {expected:08x}")]
     Checksum { expected: u32, found: u32 },
-    /// The bytes are as written, but are not a valid snapshot.
-    #[error("the snapshot is whole and does not make sense: {why}")]
+    /// The bytes are what was written, but not a valid snapshot.
+    #[error("the snapshot is complete but not valid: {why}")]
     Content { why: String },
 }
 
 /// A damaged place in a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Damage {
-    /// In bytes from the start of the file.
+    /// Position in bytes from the start of the file.
     pub offset: usize,
     pub why: String,
 }
@@ -171,19 +171,19 @@ pub struct Damage {
 /// The readable parts of a file.
 #[derive(Debug)]
 pub struct Decoded {
-    /// The file's generation; 0 if the first line is damaged.
+    /// The generation of the file. 0 if the first line is damaged.
     pub generation: u64,
     /// The snapshot, if it is whole.
     pub checkpoint: Result<Checkpoint, SnapshotError>,
-    /// The whole records in order.
+    /// The whole records, in order.
     pub records: Vec<Record>,
-    /// The bytes of a torn append at the end, if any.
+    /// The bytes of an incomplete append at the end, if any.
     pub torn: Option<Range<usize>>,
     /// All other damage.
     pub damaged: Vec<Damage>,
 }
 
-/// The bytes of a new file that holds `checkpoint` and no record yet.
+/// Encodes a new file that holds `checkpoint` and no records yet.
 ///
 /// ```
 /// use rescue_core::checkpoint::format::{self, Checkpoint, Entry, Record, Session};
@@ -207,7 +207,7 @@ pub fn encode_checkpoint(checkpoint: &Checkpoint, generation: u64) -> Result<Enc
     Ok(frame::frame_snapshot(&body, checkpoint.seq, generation))
 }
 
-/// The line of `record` for a file with this `stamp`, with its line feed.
+/// Encodes `record` as a line for a file with this `stamp`, including the line feed.
 ///
 /// # Errors
 ///

@@ -1,4 +1,4 @@
-//! What it takes to bring a running master nearer to a checkpoint, by calls that anybody may make.
+//! Works out which calls, of those that any node may make, bring a running master closer to a checkpoint.
 
 use crate::{
     checkpoint::compare::plain,
@@ -6,25 +6,25 @@ use crate::{
     xmlrpc::{Struct, Value},
 };
 
-/// Parameters that belong to the start of the present session. roslaunch compares `/run_id` with its own, and has its
+/// Parameters that belong to the present session. roslaunch compares `/run_id` with its own, and stores its
 /// addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 
-/// Something of the checkpoint that stays out, and why.
+/// Something in the checkpoint that is not restored, and the reason.
 pub type LeftOut = (String, String);
 
-/// The changes of parameters.
+/// The parameters to change.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Params {
-    /// Name, value in the master, if any, and value in the checkpoint.
+    /// Name, present value in the master, if any, and value in the checkpoint.
     pub set: Vec<(String, Option<Value>, Value)>,
-    /// Names that the checkpoint does not have.
+    /// Names of parameters that the checkpoint does not have.
     pub delete: Vec<String>,
     pub left_out: Vec<LeftOut>,
 }
 
-/// What is to be set so that `live` has all parameters of `file`, one by one; with `exact` also what is to be
-/// deleted so that it has no others.
+/// What to set so that `live` has all parameters of `file`. With `exact` also what to delete so that it has
+/// no others.
 pub fn params(file: &Struct, live: &Struct, exact: bool) -> Params {
     let mut found = Params::default();
     found.below("", file, live, exact);
@@ -37,13 +37,13 @@ impl Params {
             let name = format!("{path}/{key}");
             if OF_THE_SESSION.contains(&name.as_str()) {
                 if live.get(key) != Some(value) {
-                    self.leave(name, "it belongs to the session that runs now");
+                    self.leave(name, "it belongs to the present session");
                 }
                 continue;
             }
             match (value, live.get(key)) {
                 (value, Some(there)) if value == there => {}
-                // To set it would delete what is in it.
+                // Setting an empty namespace would delete everything in it.
                 (Value::Struct(none), Some(Value::Struct(_))) if none.is_empty() && !exact => {}
                 _ if !is_plain(key) => self.leave(name, "no call can name it alone"),
                 (Value::Struct(members), there) if is_namespace(members) => {
@@ -52,7 +52,7 @@ impl Params {
                     self.below(&name, members, there, exact);
                 }
                 (value, _) if !master::is_readable(value) => {
-                    self.leave(name, "rosmaster could take it but never return it");
+                    self.leave(name, "rosmaster would accept it but could never return it");
                 }
                 (value, there) => self.set.push((name, there.cloned(), value.clone())),
             }
@@ -72,37 +72,37 @@ impl Params {
     }
 }
 
-/// Whether `key` alone can be a part of a name.
+/// Whether `key` can be one part of a parameter name.
 fn is_plain(key: &str) -> bool {
     !key.is_empty() && !key.contains('/')
 }
 
-/// Whether each member can be set by a call of its own.
+/// Whether each member can be set by a separate call.
 fn is_namespace(members: &Struct) -> bool {
     !members.is_empty() && members.keys().all(|key| is_plain(key))
 }
 
-/// A registration of a node.
+/// A registration to restore.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Registration {
-    /// As in `/talker publishes /chatter`.
+    /// A description, such as `/talker publishes /chatter`.
     pub text: String,
-    /// The service and its address, for a service.
+    /// Name and address, if it is a service.
     pub service: Option<(String, String)>,
     pub call: Request,
 }
 
-/// A node of a checkpoint, with what a master lacks of it.
+/// A node of a checkpoint that the master does not know, or does not know completely.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Absent {
     pub node: String,
     pub api: String,
-    /// In the order in which they are to be made.
+    /// The registrations that the master lacks, in the order in which to make them.
     pub registrations: Vec<Registration>,
 }
 
-/// The nodes of `file` that `live` does not know, or knows at the same address with fewer registrations. A node that
-/// is at another address now is left out: rosmaster would shut it down.
+/// The nodes of `file` that `live` does not know, or knows at the same address with fewer registrations. A
+/// node that is at another address now is left out, because rosmaster would shut it down.
 pub fn absent(file: &Master, live: &Master) -> (Vec<Absent>, Vec<LeftOut>) {
     let (mut absent, mut left_out) = (Vec::new(), Vec::new());
     for (node, api) in file.nodes() {
@@ -139,7 +139,7 @@ fn missing(
                 service,
                 call: call(&name),
             }),
-            None => left_out.push((text, "no name leads to it".to_owned())),
+            None => left_out.push((text, "no call can name it".to_owned())),
         };
     let named = |key: &str| master::name_for(key, node);
     for (verb, method, held, there) in [
@@ -166,7 +166,7 @@ fn missing(
             );
         }
     }
-    // Whether a node that is known subscribes parameters cannot be read.
+    // Whether a known node subscribes to parameters cannot be read from a master.
     let watched = file.param_subscriptions(node);
     for key in watched.filter(|_| live.api_of(node).is_none()) {
         let text = format!("{node} watches the parameter {}", plain(key));
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_differs_is_set_and_only_if_it_must_be_exact_is_anything_deleted() {
+    fn only_differing_parameters_are_set_and_others_are_deleted_only_if_asked_to() {
         let file = tree(&[
             ("same", 1.into()),
             ("a", space(&[("x", 1.into()), ("y", 2.into())])),
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_master_lacks_of_a_node_is_put_back_where_the_node_is() {
+    fn missing_registrations_of_a_node_are_restored_at_its_address() {
         let publish = call(
             Method::RegisterPublisher,
             &["/p", "/t", "x/Y", "http://p:1/"],
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(calls, [publish, watch, serve]);
         let left: Vec<_> = left_out.iter().map(|(what, _)| what).collect();
         assert_eq!(left, ["/p provides /u", "node /m"]);
-        // With all of it nothing is left to do, and what cannot be read is not done again.
+        // If nothing is missing, there is nothing to do, and parameter subscriptions, which cannot be read, are not repeated.
         let (found, _) = absent(&file, &file);
         assert_eq!(found, []);
     }

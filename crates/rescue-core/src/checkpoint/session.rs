@@ -1,6 +1,6 @@
-//! Whether a checkpoint's session continues, or the robot was switched on anew.
+//! Decides whether the session of a checkpoint continues, or the robot has been switched on again.
 //!
-//! A robot that is switched on in the morning must not start with yesterday's parameters.
+//! A robot that is switched on in the morning must not start with the parameters of yesterday.
 
 use std::collections::BTreeMap;
 
@@ -9,33 +9,33 @@ use crate::{
     master::{Displaced, Master, Request},
 };
 
-/// When a checkpoint is restored at start.
+/// When to restore a checkpoint at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Restore {
-    /// If the session continues: same boot and no orderly stop, or a registered node still lives.
+    /// Restore it if the session continues: same boot and no clean stop, or a registered node is still alive.
     Auto,
-    /// Always.
+    /// Always restore it.
     Always,
-    /// Never: the old file is kept under another name.
+    /// Never restore it. The old file is kept under another name.
     Never,
 }
 
-/// What is known about a recorded session.
+/// What is known about the session in a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Evidence {
-    /// The computer has not rebooted since.
+    /// Whether the computer has not rebooted since.
     pub same_boot: bool,
-    /// rosrescue was stopped in order.
+    /// Whether rosrescue was stopped cleanly.
     pub closed: bool,
-    /// A registered node answers. After a reboot only nodes on other computers count.
+    /// Whether a registered node answers. After a reboot only nodes on other computers count.
     pub node_alive: bool,
 }
 
-/// Whether a checkpoint is restored, and the reason in words.
+/// Whether to restore a checkpoint, with the reason as text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     Restore(&'static str),
-    /// Start a new session.
+    /// Begin a new session.
     Fresh(&'static str),
 }
 
@@ -53,8 +53,8 @@ pub fn depends_on_nodes(policy: Restore, evidence: Evidence) -> bool {
     with(true) != with(false)
 }
 
-/// Whether the recorded session goes on, and why: it does after a kill, and after an orderly stop or a boot
-/// only if one of its nodes is alive.
+/// Decides whether the session in a checkpoint continues. It does after a kill. After a clean stop or a
+/// reboot it does only if one of its nodes is alive.
 pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
     let Evidence {
         same_boot,
@@ -65,13 +65,13 @@ pub fn decide(policy: Restore, evidence: Evidence) -> Decision {
         Restore::Always => Decision::Restore("--restore always"),
         Restore::Never => Decision::Fresh("--restore never"),
         Restore::Auto if same_boot && !closed => {
-            Decision::Restore("the session goes on: rosrescue was not stopped in order")
+            Decision::Restore("the session continues: rosrescue was not stopped cleanly")
         }
-        Restore::Auto if node_alive => Decision::Restore("the session goes on: nodes are alive"),
+        Restore::Auto if node_alive => Decision::Restore("the session continues: nodes are alive"),
         Restore::Auto if closed => {
-            Decision::Fresh("rosrescue was stopped in order and no node is alive")
+            Decision::Fresh("rosrescue was stopped cleanly and no node is alive")
         }
-        Restore::Auto => Decision::Fresh("the computer was booted anew and no node is alive"),
+        Restore::Auto => Decision::Fresh("the computer was rebooted and no node is alive"),
     }
 }
 
@@ -82,16 +82,16 @@ pub struct Rebuilt {
     pub session: Option<Session>,
     /// Writes that have not reached the master yet, in order.
     pub pending: Vec<Request>,
-    /// Nodes whose names were taken in the records or shortly before the snapshot, in the order of their addresses. It is not known which were
-    /// told to shut down.
+    /// Nodes whose names were taken in the records or shortly before the snapshot, in the order of their
+    /// addresses. It is not known which of them were told to shut down.
     pub displaced: Vec<Displaced>,
-    /// Why the snapshot was left out: it is not the state of a master.
+    /// Why the snapshot was left out: no master can be in that state.
     pub trouble: Option<String>,
 }
 
 pub fn rebuild(checkpoint: Option<Checkpoint>, records: Vec<Record>) -> Rebuilt {
     let mut rebuilt = Rebuilt::default();
-    // With the number of each write's record, or of the snapshot.
+    // Each write with the number of its record, or of the snapshot.
     let mut pending: Vec<(u64, Request)> = Vec::new();
     let mut displaced = BTreeMap::new();
     if let Some(checkpoint) = checkpoint {
@@ -157,7 +157,7 @@ mod tests {
         Record { seq, entry }
     }
 
-    /// The numbers of the writes that wait, of those in a snapshot as of record 5 and in `records`.
+    /// The writes that still wait: those in a snapshot taken at record 5, and those in `records`.
     fn waiting(records: &[Record]) -> Vec<String> {
         let Entry::Call { call, .. } = write(4, true).entry else {
             unreachable!()
@@ -174,13 +174,13 @@ mod tests {
     }
 
     #[test]
-    fn writes_wait_until_they_were_delivered() {
+    fn pending_writes_wait_until_they_are_delivered() {
         let mut records = vec![write(6, false), write(7, true), write(8, true)];
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
-        // The session changed for another reason.
+        // A session record that was written for another reason changes nothing.
         records.push(delivered(9, 3));
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
-        // That of the snapshot counts as of the snapshot.
+        // The pending writes in the snapshot have the number of its last record.
         records.push(delivered(10, 4));
         assert_eq!(waiting(&records), ["/p4", "/p7", "/p8"]);
         records.push(delivered(11, 7));
@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(waiting(&records), ["/p14"]);
     }
 
-    /// The number of the last call in the computers' journal, of a file with `records` after a snapshot of call 7.
+    /// The number of the last call in the etcd journal, for a file with `records` after a snapshot of call 7.
     fn cluster_seq(records: Vec<Record>) -> u64 {
         let mut checkpoint = Checkpoint::default();
         checkpoint.session.cluster_seq = 7;
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn each_call_after_the_session_was_written_is_one_more_in_the_computers_journal() {
+    fn each_call_after_a_session_record_counts_as_one_more_in_the_etcd_journal() {
         let session = |seq, cluster_seq| {
             let entry = Entry::Session(Session {
                 cluster_seq,
@@ -214,13 +214,13 @@ mod tests {
         assert_eq!(cluster_seq(vec![write(1, false), write(2, true)]), 9);
         let records = vec![write(1, false), session(2, 8), write(3, false)];
         assert_eq!(cluster_seq(records), 9);
-        // What was not recorded makes the number unknown.
+        // Without the session's number the number of the calls after it is unknown.
         let records = vec![write(1, false), session(2, 0), write(3, false)];
         assert_eq!(cluster_seq(records), 1);
     }
 
     #[test]
-    fn who_was_displaced_is_known_from_the_records() {
+    fn displaced_nodes_are_found_in_the_records() {
         let publish = |topic: &str, port: u16| {
             let api = format!("http://n:{port}/");
             let params = ["/n", topic, "x/Y", &api].map(Into::into);
@@ -236,7 +236,7 @@ mod tests {
         assert_eq!(
             displaced.collect::<Vec<_>>(),
             [
-                // Once, with what it did last.
+                // Listed once, with the topics that it had last.
                 ("http://n:1/", &vec!["/c".to_owned()]),
                 ("http://n:2/", &vec!["/a".to_owned()]),
             ]
@@ -253,18 +253,18 @@ mod tests {
     }
 
     #[test]
-    fn a_session_goes_on_after_a_crash_or_while_nodes_live() {
+    fn a_session_continues_after_a_crash_or_while_nodes_are_alive() {
         assert!(
             restores(Restore::Auto, true, false, false),
             "crash and start"
         );
         assert!(
             !restores(Restore::Auto, true, true, false),
-            "orderly stop and start"
+            "clean stop and start"
         );
         assert!(
             restores(Restore::Auto, true, true, true),
-            "orderly stop, nodes alive"
+            "clean stop, nodes alive"
         );
         assert!(!restores(Restore::Auto, false, false, false), "reboot");
         assert!(
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_asked_only_if_it_matters() {
+    fn nodes_are_asked_only_if_the_decision_depends_on_them() {
         for (policy, same_boot, closed, matters) in [
             (Restore::Auto, true, false, false),
             (Restore::Auto, true, true, true),
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn always_and_never_say_so_outright() {
+    fn restore_always_and_never_decide_without_asking_nodes() {
         for evidence in 0..8 {
             let [boot, closed, alive] = [1, 2, 4].map(|bit| evidence & bit != 0);
             assert!(restores(Restore::Always, boot, closed, alive));

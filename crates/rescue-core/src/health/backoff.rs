@@ -1,8 +1,8 @@
-//! Growing pauses.
+//! Pauses that grow from one attempt to the next.
 
 use std::time::{Duration, Instant};
 
-/// When something is due next, and the pause after that.
+/// The time of the next attempt, and the pause after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Backoff {
     next: Instant,
@@ -10,7 +10,7 @@ pub(super) struct Backoff {
 }
 
 impl Backoff {
-    /// First due at `next`, then after `pause`.
+    /// Sets the first attempt to `next`, with a `pause` after it.
     pub(super) fn new(next: Instant, pause: Duration) -> Self {
         Self { next, pause }
     }
@@ -19,7 +19,7 @@ impl Backoff {
         self.next
     }
 
-    /// It was done at `now`. Pauses double up to `longest`.
+    /// Notes an attempt at `now`. Pauses double up to `longest`.
     pub(super) fn done(&mut self, now: Instant, longest: Duration) {
         self.next = now + self.pause;
         self.pause = (self.pause * 2).min(longest);

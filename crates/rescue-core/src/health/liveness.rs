@@ -1,4 +1,5 @@
-//! Which registered nodes live, by evidence that no node notices. It is reported, and decides nothing.
+//! Tells which registered nodes are alive, from evidence that can be collected without disturbing them. This
+//! is only reported, and decides nothing.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -9,48 +10,49 @@ use serde::Serialize;
 
 use super::Sign;
 
-/// Pause before a node is asked again, unless the table of sockets answers for it.
+/// Pause before a node is asked again. Shorter if the table of sockets shows that its process has ended.
 const ASK_AGAIN: Duration = Duration::from_secs(30);
-/// Evidence that is older says nothing about now.
+/// Evidence older than this says nothing about the present.
 const STALE: Duration = Duration::from_secs(120);
 
-/// What is known of a node's life.
+/// What is known about whether a node is alive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Health {
-    /// A process listens at its port, or it has answered.
+    /// A process listens at the node's port, or the node has answered.
     Alive,
-    /// It was not asked yet, or not lately.
+    /// The node has not been asked yet, or not lately.
     Unchecked,
-    /// It does not answer, and is not known to be dead. It stays registered.
+    /// The node does not answer and is not known to be dead. It stays registered.
     Unreachable,
-    /// Its port refuses connections, or it was found dead and unregistered and has not come back.
+    /// The node's port refuses connections, or the node was found dead and unregistered and has not come
+    /// back.
     Dead,
 }
 
-/// The latest evidence.
+/// The latest evidence about a port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Seen {
     sign: Sign,
     pub at: Instant,
 }
 
-/// The evidence about each port where a node is registered.
+/// The latest evidence about each port at which a node is registered.
 #[derive(Debug, Default)]
 pub struct Liveness(BTreeMap<String, Port>);
 
 #[derive(Debug)]
 struct Port {
     seen: Option<Seen>,
-    /// When to ask.
+    /// When to ask the port next.
     next: Instant,
-    /// It is being asked.
+    /// Whether the port is being asked right now.
     asked: bool,
 }
 
 impl Liveness {
-    /// Returns the ports to ask now. `registered` are all that have nodes, and `listens` is whether a process
-    /// listens there; none if that is not known.
+    /// Returns the ports to ask now. `registered` are all ports that have nodes. `listens` tells whether a
+    /// process listens at a port; `None` if that is not known.
     pub fn round(
         &mut self,
         registered: &BTreeSet<String>,
@@ -73,7 +75,8 @@ impl Liveness {
             };
             match listens(name) {
                 Some(true) => port.note(Sign::Alive, now),
-                // It has just ended. A connection tells it from a port that the kernel forwards elsewhere.
+                // The process has just ended, or the kernel forwards the port to another place. A connection
+                // shows which.
                 Some(false) if port.is_alive() => port.next = now,
                 _ => {}
             }
@@ -85,7 +88,8 @@ impl Liveness {
         due
     }
 
-    /// A port that was asked has given this sign, or none. Returns whether it is dead and was not before.
+    /// Notes the sign that a port has given when it was asked, if any. Returns whether it has just been found
+    /// dead.
     pub fn answered(&mut self, port: &str, sign: Option<Sign>, now: Instant) -> bool {
         let Some(port) = self.0.get_mut(port) else {
             return false;
@@ -116,8 +120,8 @@ impl Port {
 }
 
 impl Health {
-    /// The health of a node with this evidence. `unreachable`: it has not answered the health check or a
-    /// notification.
+    /// The health of a node with this evidence about its port. `unreachable` is whether the node has failed
+    /// to answer the health check or a notification.
     pub fn of(seen: Option<Seen>, unreachable: bool, now: Instant) -> Self {
         let fresh = seen.filter(|seen| now.saturating_duration_since(seen.at) < STALE);
         match fresh.map(|seen| seen.sign) {
@@ -141,13 +145,13 @@ mod tests {
     }
 
     #[test]
-    fn a_port_of_this_computer_is_asked_when_its_process_has_ended() {
+    fn a_port_of_this_computer_is_asked_as_soon_as_its_process_has_ended() {
         let mut now = Instant::now();
         let mut liveness = Liveness::default();
         let all = ports(&["here"]);
         let health = |liveness: &Liveness, now| Health::of(liveness.seen("here"), false, now);
         assert_eq!(health(&liveness, now), Health::Unchecked);
-        // Whose it is, is not known yet.
+        // The table of sockets has not been read yet.
         assert_eq!(liveness.round(&all, |_| None, now), ["here"]);
         assert!(liveness.round(&all, |_| None, now).is_empty(), "once");
         assert!(!liveness.answered("here", Some(Sign::Alive), now));
@@ -168,13 +172,13 @@ mod tests {
             !liveness.answered("here", Some(Sign::Dead), now),
             "told once"
         );
-        // Another process with the same port.
+        // Another process uses the same port now.
         assert!(liveness.round(&all, |_| Some(true), now).is_empty());
         assert_eq!(health(&liveness, now), Health::Alive);
     }
 
     #[test]
-    fn a_port_elsewhere_is_asked_now_and_then_and_old_answers_say_nothing() {
+    fn a_port_of_another_computer_is_asked_from_time_to_time_and_old_answers_expire() {
         let mut now = Instant::now();
         let mut liveness = Liveness::default();
         let all = ports(&["far", "nowhere"]);
@@ -189,7 +193,7 @@ mod tests {
         liveness.answered("far", Some(Sign::Alive), now);
         assert_eq!(health("far", &liveness, now), Health::Alive);
         assert_eq!(health("far", &liveness, now + STALE), Health::Unchecked);
-        // The health check knows better.
+        // The result of the health check counts for more.
         let seen = liveness.seen("far");
         assert_eq!(Health::of(seen, true, now), Health::Unreachable);
         liveness.round(&ports(&[]), |_| None, now);

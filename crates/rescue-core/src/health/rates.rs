@@ -1,22 +1,23 @@
-//! How often the nodes of one host are asked, so that registered names cannot direct a flood at a host.
+//! Limits how often the nodes of one host are asked, so that registrations cannot make rosrescue flood a
+//! host.
 
 use std::{
     collections::BTreeMap,
     time::{Duration, Instant},
 };
 
-/// Visits that one host may get at once: a robot's recovery asks all its nodes, which may be on one computer,
-/// at the same time, and soon after their start for the first time.
+/// Number of visits that a host may get at once. A recovery asks all nodes of a robot at the same time, and
+/// asks again soon after they have started; all of them may be on one computer.
 const AT_ONCE: u32 = 400;
-/// Pause between further visits.
+/// Pause between further visits to the same host.
 const PAUSE: Duration = Duration::from_millis(10);
-/// Hosts to remember before those that have not been visited lately are forgotten.
+/// Number of hosts to remember. If there are more, those without recent visits are forgotten.
 const HOSTS: usize = 1024;
 
-/// When each host has had its visits, as a leaky bucket for each (the generic cell rate algorithm).
+/// The visits to each host, limited by a leaky bucket per host (the generic cell rate algorithm).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rates<K: Ord> {
-    /// When all visits so far would be over, if there had been a pause before each.
+    /// When all visits so far would be over if there had been a pause before each.
     over_at: BTreeMap<K, Instant>,
     forget_at: usize,
 }
@@ -31,7 +32,7 @@ impl<K: Ord> Default for Rates<K> {
 }
 
 impl<K: Ord> Rates<K> {
-    /// Notes one more visit to `host`. Returns when it may begin.
+    /// Reserves one more visit to `host`. Returns when it may begin.
     pub fn reserve(&mut self, host: K, now: Instant) -> Instant {
         if self.over_at.len() >= self.forget_at {
             self.over_at.retain(|_, over_at| *over_at > now);
@@ -56,14 +57,14 @@ mod tests {
     }
 
     #[test]
-    fn so_many_visits_at_once_and_then_one_after_each_pause() {
+    fn a_host_gets_a_number_of_visits_at_once_and_then_one_per_pause() {
         let start = Instant::now();
         let mut rates = Rates::default();
         let waits = pauses(&mut rates, 1, 2000, start);
         let count = |until| waits.iter().filter(|wait| **wait <= until).count();
         assert_eq!(count(Duration::ZERO), 400);
         assert_eq!(count(Duration::from_secs(2)), 600);
-        // Another host has its own, and after a while so has this one.
+        // Another host has a limit of its own, and after a while this one may be visited at once again.
         assert_eq!(pauses(&mut rates, 2, 1, start), [Duration::ZERO]);
         let later = start + Duration::from_secs(20);
         let waits = pauses(&mut rates, 1, 401, later);
@@ -72,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn two_recoveries_of_two_hundred_nodes_wait_for_nothing() {
+    fn two_recoveries_of_two_hundred_nodes_are_not_delayed() {
         let start = Instant::now();
         let mut rates = Rates::default();
         for second in [0, 0, 2, 4, 6, 8] {
@@ -83,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn hosts_that_nobody_visits_are_forgotten() {
+    fn hosts_without_recent_visits_are_forgotten() {
         let start = Instant::now();
         let mut rates = Rates::default();
         for host in 0..HOSTS {

@@ -1,9 +1,9 @@
-//! Notifications that rosrescue sends because the master's own may be late.
+//! Decides when rosrescue itself notifies nodes because the master's notifications may be late.
 //!
-//! rosmaster makes each list of publishers when something changes, but sends it when one of its threads is
-//! free: after minutes, if unreachable nodes hold them up. So rosrescue sends the change itself, but not
-//! earlier than an unhindered master would: an old list from the master that arrives after our newer one
-//! makes roscpp nodes drop links until the next notification. Such a list may still be on its way, so our
+//! rosmaster makes a list of publishers when something changes, but sends it only when one of its threads is
+//! free. If unreachable nodes hold up these threads, that takes minutes. So rosrescue sends the change
+//! itself, but no earlier than an undisturbed master would: if an old list from the master arrives after our
+//! newer one, roscpp nodes drop links until the next notification. Such a list may still come later, so our
 //! notification is repeated.
 
 use std::{
@@ -13,19 +13,20 @@ use std::{
 
 use super::backoff::Backoff;
 
-/// How long a subject must be unchanged before its notification: idle threads of rosmaster look for work
+/// How long a subject must be unchanged before its notification. Idle threads of rosmaster look for work
 /// every 100 ms.
 const QUIET: Duration = Duration::from_millis(300);
-/// Longest delay of a notification whose subject keeps changing.
+/// Longest delay of a notification while its subject keeps changing.
 const LATEST: Duration = Duration::from_millis(600);
-/// Pause before the first repetition.
+/// Pause before the first repeat.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Pauses double up to this one.
+/// Pauses between repeats double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
-/// How long after the last change it is repeated: two connects of rosmaster without an answer.
+/// How long after the last change it is still repeated: as long as two connection attempts of rosmaster
+/// without an answer take.
 const LIFE: Duration = Duration::from_secs(300);
 
-/// Changed subjects, and when each notification is due.
+/// The subjects that have changed, and when the notification of each is due.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Repeats<K: Ord> {
     of: BTreeMap<K, Wait>,
@@ -33,7 +34,7 @@ pub struct Repeats<K: Ord> {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
-    /// The first change without a notification since, if any.
+    /// The time of the first change since the last notification, if there was one.
     untold: Option<Instant>,
     backoff: Backoff,
     end: Instant,
@@ -50,7 +51,7 @@ impl<K: Ord> Default for Repeats<K> {
 }
 
 impl<K: Ord + Clone> Repeats<K> {
-    /// `key` has changed.
+    /// Notes that `key` has changed.
     pub fn changed(&mut self, key: K, now: Instant) {
         let before = self.of.get(&key);
         let untold = before.and_then(|wait| wait.untold).unwrap_or(now);
@@ -63,8 +64,8 @@ impl<K: Ord + Clone> Repeats<K> {
         self.of.insert(key, wait);
     }
 
-    /// The notifications due now. `holding_up`: there are unreachable nodes. Without them the master notifies
-    /// nodes itself.
+    /// The notifications that are due now. `holding_up` is whether there are unreachable nodes; without them
+    /// the master notifies nodes itself.
     pub fn due(&mut self, now: Instant, holding_up: bool) -> Vec<K> {
         let mut due = Vec::new();
         self.of.retain(|key, wait| {
@@ -93,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_is_told_while_everybody_answers() {
+    fn no_notification_is_due_while_all_nodes_answer() {
         let start = Instant::now();
         let mut repeats = Repeats::default();
         repeats.changed("/t", start);
@@ -103,13 +104,13 @@ mod tests {
     }
 
     #[test]
-    fn it_is_told_again_for_as_long_as_the_master_may_be_late() {
+    fn a_notification_is_repeated_as_long_as_the_master_may_be_late() {
         let start = Instant::now();
         let mut repeats = Repeats::default();
         repeats.changed("/t", start);
         let mut told = Vec::new();
         while let Some(next) = repeats.next() {
-            // Also when they answer again: a thread may still hang.
+            // This goes on when all nodes answer again, because a thread of the master may still hang.
             told.extend(repeats.due(next, told.is_empty()).iter().map(|_| next));
         }
         let times: Vec<_> = told.iter().map(|at| (*at - start).as_millis()).collect();
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn what_changes_all_the_time_is_told_nevertheless() {
+    fn a_subject_that_keeps_changing_is_notified_nevertheless() {
         let start = Instant::now();
         let step = Duration::from_millis(100);
         let mut repeats = Repeats::default();

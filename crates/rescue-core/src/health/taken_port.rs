@@ -1,8 +1,8 @@
-//! Ports that pass from one node to another. A port has one process behind it: when a node registers with a
-//! port, any node registered with it before is gone.
+//! Finds nodes that are gone because another node now uses their port. A port has one process behind it, so
+//! when a node registers with a port, any other node that is registered there is gone.
 //!
-//! A master does not know that. When the old node is started again, at another port, it sends a `shutdown` to
-//! the former one, where by now an innocent node listens (ros_comm issue 2241).
+//! A master does not know that. When the old node starts again at another port, the master sends a `shutdown`
+//! to the old address, where an innocent node listens by then (ros_comm issue 2241).
 
 use std::collections::HashMap;
 
@@ -12,7 +12,7 @@ use crate::{
     replay::Token,
 };
 
-/// Nodes by their ports.
+/// The nodes registered at each port.
 struct Holders<'a>(HashMap<&'a str, Vec<&'a str>>);
 
 impl<'a> Holders<'a> {
@@ -24,8 +24,8 @@ impl<'a> Holders<'a> {
         holders
     }
 
-    /// Those that lose their ports to `registrants`. One call may register several names at one port: it
-    /// says itself that they are one process.
+    /// The nodes that lose their ports to `registrants`. If one call registers several names at one port,
+    /// that call itself says that they are one process.
     fn displaced(&self, registrants: &[(&str, &str)]) -> Vec<&'a str> {
         let ports = registrants.iter();
         let holders = ports.flat_map(|(_, port)| self.0.get(port).map_or(&[][..], Vec::as_slice));
@@ -39,7 +39,7 @@ impl<'a> Holders<'a> {
     }
 }
 
-/// The nodes for which `call`, or an entry of it, registers something, with their ports.
+/// The nodes for which `call`, or an entry of it, registers something, and their ports.
 fn registrants(call: &Request) -> Vec<(&str, &str)> {
     let registrants = call.calls().into_iter().filter_map(Request::registrant);
     registrants
@@ -47,7 +47,7 @@ fn registrants(call: &Request) -> Vec<(&str, &str)> {
         .collect()
 }
 
-/// The first of `calls` that takes a port from a node of `mirror`, or from one of an earlier call.
+/// The first of `calls` that takes a port from a node of `mirror`, or from a node of an earlier call.
 pub fn first_taking<'a>(
     mirror: &'a Master,
     calls: impl Iterator<Item = &'a Request>,
@@ -67,7 +67,7 @@ pub fn first_taking<'a>(
     })
 }
 
-/// Nodes that are gone, and the call that takes them out.
+/// Nodes that are gone, and the call that unregisters them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Eviction {
     pub nodes: Vec<String>,
@@ -75,8 +75,8 @@ pub struct Eviction {
 }
 
 impl Eviction {
-    /// What has to go before `call`, if it takes ports from nodes of `mirror`. A registration that is refused
-    /// takes none.
+    /// What must be unregistered before `call` because it takes ports from nodes of `mirror`. `None` if it
+    /// takes none. A registration that the master would refuse takes no port.
     pub fn before(mirror: &Master, call: &Request) -> Option<Self> {
         first_taking(mirror, std::iter::once(call))?;
         let mut after = mirror.clone();
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_port_changes_hands_by_any_registration_alone_or_in_a_multicall() {
+    fn any_registration_alone_or_in_a_multicall_can_take_a_port() {
         let mirror = master([publish("/old", "/t", "http://h:1/")]);
         let subscribe = Request::new(
             Method::SubscribeParam,
@@ -146,20 +146,21 @@ mod tests {
     }
 
     #[test]
-    fn others_keep_what_they_have() {
+    fn nodes_whose_port_is_not_taken_keep_their_registrations() {
         let [_, token] = Token::new("mark", 1).leave();
         let mirror = master([publish("/old", "/t", "http://h:1/"), token]);
         let token_api = mirror.nodes().find(|(node, _)| Token::is_ours(node));
         let (_, token_api) = token_api.unwrap();
         for call in [
-            // The node itself; another port; another host; a refused call; the token; no registration.
+            // The node itself, another port, another host, a refused call, the token, and a call that
+            // registers nothing.
             publish("/old", "/u", "http://h:1/"),
             publish("/new", "/t", "http://h:10/"),
             publish("/new", "/t", "http://i:1/"),
             publish("/new", "", "http://h:1/"),
             publish("/new", "/t", token_api),
             Request::new(Method::GetParam, ["/new", "/t"]),
-            // One process that has several names says so.
+            // One process that has two names registers both in one call.
             Request::multicall([
                 publish("/old", "/t", "http://h:1/"),
                 publish("/new", "/t", "http://h:1/"),
@@ -169,9 +170,9 @@ mod tests {
         }
     }
 
-    /// A node that has lost its service keeps a reference, and a master never forgets it.
+    /// A node whose service was taken over leaves a reference, which a master never forgets.
     #[test]
-    fn a_reference_by_a_lost_service_goes_and_its_provider_keeps_it() {
+    fn the_reference_left_by_a_taken_over_service_is_removed_and_the_provider_keeps_the_service() {
         let mut mirror = master([
             offer("/old", "/s", 11),
             offer("/old", "/lost", 11),
@@ -189,13 +190,13 @@ mod tests {
         let applied = mirror.apply(&eviction.call);
         assert_eq!(mirror.api_of("/old"), None);
         assert_eq!(mirror.snapshot().services, before);
-        // Nobody is told to shut down.
+        // No node is told to shut down.
         let told = |notice| matches!(notice, crate::master::Notice::Shutdown { .. });
         assert!(!applied.notices.into_iter().any(told));
     }
 
     #[test]
-    fn a_batch_ends_before_the_call_that_takes_a_port() {
+    fn a_batch_ends_before_a_call_that_takes_a_port() {
         let mirror = master([publish("/old", "/t", "http://h:1/")]);
         let first = |calls: &[Request]| first_taking(&mirror, calls.iter());
         let [one, two] = ["/one", "/two"].map(|node| publish(node, "/t", "http://h:2/"));

@@ -30,7 +30,8 @@ fn name(node: &str, known_pid: Option<i32>, registered: u64) -> Name {
     }
 }
 
-/// The verdicts on `/a` and `/b`, which are registered at one port: `/a` publishes /ta, `/b` /tb.
+/// The verdicts on `/a` and `/b`, which are registered at one port. `/a` publishes `/ta`, `/b` publishes
+/// `/tb`.
 fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<Verdict> {
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
@@ -42,7 +43,7 @@ fn verdicts(known: [Option<i32>; 2], pid: i32, claims: Option<&Claims>) -> Vec<V
 }
 
 #[test]
-fn names_share_a_port_whatever_follows_it() {
+fn addresses_that_differ_only_after_the_port_share_it() {
     for (api, port) in [
         ("http://n:1/", "http://n:1"),
         ("http://n:1", "http://n:1"),
@@ -56,22 +57,22 @@ fn names_share_a_port_whatever_follows_it() {
 }
 
 #[test]
-fn another_process_id_is_another_node() {
+fn a_different_process_id_means_another_node() {
     use Verdict::{Another, Itself};
     assert_eq!(verdicts([Some(1), Some(2)], 2, None), [Another, Itself]);
-    // One process may well bear two names.
+    // One process may have two names.
     assert_eq!(verdicts([Some(2), Some(2)], 2, None), [Itself, Itself]);
-    // But it may have been asked before it registered, in the name of the one before it.
+    // But the process may have been asked before it registered, under the name of the node before it.
     let of_b = claims(&["/tb"], &[]);
     let both = verdicts([Some(2), Some(2)], 2, Some(&of_b));
     assert_eq!(both, [Another, Itself]);
-    // The process id outweighs the topics: it is that node, whatever it has done since.
+    // The process id counts for more than the topics: it is that node, whatever it has done since.
     let other = claims(&["/tb"], &[]);
     assert_eq!(verdicts([Some(1), None], 1, Some(&other)), [Itself, Itself]);
 }
 
 #[test]
-fn topics_that_match_outweigh_a_process_id_that_changes() {
+fn matching_topics_count_for_more_than_a_changed_process_id() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
     publish(&mut master, "/a", "/more", "http://n:1/");
@@ -83,14 +84,14 @@ fn topics_that_match_outweigh_a_process_id_that_changes() {
     assert_eq!(judge(std::slice::from_ref(&a), &all), [Verdict::Itself]);
     let some = ["/ta", "/other"];
     assert_eq!(judge(std::slice::from_ref(&a), &some), [Verdict::Another]);
-    // A later node at the port publishes the same topics.
+    // A node that came later to the port publishes the same topics.
     publish(&mut master.clone(), "/b", "/ta", "http://n:1/");
     let verdicts = judge(&[a, name("/b", Some(2), 2)], &all);
     assert_eq!(verdicts, [Verdict::Another, Verdict::Itself]);
 }
 
 #[test]
-fn a_list_of_nothing_is_no_evidence() {
+fn an_empty_report_is_no_evidence() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/t", "http://n:1/");
     subscribe(&mut master, "/a", "/s", "http://n:1/");
@@ -105,7 +106,7 @@ fn a_list_of_nothing_is_no_evidence() {
 }
 
 #[test]
-fn a_node_that_registered_since_may_be_another_process() {
+fn a_name_that_registered_again_may_be_another_process() {
     let mut master = Master::default();
     publish(&mut master, "/a", "/ta", "http://n:1/");
     let judge = |pid, topic: &str| {
@@ -120,7 +121,7 @@ fn a_node_that_registered_since_may_be_another_process() {
 }
 
 #[test]
-fn other_topics_are_another_node() {
+fn different_topics_mean_another_node() {
     use Verdict::{Another, Itself, Unknown};
     let of_b = claims(&["/rosout", "/tb"], &["/clock"]);
     assert_eq!(verdicts([None, None], 1, Some(&of_b)), [Another, Itself]);
@@ -129,14 +130,14 @@ fn other_topics_are_another_node() {
         verdicts([None, None], 1, Some(&neither)),
         [Another, Another]
     );
-    // What all nodes have is no evidence, and neither is nothing.
+    // Neither topics that all nodes have nor an empty report are evidence.
     let common = claims(&["/rosout"], &["/clock", "/tf"]);
     assert_eq!(verdicts([None, None], 1, Some(&common)), [Unknown, Unknown]);
     assert_eq!(verdicts([None, None], 1, None), [Unknown, Unknown]);
 }
 
 #[test]
-fn of_two_that_share_topics_the_one_that_fits_is_there() {
+fn of_two_nodes_that_share_topics_the_one_that_matches_is_there() {
     use Verdict::{Another, Itself};
     let mut master = Master::default();
     for (node, topic) in [("/a", "/ta"), ("/b", "/tb")] {
@@ -164,13 +165,13 @@ fn a_port_has_one_node_behind_it() {
         judge(&master, &names, Some(1), Some(&said))
     };
     assert_eq!(judge(1, 2), [Verdict::Another, Verdict::Itself]);
-    // A process that took a second name, or an order that is not known: kept.
+    // A process that took a second name, or registrations in an unknown order: both nodes are kept.
     assert_eq!(judge(2, 1), [Verdict::Unknown, Verdict::Itself]);
     assert_eq!(judge(0, 0), [Verdict::Unknown, Verdict::Itself]);
 }
 
 #[test]
-fn claims_that_no_node_would_make_are_not_read() {
+fn malformed_reports_are_ignored() {
     let fine = list(&["/t"]);
     for odd in [
         Value::Nil,
@@ -188,7 +189,7 @@ fn claims_that_no_node_would_make_are_not_read() {
 }
 
 #[test]
-fn the_difference_is_what_one_side_lacks() {
+fn topics_that_one_side_lacks_are_the_difference() {
     let mut master = Master::default();
     for topic in ["/both", "/gone"] {
         publish(&mut master, "/a", topic, "http://n:1/");
@@ -215,7 +216,7 @@ fn the_difference_is_what_one_side_lacks() {
 }
 
 #[test]
-fn a_port_that_refuses_twice_without_a_call_in_between_is_of_a_dead_node() {
+fn a_node_is_dead_if_its_port_refuses_twice_with_no_call_in_between() {
     let refused = |master_serves, before: Option<u64>, calls| {
         judge_refusal(master_serves, before.as_ref(), &calls)
     };

@@ -1,4 +1,4 @@
-//! Nodes that do not answer and are not known to be dead.
+//! Keeps track of nodes that do not answer and are not known to be dead.
 
 use std::{
     collections::BTreeMap,
@@ -12,7 +12,7 @@ const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Pauses double up to this one.
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
-/// The unreachable ports, and when each is asked next.
+/// The unreachable ports, and when to ask each one next.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Unreachable {
     of: BTreeMap<String, Wait>,
@@ -21,13 +21,12 @@ pub struct Unreachable {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Wait {
     backoff: Backoff,
-    /// It is due, and has not answered yet.
+    /// Whether the port was due and has not answered yet.
     asked: bool,
 }
 
 impl Unreachable {
-    /// Adds a port that has not answered, or notes that it has not answered again. Returns whether that is
-    /// new.
+    /// Notes that a port has not answered. Returns whether it was reachable until now.
     pub fn add(&mut self, port: &str, now: Instant) -> bool {
         if let Some(wait) = self.of.get_mut(port) {
             if std::mem::take(&mut wait.asked) {
@@ -43,12 +42,12 @@ impl Unreachable {
         true
     }
 
-    /// Removes a port that has answered or has nobody. Returns whether it was unreachable.
+    /// Removes a port that has answered or has no nodes any more. Returns whether it was unreachable.
     pub fn remove(&mut self, port: &str) -> bool {
         self.of.remove(port).is_some()
     }
 
-    /// Drops those that are not registered any more.
+    /// Removes ports at which no node is registered any more.
     pub fn retain(&mut self, registered: impl Fn(&str) -> bool) {
         self.of.retain(|port, _| registered(port));
     }
@@ -61,8 +60,8 @@ impl Unreachable {
         self.of.is_empty()
     }
 
-    /// Ports to ask now. None is returned again before it has been added again: however long it has to wait
-    /// for its visit, there is one at a time. Each following pause is longer.
+    /// The ports to ask now. A port is not returned again until it has been added again, so it is asked by
+    /// only one visit at a time, however long that visit is delayed. The pauses grow.
     pub fn due(&mut self, now: Instant) -> Vec<String> {
         let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
         let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);
@@ -73,7 +72,7 @@ impl Unreachable {
         .collect()
     }
 
-    /// When the next one is due.
+    /// When the next port is due.
     pub fn next(&self) -> Option<Instant> {
         let waiting = self.of.values().filter(|wait| !wait.asked);
         waiting.map(|wait| wait.backoff.next()).min()
@@ -85,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unreachable_nodes_are_asked_with_growing_pauses() {
+    fn unreachable_nodes_are_asked_again_with_growing_pauses() {
         let start = Instant::now();
         let mut unreachable = Unreachable::default();
         assert!(unreachable.add("a", start) && !unreachable.add("a", start));
@@ -103,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_being_asked_is_not_asked_again() {
+    fn a_node_that_is_being_asked_is_not_asked_again() {
         let start = Instant::now();
         let mut unreachable = Unreachable::default();
         unreachable.add("a", start);
@@ -116,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_not_registered_any_more_is_not_unreachable() {
+    fn a_node_that_is_no_longer_registered_is_not_unreachable() {
         let mut unreachable = Unreachable::default();
         unreachable.add("a", Instant::now());
         unreachable.add("b", Instant::now());

@@ -1,4 +1,4 @@
-//! Things by what they are about.
+//! A collection that is looked up by subject.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -7,7 +7,7 @@ use std::{
 
 use super::Subject;
 
-/// Things by their subjects. A parameter is also found by the keys above and below its own.
+/// Things, filed under their subjects. A parameter is also found by the keys above and below its own key.
 #[derive(Debug)]
 pub struct BySubject<T> {
     exact: HashMap<Subject, Vec<T>>,
@@ -73,7 +73,7 @@ impl<T: Copy + PartialEq> BySubject<T> {
         all.flatten().copied()
     }
 
-    /// Whether `subject` concerns anything here.
+    /// Whether `subject` concerns anything in this collection.
     pub fn has(&self, subject: &Subject) -> bool {
         self.about(subject).next().is_some()
     }
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_removed_is_gone_and_other_kinds_are_apart() {
+    fn removed_things_are_gone_and_a_topic_is_no_parameter_of_the_same_name() {
         let mut things = BySubject::default();
         let topic = Subject::Topic("/a/".to_owned());
         things.add(&topic, 1);

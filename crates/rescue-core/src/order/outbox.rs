@@ -1,4 +1,4 @@
-//! Notifications that wait to be sent by rosrescue: those of each node in order.
+//! The notifications that rosrescue has yet to send, in order for each node.
 
 use std::{
     collections::{HashMap, HashSet, VecDeque},
@@ -9,17 +9,19 @@ use std::{
 use super::Subject;
 use crate::{health::port_of, master::Master, xmlrpc::Call};
 
-/// When more notifications wait for a node, each subject is told once, as it is when it is sent.
-const QUEUE_MOST: usize = 256;
+/// When more notifications than this wait for a node, it is told each subject only once, as it is at the time
+/// of sending.
+const QUEUE_MAX: usize = 256;
 
-/// What to do for a node.
+/// The next thing to do for a node.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Next {
-    /// Send `call`, then say so by [`taken`](super::Order::taken).
+    /// Send `call`, then report it by [`taken`](super::Order::taken).
     Send { call: Arc<Call>, number: u64 },
-    /// Ask again when something has changed, at `until` at the latest.
+    /// Ask again when something has changed, or at `until` at the latest.
     Wait { until: Option<Instant> },
-    /// Nothing waits. The port is [idle](super::Order::take_idle_ports) when there is something again.
+    /// Nothing waits. When there is something again, the port is among the [idle
+    /// ports](super::Order::take_idle_ports).
     Idle,
 }
 
@@ -27,18 +29,18 @@ pub enum Next {
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     ports: HashMap<String, VecDeque<Notification>>,
-    /// Ports with notifications for which nobody sends them yet.
+    /// Ports that have notifications waiting and no sender yet.
     idle: Vec<String>,
 }
 
-/// What a notification says.
+/// The content of a notification.
 #[derive(Clone, Debug)]
 pub(super) enum Content {
-    /// What a master would have sent.
+    /// The call that a master would have sent.
     Call(Arc<Call>),
     /// The state at the time of sending.
     State,
-    /// The same, once more.
+    /// The state at the time of sending, as a repeat.
     StateAgain,
 }
 
@@ -49,12 +51,12 @@ pub(super) struct Notification {
 }
 
 impl Notification {
-    /// Whether it tells the state at the time of sending.
+    /// Whether the notification tells the state at the time of sending.
     pub(super) fn is_state(&self) -> bool {
         !matches!(self.content, Content::Call(_))
     }
 
-    /// Whether it is told once more.
+    /// Whether the notification is a repeat.
     pub(super) fn is_repeat(&self) -> bool {
         matches!(self.content, Content::StateAgain)
     }
@@ -75,7 +77,7 @@ impl Outbox {
             return;
         }
         queue.push_back(notification);
-        if queue.len() > QUEUE_MOST {
+        if queue.len() > QUEUE_MAX {
             renew(queue, |_| true);
         }
     }
@@ -88,7 +90,7 @@ impl Outbox {
         self.ports.remove(port);
     }
 
-    /// Drops all. Whoever sends to a port finds nothing more.
+    /// Drops all notifications, but keeps their senders, which find nothing more to do.
     pub(super) fn clear(&mut self) {
         self.ports.values_mut().for_each(VecDeque::clear);
     }
@@ -103,7 +105,7 @@ impl Outbox {
         self.ports.get_mut(port)?.pop_front()
     }
 
-    /// The call that makes `notification` to `port` now; none if it no longer concerns the node there.
+    /// The call to make to `port` for `notification`. `None` if it does not concern the node there any more.
     pub(super) fn call(
         &mut self,
         port: &str,
@@ -114,21 +116,21 @@ impl Outbox {
         if let Content::Call(call) = content {
             return Some(call);
         }
-        // What waits behind the present state is older than it.
+        // Notifications that wait behind the present state are older than it.
         let queue = self.ports.get_mut(port)?;
         renew(queue, |other| other.concerns(&subject));
         queue.retain(|other| other.subject != subject);
         state(mirror, port, &subject)
     }
 
-    /// What waits for `port` about `subject` is told as it is when it is sent.
+    /// Replaces the notifications to `port` about `subject` by the state at the time of sending.
     pub(super) fn renew(&mut self, port: &str, subject: &Subject) {
         if let Some(queue) = self.ports.get_mut(port) {
             renew(queue, |other| other.concerns(subject));
         }
     }
 
-    /// As [`Self::renew`], for all ports.
+    /// Like [`Self::renew`], for all ports.
     pub(super) fn renew_all(&mut self, subject: &Subject) {
         for queue in self.ports.values_mut() {
             renew(queue, |other| other.concerns(subject));
@@ -136,7 +138,8 @@ impl Outbox {
     }
 }
 
-/// Replaces notifications about these subjects by one each, of the state at the time of sending.
+/// Replaces the notifications about each accepted subject by a single one, which tells the state at the time
+/// of sending.
 fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     let is_old = |it: &Notification| !it.is_state() && is_it(&it.subject);
     if !queue.iter().any(is_old) {
@@ -151,7 +154,7 @@ fn renew(queue: &mut VecDeque<Notification>, is_it: impl Fn(&Subject) -> bool) {
     });
 }
 
-/// The call that tells the node at `port` the state of `subject`; none if it does not subscribe it.
+/// The call that tells the node at `port` the state of `subject`. `None` if it does not subscribe to it.
 fn state(mirror: &Master, port: &str, subject: &Subject) -> Option<Arc<Call>> {
     let at = |api: &str| port_of(api) == port;
     match subject {

@@ -1,23 +1,24 @@
-//! What a call has to do with what nodes hear.
+//! The subjects about which nodes hear, and those that a call concerns.
 
 use crate::{
     health::port_of,
     master::{Master, Method, Request, names},
 };
 
-/// What a node can be told of.
+/// A subject about which a node can be told.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Subject {
-    /// The publishers of a topic, by its resolved name.
+    /// The publishers of a topic, given by its resolved name.
     Topic(String),
-    /// A parameter, by its resolved key, which ends in a slash. It concerns those above and below it.
+    /// A parameter, given by its resolved key, which ends in a slash. It also concerns the keys above and
+    /// below.
     Param(String),
-    /// A node's own name: a node is shut down when another one takes its name.
+    /// A node's own name. A node is shut down when another node takes its name.
     Name(String),
 }
 
 impl Subject {
-    /// Whether news about the one is news about the other.
+    /// Whether news about one of the two subjects is news about the other.
     pub fn concerns(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Param(one), Self::Param(other)) => {
@@ -28,29 +29,29 @@ impl Subject {
     }
 }
 
-/// Of what the node at a port hears by an answer or a notification.
+/// A subject about which the node at a port hears by an answer or a notification.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
-    /// See [`port_of`].
+    /// Where the node listens; see [`port_of`].
     pub port: String,
     pub subject: Subject,
 }
 
-/// What a write has to do with what nodes hear.
+/// What a write has to do with the subjects about which nodes hear.
 #[derive(Clone, Debug, Default)]
 pub struct Concern {
-    /// Of what it may have nodes notified.
+    /// The subjects of which the write may make a master notify nodes.
     tells: Vec<Subject>,
-    /// Of what its answer tells the caller.
+    /// The subjects about which the answer tells the caller.
     hears: Vec<Heard>,
-    /// The address that it registers.
+    /// Where the registering node listens; see [`port_of`].
     port: Option<String>,
-    /// It may do anything: it cannot be decoded.
+    /// Whether it may do anything, because it cannot be decoded.
     anything: bool,
 }
 
 impl Concern {
-    /// That of a call; none if it could not be decoded.
+    /// The concern of a call. `None` stands for a call that could not be decoded.
     pub fn of(call: Option<&Request>) -> Self {
         let Some(call) = call else {
             return Self {
@@ -88,7 +89,7 @@ impl Concern {
             Method::SubscribeParam => param(2),
             _ => None,
         };
-        // The holder of the name is shut down if it is at another address.
+        // A node of this name at another address will be shut down.
         let name = Subject::Name(node.to_owned());
         self.tells.push(name.clone());
         let subjects = [Some(name), subject].into_iter().flatten();
@@ -99,7 +100,7 @@ impl Concern {
         self.port.get_or_insert_with(|| port.to_owned());
     }
 
-    /// Of what it may have nodes notified.
+    /// The subjects of which the write may make a master notify nodes.
     pub fn tells(&self) -> &[Subject] {
         &self.tells
     }
@@ -108,7 +109,7 @@ impl Concern {
         self.anything
     }
 
-    /// A node does not shut itself down: the port of the caller, for its own name.
+    /// For a subject that is a name, the port of the caller, because a node does not shut itself down.
     pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
         match subject {
             Subject::Name(_) => self.port.as_deref(),
@@ -116,12 +117,12 @@ impl Concern {
         }
     }
 
-    /// Of what its answer tells the caller.
+    /// The subjects about which the answer tells the caller.
     pub fn heard(&self) -> Vec<Heard> {
         self.hears.clone()
     }
 
-    /// All that it is about.
+    /// All subjects that the write is about.
     pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
         self.tells
             .iter()
@@ -129,8 +130,8 @@ impl Concern {
     }
 }
 
-/// Of what the answer to a read tells the caller: parameters that it subscribes. roscpp keeps what `getParam`
-/// returns for the value until it hears of a newer one.
+/// The subjects about which the answer to a read tells the caller: parameters to which it subscribes. roscpp
+/// uses the value that `getParam` returns until it is notified of a newer one.
 pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
     let of = |call: &Request| {
         let (caller, key) = (call.caller()?, call.text(1)?);

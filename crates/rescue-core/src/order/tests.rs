@@ -1,4 +1,4 @@
-//! Single situations. `write_queue/tests` plays the whole with nodes, masters and deaths at random.
+//! Single situations. `write_queue/tests` runs nodes, masters and deaths at random.
 
 use super::*;
 use crate::{
@@ -40,7 +40,7 @@ fn holds(order: &mut Order, now: Instant, call: &Request) -> bool {
     order.hold(now, &Concern::of(Some(call))).is_some()
 }
 
-/// The list of publishers in a `publisherUpdate` that is to be sent.
+/// The list of publishers in the `publisherUpdate` to send, and the number of the notification.
 fn sent(next: Next) -> (Value, u64) {
     match next {
         Next::Send { call, number } => (call.params[2].clone(), number),
@@ -49,7 +49,7 @@ fn sent(next: Next) -> (Value, u64) {
 }
 
 #[test]
-fn what_notifies_a_node_waits_for_its_answer_about_the_same_subject() {
+fn a_write_that_notifies_a_node_waits_for_an_answer_to_that_node_about_the_same_subject() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     let subscribed = begin(&mut order, now, &subscribe("/a", "/t"));
     let gone = call("unregisterPublisher", &["/b", "/t", "http://b:1/"]);
@@ -64,7 +64,7 @@ fn what_notifies_a_node_waits_for_its_answer_about_the_same_subject() {
             Request::multicall([publish("/b", "/u"), publish("/b", "/t")]),
             true,
         ),
-        // It takes the node's name at another address.
+        // This call takes the name of the node at another address.
         (call("subscribeParam", &["/a", "http://a:2/", "/k"]), true),
         (call("subscribeParam", &["/a", "http://a:1/", "/k"]), false),
     ] {
@@ -85,7 +85,7 @@ fn what_notifies_a_node_waits_for_its_answer_about_the_same_subject() {
 }
 
 #[test]
-fn a_read_of_a_subscribed_parameter_is_an_answer_too() {
+fn the_answer_to_a_read_of_a_subscribed_parameter_counts_as_well() {
     let (mut order, mut mirror) = (Order::default(), Master::default());
     let now = Instant::now();
     let read = call("getParam", &["/a", "/k/x"]);
@@ -111,7 +111,7 @@ fn a_read_of_a_subscribed_parameter_is_an_answer_too() {
 }
 
 #[test]
-fn a_notification_waits_for_the_answer_and_for_its_lead_and_is_repeated_once() {
+fn a_notification_waits_until_shortly_after_the_answer_and_is_repeated_once() {
     let (mut order, start, mut mirror) = (Order::default(), Instant::now(), Master::default());
     let number = begin(&mut order, start, &subscribe("/a", "/t"));
     mirror.apply(&subscribe("/a", "/t"));
@@ -126,7 +126,7 @@ fn a_notification_waits_for_the_answer_and_for_its_lead_and_is_repeated_once() {
     let now = start + LEAD;
     let (list, number) = sent(order.next(now, A, &mirror));
     assert_eq!(list, update.params[2]);
-    // While it is on its way, what makes a master notify of something newer waits, but not for ever.
+    // While it is under way, writes that would notify the node of something newer wait, but not forever.
     assert!(holds(&mut order, now, &publish("/c", "/t")));
     assert!(!holds(
         &mut order,
@@ -149,7 +149,7 @@ fn a_notification_waits_for_the_answer_and_for_its_lead_and_is_repeated_once() {
 }
 
 #[test]
-fn what_is_out_of_date_is_left_out_and_never_sent_after_something_newer() {
+fn outdated_notifications_are_left_out_and_never_sent_after_newer_ones() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
     let mut lists = Vec::new();
@@ -159,11 +159,11 @@ fn what_is_out_of_date_is_left_out_and_never_sent_after_something_newer() {
         lists.push(update.params[2].clone());
         order.notify(A, topic("/t"), update);
     }
-    // One by one, as a master sends them.
+    // They are sent one by one, as a master would send them.
     let (first, number) = sent(order.next(now, A, &mirror));
     assert_eq!(first, lists[0]);
     order.taken(number);
-    // The present state, of which somebody else has asked: the older ones are left out.
+    // Another part of rosrescue asks for the present state, so the older notifications are left out.
     order.tell_state(A, topic("/t"));
     order.begin(
         now,
@@ -181,7 +181,7 @@ fn what_is_out_of_date_is_left_out_and_never_sent_after_something_newer() {
 }
 
 #[test]
-fn so_many_that_they_pile_up_are_told_once_each() {
+fn notifications_that_pile_up_are_reduced_to_one_per_subject() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&call("subscribeParam", &["/a", "http://a:1/", "/k"]));
     for value in 0..1000 {
@@ -203,7 +203,7 @@ fn so_many_that_they_pile_up_are_told_once_each() {
 }
 
 #[test]
-fn where_the_master_may_be_notifying_ours_is_put_off_and_told_with_the_state() {
+fn our_notification_is_put_off_while_the_master_may_be_sending_one() {
     let (mut order, now, mut mirror) = (Order::default(), Instant::now(), Master::default());
     mirror.apply(&subscribe("/a", "/t"));
     let old = Arc::new(mirror.publisher_update("/t"));
@@ -222,7 +222,8 @@ fn where_the_master_may_be_notifying_ours_is_put_off_and_told_with_the_state() {
     assert_eq!(list, mirror.publisher_update("/t").params[2]);
     order.taken(number);
     assert_eq!(order.next(later, A, &mirror), Next::Idle);
-    // After its death ours comes at once; what it had sent may be read later all the same.
+    // After the master's death ours is sent at once. It is repeated, because the node may read what the
+    // master had sent later.
     order.told_by_master(later, &topic("/t"), 1);
     order.notify(A, topic("/t"), Arc::new(mirror.publisher_update("/t")));
     let (_, number) = sent(order.next(later, A, &mirror));
@@ -231,11 +232,11 @@ fn where_the_master_may_be_notifying_ours_is_put_off_and_told_with_the_state() {
 }
 
 #[test]
-fn a_master_that_notifies_shortly_after_an_answer_is_repeated() {
+fn the_state_is_told_again_if_the_master_notifies_shortly_after_an_answer() {
     let (mut order, now) = (Order::default(), Instant::now());
     let number = begin(&mut order, now, &subscribe("/a", "/t"));
     order.sent([], vec![number]);
-    // In one batch with it only what came before it in the queue: its answer is newer.
+    // In a batch the master only notifies of calls that came before the answered one, so the answer is newer.
     order.told_by_master(now, &topic("/t"), 1);
     order.settled();
     assert_eq!(order.next_repeat(), None);
@@ -244,13 +245,13 @@ fn a_master_that_notifies_shortly_after_an_answer_is_repeated() {
     assert!(order.has_new_repeat());
     let late = now + RECENT;
     order.told_by_master(late, &topic("/t"), 1);
-    // That is the state once more.
+    // The master's own notification counts as telling the state once more.
     assert_eq!(order.next_repeat(), None);
     assert_eq!(port_of("http://a:1/"), A);
 }
 
 #[test]
-fn a_parameter_that_is_set_all_the_time_takes_no_more_room_than_one_that_is_set_once() {
+fn a_parameter_that_is_set_again_and_again_takes_no_more_memory() {
     let (mut order, now) = (Order::default(), Instant::now());
     for step in 0..10_000 {
         let now = now + Duration::from_micros(100) * step;
@@ -259,11 +260,12 @@ fn a_parameter_that_is_set_all_the_time_takes_no_more_room_than_one_that_is_set_
     assert_eq!(order.told.until.about(&param("/k/")).count(), 1);
     assert_eq!(order.told.ends.queue.len(), 1);
     let until = order.told.until(now, &param("/")).unwrap();
-    assert!(until < now + Duration::from_secs(1) + BACKLOG_MOST + 2 * REPEAT_AFTER);
+    assert!(until < now + Duration::from_secs(1) + BACKLOG_MAX + 2 * REPEAT_AFTER);
     assert_eq!(order.told.until(until, &param("/")), None);
 }
 
-/// Loggers subscribe the same parameter again and again, also while the master has a call of the same node.
+/// Loggers subscribe to the same parameter again and again, also while the master is running a call of the
+/// same node.
 #[test]
 fn a_node_does_not_wait_for_its_own_registrations() {
     let mut order = Order::default();

@@ -1,4 +1,4 @@
-//! Answers and notifications on their way to nodes.
+//! Answers and notifications that are under way to nodes.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -7,13 +7,13 @@ use std::{
 
 use super::{BySubject, Heard, RECENT, Subject};
 
-/// What is on its way, by number, and what has arrived lately.
+/// The answers and notifications under way, by number, and the answers that were written lately.
 #[derive(Debug, Default)]
 pub(super) struct UnderWay {
     last: u64,
     entries: HashMap<u64, Entry>,
     by_subject: BySubject<u64>,
-    /// What has arrived, the oldest first.
+    /// Answers that were written, the oldest first.
     written: VecDeque<(Instant, u64)>,
 }
 
@@ -27,7 +27,7 @@ pub(super) enum Kind {
 struct Entry {
     kind: Kind,
     heard: Vec<Heard>,
-    /// Until when it holds up others.
+    /// Until when it delays others. `None` if there is no limit yet.
     limit: Option<Instant>,
     written: Option<Instant>,
 }
@@ -41,14 +41,14 @@ impl Entry {
 /// The last answer to a node about a subject.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Answer {
-    /// It holds up others until `limit`, if there is one.
+    /// It is under way and delays others until `limit`, if there is one.
     UnderWay { limit: Option<Instant> },
-    /// It was written at this time, not long ago.
+    /// It was written at this time, less than [`RECENT`] ago.
     Written { at: Instant },
 }
 
 impl UnderWay {
-    /// Something about `heard` is under way, and holds up others until `limit`.
+    /// Adds an answer or a notification about `heard`, which delays others until `limit`. Returns its number.
     pub(super) fn add(&mut self, kind: Kind, heard: Vec<Heard>, limit: Option<Instant>) -> u64 {
         self.last += 1;
         for heard in &heard {
@@ -70,7 +70,7 @@ impl UnderWay {
         }
     }
 
-    /// It has been written to its caller.
+    /// Notes that the answer has been written to its caller.
     pub(super) fn written(&mut self, now: Instant, number: u64) {
         if let Some(entry) = self.entries.get_mut(&number) {
             entry.written = Some(now);
@@ -78,7 +78,7 @@ impl UnderWay {
         }
     }
 
-    /// It is not under way any more.
+    /// Removes an answer or a notification.
     pub(super) fn remove(&mut self, number: u64) {
         for heard in self
             .entries
@@ -90,7 +90,7 @@ impl UnderWay {
         }
     }
 
-    /// Forgets what is not recent any more.
+    /// Forgets the answers that were written [`RECENT`] ago or longer.
     pub(super) fn forget(&mut self, now: Instant) {
         while let Some((at, number)) = self.written.front()
             && now.duration_since(*at) >= RECENT
@@ -101,13 +101,14 @@ impl UnderWay {
         }
     }
 
-    /// Whether anything is under way, and until when it holds up others.
+    /// Whether anything under way delays others, and until when.
     pub(super) fn any(&self, now: Instant) -> Option<Option<Instant>> {
         let mut entries = self.entries.values();
         entries.find(|entry| entry.holds_up(now)).map(|it| it.limit)
     }
 
-    /// Whether something about `subject` is under way, other than to `port`, and until when it holds up others.
+    /// Whether anything about `subject` is under way to a port other than `port`, and until when it delays
+    /// others.
     pub(super) fn before(
         &self,
         now: Instant,
@@ -120,7 +121,7 @@ impl UnderWay {
         })
     }
 
-    /// The numbers and ports of what is under way about `subject`, or was not long ago.
+    /// Numbers and ports of everything about `subject` that is under way, or was written lately.
     pub(super) fn about(&mut self, now: Instant, subject: &Subject) -> Vec<(u64, String)> {
         self.forget(now);
         self.concerned(subject)
@@ -128,7 +129,7 @@ impl UnderWay {
             .collect()
     }
 
-    /// The last answer to the node at `port` about `subject`, if it is under way or not long ago.
+    /// The last answer to the node at `port` about `subject`, if it is under way or was written lately.
     pub(super) fn answer_to(&self, now: Instant, port: &str, subject: &Subject) -> Option<Answer> {
         let to_port = self
             .concerned(subject)

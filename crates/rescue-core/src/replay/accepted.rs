@@ -1,26 +1,28 @@
-//! Which of a call's mutations a master has executed, and whether the mirror agrees.
+//! Which writes of a call a master has executed, and whether the mirror agrees.
 
 use super::order;
 use crate::master::{Entry, Master, Method, Request, entry_reply, is_success};
 use crate::xmlrpc::{Reply, Value};
 
-/// An answered mutating call, possibly an entry of a multicall.
+/// A write that the master has answered. It may be an entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Answered<'a> {
     pub call: &'a Request,
     /// The master's answer.
     pub reply: Reply,
-    /// Whether it changed the master's state.
+    /// Whether the write changed the master's state.
     pub executed: bool,
-    /// The master's dictionaries have no order.
+    /// Whether the master's dictionaries have no order, as on Python 2.
     pub unordered: bool,
 }
 
 impl Answered<'_> {
-    /// Whether the mirror's answer to the same call leaves both in the same state and has the same value. Two
-    /// refusals agree, whatever their text. `live`: parameters may have been written later in the same
-    /// request. A `subscribeParam` may return those already, because rosmaster encodes the dictionary itself
-    /// after all calls have run; by then a value that could not be encoded may have been replaced.
+    /// Whether the mirror's answer to the same call means that both are in the same state and return the same
+    /// value. Two refusals agree, whatever their text.
+    ///
+    /// `live`: the same request may have written parameters later. A `subscribeParam` may then return those
+    /// later values, because rosmaster encodes the dictionary itself, after all calls have run. By then a
+    /// value that could not be encoded may have been replaced, too.
     pub fn agrees(&self, mirror: &Reply, live: bool) -> bool {
         let method = self.call.method();
         let live = live && *method == Method::SubscribeParam;
@@ -37,23 +39,23 @@ impl Answered<'_> {
     }
 }
 
-/// The answered mutating calls of a request, multicalls flattened.
+/// All writes in a request that the master has answered, including those in nested multicalls.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Accepted<'a> {
-    /// In the order of execution.
+    /// In the order in which the master executed them.
     pub calls: Vec<Answered<'a>>,
-    /// If false, the master's state must be read again.
+    /// Whether this is certain. If not, the master's state must be read again.
     pub certain: bool,
 }
 
-/// The mutating calls in `call` that the master has answered, given its `reply`.
+/// The writes in `call` that the master has answered, according to its `reply`.
 ///
-/// A call has been executed if its answer's code is 1. In a few cases rosmaster also changes its state and
-/// answers an error: a `setParam` whose callbacks cannot be computed, a `subscribeParam` of a value that
-/// cannot be returned.
+/// A write has been executed if its answer has code 1. In a few cases rosmaster changes its state and answers
+/// an error nevertheless: to a `setParam` whose callbacks cannot be computed, and to a `subscribeParam` of a
+/// value that cannot be returned.
 ///
-/// A multicall that fails as a whole has run up to the faulty entry. For such a call this returns what
-/// `mirror`, the state before the call, would have accepted, and marks it as not certain.
+/// A multicall that fails as a whole has run up to the entry that failed. For such a call this returns what
+/// the state before the call, `mirror`, would have accepted, and marks it as not certain.
 pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accepted<'a> {
     let mut walk = Walk {
         mirror,
@@ -70,7 +72,7 @@ pub fn accepted<'a>(mirror: &Master, call: &'a Request, reply: &Reply) -> Accept
 
 struct Walk<'m, 'a> {
     mirror: &'m Master,
-    /// The mirror after the first `modelled` calls of `accepted`, made on demand.
+    /// The mirror after the first `modelled` accepted calls. Made when first needed.
     model: Option<Master>,
     modelled: usize,
     accepted: Accepted<'a>,
@@ -104,7 +106,7 @@ impl<'a> Walk<'_, 'a> {
         let results = match reply {
             Reply::Value(Value::Array(results)) if results.len() == entries.len() => results,
             Reply::Fault { .. } => return self.simulate(request),
-            // Not a rosmaster's answer: only reading the master can show the effect.
+            // This is not an answer of rosmaster. Only reading the master can show the effect of the call.
             Reply::Value(_) => {
                 self.accepted.certain = false;
                 return;
@@ -120,7 +122,7 @@ impl<'a> Walk<'_, 'a> {
         }
     }
 
-    /// Runs the entries in the mirror, because the master's reply does not show their results.
+    /// Runs the entries on a model, because the master's reply does not show their results.
     fn simulate(&mut self, request: &'a Request) {
         for call in request.calls() {
             if !call.kind().mutates() {
@@ -135,8 +137,8 @@ impl<'a> Walk<'_, 'a> {
         }
     }
 
-    /// The mirror's answer to a call, after the accepted ones. The model is kept, because there may be many
-    /// multicalls to simulate.
+    /// The model's answer to a call, after the calls accepted so far. The model is kept, because there may be
+    /// many multicalls to simulate.
     fn predict(&mut self, request: &Request) -> Reply {
         let model = self.model.get_or_insert_with(|| self.mirror.clone());
         for answered in self.accepted.calls.iter().skip(self.modelled) {
@@ -147,12 +149,12 @@ impl<'a> Walk<'_, 'a> {
     }
 }
 
-/// Whether a mutating call has been executed, by its answer; none if that is unclear.
+/// Whether a write has been executed, according to its answer. `None` if that is unclear.
 ///
-/// rosmaster changes its state and answers an error
+/// rosmaster changes its state and answers an error nevertheless
 ///
-/// * to `setParam`, if computing the callbacks fails (a struct with slashes in its keys),
-/// * to `subscribeParam` of a nil, or of anything with a value that it cannot encode.
+/// * to `setParam`, if it cannot compute the callbacks (for a struct with slashes in its keys),
+/// * to `subscribeParam`, if the value is nil or holds anything that it cannot encode.
 fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     let answer = match reply {
         Reply::Value(Value::Array(answer)) => answer.as_slice(),
@@ -176,7 +178,7 @@ fn executed(method: &Method, reply: &Reply) -> Option<bool> {
     })
 }
 
-/// Whether a fault is about encoding the reply and not about decoding the call.
+/// Whether a fault is about encoding the reply rather than decoding the call.
 pub(super) fn is_write_error(text: &str) -> bool {
     [
         "TypeError",
@@ -197,7 +199,7 @@ mod tests {
     use crate::{replay::tests::calls::malformed, xmlrpc::Struct};
 
     #[test]
-    fn two_refusals_are_alike_and_a_refusal_is_no_success() {
+    fn two_refusals_agree_and_a_refusal_does_not_agree_with_a_success() {
         let answer = |code: i32, text: &str, value: Value| {
             Reply::Value(vec![Value::from(code), text.into(), value].into())
         };
@@ -214,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_behind_a_subscription_may_be_seen_by_it() {
+    fn a_subscription_may_return_what_the_same_multicall_writes_later() {
         let answer =
             |value: i32| Reply::Value(vec![Value::from(1), "".into(), value.into()].into());
         let params = [Value::from("/n"), "http://n/".into(), "/a".into()];
@@ -224,7 +226,7 @@ mod tests {
             .remove(0);
         assert!(of.agrees(&answer(1), true));
         assert!(!of.agrees(&answer(1), false));
-        // What could not have been written has been replaced.
+        // A value that could not have been encoded has been replaced by then.
         let fault = |class: &str| Reply::Fault {
             code: 1,
             text: format!("<class '{class}'>:cannot marshal it"),
@@ -232,7 +234,7 @@ mod tests {
         assert!(of.agrees(&fault("TypeError"), true));
         assert!(!of.agrees(&fault("TypeError"), false));
         assert!(!of.agrees(&fault("Exception"), true));
-        // A `setParam` that has run and failed says so in its own words.
+        // A `setParam` that has run and then failed has a message of its own.
         let failed = |text: &str| answer_with(0, &format!("Internal failure: {text}"));
         let set = set("/a", 1);
         let of = accepted(&Master::default(), &set, &failed("'x'"));
@@ -267,14 +269,14 @@ mod tests {
         executed.map(|of| of.call.clone()).collect()
     }
 
-    /// What is accepted of `call`, by what the model itself answers.
+    /// What is accepted of `call`, judging by the model's own answer.
     fn of<'a>(master: &Master, call: &'a Request) -> Accepted<'a> {
         let reply = master.clone().apply(call).reply;
         accepted(master, call, &reply)
     }
 
     #[test]
-    fn a_refused_call_is_not_accepted_and_a_read_never() {
+    fn refused_calls_and_reads_are_not_accepted() {
         let master = Master::default();
         assert_eq!(executed(of(&master, &set("/a", 1))), [set("/a", 1)]);
         assert_eq!(executed(of(&master, &set("/", 1))), []);
@@ -287,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_are_judged_one_by_one() {
+    fn each_entry_of_a_multicall_is_judged_by_its_own_result() {
         let inner = Request::multicall([set("/b", 2), set("/", 3)]);
         let call = Request::multicall([set("/a", 1), set("", 1), inner]);
         let found = of(&Master::default(), &call);
@@ -296,16 +298,16 @@ mod tests {
     }
 
     #[test]
-    fn what_came_before_a_malformed_entry_has_run() {
+    fn entries_before_a_malformed_one_have_run() {
         let call = malformed(Request::multicall([set("/a", 1)]));
         let found = of(&Master::default(), &call);
         assert_eq!(found.calls.len(), 1);
         assert!(!found.certain);
     }
 
-    /// The model of the mirror is not made anew for each: that would take hours.
+    /// The model must not be built again for each inner multicall: that would take hours.
     #[test]
-    fn many_multicalls_that_fail_inside_a_long_one_take_no_longer_than_their_entries() {
+    fn many_failing_multicalls_inside_a_long_one_are_judged_quickly() {
         let count = 20_000;
         let sets = (0..count).map(|index| set(&format!("/p{index}"), 1));
         let fails = (0..count)
@@ -317,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_made_of_a_reply_that_is_none_to_a_multicall() {
+    fn a_reply_that_does_not_fit_a_multicall_accepts_nothing_and_is_uncertain() {
         let call = Request::multicall([set("/a", 1)]);
         for value in [Value::Int(1), Value::Array(vec![])] {
             let found = accepted(&Master::default(), &call, &Reply::Value(value));
@@ -342,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_subscription_to_what_cannot_be_returned_has_run() {
+    fn a_subscription_to_an_unreturnable_value_has_run() {
         let mut master = Master::default();
         master.apply(&set("/p", Value::Array(vec![Value::Nil])));
         master.apply(&set(

@@ -1,15 +1,15 @@
-//! The differences between two states, as lines of text.
+//! Describes how the states of the mirror and a master differ.
 
 use indexmap::IndexMap;
 
 use crate::master::Master;
 use crate::xmlrpc::{Struct, Value};
 
-/// Most sentences.
-const MOST: usize = 20;
+/// Maximum number of sentences.
+const SENTENCES_MAX: usize = 20;
 
-/// The differences between `mirror` and `master`, as at most 20 short sentences. Empty if and only if the two
-/// are equal. Names keys, nodes and addresses, never the value of a parameter.
+/// The differences between `mirror` and `master` as at most 20 short sentences. There are none if and only if
+/// the two are equal. The sentences name keys, nodes and addresses, but never the value of a parameter.
 pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     let mut words = Words(Vec::new());
     let (a, b) = (mirror.registry(), master.registry());
@@ -22,7 +22,7 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
                 )
             });
         } else if a != b {
-            words.say(|| format!("the node `{caller_id}` is known for other registrations"));
+            words.say(|| format!("the node `{caller_id}` has other registrations in the master"));
         }
     });
     for (what, a, b) in [
@@ -42,7 +42,7 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
                 words.say(|| format!("`{node}` is among the {what} of `{key}` only in the master"));
             }
             if a != b {
-                words.say(|| format!("the {what} of `{key}` are others or in another order"));
+                words.say(|| format!("the {what} of `{key}` differ, or are in another order"));
             }
         });
         words.order(what, a, b);
@@ -57,7 +57,7 @@ pub fn difference(mirror: &Master, master: &Master) -> Vec<String> {
     });
     words.order("services", &a.services, &b.services);
     if a.had_services != b.had_services {
-        words.say(|| "only one of both has ever had a service".to_owned());
+        words.say(|| "only one of the two has ever had a service".to_owned());
     }
     let (a, b) = (mirror.topic_types(), master.topic_types());
     words.map("the type of", a, b, |words, topic, a, b| {
@@ -76,7 +76,7 @@ struct Words(Vec<String>);
 
 impl Words {
     fn say(&mut self, sentence: impl FnOnce() -> String) {
-        if self.0.len() < MOST {
+        if self.0.len() < SENTENCES_MAX {
             self.0.push(sentence());
         }
     }

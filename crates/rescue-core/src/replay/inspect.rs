@@ -10,43 +10,43 @@ use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Why a reply to an inspection is not a master's.
+/// Why the answer to an inspection cannot be used.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum NotAMaster {
     /// The whole inspection was answered with a fault.
     #[error(
-        "the look was answered with a fault, `{text}`: this is no rosmaster, or it is in trouble"
+        "the request for its state was answered with a fault, `{text}`: this is not a rosmaster, or it is failing"
     )]
     Fault { text: String },
-    /// The parameters cannot be read, because one of them cannot be returned: inspect again with
+    /// The parameters cannot be read, because one of them cannot be returned. Inspect again with
     /// [`Inspection::call_without_params`].
     #[error(
-        "the master holds a parameter that it cannot return ({text}): look again without parameters"
+        "the master holds a parameter that it cannot return ({text}): read its state again without parameters"
     )]
     ParamsUnreadable { text: String },
-    /// The answer's form differs from a master's.
+    /// An answer does not have the form of a master's answer.
     #[error(
-        "the answer to {method} has another form than a master's: check that the upstream address is that of a rosmaster"
+        "the answer to {method} does not have the form of a master's answer: check that the upstream address is that of a rosmaster"
     )]
     Form { method: Method },
 }
 
-/// The first part of an inspection.
+/// The state of a master as far as the first request of an inspection shows it.
 #[derive(Clone, Debug)]
 pub struct Inspection {
     pid: i32,
     bears: Bears,
     publishers: IndexMap<String, Vec<String>>,
     subscribers: IndexMap<String, Vec<String>>,
-    /// Provider by service.
+    /// Providers by service.
     services: IndexMap<String, String>,
     topic_types: IndexMap<String, String>,
-    /// None if they were left out because they cannot be read.
+    /// `None` if the parameters were left out because they cannot be read.
     params: Option<Struct>,
 }
 
 impl Inspection {
-    /// The inspection of a rosmaster that has just been started as process `pid`.
+    /// The inspection of a rosmaster that has just been started as process `pid`, and so is empty.
     pub fn at_new(pid: i32) -> Self {
         Self {
             pid,
@@ -59,7 +59,8 @@ impl Inspection {
         }
     }
 
-    /// Puts everything into the order of `mirror`, as far as it is there: the master has none of its own.
+    /// Puts everything that `mirror` has too into the mirror's order, for a master without an order of its
+    /// own.
     pub fn arrange_like(&mut self, mirror: &Master) {
         let registry = mirror.registry();
         order::arrange(&mut self.publishers, &registry.publishers);
@@ -71,13 +72,13 @@ impl Inspection {
         }
     }
 
-    /// Whether the parameters are known.
+    /// Whether the parameters could be read.
     pub fn has_params(&self) -> bool {
         self.params.is_some()
     }
 
-    /// The first request: a multicall of `getPid`, `lookupNode` of the token and its session,
-    /// `getSystemState`, `getTopicTypes` and `getParam('/')`. Changes nothing.
+    /// The first request: a multicall of `getPid`, `lookupNode` for the token and for its session,
+    /// `getSystemState`, `getTopicTypes` and `getParam('/')`. It changes nothing.
     pub fn call(token: &Token) -> Request {
         let params = Request::new(Method::GetParam, [CALLER_ID, "/"]);
         Request::multicall(Self::reads(token).into_iter().chain([params]))
@@ -99,11 +100,11 @@ impl Inspection {
         ]
     }
 
-    /// Decodes the reply to either request with `token`.
+    /// Decodes the reply to either of the first requests, made with the same `token`.
     ///
     /// # Errors
     ///
-    /// If this is not a master's reply. After [`NotAMaster::ParamsUnreadable`], use
+    /// If this is not a master's reply. After [`NotAMaster::ParamsUnreadable`], send
     /// [`Inspection::call_without_params`].
     pub fn decode(reply: &Reply, token: &Token) -> Result<Self, NotAMaster> {
         let results = results(reply)?;
@@ -158,12 +159,12 @@ impl Inspection {
         self.pid
     }
 
-    /// The master's token.
+    /// The token that the master bears.
     pub fn bears(&self) -> Bears {
         self.bears
     }
 
-    /// Whether the master holds nothing that an inspection shows.
+    /// Whether the master holds nothing that an inspection can show.
     pub fn is_empty(&self) -> bool {
         self.publishers.is_empty()
             && self.subscribers.is_empty()
@@ -185,8 +186,8 @@ impl Inspection {
             .collect()
     }
 
-    /// Asks for all addresses: `lookupNode` of each node of the inspection or `previous`, `lookupService` of
-    /// each service. None if there is nothing to ask.
+    /// The second request, for all addresses: `lookupNode` of each node of the inspection or of `previous`,
+    /// and `lookupService` of each service. `None` if there is nothing to ask for.
     pub fn second_call(&self, previous: &Master) -> Option<Request> {
         let nodes = self.nodes(previous).into_iter();
         let nodes = nodes.filter_map(|node| lookup(Method::LookupNode, node));
@@ -199,13 +200,14 @@ impl Inspection {
 
     /// The model of the master's state.
     ///
-    /// What cannot be read back is taken from `previous`, for nodes with an unchanged address: parameter
-    /// subscriptions, references by services that another node took over, and the parameters if they cannot
-    /// be read. What vanished between the two requests is left out.
+    /// What a master does not show is taken from `previous`, for nodes whose address is unchanged: parameter
+    /// subscriptions, references to nodes whose services were taken over, and the parameters if they cannot
+    /// be read. Anything that vanished between the two requests is left out.
     ///
     /// # Errors
     ///
-    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not a master's.
+    /// If `second`, the reply to [`Inspection::second_call`] with the same `previous`, is not a master's
+    /// reply.
     pub fn into_master(
         self,
         second: Option<&Reply>,
@@ -279,7 +281,8 @@ impl Inspection {
     }
 }
 
-/// For each node without a registration, adds the service reference that explains it, or drops the node.
+/// For each node without a registration, adds the taken-over services that explain why the master still knows
+/// it. Drops the node if nothing does.
 fn keep_references(found: &mut Snapshot, previous: &Master) {
     let shared = [
         &found.publishers,
@@ -304,8 +307,8 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
             };
             let known = previous.taken_over(caller_id, before).filter(lost);
             node.taken_over_services = known.cloned().collect();
-            // It is still known without a registration: another node has taken over a service of it
-            // meanwhile.
+            // The master still knows it without a registration, so another node has taken over one of its
+            // services in the meantime.
             if node.taken_over_services.is_empty() && !held.contains(caller_id) {
                 let lost = before.services.iter().filter(lost);
                 node.taken_over_services = lost.cloned().collect();
@@ -315,7 +318,7 @@ fn keep_references(found: &mut Snapshot, previous: &Master) {
     });
 }
 
-/// The registrations of those nodes; empty lists are dropped.
+/// The registrations of these nodes, without lists that would be empty.
 fn only(
     registrations: IndexMap<String, Vec<String>>,
     of: impl Fn(&str) -> bool,
@@ -327,7 +330,7 @@ fn only(
     lists.collect()
 }
 
-/// A lookup of `name`, if a call can name it.
+/// A lookup of `name`, if any call can name it.
 pub(super) fn lookup(method: Method, name: &str) -> Option<Request> {
     let (caller_id, name) = names::reach(name, CALLER_ID, |_| true)?;
     Some(Request::new(method, [caller_id, name]))
@@ -363,7 +366,7 @@ fn answer(result: &Value) -> Option<(i32, &Value)> {
     }
 }
 
-/// `[[key, [node, …]], …]`.
+/// Reads a value of the form `[[key, [node, …]], …]`.
 fn lists(value: &Value) -> Option<IndexMap<String, Vec<String>>> {
     let lists = value.as_array()?.iter().map(|list| match list.as_array()? {
         [Value::String(key), Value::Array(nodes)] => {
@@ -375,7 +378,8 @@ fn lists(value: &Value) -> Option<IndexMap<String, Vec<String>>> {
     lists.collect()
 }
 
-/// `[[topic, type], …]`. A date that reads `*` counts as a type, and is restored as a string.
+/// Reads a value of the form `[[topic, type], …]`. A date whose text is `*` counts as a type, and is restored
+/// as a string.
 fn pairs(value: &Value) -> Option<IndexMap<String, String>> {
     let pairs = value.as_array()?.iter().map(|pair| match pair.as_array()? {
         [

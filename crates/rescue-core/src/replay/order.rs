@@ -1,17 +1,17 @@
-//! Masters whose dictionaries have no order of their own: Python 2. Their answers show an order that no call has
-//! made, and that another master with the same state may not have.
+//! Compares masters whose dictionaries have no order, that is on Python 2. Their answers show an order that
+//! no call has determined, and that another master with the same state may not have.
 
 use indexmap::IndexMap;
 
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Puts `found` into the order of `known`. What only `found` has comes last, as it is.
+/// Puts `found` into the order of `known`. Whatever only `found` has comes last, in its own order.
 pub(super) fn arrange<A, B>(found: &mut IndexMap<String, A>, known: &IndexMap<String, B>) {
     let place = |key: &str| known.get_index_of(key).unwrap_or(usize::MAX);
     found.sort_by(|a, _, b, _| place(a).cmp(&place(b)));
 }
 
-/// As [`arrange`], with the structs within.
+/// Like [`arrange`], including the structs inside.
 pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     if found == known {
         return;
@@ -24,7 +24,7 @@ pub(super) fn arrange_params(found: &mut Struct, known: &Struct) {
     }
 }
 
-/// Whether two replies are the same but for the order of members of structs.
+/// Whether two replies are the same apart from the order of struct members.
 pub(super) fn are_alike(a: &Reply, b: &Reply) -> bool {
     match (a, b) {
         (Reply::Value(a), Reply::Value(b)) => sorted(a, false) == sorted(b, false),
@@ -32,7 +32,7 @@ pub(super) fn are_alike(a: &Reply, b: &Reply) -> bool {
     }
 }
 
-/// `value` with the members of its structs sorted. `lists`: with lists of `[name, …]` sorted, too.
+/// `value` with the members of its structs sorted. With `lists`, also with lists of `[name, …]` sorted.
 pub(super) fn sorted(value: &Value, lists: bool) -> Value {
     match value {
         Value::Struct(members) => {
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_read_gets_the_known_order() {
+    fn a_state_read_from_an_unordered_master_gets_the_known_order() {
         let known = tree(&["c", "a", "b"]);
         let mut found = tree(&["a", "b", "c"]);
         arrange_params(&mut found, &known);
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_order_of_dictionaries_is_no_difference() {
+    fn two_replies_are_alike_if_only_the_order_of_dictionaries_differs() {
         let list = |names: &[&str]| -> Value {
             let pairs = names.iter().map(|name| vec![(*name).into(), "type".into()]);
             Value::Array(pairs.map(Value::Array).collect())
@@ -98,7 +98,7 @@ mod tests {
         let of = |keys: &[&str]| Reply::Value(Value::Struct(tree(keys)));
         assert!(are_alike(&of(&["a", "b"]), &of(&["b", "a"])));
         assert!(!are_alike(&of(&["a", "b"]), &of(&["b", "c"])));
-        // Nodes are kept in lists.
+        // Lists of nodes do have an order.
         let nodes = |names: [&str; 2]| Value::Array(names.map(Value::from).into());
         assert_ne!(
             sorted(&nodes(["/n", "/m"]), true),

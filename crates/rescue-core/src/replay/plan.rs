@@ -1,4 +1,4 @@
-//! Brings a new master to a state with one call, and checks the answer.
+//! Brings a new master to a state with one call, and verifies the answer.
 
 use std::fmt;
 
@@ -10,37 +10,40 @@ use super::{Token, order};
 use crate::master::{CALLER_ID, Master, Method, Request, reply_entry, returnable};
 use crate::xmlrpc::{self, ListWriter, Reply, Value};
 
-/// Most mismatches to list.
-const MOST_MISMATCHES: usize = 20;
+/// Maximum number of mismatches in an error.
+const MISMATCHES_MAX: usize = 20;
 
 /// One multicall that brings a master to a state, reads it back and leaves a token.
 ///
 /// # Order
 ///
-/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, who are then not notified.
-/// 2. Publishers, before there are subscribers to notify. Some types are set by a helper's subscription that
-///    is undone at once: those of topics without publishers and subscribers, and those that the order of
-///    calls would put too late in `getTopicTypes`. Only as many as the order requires.
-/// 3. Services, each after its former providers.
+/// 1. One `setParam('/', tree)`. Parameters come before their subscribers, so these are not notified.
+/// 2. Publishers, before there are subscribers to notify. Some topic types are set by a helper that
+///    subscribes and unsubscribes at once: types of topics without publishers and subscribers, and types that
+///    the order of the calls would put too late in `getTopicTypes`. There are only as many of these as the
+///    order requires.
+/// 3. Services, each after the nodes that provided it before.
 /// 4. Subscribers, then subscribers of parameters.
-/// 5. Reads of everything, for [`Plan::verify`]. Of addresses only those that the master had before: a
-///    successful registration has the address of its call, and reading each would cost a tenth of the
-///    injection.
+/// 5. Reads of everything, for [`Plan::verify`]. Addresses are read back only where the master had one
+///    before: a successful registration has the address of its call, and reading all addresses would take a
+///    tenth of the injection's time.
 /// 6. The token: a master that bears it has been brought to the whole state.
 ///
-/// On an empty master no callback is sent, and afterwards every read is answered as before.
+/// An empty master sends no callback because of this call, and afterwards answers every read as before.
 ///
 /// # A master that is not empty
 ///
-/// What it holds is newer, and stays. A node that has another address there is left out, so that the master
-/// shuts no node down; so is a service that has a provider. Parameters are merged, and ours win. If the new
-/// master has subscribers of a topic that lacks several publishers, they are unregistered first and
-/// registered again before the last publisher. So they are notified once, with the complete list; every partial list
-/// would make a roscpp node drop its live connections.
+/// What it holds is newer and stays. A node that has another address there is left out, so that the master
+/// shuts no node down, and so is a service that has a provider there. Parameters are merged, and the target's
+/// values win. If the new master already has subscribers of a topic that lacks several publishers, they are
+/// unregistered first and registered again just before the last publisher. So they are notified once, with
+/// the complete list; each partial list would make a roscpp node drop live connections.
 ///
 /// # Memory
 ///
-/// Call and answer are text from the start. As values those of a thousand nodes take ten times as much, and
+/// Call and answer are built as text. As values those of a thousand nodes would take ten times as much
+/// memory, and the C library keeps most of the memory of so many small allocations.
+///
 /// the C library keeps most of the memory of so many small allocations.
 ///
 /// # Example
@@ -62,38 +65,38 @@ const MOST_MISMATCHES: usize = 20;
 #[derive(Clone, Debug)]
 pub struct Plan {
     request: Bytes,
-    /// The expected answer.
+    /// The body of the answer that a rosmaster is expected to give.
     answer: Bytes,
     expected: Master,
     skipped: Vec<Skipped>,
 }
 
-/// A part of the state that is not brought to the master.
+/// A part of the state that is not restored in the new master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Skipped {
     /// The node has another address in the new master.
     Node {
         caller_id: String,
-        /// Its address in the state.
+        /// Its address in the state to restore.
         api: String,
-        /// Its address in the new master, which is kept.
+        /// Its address in the new master, which stays.
         found_api: String,
     },
     /// The service has another provider in the new master.
     Service {
         service: String,
-        /// The provider in the state.
+        /// The provider in the state to restore.
         caller_id: String,
-        /// The provider in the new master, which is kept.
+        /// The provider in the new master, which stays.
         found: String,
     },
-    /// A node's reference by a service that another node took over.
+    /// The reference to a node that exists only because another node took over this service.
     Reference { caller_id: String, service: String },
-    /// The type `*` of a topic without publishers, but with subscribers in the new master.
+    /// The type `*` of a topic that has no publishers, but has subscribers in the new master.
     Type { topic: String },
     /// A parameter that the master would accept but could not return, alone or together with the whole tree.
     Param { key: String },
-    /// A registration whose key no name resolves to.
+    /// A registration under a key that no call can name.
     Unnameable { key: String, caller_id: String },
 }
 
@@ -114,7 +117,7 @@ impl fmt::Display for Skipped {
                 found,
             } => write!(
                 f,
-                "the service `{service}` of `{caller_id}`: the new master has it from `{found}`"
+                "the service `{service}` of `{caller_id}`: in the new master `{found}` provides it"
             ),
             Self::Reference { caller_id, service } => write!(
                 f,
@@ -123,39 +126,39 @@ impl fmt::Display for Skipped {
             ),
             Self::Type { topic } => write!(
                 f,
-                "the type `*` of the topic `{topic}`: its subscribers would be told"
+                "the type `*` of the topic `{topic}`: setting it would notify its subscribers"
             ),
             Self::Param { key } => write!(
                 f,
-                "the parameter `{key}`: rosmaster could not return it, or not in one reply with all others"
+                "the parameter `{key}`: rosmaster could not return it, or not together with all others"
             ),
             Self::Unnameable { key, caller_id } => {
-                write!(f, "`{key}` of `{caller_id}`: no name leads to it")
+                write!(f, "`{key}` of `{caller_id}`: no call can name it")
             }
         }
     }
 }
 
 impl Plan {
-    /// The plan that brings a master that holds `found` to `target` and leaves `token`.
+    /// Plans to bring a master that holds `found` to `target`, and to leave `token` in it.
     ///
-    /// Tokens in `target` or `found` are ignored.
+    /// Tokens in `target` and `found` are ignored.
     pub fn new(target: &Master, found: &Master, token: &Token) -> Self {
         Self::write(target, found, None, false, token)
     }
 
-    /// The plan that replaces the token `before` of a master that holds `found`, and changes nothing else.
+    /// Plans to replace the token `before` of a master that holds `found`, and to change nothing else.
     pub fn renew(found: &Master, before: &Token, token: &Token) -> Self {
         Self::write(found, found, Some(before), false, token)
     }
 
-    /// The plan that brings a master that holds `found` to exactly `target`, and replaces its token `before`
-    /// by `token`. Everything is removed, subscribers first, and added again. No node is called back.
+    /// Plans to bring a master that holds `found` to exactly `target`, and to replace its token `before` by
+    /// `token`. Everything is removed, subscribers first, and added again. No node is notified.
     pub fn replace(target: &Master, found: &Master, before: &Token, token: &Token) -> Self {
         Self::write(target, found, Some(before), true, token)
     }
 
-    /// The plan that has a master that holds `behind` run `writes`, and replaces its token `before` by `token`.
+    /// Plans to run `writes` on a master that holds `behind`, and to replace its token `before` by `token`.
     pub fn run(behind: &Master, writes: Vec<Request>, before: &Token, token: &Token) -> Self {
         Self::sequence(behind, Some(before), token, |write| {
             let mut model = behind.clone();
@@ -167,7 +170,7 @@ impl Plan {
         })
     }
 
-    /// `empties`: everything is removed first.
+    /// With `empties`, everything is removed first.
     fn write(
         target: &Master,
         found: &Master,
@@ -191,8 +194,8 @@ impl Plan {
         })
     }
 
-    /// The plan of the calls that `bring` writes, to a master that holds `found`. It returns the state afterwards,
-    /// and what it has left out.
+    /// Plans the calls that `bring` writes, for a master that holds `found`. `bring` returns the state
+    /// afterwards and what it has left out.
     fn sequence(
         found: &Master,
         before: Option<&Token>,
@@ -205,7 +208,7 @@ impl Plan {
             request.push(&call.into_entry());
             answer.push(&reply_entry(predicted));
         };
-        // Tokens are not a part of the mirror. They subscribe unset keys.
+        // A token is not part of the mirror. It subscribes to a key that is not set.
         let aside = |call: Request| {
             let predicted = Master::default().apply(&call).reply;
             (call, predicted)
@@ -236,48 +239,48 @@ impl Plan {
         &self.request
     }
 
-    /// The answer's body if rosmaster answers each entry as the model predicted.
+    /// The body of the answer, if rosmaster answers every entry as the model predicts.
     pub fn answer(&self) -> &Bytes {
         &self.answer
     }
 
-    /// The master's state afterwards, without the token.
+    /// The state of the master afterwards, without the token.
     pub fn expected(&self) -> &Master {
         &self.expected
     }
 
-    /// The parts of the target that are not brought to the master.
+    /// The parts of the target that are not restored in the master.
     pub fn skipped(&self) -> &[Skipped] {
         &self.skipped
     }
 
-    /// Whether every entry was answered as the model predicted; texts of refusals may differ. Not needed if
-    /// the reply equals [`Self::answer`] byte for byte.
+    /// Checks that every entry was answered as the model predicted; texts of refusals may differ. Not needed
+    /// if the reply equals [`Self::answer`] byte for byte.
     ///
     /// # Errors
     ///
-    /// A sentence for each entry that was not, up to 20 of them. They hold no parameter values.
+    /// A sentence for each entry that was answered differently, at most 20. They contain no parameter values.
     pub fn verify(&self, reply: &Reply) -> Result<(), Vec<String>> {
         self.verify_by(reply, true)
     }
 
-    /// As [`Self::verify`], for a master whose dictionaries have no order.
+    /// Like [`Self::verify`], for a master whose dictionaries have no order.
     ///
     /// # Errors
     ///
-    /// The same.
+    /// As for [`Self::verify`].
     pub fn verify_in_any_order(&self, reply: &Reply) -> Result<(), Vec<String>> {
         self.verify_by(reply, false)
     }
 
     fn verify_by(&self, reply: &Reply, ordered: bool) -> Result<(), Vec<String>> {
         let whole = |text: &str| {
-            let sentence = format!("the injection as a whole was answered: {text}");
+            let sentence = format!("the whole injection was answered with {text}");
             Err(vec![sentence])
         };
         let call = Request::decode(&self.request);
         let (Ok(call), Ok(predicted)) = (call, xmlrpc::decode_reply(&self.answer)) else {
-            return whole("otherwise than predicted");
+            return whole("something else than predicted");
         };
         let (results, predicted) = match (reply, &predicted) {
             (Reply::Value(Value::Array(results)), Reply::Value(Value::Array(predicted)))
@@ -286,7 +289,7 @@ impl Plan {
                 (results, predicted)
             }
             (Reply::Fault { text, .. }, _) => return whole(text),
-            _ => return whole("another number of results than of calls"),
+            _ => return whole("another number of results than there were calls"),
         };
         let mismatches: Vec<_> = (results.iter().zip(predicted))
             .zip(call.calls())
@@ -298,7 +301,7 @@ impl Plan {
                 !is_alike(result, predicted) && (ordered || !in_any_order())
             })
             .map(|(_, call)| mismatch(call))
-            .take(MOST_MISMATCHES)
+            .take(MISMATCHES_MAX)
             .collect();
         if mismatches.is_empty() {
             Ok(())
@@ -308,12 +311,12 @@ impl Plan {
     }
 }
 
-/// Reads that show everything that a master in the target state can show, except for addresses given in the
-/// same call.
+/// Reads that show everything that a master in the target state can show, except for addresses that the same
+/// call has set.
 fn reads(model: &Master, found: &Master) -> Vec<Request> {
     let own = |method| Request::new(method, [CALLER_ID]);
     let mut calls = vec![own(Method::GetSystemState), own(Method::GetTopicTypes)];
-    // A single value that cannot be returned would fault the whole multicall.
+    // A single value that cannot be returned would make the whole multicall fail.
     if returnable::is_writable(model.params()) {
         calls.push(Request::new(Method::GetParam, [CALLER_ID, "/"]));
     }
@@ -324,14 +327,14 @@ fn reads(model: &Master, found: &Master) -> Vec<Request> {
     calls
 }
 
-/// Whether an entry was answered as predicted. Of a refusal only the code is compared.
+/// Whether an entry was answered as predicted. For a refusal only the code is compared.
 fn is_alike(result: &Value, predicted: &Value) -> bool {
     let code = |entry: &Value| entry.as_array()?.first()?.as_array()?.first()?.as_int();
     let refused = code(predicted).filter(|code| *code != 1);
     result == predicted || refused.is_some() && refused == code(result)
 }
 
-/// Describes a call whose answer was not as predicted.
+/// Names a call that was not answered as predicted.
 fn mismatch(call: &Request) -> String {
     let method = call.method();
     let at = match method {
@@ -341,5 +344,5 @@ fn mismatch(call: &Request) -> String {
     let subject = call.text(at).map_or_else(String::new, |subject| {
         format!(" of `{subject}` by `{}`", call.caller().unwrap_or_default())
     });
-    format!("{method}{subject} was answered otherwise than predicted")
+    format!("{method}{subject} was not answered as predicted")
 }

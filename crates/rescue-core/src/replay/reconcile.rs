@@ -1,22 +1,23 @@
-//! The state for a master that was unreachable and is back.
+//! The state for a master that was unreachable and has come back.
 
 use super::{Token, restore};
 use crate::master::{Master, Method, Request, names};
 use crate::xmlrpc::Value;
 
-/// Which side wins where a master of the present incarnation and the mirror differ.
+/// Which side wins where the mirror and a master of the present incarnation differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Authority {
-    /// The mirror only where it has answered writes since both were equal: all other differences were written
-    /// to the master directly, or are in no checkpoint, and are newer.
+    /// The mirror wins only where it has answered writes since both were equal. All other differences were
+    /// written directly to the master, or are missing in the checkpoint, and so are newer.
     PendingWrites,
-    /// The mirror wherever it has an entry: the master was given its state, and has not confirmed it.
+    /// The mirror wins wherever it has an entry, because the master was given the mirror's state and has not
+    /// confirmed it.
     Mirror,
 }
 
-/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending`: the writes
-/// that the mirror has answered and the master may not have run. If it has run some of them, running them
-/// again leads to the same state.
+/// Combines `held`, the state of a master of the present incarnation, with `mirror`. `pending` are the writes
+/// that the mirror has answered and the master may not have run. If the master has run some of them, running
+/// them again leads to the same state.
 pub fn reconcile(
     mirror: &Master,
     held: &Master,
@@ -37,12 +38,12 @@ pub fn reconcile(
     target
 }
 
-/// State of a master of the present incarnation that cannot be read from it: the parameter subscriptions in
-/// `mirror`, and those that a pending write removes.
+/// The part of a master's state that cannot be read back: the parameter subscriptions in `mirror`, and those
+/// that a pending write removes. The master must be of the present incarnation.
 pub fn may_hold(mirror: &Master, pending: &[Request]) -> Master {
     let mut master = mirror.clone();
     for call in pending {
-        // Not if the node has another address now: its subscriptions ended.
+        // Not if the node has another address now, because then its subscriptions have ended.
         let known = call.caller().and_then(|caller_id| mirror.api_of(caller_id));
         if *call.method() == Method::UnsubscribeParam
             && known.is_none_or(|known| call.text(1) == Some(known))
@@ -134,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_past_us_is_kept_where_nothing_pending_is_newer() {
+    fn writes_that_bypassed_rosrescue_are_kept_unless_a_pending_write_is_newer() {
         let base = [set("/old", 1), set("/both", 1), publish("/n", "/t")];
         let gone = call("unregisterPublisher", &["/n", "/t", "http://n:1/"]);
         let pending = [set("/both", 2), gone.clone()];
@@ -144,14 +145,14 @@ mod tests {
         let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
         let expected = [&base[..], &past_us, &pending].concat();
         assert_eq!(target, after(&expected));
-        // Also if the master has run some of it.
+        // The result is the same if the master has run some of the pending writes.
         let held = after(&[&base[..], &past_us, &pending[..1]].concat());
         let target = reconcile(&mirror, &held, &pending, Authority::PendingWrites);
         assert_eq!(target, after(&expected));
     }
 
     #[test]
-    fn the_mirror_wins_for_all_that_it_knows_and_takes_over_the_rest() {
+    fn the_mirror_wins_wherever_it_has_an_entry_and_takes_over_the_rest() {
         let base = [set("/a", 1), publish("/n", "/t")];
         let mirror = after(&base);
         let moved = call("registerPublisher", &["/n", "/t", "x/Y", "http://n:2/"]);
@@ -175,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_mirror_no_longer_has_is_not_taken_over_again() {
+    fn what_a_pending_write_removed_is_not_taken_over_again() {
         let offer = call(
             "registerService",
             &["/n", "/s", "rosrpc://n:2", "http://n:1/"],
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_look_shows_and_a_pending_write_takes_away_may_be_there() {
+    fn a_parameter_subscription_that_a_pending_write_removes_may_still_be_there() {
         let watch = |api: &str| call("subscribeParam", &["/n", api, "/k"]);
         let gone = |api: &str| call("unsubscribeParam", &["/n", api, "/k"]);
         let mirror = after(&[watch("http://n:1/"), gone("http://n:1/")]);
@@ -205,9 +206,9 @@ mod tests {
         assert_eq!(may_hold(&moved, &[gone("http://n:1/")]), moved);
     }
 
-    /// Whatever is said to change nothing leaves an equal state.
+    /// A call that is said to change nothing leaves an equal state.
     #[test]
-    fn what_changes_nothing_is_told_from_what_does() {
+    fn calls_that_would_change_nothing_are_recognised() {
         let watch = call("subscribeParam", &["/n", "http://n:1/", "k"]);
         let offer = call(
             "registerService",

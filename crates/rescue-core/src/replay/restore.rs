@@ -9,10 +9,11 @@ use crate::master::names::{self, CALLER_ID};
 use crate::master::{Master, Method, Request, returnable};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// Passes the calls that change state, each with its answer, to `write`. `model` is the master after them.
+/// Generates the calls that change state and passes each, with its predicted answer, to `write`. Afterwards
+/// `model` is the state of the master.
 pub(super) struct Restore<'a, W> {
     write: W,
-    /// Number of calls.
+    /// Number of calls so far.
     count: usize,
     pub(super) model: Master,
     pub(super) skipped: Vec<Skipped>,
@@ -20,15 +21,16 @@ pub(super) struct Restore<'a, W> {
     found: &'a Master,
     /// Number of the target's topic types that are in place.
     types_in: usize,
-    /// Whether the new master's topic types are the first of the target's; if not, their order is lost.
+    /// Whether the new master's topic types are the first ones of the target. If not, the target's order of
+    /// types cannot be restored.
     ordered: bool,
-    /// Whether the target's topic types win over those of the new master, which has no registrations.
+    /// Whether the target's topic types win over those of the new master, which then has no registrations.
     types_win: bool,
 }
 
 impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
-    /// Brings a model of `found` to `target`. `types_win`: `found` has no registrations, and where it has another
-    /// type for a topic it gets the target's.
+    /// Brings a model of `found` to `target`. With `types_win`, `found` must have no registrations, and
+    /// topics that have another type there get the target's type.
     pub(super) fn run(target: &'a Master, found: &'a Master, types_win: bool, write: W) -> Self {
         let known = found.topic_types().keys();
         let first = target.topic_types().keys().take(known.len());
@@ -68,7 +70,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         let both = (!found.is_empty()).then(|| merged(self.target.params(), found));
         let whole = both.as_ref().unwrap_or_else(|| self.target.params());
         if whole.iter().eq(found) {
-            // Nothing to set. Parameters that a master cannot return stay in place.
+            // There is nothing to set, so even parameters that a master cannot return stay in place.
             return;
         }
         let (tree, left_out) = returnable::writable(whole);
@@ -80,7 +82,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Notes the nodes that are left out.
+    /// Notes which nodes are left out.
     fn nodes(&mut self) {
         for (caller_id, api) in self.target.nodes() {
             if let Some(found_api) = self.found.api_of(caller_id)
@@ -96,7 +98,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The address for a node's registrations, unless the node is left out.
+    /// The address at which to register a node. `None` if the node is left out.
     fn api(&self, caller_id: &str) -> Option<&'a str> {
         let api = self.target.api_of(caller_id)?;
         let free = self
@@ -106,7 +108,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         (free && !Token::is_ours(caller_id)).then_some(api)
     }
 
-    /// Those of `callers` that are brought in and not present yet: caller id, name for `key`, address.
+    /// The nodes among `callers` that still have to be registered under `key`: caller id, name that leads to
+    /// `key`, address.
     fn missing(
         &mut self,
         key: &'a str,
@@ -140,7 +143,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// The type to register a topic with. A type known to the new master is kept, unless the target's wins.
+    /// The type with which to register a topic. A type that the new master knows is kept, unless the target's
+    /// types win.
     fn topic_type(&self, topic: &str) -> &'a str {
         let known = self.found.type_of(topic);
         let known = known.filter(|known| *known != "*" && !self.types_win);
@@ -180,8 +184,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Unregisters the new master's own subscribers of a topic, so that they are not notified of each
-    /// publisher separately.
+    /// Unregisters the subscribers that the new master already has for a topic, so that they are not notified
+    /// of each publisher separately.
     fn take_out_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
         let found = self.found;
         let subscribers = found
@@ -240,7 +244,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// A master that has ever had a service answers `unregisterService` with a different message.
+    /// Registers and unregisters a service if the target once had one, because a master that never had a
+    /// service answers `unregisterService` with another message.
     fn had_services(&mut self) {
         if self.target.registry().had_services
             && !self.model.registry().had_services
@@ -255,8 +260,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.push(Method::UnregisterService, [helper, service, NO_API]);
     }
 
-    /// Whether a service has a provider in the new master. Then the service and its former providers are left
-    /// out.
+    /// Whether a service has a provider in the new master. If so, the service and the nodes that provided it
+    /// before are left out.
     fn leave_service(&mut self, service: &str, losers: &[&str]) -> bool {
         let Some(found) = self.found.registry().services.get(service) else {
             return false;
@@ -284,7 +289,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         true
     }
 
-    /// Registers a service for its former providers.
+    /// Registers a service for the nodes that provided it before.
     fn lose(&mut self, service: &str, losers: &[&str]) {
         for caller_id in losers {
             let Some(api) = self.api(caller_id) else {
@@ -302,7 +307,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// As [`Self::lose`], for a service without a provider: a helper registers and unregisters it last.
+    /// Like [`Self::lose`], for a service without a provider: finally a helper registers and unregisters it.
     fn lose_to_nobody(&mut self, service: &str, losers: &[&str]) {
         let before = self.count;
         let Some((helper, name)) = self.helper(service) else {
@@ -346,7 +351,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the types that precede that of a topic about to be registered.
+    /// Adds the types that come before the type of a topic that is about to be registered.
     fn types_up_to(&mut self, topic: &str) {
         if self.ordered
             && !self.model.topic_types().contains_key(topic)
@@ -356,8 +361,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds types `*` of topics without publishers. Only a publisher can set them, and it must come before
-    /// the subscribers, who would be notified of it.
+    /// Adds the types `*` of topics without publishers. Only a publisher can set them, and it must register
+    /// before the subscribers, who would be notified of it.
     fn star_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -368,8 +373,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Changes the types of topics without publishers. Only a publisher can do that, and it must come before the
-    /// subscribers, who would be notified of it.
+    /// Corrects the types of topics without publishers. Only a publisher can do that, and it must register
+    /// before the subscribers, who would be notified of it.
     fn changed_types(&mut self) {
         let target = self.target;
         for (topic, topic_type) in target.topic_types() {
@@ -381,7 +386,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Adds the first `end` of the target's types.
+    /// Adds the first `end` types of the target.
     fn types_before(&mut self, end: usize) {
         let target = self.target;
         let types = target.topic_types().iter().take(end).skip(self.types_in);
@@ -391,7 +396,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.types_in = self.types_in.max(end);
     }
 
-    /// A caller id that is not a node's, and the name with which it addresses `key`.
+    /// A caller id that no node has, and the name by which it reaches `key`.
     fn helper(&self, key: &str) -> Option<(String, String)> {
         let is_node = |caller_id: &str| {
             let nodes = [self.target, self.found].map(|master| &master.registry().nodes);
@@ -409,7 +414,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let skipped = Skipped::Type {
                 topic: topic.to_owned(),
             };
-            // Tried again at the end: listed once.
+            // This is tried again at the end, but listed only once.
             if !self.skipped.contains(&skipped) {
                 self.skipped.push(skipped);
             }
@@ -418,7 +423,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         self.set_type(topic, topic_type, is_star);
     }
 
-    /// Has a helper register the topic, as a publisher or a subscriber, and unregister it again.
+    /// Makes a helper register the topic, as a publisher or a subscriber, and unregister it again.
     fn set_type(&mut self, topic: &str, topic_type: &str, as_publisher: bool) {
         let Some((helper, name)) = self.helper(topic) else {
             return self.skip_unnameable(topic, HELPER);
@@ -432,8 +437,8 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
     }
 }
 
-/// The calls that empty a master that holds `found`, so that it can hold exactly `target`. Subscribers are
-/// removed first, so that they are not notified of the rest. Parameters stay if they are right.
+/// The calls that empty a master that holds `found`, so that it can be given exactly `target`. Subscribers
+/// are removed first, so that they are not notified of the rest. Parameters stay if they are already right.
 pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     let nodes = found.nodes().filter(|(name, _)| !Token::is_ours(name));
     let calls = nodes.flat_map(|(name, _)| found.unregister_calls(name));
@@ -448,7 +453,7 @@ pub(super) fn removal(found: &Master, target: &Master) -> Vec<Request> {
     first
 }
 
-/// `ours` over `theirs`, namespace by namespace.
+/// Merges two parameter trees namespace by namespace. `ours` wins over `theirs`.
 pub(super) fn merged(ours: &Struct, theirs: &Struct) -> Struct {
     let mut tree = ours.clone();
     for (key, value) in theirs {

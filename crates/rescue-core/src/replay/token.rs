@@ -1,25 +1,27 @@
-//! The incarnation token: left in a master to recognise its process again.
+//! The incarnation token: left in a master in order to recognise that process again.
 
 use crate::{
     master::{self, Method, Request},
     xmlrpc::Reply,
 };
 
-/// The namespace of tokens. It has no leading slash, so no node's name and no parameter in `getParam('/')`
-/// can be in it.
+/// The namespace of tokens. It has no leading slash, so no node name and no parameter below `/` can be in it.
 const NAMESPACE: &str = "rosrescue/";
 /// The caller id of registrations that are undone at once.
 pub(super) const HELPER: &str = "rosrescue/injection";
-/// An address that rosmaster accepts but never connects to: `xmlrpc.client` refuses its scheme.
+/// An address that rosmaster accepts but never connects to, because `xmlrpc.client` refuses its scheme.
 pub(super) const NO_API: &str = "rosrpc://rosrescue:0";
 
-/// Two parameter subscriptions by unique caller ids: one has the session's id, the other the id and the
-/// incarnation's number. The address of the first one ends in that number, so that a rosrescue with an older
-/// checkpoint can read it. A master with another number was ours before, or is newer than the checkpoint.
+/// Identifies an incarnation of a master.
 ///
-/// Each makes a node reference that only `lookupNode` finds: it has no registration, parameter or topic type
-/// that another read could show. The subscribed key is outside the tree that starts at `/`, so no `setParam`
-/// or `deleteParam` below `/`, or of `/` itself, ever queues a callback to it.
+/// In the master it is two parameter subscriptions by unique caller ids: one contains the id of the session,
+/// the other one the id and the number of the incarnation. The address of the first one ends in that number
+/// too, so that a rosrescue with an older checkpoint can read it. A master with another number was ours
+/// before, or is newer than the checkpoint.
+///
+/// Each subscription makes a reference to a node that only `lookupNode` finds: it has no registration,
+/// parameter or topic type that another read could show. The key is outside the tree that starts at `/`, so
+/// no `setParam` or `deleteParam` of `/` or below ever queues a callback to it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Token {
     session: String,
@@ -27,22 +29,22 @@ pub struct Token {
     number: u64,
 }
 
-/// The token in a master.
+/// Which token of a session a master bears.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bears {
-    /// Of the incarnation asked for: it has been brought to the whole state.
+    /// The token of the incarnation asked for: the master has been brought to the whole state.
     Present,
-    /// Of an earlier incarnation of the same session.
+    /// The token of an earlier incarnation of the session.
     Earlier,
-    /// Of a later incarnation of the same session, with its number.
+    /// The token of a later incarnation of the session, with its number.
     Later(u64),
-    /// No token of this session.
+    /// No token of the session.
     Nothing,
 }
 
 impl Token {
     /// The token of incarnation `number` in the session `id`. Characters of `id` other than ASCII letters,
-    /// digits and `-` become `_`.
+    /// digits and `-` are replaced by `_`.
     pub fn new(id: &str, number: u64) -> Self {
         let safe = |c: char| {
             if c.is_ascii_alphanumeric() || c == '-' {
@@ -59,19 +61,19 @@ impl Token {
         }
     }
 
-    /// The calls that leave it, in order: the incarnation's number is last.
+    /// The calls that leave the token in a master. The one with the incarnation's number comes last.
     pub fn leave(&self) -> [Request; 2] {
         let session_api = format!("{NO_API}/{}", self.number);
         [(&self.session, session_api.as_str()), (&self.name, NO_API)]
             .map(|(name, api)| subscription(Method::SubscribeParam, name, api))
     }
 
-    /// The call that removes the incarnation's number.
+    /// The call that removes the incarnation's number from a master.
     pub fn remove(&self) -> Request {
         subscription(Method::UnsubscribeParam, &self.name, NO_API)
     }
 
-    /// The call that looks up the incarnation's number: answered with code 1 if it is there.
+    /// The call that looks up the incarnation's number. Its answer has code 1 if the number is there.
     pub fn lookup(&self) -> Request {
         lookup(&self.name)
     }
@@ -81,9 +83,9 @@ impl Token {
         lookup(&self.session)
     }
 
-    /// What a master bears that answers [`Self::lookup`] with `number`, whether the token is there, and
-    /// [`Self::lookup_session`] with `session`, the address of the session's token. Without a number in the
-    /// address, as earlier versions left it, the master is no later one.
+    /// What a master bears, from its answers: `number` is whether [`Self::lookup`] found the token, `session`
+    /// is the address that [`Self::lookup_session`] returned. If that address has no number, an earlier
+    /// version of rosrescue left it, and the master is not a later one.
     pub(super) fn found(&self, number: bool, session: Option<&str>) -> Bears {
         let later = session
             .and_then(|api| api.strip_prefix(NO_API)?.strip_prefix('/')?.parse().ok())
@@ -96,7 +98,7 @@ impl Token {
         }
     }
 
-    /// Whether the reply to [`Self::lookup`] means that the token is there.
+    /// Whether this reply to [`Self::lookup`] means that the token is there.
     pub fn is_found(reply: &Reply) -> bool {
         master::is_success(reply)
     }
@@ -162,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn no_parameter_below_the_root_calls_a_token_back() {
+    fn no_parameter_change_sends_a_callback_to_a_token() {
         let mut master = Master::default();
         for call in Token::new("a", 1).leave() {
             master.apply(&call);

@@ -1,41 +1,42 @@
-//! What is done with a master that is examined: the table of `docs/architecture.md` (Recovery, 4).
+//! What to do with a master that was examined: the table in `docs/architecture.md` (Recovery, 4).
 
 use super::{Authority, Bears};
 
-/// What is known of a master before it is examined.
+/// What is known about a master before it is examined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Known {
-    /// Nothing.
+    /// Nothing is known.
     Nothing,
-    /// If it bears the token, this process has served it before.
+    /// If it bears the token, this process has already served calls with it.
     ServedIfPresent,
-    /// If it bears the token, it has been injected but never confirmed.
+    /// If it bears the token, it has been injected but its state was never confirmed.
     InjectedIfPresent,
-    /// This process has just started it on a free loopback port, as the successor of one that it served. So
-    /// it is empty and not read before the injection; reading back would show if it were not.
+    /// This process has just started it on a free loopback port, as the successor of a master that it served.
+    /// So it is empty, and it is not read before the injection; reading back afterwards would show if it was
+    /// not empty.
     New {
         /// Its process id.
         pid: i32,
     },
 }
 
-/// What is done with it.
+/// What to do with a master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Treatment {
-    /// It is empty, and so is the mirror: a session begins.
+    /// Begin a session: master and mirror are both empty.
     Begin,
-    /// It gets the mirror's state in addition to what it holds.
+    /// Give it the mirror's state in addition to what it holds.
     Inject,
-    /// The mirror, which is empty, takes over what it holds.
+    /// Take over its state into the mirror, which is empty.
     TakeOver,
-    /// All that it holds is replaced by the mirror's state.
+    /// Replace everything that it holds by the mirror's state.
     Replace,
-    /// It gets what [`reconcile`](super::reconcile) makes of its state, the mirror and the pending writes.
+    /// Give it what [`reconcile`](super::reconcile) makes of its state, the mirror and the pending writes.
     Reconcile(Authority),
 }
 
-/// What to do with a master that bears `bears`. One that bears the present token, has been served and misses no
-/// write goes on as it is and does not come here.
+/// Decides what to do with a master that bears `bears`. A master that bears the present token, has been
+/// served and has missed no write goes on as it is and does not come here.
 pub fn treatment(
     bears: Bears,
     known: Known,
@@ -46,14 +47,14 @@ pub fn treatment(
         (Bears::Nothing, _) if !mirror_is_empty => Treatment::Inject,
         (Bears::Nothing, _) if master_is_empty => Treatment::Begin,
         (Bears::Nothing, _) => Treatment::TakeOver,
-        // A session that has just begun knows nothing that could replace what it holds.
+        // A session that has just begun knows nothing that could replace the master's state.
         (Bears::Earlier, Known::Nothing) if mirror_is_empty => Treatment::TakeOver,
-        // Another incarnation has succeeded it: the mirror is newer than anything it holds.
+        // Another incarnation has succeeded this one, so the mirror is newer than anything it holds.
         (Bears::Earlier, _) => Treatment::Replace,
         // The checkpoint is older than this master, or another rosrescue has a copy of it.
         (Bears::Later(_), Known::Nothing) => Treatment::Reconcile(Authority::PendingWrites),
         (Bears::Later(_), _) => Treatment::Replace,
-        // It has run every write of the checkpoint that is not pending, and maybe more.
+        // It has run every write of the checkpoint that is not pending, and possibly more.
         (Bears::Present, Known::Nothing | Known::ServedIfPresent) => {
             Treatment::Reconcile(Authority::PendingWrites)
         }
@@ -66,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_master_gets_what_the_document_says() {
+    fn each_master_is_treated_as_the_architecture_document_says() {
         use Treatment::{Begin, Inject, Reconcile, Replace, TakeOver};
         let (served, injected) = (Known::ServedIfPresent, Known::InjectedIfPresent);
         for (bears, known, mirror_is_empty, master_is_empty, expected) in [

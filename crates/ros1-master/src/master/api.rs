@@ -1,25 +1,25 @@
-//! The methods of the Master API, and their dispatcher.
+//! The methods of the Master API, and the dispatcher that runs them.
 
 use std::fmt;
 
 use super::{Entry, Kind, Master, Notice, NoticeSink, Request, returnable};
 use crate::xmlrpc::{Reply, Value};
 
-/// Returned by a method: status code, message, value.
+/// What a method returns: status code, message, value.
 pub(crate) type Answer = Result<(i32, String, Value), Failure>;
 
-/// Why a method ends early.
+/// Why a method ended early.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Failure {
-    /// A check refused a parameter: the text is the message.
+    /// A check refused a parameter. The text is the message of the answer.
     Refused(String),
-    /// rosmaster raises a `TypeError`: code -1, with a text of our own.
+    /// rosmaster raises a `TypeError`, which it answers with code -1. The text is our own.
     Type(&'static str),
-    /// rosmaster raises another error: code 0.
+    /// rosmaster raises another exception, which it answers with code 0. The text is our own.
     Internal(&'static str),
 }
 
-/// Arguments of a method.
+/// The arguments of a method.
 pub(crate) struct Args<'a> {
     pub(crate) caller_id: &'a str,
     /// The parameters after the caller id.
@@ -33,19 +33,20 @@ impl<'a> Args<'a> {
     }
 }
 
-/// Properties of a method of the Master API.
+/// The properties of a Master API method.
 struct Spec {
     kind: Kind,
     /// Number of parameters, the caller id included.
     arity: usize,
-    /// The value that is returned with an error.
+    /// The value of an answer that reports an error.
     error: fn() -> Value,
     run: fn(&mut Master, Args<'_>) -> Answer,
 }
 
 const MULTICALL: &str = "system.multicall";
 
-/// What rosmaster takes for methods, with their Python types: the public attributes of `ROSMasterHandler`.
+/// The public attributes of `ROSMasterHandler` with their Python types. rosmaster takes their names for
+/// methods.
 const ATTRIBUTES: [(&str, &str); 11] = [
     ("done", "bool"),
     ("param_server", "ParamDictionary"),
@@ -62,13 +63,13 @@ const ATTRIBUTES: [(&str, &str); 11] = [
 
 macro_rules! methods {
     ($($method:ident $name:literal $kind:ident $arity:literal $error:expr => $run:ident;)*) => {
-        /// A method of a master.
+        /// A method of the Master API, or any other method that a client may call.
         #[derive(Clone, Debug, PartialEq, Eq, Hash)]
         pub enum Method {
             $(#[doc = concat!("`", $name, "`.")] $method,)*
             /// `system.multicall`, from CPython's `xmlrpc.server`.
             Multicall,
-            /// A method that rosmaster lacks.
+            /// Any method that rosmaster does not have.
             Unknown(Box<str>),
         }
 
@@ -136,7 +137,7 @@ impl fmt::Display for Method {
 }
 
 impl Method {
-    /// Its kind. [`Kind::Unknown`] for a multicall, whose entries decide.
+    /// The kind of this method. [`Kind::Unknown`] for a multicall, whose entries decide.
     pub(crate) fn kind(&self) -> Kind {
         self.spec().map_or(Kind::Unknown, |spec| spec.kind)
     }
@@ -150,18 +151,18 @@ pub(crate) fn strings(texts: impl IntoIterator<Item = String>) -> Value {
     Value::Array(texts.into_iter().map(Value::String).collect())
 }
 
-/// The answer to a call, and the callbacks that the master sends because of it.
+/// The answer to a call, and the callbacks that the master sends to nodes because of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Applied {
     pub reply: Reply,
-    /// The callbacks, in the order in which the master queues them. Those to one address are sent one after
-    /// another, those to different addresses at the same time.
+    /// The callbacks, in the order in which the master queues them. It sends callbacks to one address one
+    /// after another, and callbacks to different addresses at the same time.
     pub notices: Vec<Notice>,
 }
 
 impl Master {
-    /// Answers and changes as rosmaster does. `shutdown` is answered and changes nothing. Texts of errors
-    /// that no ROS client provokes are our own.
+    /// Answers `request` and changes the state as rosmaster does. `shutdown` is answered but changes nothing.
+    /// Only the texts of errors that no ROS client causes are our own.
     ///
     /// ```
     /// use ros1_master::master::{Master, Method, Notice, Request, is_success};
@@ -181,7 +182,7 @@ impl Master {
         Applied { reply, notices }
     }
 
-    /// As [`Master::apply`], but passes the callbacks to `notices`, which copies only what it needs.
+    /// Like [`Master::apply`], but passes the callbacks to `notices`, which copies only what it needs.
     pub fn apply_telling(&mut self, request: &Request, notices: &mut dyn NoticeSink) -> Reply {
         let result = match request.method() {
             Method::Multicall => self.run_multicall(request.entries(), notices),
@@ -196,8 +197,8 @@ impl Master {
         }
     }
 
-    /// The result of a read, if rosmaster's is the same to the byte. None for any other call, and where the
-    /// wording may differ.
+    /// The result of a read, if rosmaster would give the same result byte for byte. `None` for any other
+    /// call, and where rosmaster's wording may differ.
     pub fn exact_answer(&mut self, read: &Request) -> Option<Value> {
         if self.is_inexact() {
             return None;
@@ -218,13 +219,14 @@ impl Master {
             .validate_and_run(spec, read.params(), &mut ())
             .ok()
             .filter(|(_, _, value)| *value != Value::Nil)?;
-        // A node that only subscribes parameters may have registered past rosrescue: nothing shows it.
+        // A node that only subscribes to parameters may have registered without rosrescue seeing it, and no
+        // other read shows such a node.
         let hidden = *read.method() == Method::LookupNode && code != 1;
         let in_some_order = self.unordered && shows_order(read.method(), &value);
         (!hidden && !in_some_order).then(|| Value::Array(vec![code.into(), message.into(), value]))
     }
 
-    /// Answers any method except for a multicall. An error is the text of a fault.
+    /// Answers any method except a multicall. The error is the text of a fault.
     pub(crate) fn dispatch(
         &mut self,
         request: &Request,
@@ -255,21 +257,21 @@ impl Master {
         Ok(Value::Array(vec![code.into(), message.into(), value]))
     }
 
-    /// The text of the fault to a method that rosmaster lacks.
+    /// The text of the fault that answers a method that rosmaster does not have.
     fn unsupported(&self, name: &str) -> String {
         let attribute = ATTRIBUTES.iter().find(|(attribute, _)| *attribute == name);
         let (class, text) = match attribute {
             None => ("Exception", format!("method \"{name}\" is not supported")),
             Some((_, is_a)) => ("TypeError", format!("'{is_a}' object is not callable")),
         };
-        // Only Python 2 has dictionaries without an order.
+        // A master whose dictionaries have no order runs on Python 2.
         match self.unordered {
             true => format!("<type 'exceptions.{class}'>:{text}"),
             false => format!("<class '{class}'>:{text}"),
         }
     }
 
-    /// `apivalidate`.
+    /// rosmaster's `apivalidate`.
     fn validate_and_run(
         &mut self,
         spec: &Spec,
@@ -294,7 +296,7 @@ impl Master {
     }
 }
 
-/// Whether a method was answered with code 1.
+/// Whether a method was answered with code 1, success.
 pub fn is_success(reply: &Reply) -> bool {
     matches!(reply, Reply::Value(Value::Array(answer)) if answer.first() == Some(&Value::Int(1)))
 }
@@ -314,7 +316,7 @@ pub(crate) fn fault(text: &str) -> Reply {
     }
 }
 
-/// Whether the value of a read shows the order of a dictionary.
+/// Whether the value of this read shows the order of a dictionary.
 fn shows_order(method: &Method, value: &Value) -> bool {
     match (method, value) {
         (Method::GetSystemState, Value::Array(lists)) => {

@@ -1,4 +1,4 @@
-//! The checks on parameters: `rosmaster/validators.py`, with its texts.
+//! The checks of parameters from `rosmaster/validators.py`, with the same messages.
 
 use super::api::Failure;
 use super::names;
@@ -12,7 +12,7 @@ fn refuse<T>(what: &str, complaint: &str) -> Checked<T> {
     )))
 }
 
-/// `non_empty_str('key')`.
+/// rosmaster's `non_empty_str('key')`.
 pub(crate) fn key(value: &Value) -> Checked<&str> {
     match value.as_str() {
         Some(text) if !text.is_empty() => Ok(text),
@@ -21,7 +21,7 @@ pub(crate) fn key(value: &Value) -> Checked<&str> {
     }
 }
 
-/// Whether Python takes a value other than a text for false.
+/// Whether Python treats a value that is not a string as false.
 fn is_falsy(value: &Value) -> bool {
     match value {
         Value::Nil | Value::Bool(false) | Value::Int(0) => true,
@@ -32,7 +32,7 @@ fn is_falsy(value: &Value) -> bool {
     }
 }
 
-/// `not_none('value')`.
+/// rosmaster's `not_none('value')`.
 pub(crate) fn param_value(value: &Value) -> Checked<&Value> {
     match value {
         Value::Nil => refuse("value", "must be specified"),
@@ -40,7 +40,7 @@ pub(crate) fn param_value(value: &Value) -> Checked<&Value> {
     }
 }
 
-/// `is_api`.
+/// rosmaster's `is_api`.
 pub(crate) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
     match value.as_str() {
         None | Some("") => refuse(what, "is not an XMLRPC URI"),
@@ -49,7 +49,7 @@ pub(crate) fn api<'a>(what: &str, value: &'a Value) -> Checked<&'a str> {
     }
 }
 
-/// `valid_name`.
+/// rosmaster's `valid_name`.
 pub(crate) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
     match value.as_str() {
         None | Some("") => refuse(what, "must be a non-empty string"),
@@ -58,7 +58,7 @@ pub(crate) fn name(what: &str, value: &Value, caller_id: &str) -> Checked<String
     }
 }
 
-/// `is_topic` and `is_service`.
+/// rosmaster's `is_topic` and `is_service`.
 pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<String> {
     let resolved = name(what, value, caller_id)?;
     match value.as_str() {
@@ -67,8 +67,8 @@ pub(crate) fn resource(what: &str, value: &Value, caller_id: &str) -> Checked<St
     }
 }
 
-/// `valid_type_name('topic_type')`. rosmaster also accepts a date that reads `*`, and keeps it as a date;
-/// here it becomes a string.
+/// rosmaster's `valid_type_name('topic_type')`. rosmaster also accepts a date whose text is `*`, and keeps it
+/// as a date; here it becomes a string.
 pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     match value {
         Value::DateTime(text) | Value::String(text) if text == "*" => Ok(text),
@@ -80,7 +80,7 @@ pub(crate) fn topic_type(value: &Value) -> Checked<&str> {
     }
 }
 
-/// `empty_or_valid_name('subgraph')`.
+/// rosmaster's `empty_or_valid_name('subgraph')`.
 pub(crate) fn subgraph(value: &Value, caller_id: &str) -> Checked<String> {
     match value.as_str() {
         None => refuse("subgraph", "must be a string"),

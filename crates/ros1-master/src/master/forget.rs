@@ -1,15 +1,16 @@
-//! Taking a node out of a master altogether.
+//! Removes a node from a master completely.
 
 use super::{Master, Method, Request, names};
 
-/// The address of a service for as long as it takes to give it up.
+/// The address under which a service is registered only to unregister it again.
 const GONE_SERVICE: &str = "rosrpc://127.0.0.1:1";
 
 impl Master {
-    /// The calls after which a master knows nothing of a node any more.
+    /// The calls that make a master forget a node completely.
     ///
-    /// To a reference by a service that another node took over, the node takes the service back, gives it up,
-    /// and the other one registers it anew.
+    /// If another node has taken over a service of this node, rosmaster keeps a reference to the node. To
+    /// remove that, the node takes the service back and unregisters it, and then the other node's service is
+    /// registered again.
     pub fn forget_calls(&self, caller_id: &str) -> Vec<Request> {
         let mut calls = self.unregister_calls(caller_id);
         let Some(node) = self.registry.nodes.get(caller_id) else {
@@ -22,7 +23,7 @@ impl Master {
                 let params = [&entry.node, &name, &entry.api, self.api_of(&entry.node)?];
                 Some(Request::new(Method::RegisterService, params))
             });
-            // Not if it could not be given back.
+            // Only if it can be given back to the other node afterwards.
             if let Some(name) = names::name_for(service, caller_id)
                 && again != Some(None)
             {

@@ -1,6 +1,6 @@
-//! Kinds of calls: reads, writes, and calls that only the master understands.
+//! The kinds of calls: reads, writes, and calls that only the master understands.
 
-/// The kind of a call, by its method; for a multicall, by its entries.
+/// The kind of a call. Its method decides; for a multicall its entries do.
 ///
 /// ```text
 ///            Shutdown
@@ -14,21 +14,22 @@
 ///            Identity
 /// ```
 ///
-/// The kind of a multicall is the lowest one above all its entries, nested ones too. A call that unregisters
-/// and also does something unknown must be recorded and must go to the master, so it is a `Mutate`.
+/// The kind of a multicall is the lowest kind that lies above those of all its entries, including nested
+/// ones. A call that unregisters something and also does something unknown must be recorded and must go to
+/// the master, so it is a `Mutate`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
-    /// `getPid`, `getUri`: answers about the master's process.
+    /// `getPid` and `getUri`: ask about the master's process.
     Identity,
-    /// Changes nothing.
+    /// A call that changes nothing.
     Read,
-    /// `unregister*`, `unsubscribeParam`: removes something that the caller registered.
+    /// `unregister*` and `unsubscribeParam`: remove something that the caller registered.
     Unregister,
-    /// A method that the Master API lacks, or a multicall that cannot run.
+    /// A method that the Master API does not have, or a multicall that cannot run.
     Unknown,
-    /// `register*`, `setParam`, `deleteParam`, `subscribeParam`: changes state.
+    /// `register*`, `setParam`, `deleteParam`, `subscribeParam`: change the state.
     Mutate,
-    /// Ends the master.
+    /// `shutdown`: ends the master.
     Shutdown,
 }
 
@@ -38,7 +39,7 @@ impl Kind {
         matches!(self, Self::Unregister | Self::Mutate)
     }
 
-    /// The lowest kind above both.
+    /// The lowest kind that lies above both.
     #[must_use]
     pub fn join(self, other: Self) -> Self {
         match (self, other) {

@@ -1,4 +1,4 @@
-//! The methods of the Master API: the body of `rosmaster/master_api.py`.
+//! The methods of the Master API, as in `rosmaster/master_api.py`.
 
 use super::api::{Answer, Args, Failure, strings};
 use super::registry::Shared;
@@ -245,7 +245,8 @@ impl Master {
         Ok((1, format!("Unsubscribe to parameter [{key}]"), 1.into()))
     }
 
-    /// Queues the topic's publisher list for its subscribers, and returns their addresses.
+    /// Queues the topic's list of publishers for its subscribers, and returns the addresses of the
+    /// subscribers.
     fn notify_publishers(&self, topic: &str, notices: &mut dyn NoticeSink) -> Vec<String> {
         let subscribers = self.registry.apis(Shared::Subscribers, topic);
         if !subscribers.is_empty() {
@@ -262,7 +263,7 @@ impl Master {
             checks::topic_type(topic_type)?,
             checks::api("caller_api", api)?,
         );
-        // A date: rosmaster keeps it as one.
+        // It is a date, which rosmaster keeps as one.
         self.inexact |= topic_type.as_str().is_none();
         Ok(params)
     }
@@ -273,7 +274,7 @@ fn pair(topic: &str, topic_type: &str) -> Value {
 }
 
 impl Master {
-    /// Tells the node whose name was taken.
+    /// Tells a node whose name was taken to shut down.
     fn notify_bumped(&self, by: &str, bumped: Option<String>, notices: &mut dyn NoticeSink) {
         if let Some(to) = bumped {
             notices.shutdown(&to, &super::tell::bump_reason(by, self.old == Some(true)));

@@ -1,4 +1,4 @@
-//! `system.multicall`, from CPython's `xmlrpc.server`.
+//! `system.multicall`, as in CPython's `xmlrpc.server`.
 
 use super::api::fault;
 use super::{Entry, Kind, Master, Method, NoticeSink, Request, names};
@@ -30,7 +30,7 @@ impl Master {
     ) -> Result<Value, String> {
         let mut results = Vec::with_capacity(entries.len());
         for (index, entry) in entries.iter().enumerate() {
-            // The result of entry `index` is the only element of a list.
+            // The result of entry `index` is a list with one element.
             at.extend([index, 0]);
             let depth = at.len();
             let result = match entry {
@@ -54,8 +54,8 @@ impl Master {
         Ok(Value::Array(results))
     }
 
-    /// Whether all answers to the reads of a multicall need no more than about `most` bytes of memory. Each
-    /// answer is made and dropped. Other calls always fit.
+    /// Whether the answers to all reads of a multicall fit into about `most` bytes of memory. Makes each
+    /// answer and drops it again. Other calls always fit.
     pub fn fits(&mut self, request: &Request, mut most: usize) -> bool {
         if *request.method() != Method::Multicall {
             return true;
@@ -72,7 +72,7 @@ impl Master {
         })
     }
 
-    /// Notes where a dict of the parameter tree is part of the result.
+    /// Notes where the result shows a dict of the parameter tree itself.
     fn watch(&mut self, request: &Request, result: Option<&Value>, at: &[usize]) {
         let (key, subscribes) = match request.method() {
             Method::GetParam => (request.text(1), false),
@@ -91,7 +91,7 @@ impl Master {
         if subscribes {
             key = names::param_key(&key);
         }
-        // A subscription to an unset key gets a dict of its own.
+        // For a key that is not set, `subscribeParam` returns a new dict.
         if self.params.has(&key) {
             let at = at.iter().copied().chain([2]).collect();
             self.params.watch(&key, at);
@@ -106,7 +106,7 @@ fn place<'a>(value: &'a mut Value, at: &[usize]) -> Option<&'a mut Value> {
     })
 }
 
-/// A fault as an entry of a multicall's result.
+/// A fault, as an entry of a multicall's result.
 fn fault_entry(text: String) -> Value {
     Value::Struct(Struct::from([
         ("faultCode".to_owned(), 1.into()),
@@ -114,7 +114,7 @@ fn fault_entry(text: String) -> Value {
     ]))
 }
 
-/// A reply as an entry of a multicall's result.
+/// A reply, as an entry of a multicall's result.
 pub fn reply_entry(reply: Reply) -> Value {
     match reply {
         Reply::Value(value) => Value::Array(vec![value]),
@@ -122,7 +122,7 @@ pub fn reply_entry(reply: Reply) -> Value {
     }
 }
 
-/// The reply contained in an entry of a multicall's result.
+/// The reply that an entry of a multicall's result contains.
 pub fn entry_reply(result: &Value) -> Option<Reply> {
     match result {
         Value::Array(only) => match only.as_slice() {

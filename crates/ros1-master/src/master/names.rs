@@ -1,14 +1,14 @@
-//! Graph resource names as `rosgraph/names.py` resolves them.
+//! Graph resource names, resolved as in `rosgraph/names.py`.
 //!
-//! rosmaster resolves more than it validates: a caller id such as `a/b` makes topics such as `a/t`, `/a//b`
-//! makes `/a//t`. The results are stored unchanged, so everything here accepts any text.
+//! rosmaster resolves more names than it validates: the caller id `a/b` makes topics such as `a/t`, and
+//! `/a//b` makes `/a//t`. It stores the results unchanged, so these functions accept any text.
 
 use std::borrow::Cow;
 
-/// The caller id of rosrescue's own calls to a master.
+/// The caller id of the calls that rosrescue itself makes to a master.
 pub const CALLER_ID: &str = "/rosrescue";
 
-/// `canonicalize_name`: without doubled and trailing slashes.
+/// rosgraph's `canonicalize_name`: removes doubled and trailing slashes.
 pub(crate) fn canonicalize(name: &str) -> Cow<'_, str> {
     let global = name.starts_with('/');
     if name.len() < 2 || !(name.contains("//") || name.ends_with('/')) {
@@ -32,7 +32,7 @@ pub fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 
-/// `namespace`: up to and including the last slash, ignoring one trailing slash.
+/// rosgraph's `namespace`: everything up to and including the last slash, not counting one trailing slash.
 pub(crate) fn namespace(name: &str) -> &str {
     let name = name.strip_suffix('/').unwrap_or(name);
     match name.rfind('/') {
@@ -41,7 +41,7 @@ pub(crate) fn namespace(name: &str) -> &str {
     }
 }
 
-/// `resolve_name` of a non-empty name.
+/// rosgraph's `resolve_name`, for a non-empty name.
 pub fn resolve(name: &str, caller_id: &str) -> String {
     let name = canonicalize(name);
     if name.starts_with('/') {
@@ -53,7 +53,7 @@ pub fn resolve(name: &str, caller_id: &str) -> String {
     }
 }
 
-/// `ns_join`: leaves a name that starts with `/` or `~` unchanged, and adds no slash after `~`.
+/// rosgraph's `ns_join`: leaves a name that starts with `/` or `~` unchanged, and adds no slash after `~`.
 pub(crate) fn join(namespace: &str, name: &str) -> String {
     if name.starts_with(['/', '~']) || namespace.is_empty() {
         name.to_owned()
@@ -64,7 +64,8 @@ pub(crate) fn join(namespace: &str, name: &str) -> String {
     }
 }
 
-/// The stored and announced form of parameter subscriptions: with a trailing slash.
+/// The form in which rosmaster stores and announces the key of a parameter subscription: with a trailing
+/// slash.
 pub fn param_key(key: &str) -> String {
     let mut key = canonicalize(key).into_owned();
     if key != "/" {
@@ -73,13 +74,13 @@ pub fn param_key(key: &str) -> String {
     key
 }
 
-/// Characters that validators refuse in the name of a topic, service or node.
+/// Whether `name` has characters that rosmaster refuses in the name of a topic, service or node.
 pub(crate) fn has_illegal_chars(name: &str) -> bool {
     name.contains([':', ' '])
 }
 
-/// A name that the master resolves to `key` for `caller_id`. It exists for each key that a caller has ever
-/// registered.
+/// A name that the master resolves to `key` for `caller_id`. There is one for every key that this caller has
+/// ever registered.
 pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
     let plain = key.len() > 1 && key.starts_with('/') && !has_illegal_chars(key);
     if plain && canonicalize(key) == key {
@@ -90,7 +91,7 @@ pub fn name_for(key: &str, caller_id: &str) -> Option<String> {
     })
 }
 
-/// As [`name_for`], for a key of a parameter subscription.
+/// Like [`name_for`], for the key of a parameter subscription.
 pub fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
     let trimmed = if key == "/" {
         key
@@ -103,7 +104,7 @@ pub fn param_name_for(key: &str, caller_id: &str) -> Option<String> {
 }
 
 fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<String> {
-    // The global namespace is refused as `/` but accepted as `//`.
+    // `/` is refused as the global namespace, but `//` is accepted.
     let absolute = if key == "/" { "//" } else { key };
     if names(absolute) {
         return Some(absolute.to_owned());
@@ -118,8 +119,8 @@ fn spell(key: &str, caller_id: &str, names: impl Fn(&str) -> bool) -> Option<Str
         .find(|name| !name.is_empty() && names(name))
 }
 
-/// A caller id and a name that the master resolves to `key`. The caller id must be `usable`, and is
-/// `preferred` if possible. None if no call can name `key`, as for a node that calls itself `/a/`.
+/// A caller id and a name that the master resolves to `key`. The caller id is `preferred` if possible, and
+/// must pass `usable`. `None` if no call can name `key`, as for a node that calls itself `/a/`.
 pub fn reach(
     key: &str,
     preferred: &str,
@@ -143,7 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn canonical_form_is_rosgraphs() {
+    fn names_are_canonicalized_as_rosgraph_does() {
         for (name, canonical) in [
             ("", ""),
             ("/", "/"),
@@ -159,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_joined_as_rosgraph_joins_them() {
+    fn names_are_joined_as_rosgraph_does() {
         for (namespace, name, joined) in [
             ("/", "a", "/a"),
             ("/a", "b", "/a/b"),
@@ -175,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn names_resolve_as_rosgraph_resolves_them() {
+    fn names_are_resolved_as_rosgraph_does() {
         for (name, caller_id, resolved) in [
             ("t", "/talker", "/t"),
             ("t", "/ns/talker", "/ns/t"),
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn every_key_can_be_said_by_the_caller_that_made_it() {
+    fn a_caller_can_name_every_key_that_it_has_registered() {
         let callers = ["/x", "/ns/x", "x", "a/b", "/a//b", "", "/a b/c", "/x/", "/"];
         let names = ["t", "/t", "//", "~", "~t", "t/u", "~//t/"];
         for caller in callers {

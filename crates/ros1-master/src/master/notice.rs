@@ -4,33 +4,33 @@ use crate::xmlrpc::{Call, Value};
 
 #[derive(Clone, Debug, PartialEq)]
 pub enum Notice {
-    /// `publisherUpdate('/master', topic, publishers)`.
+    /// `publisherUpdate('/master', topic, publishers)`, sent to a subscriber.
     PublisherUpdate {
         /// Address of the subscriber.
         to: String,
         topic: String,
-        /// Addresses of all the topic's publishers.
+        /// Addresses of all publishers of the topic.
         publishers: Vec<String>,
     },
-    /// `paramUpdate('/master', key, value)`.
+    /// `paramUpdate('/master', key, value)`, sent to a subscriber of a parameter.
     ParamUpdate {
         /// Address of the subscriber.
         to: String,
         /// The changed key, with a trailing slash.
         key: String,
-        /// The new value; an empty struct for a deleted parameter.
+        /// The new value, or an empty struct if the parameter was deleted.
         value: Value,
     },
-    /// `shutdown('/master', reason)`, to a node whose name was taken.
+    /// `shutdown('/master', reason)`, sent to a node whose name was taken.
     Shutdown {
-        /// The old node's address.
+        /// Address of the node that had the name before.
         to: String,
         reason: String,
     },
 }
 
 impl Notice {
-    /// The address of the node.
+    /// Address of the node to which this callback goes.
     pub fn to(&self) -> &str {
         match self {
             Self::PublisherUpdate { to, .. }
@@ -54,13 +54,13 @@ impl Notice {
     }
 }
 
-/// Receives callbacks as the master queues them. Arguments are borrowed: one change may go to thousands of
-/// nodes, each with a large value. By default callbacks are ignored.
+/// Receives callbacks as the master queues them. Arguments are borrowed, because one change may go to
+/// thousands of nodes, each time with a large value. By default callbacks are ignored.
 pub trait NoticeSink {
-    /// A [`Notice::PublisherUpdate`] to each of these addresses.
+    /// Receives a [`Notice::PublisherUpdate`] for each address in `to`.
     fn publisher_update(&mut self, _to: &[String], _topic: &str, _publishers: &[String]) {}
 
-    /// A [`Notice::ParamUpdate`] to each of these addresses.
+    /// Receives a [`Notice::ParamUpdate`] for each address in `to`.
     fn param_update(&mut self, _to: &[String], _key: &str, _value: &Value) {}
 
     fn shutdown(&mut self, _to: &str, _reason: &str) {}

@@ -1,4 +1,4 @@
-//! The parameter server: `rosmaster/paramserver.py`.
+//! The parameter server, as in `rosmaster/paramserver.py`.
 
 use super::api::Failure;
 use super::names;
@@ -6,29 +6,30 @@ use super::registry::Registrations;
 use super::updates::{GONE, Update, updates};
 use crate::xmlrpc::{Struct, Value};
 
-/// Kept levels of the tree. rosmaster accepts any depth, through long keys or deep values, and cannot return
-/// more than 491 levels at once. Deeper parts are kept as nil, which bounds recursion over the tree, its drop
-/// included. rosmaster returns them for a key that leads close enough; but they could not be injected into
-/// another master anyway.
+/// Number of levels of the tree that are kept. rosmaster accepts any depth, through long keys or deep values,
+/// and cannot return more than 491 levels at once. Deeper parts are kept as nil, which bounds recursion over
+/// the tree, including when it is dropped. rosmaster does return deeper parts for a key that leads close
+/// enough to them, but they could not be injected into another master anyway.
 const DEEPEST_TREE: usize = 512;
 
 #[derive(Clone, Default)]
 pub(crate) struct Params {
     tree: Struct,
-    /// Whether a part below [`DEEPEST_TREE`] was left out.
+    /// Whether anything below [`DEEPEST_TREE`] was left out.
     cut: bool,
-    /// Results of the present multicall that are dicts of the tree itself: see [`Live`].
+    /// The results of the current multicall that are dicts of the tree itself; see [`Live`].
     live: Vec<Live>,
 }
 
-/// `getParam` returns the tree's own dict, and a multicall encodes its results only after its last entry has
-/// run. So a later `setParam` below that dict shows in the earlier result.
+/// A result of a multicall that is a dict of the parameter tree itself. rosmaster's `getParam` returns the
+/// tree's own dict, and a multicall encodes its results only after its last entry has run, so a later
+/// `setParam` below that dict shows in the earlier result.
 #[derive(Clone)]
 struct Live {
-    /// The value's place in the multicall's result.
+    /// The place of the dict in the multicall's result.
     at: Vec<usize>,
     path: Vec<String>,
-    /// The value after the dict was removed from the tree.
+    /// The last value of the dict, once it was removed from the tree.
     detached: Option<Value>,
 }
 
@@ -82,7 +83,8 @@ impl Params {
         Some(found)
     }
 
-    /// `set_param` of a key with a trailing slash. The tree changes even if computing the updates fails. None go to `ignored`.
+    /// rosmaster's `set_param`, for a key with a trailing slash. The tree changes even if the updates cannot
+    /// be computed. The updates leave out `ignored`.
     pub(crate) fn set<'a>(
         &mut self,
         key: &'a str,
@@ -104,7 +106,7 @@ impl Params {
         updates
     }
 
-    /// Sets a value and creates its namespaces. Values that lie too deep become nil.
+    /// Sets a value and creates the namespaces on the way to it. Values that lie too deep become nil.
     pub(crate) fn put(&mut self, path: &[&str], value: Value) -> Result<(), Failure> {
         let path = path.get(..DEEPEST_TREE).unwrap_or(path);
         let levels = DEEPEST_TREE - path.len();
@@ -131,7 +133,7 @@ impl Params {
         Ok(())
     }
 
-    /// `delete_param` of a key with a trailing slash; none if the parameter is not set.
+    /// rosmaster's `delete_param`, for a key with a trailing slash. `None` if the parameter is not set.
     pub(crate) fn delete<'a>(
         &mut self,
         key: &'a str,
@@ -146,7 +148,7 @@ impl Params {
             Some(Found::Tree(members) | Found::Value(Value::Struct(members))) => {
                 members.contains_key(*last)
             }
-            // Python's `in` finds a substring, or an element of a list, but cannot delete it.
+            // Python's `in` finds a substring, or an element of a list, which then cannot be deleted.
             Some(Found::Value(Value::String(text))) if !text.contains(*last) => false,
             Some(Found::Value(Value::Array(elements))) if !elements.iter().any(is(last)) => false,
             Some(Found::Value(_)) => return Err(Failure::Type("this parameter is no namespace")),
@@ -166,7 +168,7 @@ impl Params {
         updates(subscribers, key, &GONE, None).map(Some)
     }
 
-    /// `search_param`.
+    /// rosmaster's `search_param`.
     pub(crate) fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, Failure> {
         if key.starts_with('~') {
             return Err(Failure::Internal("invalid key"));
@@ -177,7 +179,7 @@ impl Params {
         if key.starts_with('/') {
             return Ok(self.has(key).then(|| key.to_owned()));
         }
-        // Only the first part of the key must exist.
+        // rosmaster requires only the first part of the key to exist.
         let Some(first) = names::parts(key).next() else {
             return Ok(None);
         };
@@ -194,7 +196,7 @@ impl Params {
         Ok(None)
     }
 
-    /// `get_param_names`: every key whose value is not a dict.
+    /// rosmaster's `get_param_names`: every key whose value is not a dict.
     pub(crate) fn names(&self) -> Vec<String> {
         fn collect(key: &str, members: &Struct, found: &mut Vec<String>) {
             for (name, value) in members {
@@ -210,7 +212,7 @@ impl Params {
         found
     }
 
-    /// Number of parameters that are not dicts.
+    /// Number of parameters, not counting namespaces.
     pub(crate) fn leaves(&self) -> usize {
         fn count(members: &Struct) -> usize {
             let leaves = members.values().map(|value| match value {
@@ -222,7 +224,7 @@ impl Params {
         count(&self.tree)
     }
 
-    /// Notes that the dict under `key` is part of a multicall's result.
+    /// Notes that the result of the current multicall contains the dict under `key`.
     pub(crate) fn watch(&mut self, key: &str, at: Vec<usize>) {
         self.live.push(Live {
             at,
@@ -231,7 +233,7 @@ impl Params {
         });
     }
 
-    /// The values of the dicts watched during the multicall, and their places in its result.
+    /// The dicts noted during the multicall, with their values at its end and their places in its result.
     pub(crate) fn take_watched(&mut self) -> Vec<(Vec<usize>, Value)> {
         let live = std::mem::take(&mut self.live);
         live.into_iter()
@@ -245,7 +247,7 @@ impl Params {
             .collect()
     }
 
-    /// Detaches the dicts at `path` and below, before they leave the tree.
+    /// Keeps the values of the noted dicts at `path` and below before they leave the tree.
     fn detach(&mut self, path: &[&str]) {
         let mut live = std::mem::take(&mut self.live);
         for entry in &mut live {
@@ -260,7 +262,7 @@ impl Params {
     }
 }
 
-/// The namespace of that name, created if needed. Silently replaces a value.
+/// The namespace with this name, created if needed. It silently replaces any other value.
 fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> {
     let value = members.entry(name.to_owned()).or_insert(Value::Nil);
     if !matches!(value, Value::Struct(_)) {
@@ -272,7 +274,7 @@ fn namespace<'t>(members: &'t mut Struct, name: &str) -> Option<&'t mut Struct> 
     }
 }
 
-/// Returns whether an element of a list equals `name`, as in Python.
+/// Whether an element of a list equals `name`, as Python compares them.
 fn is(name: &str) -> impl Fn(&Value) -> bool {
     move |value| matches!(value, Value::String(text) | Value::DateTime(text) if text == name)
 }
@@ -287,7 +289,7 @@ fn is_deeper(value: &Value, levels: usize) -> bool {
     }
 }
 
-/// Replaces arrays and structs below that many levels by nil.
+/// Replaces arrays and structs that lie more than `levels` deep by nil.
 fn cut(value: Value, levels: usize) -> Value {
     match value {
         Value::Array(_) | Value::Struct(_) if levels == 0 => Value::Nil,
@@ -309,7 +311,7 @@ fn cut(value: Value, levels: usize) -> Value {
     }
 }
 
-/// The path that `get_param` follows. It ignores what precedes the first slash.
+/// The path that rosmaster's `get_param` follows. It ignores everything before the first slash.
 fn read_path(key: &str) -> impl Iterator<Item = &str> {
     key.split('/').skip(1).filter(|part| !part.is_empty())
 }

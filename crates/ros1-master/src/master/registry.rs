@@ -1,4 +1,4 @@
-//! Publishers, subscribers and services: `rosmaster/registrations.py`.
+//! Publishers, subscribers and services, as in `rosmaster/registrations.py`.
 
 use indexmap::{IndexMap, IndexSet};
 
@@ -7,7 +7,7 @@ use super::snapshot::ServiceEntry;
 /// Caller ids by topic or parameter key, in the order in which they registered.
 pub type Registrations = IndexMap<String, Vec<String>>;
 
-/// Kinds of registration that several nodes may share.
+/// The kinds of registration that several nodes can share under one key.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Shared {
     Publishers,
@@ -15,7 +15,7 @@ pub(crate) enum Shared {
     ParamSubscribers,
 }
 
-/// A node reference: rosmaster forgets a node once it has no registration left.
+/// A reference to a node. rosmaster forgets a node as soon as it has no registration left.
 #[derive(Clone, Default, PartialEq)]
 pub struct Node {
     /// The address of its slave API.
@@ -26,7 +26,7 @@ pub struct Node {
     pub subscriptions: IndexSet<String>,
     /// The keys of the parameters to which it subscribes.
     pub param_subscriptions: IndexSet<String>,
-    /// Services that this node registered, including those that another node has taken over since.
+    /// Services that this node has registered, including those that another node has taken over since.
     pub services: IndexSet<String>,
 }
 
@@ -50,7 +50,7 @@ impl Node {
 /// rosmaster's `RegistrationManager`.
 #[derive(Clone, Default)]
 pub struct Registry {
-    /// Node references by caller id. No reply shows their order.
+    /// References to nodes by caller id. No reply shows their order.
     pub nodes: IndexMap<String, Node>,
     /// The publishers of each topic.
     pub publishers: Registrations,
@@ -60,7 +60,7 @@ pub struct Registry {
     pub param_subscribers: Registrations,
     /// The provider of each service.
     pub services: IndexMap<String, ServiceEntry>,
-    /// Whether any service was ever registered. Shows only in a message of `unregisterService`.
+    /// Whether any service was ever registered. This shows only in a message of `unregisterService`.
     pub had_services: bool,
 }
 
@@ -90,7 +90,8 @@ impl Registry {
             .collect()
     }
 
-    /// Registers. Returns the address of a node that this displaces.
+    /// Registers a node under a key. Returns the address of the node of the same name that this displaces, if
+    /// any.
     pub(crate) fn register(
         &mut self,
         kind: Shared,
@@ -106,7 +107,8 @@ impl Registry {
         bumped
     }
 
-    /// As [`Registry::register`]. Takes the service from its present provider, which keeps a reference.
+    /// Like [`Registry::register`], for a service. The node that provides it so far loses it but keeps a
+    /// reference.
     pub(crate) fn register_service(
         &mut self,
         service: &str,
@@ -125,8 +127,8 @@ impl Registry {
         bumped
     }
 
-    /// The node's reference. With another address it is a new node of the same name, and the old node's
-    /// registrations are removed.
+    /// The reference to a node. If the address differs, this is a new node of the same name, and all
+    /// registrations of the old one are removed.
     fn node(&mut self, caller_id: &str, caller_api: &str) -> (&mut Node, Option<String>) {
         let mut bumped = None;
         if let Some(node) = self.nodes.get_mut(caller_id)
@@ -164,7 +166,7 @@ impl Registry {
         }
     }
 
-    /// Unregisters. Returns the message, and whether there was something to unregister.
+    /// Unregisters a node from a key. Returns the message, and whether there was anything to unregister.
     pub(crate) fn unregister(
         &mut self,
         kind: Shared,
@@ -184,7 +186,7 @@ impl Registry {
         (unregistered(caller_id, key), true)
     }
 
-    /// As [`Registry::unregister`].
+    /// Like [`Registry::unregister`], for a service.
     pub(crate) fn unregister_service(
         &mut self,
         service: &str,

@@ -1,15 +1,15 @@
-//! A call, parsed once: the method, its parameters, and the entries of a multicall.
+//! A call, parsed once: its method, its parameters, and the entries of a multicall.
 
 use std::borrow::Cow;
 
 use super::{Kind, Method};
 use crate::xmlrpc::{self, Call, DecodeError, Value};
 
-/// Most levels of nested multicalls that are parsed. A decoded document cannot have more, because each takes
-/// three of its levels.
+/// Maximum nesting of multicalls that is parsed. A decoded document cannot hold more, because each multicall
+/// takes three of its levels.
 const MAX_NESTED: usize = xmlrpc::MAX_DEPTH / 3 + 1;
 
-/// More parameters than any method takes.
+/// One more parameter than any method takes.
 const TOO_MANY: usize = 5;
 
 /// A call to a master, parsed once.
@@ -37,17 +37,17 @@ pub struct Request {
 /// One entry of a multicall.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Entry {
-    /// An entry to run.
+    /// An entry that can be run.
     Request(Request),
-    /// An entry that gets a fault of its own, with this text.
+    /// An entry that is answered with a fault of its own, with this text.
     Refused(&'static str),
-    /// An entry that ends the multicall with a fault after the previous ones have run. Always the last. The text
-    /// is rosmaster's if it begins with `<`, else our own.
+    /// An entry that makes the whole multicall fail with a fault, after the previous entries have run. It is
+    /// always the last one. The text is rosmaster's if it starts with `<`, otherwise our own.
     Malformed(Cow<'static, str>),
 }
 
 impl Request {
-    /// A call of `method`, other than a multicall.
+    /// Creates a call of `method`, which must not be a multicall.
     pub fn new(method: Method, params: impl IntoIterator<Item = impl Into<Value>>) -> Self {
         Self {
             method,
@@ -56,12 +56,12 @@ impl Request {
         }
     }
 
-    /// `system.multicall` of `requests`, in order.
+    /// Creates a `system.multicall` of `requests`, in order.
     pub fn multicall(requests: impl IntoIterator<Item = Self>) -> Self {
         Self::of_entries(requests.into_iter().map(Entry::Request).collect())
     }
 
-    /// `system.multicall` with these entries.
+    /// Creates a `system.multicall` with these entries.
     pub fn of_entries(entries: Vec<Entry>) -> Self {
         Self {
             method: Method::Multicall,
@@ -70,11 +70,11 @@ impl Request {
         }
     }
 
-    /// Reads the body of a request.
+    /// Decodes and parses the body of a call.
     ///
     /// # Errors
     ///
-    /// Those of [`xmlrpc::decode_call`].
+    /// The errors of [`xmlrpc::decode_call`].
     pub fn decode(body: &[u8]) -> Result<Self, DecodeError> {
         xmlrpc::decode_call(body).map(Self::from)
     }
@@ -95,7 +95,7 @@ impl Request {
         &self.method
     }
 
-    /// The parameters, the caller id first; empty for a multicall.
+    /// The parameters, caller id first. Empty for a multicall.
     pub fn params(&self) -> &[Value] {
         &self.params
     }
@@ -116,7 +116,7 @@ impl Request {
         self.params.get(index)?.as_str()
     }
 
-    /// This call or, for a multicall, all calls in it, in order; nested multicalls are flattened.
+    /// This call; for a multicall all calls in it, in order, including those of nested multicalls.
     pub fn calls(&self) -> Vec<&Self> {
         fn collect<'a>(request: &'a Request, found: &mut Vec<&'a Request>) {
             if request.method != Method::Multicall {
@@ -147,9 +147,9 @@ impl Request {
         kinds.reduce(Kind::join).unwrap_or(Kind::Read)
     }
 
-    /// Whether the mirror may answer the call alone: whether rosmaster's answer is determined. It is not for a
-    /// `shutdown`, an error whose text depends on Python's version, and what rosmaster exports by accident and does
-    /// more than answer.
+    /// Whether the mirror can answer this call without a master, because only one answer is possible. It
+    /// cannot answer `shutdown`, errors whose text depends on the Python version, and a method that rosmaster
+    /// exports by accident and that does more than answer.
     pub fn is_answerable(&self) -> bool {
         match &self.method {
             Method::Multicall => self.entries.iter().all(|entry| match entry {
@@ -174,7 +174,7 @@ impl Request {
         Some((self.caller()?, self.text(at)?))
     }
 
-    /// This call as an encoded entry of a multicall.
+    /// Converts this call to an encoded entry of a multicall.
     pub fn into_entry(self) -> Value {
         Call::from(self).into_entry()
     }
@@ -186,7 +186,7 @@ impl From<Call> for Request {
     }
 }
 
-/// A malformed entry of a multicall becomes a nil.
+/// A malformed entry of a multicall becomes nil.
 impl From<Request> for Call {
     fn from(request: Request) -> Self {
         let mut params = request.params;
@@ -201,7 +201,7 @@ impl From<Request> for Call {
     }
 }
 
-/// The entries of a multicall with these parameters, up to the first malformed one.
+/// The entries of a multicall with these parameters, up to and including the first malformed one.
 fn entries(params: Vec<Value>, depth: usize) -> Vec<Entry> {
     let Ok([list]) = <[Value; 1]>::try_from(params) else {
         return vec![Entry::Malformed("system.multicall takes one list".into())];
@@ -225,8 +225,10 @@ impl Entry {
     fn parse(element: Value, depth: usize) -> Self {
         let mut members = match element {
             Value::Struct(members) => members,
-            // Depends on Python's version.
-            Value::String(_) => return Self::Malformed("an entry of a multicall is a text".into()),
+            // rosmaster's error depends on the Python version.
+            Value::String(_) => {
+                return Self::Malformed("an entry of a multicall is a string".into());
+            }
             Value::Array(_) => {
                 let text = "<class 'TypeError'>:list indices must be integers or slices, not str";
                 return Self::Malformed(text.into());
@@ -244,22 +246,23 @@ impl Entry {
             return Self::Malformed("<class 'KeyError'>:'params'".into());
         };
         let Value::String(name) = name else {
-            return Self::Refused("the name of a method is no string");
+            return Self::Refused("the method name of an entry is not a string");
         };
         let Some(params) = items(params) else {
-            return Self::Refused("the params of an entry are no list");
+            return Self::Refused("the params of an entry are not a list");
         };
         match Method::named(&name) {
             Method::Multicall if depth >= MAX_NESTED => {
-                Self::Refused("too many multicalls inside each other")
+                Self::Refused("multicalls are nested too deep")
             }
             method => Self::Request(Request::parse(method, params, depth + 1)),
         }
     }
 }
 
-/// Python's iteration over a value as a list: a text gives its characters, a struct its keys. Limited to as
-/// many as decide the outcome of the call.
+/// The elements that Python finds when it iterates over a value: the characters of a string, the keys of a
+/// struct. Of these only as many are returned as decide the outcome of the call. `None` if Python cannot
+/// iterate over the value.
 fn items(value: Value) -> Option<Vec<Value>> {
     match value {
         Value::Array(elements) => Some(elements),
@@ -293,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_multicall_is_the_least_kind_above_its_entries() {
+    fn the_kind_of_a_multicall_covers_all_its_entries() {
         assert_eq!(of(&[]), Kind::Read);
         assert_eq!(of(&["getPid"]), Kind::Identity);
         assert_eq!(of(&["getPid", "getParam"]), Kind::Read);
@@ -308,12 +311,12 @@ mod tests {
     }
 
     #[test]
-    fn what_only_a_master_could_know_is_told_apart() {
+    fn calls_that_only_a_master_can_answer_are_recognised() {
         for method in ["registerService", "getPid", "unsubscribeParam"] {
             assert!(call(method).is_answerable(), "{method}");
         }
         for method in ["nonsense", "system.listMethods", "shutdown", "uri"] {
-            // A `shutdown` without its reason is refused.
+            // A `shutdown` without a reason is refused.
             assert!(call(method).is_answerable(), "{method}");
         }
         let shutdown = Request::new(Method::Shutdown, ["/n", "reason"]);
@@ -331,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn a_malformed_multicall_with_anything_before_the_fault_may_have_changed_state() {
+    fn a_multicall_that_fails_after_some_entries_may_have_changed_the_state() {
         let good = call("getPid").into_entry();
         let kind = |list| multicall(list).kind();
         assert_eq!(kind(vec![Value::Int(1), good.clone()]), Kind::Unknown);
@@ -341,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_multicall_is_parsed_to_its_depth_and_comes_back_as_it_was() {
+    fn a_nested_multicall_is_parsed_completely_and_encoded_unchanged() {
         let nest =
             |levels| (0..levels).fold(call("setParam"), |inner, _| Request::multicall([inner]));
         let deepest = Call::from(nest(MAX_NESTED));
@@ -353,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_text_for_a_list_only_as_much_is_taken_as_matters() {
+    fn a_long_text_in_place_of_a_list_is_not_expanded_completely() {
         let text = Value::String("x".repeat(1 << 20));
         let list = Request::from(Call::new("system.multicall", vec![text.clone()]));
         assert!(matches!(list.entries(), [Entry::Malformed(_)]));

@@ -1,13 +1,13 @@
-//! Which parameter values a master can return: `xmlrpc.client.dumps` cannot encode all that it accepts.
+//! Which parameter values a master can return. It accepts values that `xmlrpc.client.dumps` cannot encode.
 
 use crate::xmlrpc::{self, MAX_REPLY_DEPTH, Reply, Struct, Value, decode_reply, encode_reply};
 
-/// The text of the fault that rosmaster answers for a reply that it cannot encode.
+/// The text of the fault that rosmaster answers when it cannot encode this reply. `None` if it can.
 pub(crate) fn reply_error(reply: &Value) -> Option<&'static str> {
     error_within(reply, 0)
 }
 
-/// As [`reply_error`], for a parameter's value, which is returned in `[code, message, value]`.
+/// Like [`reply_error`], for the value of a parameter, which is returned as `[code, message, value]`.
 pub(crate) fn param_error(value: &Value) -> Option<&'static str> {
     error_within(value, 1)
 }
@@ -22,12 +22,12 @@ fn error_within(value: &Value, depth: usize) -> Option<&'static str> {
     }
 }
 
-/// Whether a reply can hold this value if `levels` of nesting are left for it.
+/// Whether a reply can hold this value where `levels` more levels of nesting are allowed.
 fn is_returnable(value: &Value, levels: usize) -> bool {
     error_within(value, MAX_REPLY_DEPTH - levels).is_none() && !holds_markup(value)
 }
 
-/// Whether a date's text breaks the reply's XML: CPython does not escape it.
+/// Whether the text of a date breaks the XML of a reply, because CPython does not escape it.
 fn holds_markup(value: &Value) -> bool {
     match value {
         Value::DateTime(text) if text.contains(['<', '>', '&']) => {
@@ -40,21 +40,21 @@ fn holds_markup(value: &Value) -> bool {
     }
 }
 
-/// Most levels of a namespace within the tree in a multicall's result: the tree is inside the lists of the
-/// result, the entry and the answer.
+/// Maximum nesting of a namespace in the tree when a multicall returns the tree, which then lies inside the
+/// lists of the result, the entry and the answer.
 const DEEPEST_NAMESPACE: usize = MAX_REPLY_DEPTH - 4;
 
-/// Whether a multicall can return the whole tree.
+/// Whether a multicall can return the whole tree in one piece.
 pub fn is_writable(tree: &Struct) -> bool {
     tree.values().all(is_readable)
 }
 
-/// Whether a multicall can return a value of the tree.
+/// Whether a multicall can return this value of the tree.
 pub fn is_readable(value: &Value) -> bool {
     is_returnable(value, DEEPEST_NAMESPACE)
 }
 
-/// The tree without values that a master accepts but cannot return, and the keys that were left out.
+/// The tree without the values that a master accepts but cannot return, and the keys that were left out.
 pub fn writable(tree: &Struct) -> (Struct, Vec<String>) {
     let mut left_out = Vec::new();
     let kept = keep_writable(tree, "", DEEPEST_NAMESPACE, &mut left_out);
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_left_out_by_its_smallest_key() {
+    fn an_unreturnable_value_is_left_out_without_its_neighbours() {
         let poisoned = Struct::from([
             (
                 "a".into(),
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn a_date_is_left_out_if_its_text_breaks_the_reply() {
+    fn a_date_is_left_out_if_its_text_would_break_the_reply() {
         let tree = |text: &str| {
             let date = Value::Array(vec![Value::DateTime(text.to_owned())]);
             Struct::from([("d".to_owned(), date)])

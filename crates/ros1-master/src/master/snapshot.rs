@@ -1,32 +1,32 @@
-//! A master's whole state as plain data, as in a checkpoint.
+//! The whole state of a master as plain data, as it is stored in a checkpoint.
 
 use indexmap::IndexMap;
 
 use crate::xmlrpc::Struct;
 
-/// A master's whole state. Every map and list has the master's order, because replies show it.
+/// The whole state of a master. Every map and list keeps the master's order, because replies show it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Snapshot {
-    /// Node references by caller id, including those without any registration left.
+    /// References to nodes by caller id, including nodes without any registration left.
     pub nodes: IndexMap<String, SnapshotNode>,
-    /// Types by topic. A type outlives its topic.
+    /// Types by topic. A type stays when the topic has no nodes left.
     pub topic_types: IndexMap<String, String>,
     /// Caller ids of the publishers of each topic.
     pub publishers: IndexMap<String, Vec<String>>,
     /// Caller ids of the subscribers of each topic.
     pub subscribers: IndexMap<String, Vec<String>>,
-    /// The provider of each service.
+    /// Providers by service.
     pub services: IndexMap<String, ServiceEntry>,
-    /// Whether any service was ever registered. Without services this shows only in a message of
+    /// Whether any service was ever registered. If there are none now, this shows only in a message of
     /// `unregisterService`.
     pub had_services: bool,
-    /// Caller ids of the subscribers of each parameter key. Keys end in `/`, as in the master.
+    /// Caller ids of the subscribers of each parameter key. As in the master, keys end in `/`.
     pub param_subscribers: IndexMap<String, Vec<String>>,
     pub params: Struct,
 }
 
 impl Snapshot {
-    /// Removes nodes, topics, services and parameters whose names begin with `prefix`.
+    /// Removes nodes, topics, services and parameters whose names start with `prefix`.
     pub fn remove_named(&mut self, prefix: &str) {
         let stays = |name: &str| !name.starts_with(prefix);
         self.nodes.retain(|name, _| stays(name));
@@ -47,21 +47,21 @@ impl Snapshot {
     }
 }
 
-/// A node reference.
+/// A master's reference to a node.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct SnapshotNode {
-    /// The node's own XML-RPC address.
+    /// Address of the node's own XML-RPC server.
     pub api: String,
-    /// Services that this node registered and another node took over. The master never forgets them, so
-    /// `lookupNode` still finds such a node.
+    /// Services that this node registered and another node has taken over since. The master never forgets
+    /// them, so `lookupNode` still finds the node.
     pub taken_over_services: Vec<String>,
 }
 
-/// A service's provider.
+/// The provider of a service.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceEntry {
     /// Caller id of the provider.
     pub node: String,
-    /// The service's own address, `rosrpc://HOST:PORT`.
+    /// Address of the service itself, `rosrpc://HOST:PORT`.
     pub api: String,
 }

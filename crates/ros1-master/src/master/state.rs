@@ -1,4 +1,4 @@
-//! The model's state, to and from a [`Snapshot`].
+//! The state of the model, and its conversion from and to a [`Snapshot`].
 
 use std::fmt;
 
@@ -14,21 +14,22 @@ use super::updates::Update;
 use super::{Method, Request, names};
 use crate::xmlrpc::{Reply, Struct, Value};
 
-/// A complete master without IO: rosmaster's state, with answers through [`Master::apply`].
+/// A complete master without IO: holds the state of a rosmaster and answers calls by [`Master::apply`].
 ///
-/// Two are equal if all reads give the same answers, orders included, and their node references and parameter
-/// subscriptions are the same. The identity is not compared.
+/// Two masters are equal if all reads give the same answers in the same order, and if their references to
+/// nodes and their parameter subscriptions are the same. Their identity (process id and address) is not
+/// compared.
 #[derive(Clone, Default)]
 pub struct Master {
     pub(crate) registry: Registry,
     pub(crate) topic_types: IndexMap<String, String>,
     pub(crate) params: Params,
-    /// Whether something is kept otherwise than rosmaster keeps it, so that answers may differ. No ROS client
-    /// sends such a thing.
+    /// Whether something is kept differently than rosmaster keeps it, so that answers may differ. No ROS
+    /// client sends such values.
     pub(crate) inexact: bool,
-    /// Whether the dictionaries of the master behind have no order, as in Python 2.
+    /// Whether the master behind rosrescue has dictionaries without an order, as on Python 2.
     pub(crate) unordered: bool,
-    /// Whether the master behind behaves as 1.14.3 and before, if that is known.
+    /// Whether the master behind rosrescue behaves like rosmaster 1.14.3 and before. `None` if unknown.
     pub(crate) old: Option<bool>,
     pub(crate) pid: i32,
     pub(crate) uri: String,
@@ -37,16 +38,16 @@ pub struct Master {
 /// Sizes of a master's state.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
-    /// Node references.
+    /// Number of references to nodes.
     pub nodes: usize,
-    /// Publishers of topics, each topic counted.
+    /// Number of publishers, summed over all topics.
     pub publishers: usize,
-    /// Subscribers of topics, each topic counted.
+    /// Number of subscribers, summed over all topics.
     pub subscribers: usize,
     pub services: usize,
-    /// Parameters that are not namespaces.
+    /// Number of parameters, not counting namespaces.
     pub params: usize,
-    /// Subscriptions to parameters, each key counted.
+    /// Number of parameter subscriptions, summed over all keys.
     pub param_subscribers: usize,
 }
 
@@ -69,11 +70,11 @@ impl fmt::Display for Counts {
     }
 }
 
-/// Why a snapshot is not a possible state of a master.
+/// Why no master can be in the state that a snapshot describes.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum InvalidSnapshot {
-    /// A registration of a node that is not among the nodes.
+    /// A node has a registration but is not among the nodes.
     #[error(
         "`{key}` is registered by `{caller_id}`, which is not among the nodes: add the node with its api, or remove the registration"
     )]
@@ -82,29 +83,29 @@ pub enum InvalidSnapshot {
         key: String,
         caller_id: String,
     },
-    /// A node twice in one list.
+    /// A list names a node twice.
     #[error("`{caller_id}` is listed twice for `{key}`: remove one of the two")]
     Twice {
         /// Topic or parameter key.
         key: String,
         caller_id: String,
     },
-    /// A list without nodes.
+    /// A list names no node.
     #[error("`{key}` is listed without a node: remove it")]
     NoNodes {
         /// Topic or parameter key.
         key: String,
     },
-    /// A node without any registration.
+    /// A node has no registration.
     #[error("the node `{caller_id}` has no registration: remove it")]
     EmptyNode { caller_id: String },
-    /// A node without an address.
+    /// A node has no address.
     #[error("the node `{caller_id}` has no api: add it, or remove the node and its registrations")]
     NoApi { caller_id: String },
-    /// A published topic without a type.
+    /// A published topic has no type.
     #[error("the published topic `{topic}` has no type: add one, `*` if it is not known")]
     NoType { topic: String },
-    /// A service listed as taken over from its present provider.
+    /// A service is listed as taken over from the node that provides it now.
     #[error(
         "the service `{service}` is listed as taken over from its own provider `{caller_id}`: remove it there"
     )]
@@ -117,7 +118,7 @@ impl Master {
         &self.registry
     }
 
-    /// The type of each topic, in the order in which the master learnt of the topics.
+    /// The type of each topic, in the order in which the master first saw the topics.
     pub fn topic_types(&self) -> &IndexMap<String, String> {
         &self.topic_types
     }
@@ -128,7 +129,7 @@ impl Master {
         self.uri = uri;
     }
 
-    /// A master with the same parameters and nothing else. Shares them, at no cost.
+    /// A master with the same parameters and nothing else. The parameters are shared, not copied.
     pub fn with_params_only(&self) -> Self {
         Self {
             params: self.params.clone(),
@@ -139,43 +140,44 @@ impl Master {
         }
     }
 
-    /// Whether the answers to reads may differ from rosmaster's. The state itself is compared without that.
+    /// Whether answers to reads may differ from rosmaster's. Ignored when two masters are compared.
     pub fn is_inexact(&self) -> bool {
         self.inexact || self.params.is_cut()
     }
 
-    /// Says whether something is kept otherwise than rosmaster keeps it.
+    /// Sets whether something is kept differently than rosmaster keeps it, so that answers may differ.
     pub fn set_inexact(&mut self, inexact: bool) {
         self.inexact = inexact;
     }
 
-    /// Sets whether the dictionaries of the master behind have no order, as in Python 2.
+    /// Sets whether the master behind rosrescue has dictionaries without an order, as on Python 2.
     pub fn set_unordered(&mut self, unordered: bool) {
         self.unordered = unordered;
     }
 
-    /// See [`Self::set_unordered`]. The state itself is compared without that.
+    /// What [`Self::set_unordered`] has set. Ignored when two masters are compared.
     pub fn is_unordered(&self) -> bool {
         self.unordered
     }
 
-    /// Sets whether the master behind behaves as 1.14.3 and before: a node is notified of a parameter that it has set
-    /// itself, and three refusals have the value 0.
+    /// Sets whether the master behind rosrescue behaves like rosmaster 1.14.3 and before: it also notifies
+    /// the node that sets a parameter, and the value of three of its refusals is 0. `None` if unknown.
     pub fn set_old(&mut self, old: Option<bool>) {
         self.old = old;
     }
 
-    /// See [`Self::set_old`]. None if it is not known. The state itself is compared without that.
+    /// What [`Self::set_old`] has set. Ignored when two masters are compared.
     pub fn is_old(&self) -> Option<bool> {
         self.old
     }
 
-    /// A call that shows which it is, and changes nothing.
+    /// A call whose answer shows whether a master behaves like rosmaster 1.14.3 and before. It changes
+    /// nothing.
     pub fn ask_if_old() -> Request {
         Request::new(Method::LookupService, [names::CALLER_ID, ""])
     }
 
-    /// What the answer to [`Self::ask_if_old`] shows. None if no rosmaster answers so.
+    /// What the answer to [`Self::ask_if_old`] shows. `None` if it is not an answer of rosmaster.
     pub fn shows_old(reply: &Reply) -> Option<bool> {
         match reply {
             Reply::Value(Value::Array(answer)) => match answer.as_slice() {
@@ -187,7 +189,7 @@ impl Master {
         }
     }
 
-    /// The nodes' caller ids and addresses.
+    /// Caller ids and addresses of the nodes.
     pub fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
         let nodes = self.registry.nodes.iter();
         nodes.map(|(caller_id, node)| (caller_id.as_str(), node.api.as_str()))
@@ -197,12 +199,12 @@ impl Master {
         Some(self.registry.nodes.get(caller_id)?.api.as_str())
     }
 
-    /// Addresses of a topic's publishers, in order.
+    /// Addresses of the publishers of a topic, in order.
     pub fn publishers_of(&self, topic: &str) -> Vec<String> {
         self.registry.apis(Shared::Publishers, topic)
     }
 
-    /// Addresses of a topic's subscribers, in order.
+    /// Addresses of the subscribers of a topic, in order.
     pub fn subscribers_of(&self, topic: &str) -> Vec<String> {
         self.registry.apis(Shared::Subscribers, topic)
     }
@@ -212,7 +214,7 @@ impl Master {
         self.registry.subscribers.keys().map(String::as_str)
     }
 
-    /// The type of a topic. Kept after its last publisher has gone.
+    /// The type of a topic. It stays known after the last publisher has gone.
     pub fn type_of(&self, topic: &str) -> Option<&str> {
         self.topic_types.get(topic).map(String::as_str)
     }
@@ -225,7 +227,7 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// The topics that a node subscribes.
+    /// The topics to which a node subscribes.
     pub fn subscriptions(&self, caller_id: &str) -> impl Iterator<Item = &str> {
         let node = self.registry.nodes.get(caller_id);
         node.into_iter()
@@ -233,7 +235,7 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// Whether a node publishes a topic, or else subscribes it.
+    /// Whether a node publishes a topic, or if `publishes` is false, whether it subscribes to it.
     pub fn has_topic(&self, caller_id: &str, publishes: bool, topic: &str) -> bool {
         let node = self.registry.nodes.get(caller_id);
         node.is_some_and(|node| match publishes {
@@ -258,7 +260,7 @@ impl Master {
         Some(entry.node.as_str())
     }
 
-    /// Sizes of the state. Walks everything.
+    /// Counts the state, by walking through all of it.
     pub fn counts(&self) -> Counts {
         let sum = |kind| self.registry.shared(kind).values().map(Vec::len).sum();
         Counts {
@@ -278,9 +280,10 @@ impl Master {
             && self.params.tree().is_empty()
     }
 
-    /// The calls that remove a node, as the node itself would send them at its end.
+    /// The calls that unregister everything a node has, as the node itself would send them at its end.
     ///
-    /// A reference by a service that another node took over stays: `forget_calls` removes it, too.
+    /// If another node has taken over a service of this node, the master keeps a reference to it;
+    /// `forget_calls` removes that as well.
     pub fn unregister_calls(&self, caller_id: &str) -> Vec<Request> {
         let Some(node) = self.registry.nodes.get(caller_id) else {
             return Vec::new();
@@ -333,7 +336,7 @@ impl Master {
         }
     }
 
-    /// Services that the node registered and no longer provides.
+    /// Services that the node registered and does not provide any more.
     pub fn taken_over<'a>(
         &'a self,
         caller_id: &'a str,
@@ -350,11 +353,11 @@ impl Master {
         self.params.get(key)
     }
 
-    /// The master with this state.
+    /// The master that has this state.
     ///
     /// # Errors
     ///
-    /// Why no sequence of calls leads to this state.
+    /// If no sequence of calls leads to this state.
     pub fn from_snapshot(snapshot: Snapshot) -> Result<Self, InvalidSnapshot> {
         let mut nodes: IndexMap<String, Node> = IndexMap::with_capacity(snapshot.nodes.len());
         for (caller_id, node) in snapshot.nodes {
@@ -468,7 +471,7 @@ impl PartialEq for Master {
     }
 }
 
-/// Only sizes: parameter values must not be logged.
+/// Prints only sizes, because parameter values must not appear in the log.
 impl fmt::Debug for Master {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_tuple("Master").field(&self.counts()).finish()

@@ -8,21 +8,21 @@ use crate::xmlrpc::{Call, Struct, Value};
 
 /// The caller id of rosmaster's calls to nodes.
 pub const MASTER: &str = "/master";
-/// The method that notifies a node of a topic's publishers.
+/// The method that tells a node the publishers of a topic.
 pub const PUBLISHER_UPDATE: &str = "publisherUpdate";
-/// The method that notifies a node of a parameter.
+/// The method that tells a node the value of a parameter.
 pub const PARAM_UPDATE: &str = "paramUpdate";
 
-/// A node that is to shut down: another one has taken its name at another address.
+/// A node that must shut down because another node has taken its name, at another address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Displaced {
     /// Its name.
     pub node: String,
     /// Its address.
     pub api: String,
-    /// The process id that was last seen behind the address, if any was.
+    /// The last process id seen at the address, if any.
     pub pid: Option<i32>,
-    /// What it published and subscribed.
+    /// The topics that it published and subscribed to.
     pub topics: Vec<String>,
 }
 
@@ -32,8 +32,8 @@ impl Master {
         publisher_update(topic, &self.publishers_of(topic))
     }
 
-    /// The `paramUpdate` with the value under `key`, which ends in a slash; an empty struct if it is not set,
-    /// as in rosmaster. None for a value that rosmaster could not send either.
+    /// The `paramUpdate` with the value under `key`, which ends in a slash. As in rosmaster, the value is an
+    /// empty struct if the key is not set. `None` for a value that rosmaster could not send either.
     pub fn param_update(&self, key: &str) -> Option<Call> {
         let value = self.params.get(key);
         let value = value.unwrap_or_else(|| Value::Struct(Struct::new()));
@@ -43,12 +43,12 @@ impl Master {
         Some(param_update(key, value))
     }
 
-    /// Whether anything is set under `key`, which may end in a slash.
+    /// Whether anything is set under `key`, with or without a trailing slash.
     pub fn is_set(&self, key: &str) -> bool {
         self.params.has(key)
     }
 
-    /// The parameter keys that a node subscribes, each with a trailing slash.
+    /// The parameter keys to which a node subscribes, each with a trailing slash.
     pub fn param_subscriptions(&self, caller_id: &str) -> impl Iterator<Item = &str> {
         let node = self.registry.nodes.get(caller_id);
         node.into_iter()
@@ -56,12 +56,13 @@ impl Master {
             .map(String::as_str)
     }
 
-    /// Whether a node subscribes any parameter.
+    /// Whether a node subscribes to any parameter.
     pub fn subscribes_params(&self, caller_id: &str) -> bool {
         self.param_subscriptions(caller_id).next().is_some()
     }
 
-    /// Every subscription of a set parameter: the subscriber's address, and the key with a trailing slash.
+    /// All subscriptions to parameters that are set: address of the subscriber, and key with a trailing
+    /// slash.
     pub fn param_subscribers(&self) -> Vec<(String, Arc<str>)> {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).keys();
         let set = subscribers.filter(|key| self.is_set(key));
@@ -76,13 +77,14 @@ impl Master {
         all.collect()
     }
 
-    /// Whether a node whose address is `at` subscribes a topic.
+    /// Whether a node at an address that `at` accepts subscribes to a topic.
     pub fn subscribes(&self, at: impl Fn(&str) -> bool, topic: &str) -> bool {
         let nodes = self.registry.shared(Shared::Subscribers).get(topic);
         self.any_at(&at, nodes)
     }
 
-    /// Whether a node whose address is `at` subscribes `key`, a namespace above it, or a key below it.
+    /// Whether a node at an address that `at` accepts subscribes to `key`, to a namespace above it, or to a
+    /// key below it.
     pub fn subscribes_param(&self, at: impl Fn(&str) -> bool, key: &str) -> bool {
         let subscribers = self.registry.shared(Shared::ParamSubscribers).iter();
         let mut related = subscribers.filter(|(subscribed, _)| {
@@ -98,8 +100,8 @@ impl Master {
             .any(|node| self.api_of(node).is_some_and(at))
     }
 
-    /// The node that `call` displaces: the call registers something under the same name at another address, so
-    /// the master would shut that node down. Its process id is unknown.
+    /// The node that `call` displaces: if the call registers something under the same name at another
+    /// address, the master tells that node to shut down. Its process id is not known.
     pub fn displaced_by(&self, call: &Request) -> Option<Displaced> {
         let (node, api) = call.registrant()?;
         let held = self.api_of(node).filter(|held| *held != api)?;
@@ -112,13 +114,13 @@ impl Master {
         })
     }
 
-    /// Whether a node is registered as `node` at another address than `api`.
+    /// Whether a node named `node` is registered at an address other than `api`.
     pub fn is_held_elsewhere(&self, node: &str, api: &str) -> bool {
         self.api_of(node).is_some_and(|held| held != api)
     }
 }
 
-/// The `publisherUpdate` with this list.
+/// The `publisherUpdate` with this list of publishers.
 pub fn publisher_update(topic: &str, publishers: &[String]) -> Call {
     let publishers = publishers.iter().cloned().map(Value::String);
     let list = Value::Array(publishers.collect());
@@ -130,7 +132,7 @@ pub fn param_update(key: &str, value: Value) -> Call {
     Call::new(PARAM_UPDATE, vec![MASTER.into(), key.into(), value])
 }
 
-/// The `shutdown` to a node whose name another one has taken.
+/// The `shutdown` sent to a node whose name another node has taken.
 pub fn shutdown(node: &str) -> Call {
     Call::new(
         Method::Shutdown.name(),
@@ -138,7 +140,7 @@ pub fn shutdown(node: &str) -> Call {
     )
 }
 
-/// rosmaster's reason for it; that of `old` ones does not name the node.
+/// The reason that rosmaster gives for such a shutdown. An `old` rosmaster does not name the node.
 pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     let reason = "new node registered with same name";
     match old {
@@ -147,7 +149,7 @@ pub(crate) fn bump_reason(node: &str, old: bool) -> String {
     }
 }
 
-/// A call to a node or a master whose only parameter is the caller id.
+/// A call to a node or a master that has the caller id as its only parameter.
 pub fn question(method: &str) -> Call {
     Call::new(method, vec![CALLER_ID.into()])
 }
@@ -157,7 +159,7 @@ pub fn get_pid() -> Call {
     question(Method::GetPid.name())
 }
 
-/// Whether a node can have registered this topic name unchanged: it is global and canonical.
+/// Whether a node can have registered this topic name unchanged: it must be global and canonical.
 pub fn is_plain_topic(topic: &str) -> bool {
     topic.len() > 1
         && topic.starts_with('/')
@@ -174,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_is_what_the_notices_say() {
+    fn a_state_is_told_in_the_words_of_the_callbacks_that_led_to_it() {
         let mut master = Master::default();
         master.apply(&call(
             "registerSubscriber",
@@ -208,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_is_displaced_by_its_name_at_another_address() {
+    fn a_node_is_displaced_when_its_name_is_registered_at_another_address() {
         let mut master = Master::default();
         let publish = |api: &str| call("registerPublisher", &["/p", "/t", "x/Y", api]);
         assert_eq!(master.displaced_by(&publish("http://p:1/")), None);

@@ -1,4 +1,4 @@
-//! The model on its own. That it is rosmaster's equal is for `tests/differential`.
+//! Tests of the model alone. `tests/differential` checks that it equals a real rosmaster.
 
 mod calls;
 mod costs;

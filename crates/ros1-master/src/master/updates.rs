@@ -1,4 +1,4 @@
-//! The subscribers to notify of a changed parameter: `compute_param_updates` of `rosmaster/paramserver.py`.
+//! Which subscribers to notify of a changed parameter: `compute_param_updates` of `rosmaster/paramserver.py`.
 
 use std::{collections::HashSet, sync::LazyLock};
 
@@ -10,16 +10,17 @@ use crate::xmlrpc::{Struct, Value};
 /// The value of a deleted parameter in a `paramUpdate`.
 pub(crate) static GONE: LazyLock<Value> = LazyLock::new(|| Value::Struct(Struct::new()));
 
-/// A `paramUpdate` to the subscribers of one key. Its value is that of the call, or a part of it.
+/// A `paramUpdate` to the subscribers of one key. Its value is the value of the call, or a part of it.
 pub(crate) struct Update<'a> {
     pub(crate) nodes: &'a [String],
-    /// The one of them that made the change: it is not notified.
+    /// The node that made the change and so is not notified.
     pub(crate) ignored: Option<&'a str>,
     pub(crate) key: &'a str,
     pub(crate) value: &'a Value,
 }
 
-/// The updates of `key`, which ends in a slash and has this value now. None go to `ignored`.
+/// The updates caused by setting `key`, which ends in a slash and already has this value. They leave out
+/// `ignored`.
 pub(crate) fn updates<'a>(
     subscribers: &'a Registrations,
     key: &'a str,
@@ -62,7 +63,8 @@ pub(crate) fn updates<'a>(
     }
     let length = key.chars().count();
     for (changed, nodes) in below.found {
-        // Cut off by the length of the key that was set, even if this key does not start with it.
+        // rosmaster cuts off as many characters as the key has that was set, even if this key does not start
+        // with it.
         let rest: String = changed.chars().skip(length).collect();
         updates.push(Update {
             nodes,
@@ -74,21 +76,21 @@ pub(crate) fn updates<'a>(
     Ok(updates)
 }
 
-/// `_compute_all_keys`, without keys that have no subscribers: all keys together can be far longer than the
-/// call, because each contains the names of all its parents.
+/// rosmaster's `_compute_all_keys`, but only for keys that have subscribers. All keys together can be far
+/// longer than the call, because each one contains the names of all its parents.
 struct Below<'a> {
     subscribers: &'a Registrations,
-    /// Length of the longest subscribed key.
+    /// Length of the longest key that has subscribers.
     longest: usize,
-    /// Each key with its subscribers, in the order of the members.
+    /// Each key found with its subscribers, in the order of the members.
     found: Vec<(&'a str, &'a [String])>,
 }
 
 impl Below<'_> {
-    /// Finds subscribed keys among `members`, whose key is `key`, which is left unchanged.
+    /// Finds keys with subscribers among `members` of the namespace `key`. Leaves `key` as it was.
     fn find(&mut self, key: &mut String, members: &Struct) {
         for (name, value) in members {
-            // As in `ns_join`: such a name is not joined.
+            // `ns_join` does not join such a name to the namespace.
             let mut alone = String::new();
             let key = match name.starts_with(['/', '~']) {
                 true => &mut alone,
@@ -110,7 +112,8 @@ impl Below<'_> {
     }
 }
 
-/// Members with a slash in their names are announced, but then not found.
+/// Finds the value at `path`. Like rosmaster it announces members whose names contain slashes, but then fails
+/// to find them.
 fn descend<'a>(value: &'a Value, path: &str) -> Result<&'a Value, Failure> {
     names::parts(path).try_fold(value, |value, part| match value {
         Value::Struct(members) => {

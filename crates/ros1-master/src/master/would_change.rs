@@ -1,11 +1,11 @@
-//! Whether a call would change the state, without a copy of it.
+//! Tells whether a call would change the state, without copying the state.
 
 use super::{Entry, Master, Method, Request, names};
 use crate::xmlrpc::Value;
 
 impl Master {
-    /// Whether `call` would change the state. False only if every write in it, in order, is known to leave
-    /// the state unchanged. Unregistrations without effect change nothing.
+    /// Whether `call` would change the state. Returns false only if every write in it, in order, is known to leave
+    /// the state unchanged. An unregistration without effect changes nothing.
     pub fn would_change(&self, call: &Request) -> bool {
         let entries = call.entries();
         !entries
@@ -14,13 +14,13 @@ impl Master {
             || (call.calls().iter()).any(|call| self.is_settled(call) != Some(true))
     }
 
-    /// Whether the state is already the result of `call`; none if unknown.
+    /// Whether the state already is what `call` would make of it. `None` if unknown.
     fn is_settled(&self, call: &Request) -> Option<bool> {
         let text = |index| call.text(index);
         let caller_id = call.caller()?;
         let name = |index| Some(names::resolve(text(index)?, caller_id));
         let key = |index| Some(names::param_key(&name(index)?));
-        // The node, if it is registered at the call's address.
+        // The node, if it is registered at the address in the call.
         let node = |index| {
             let node = self.registry.nodes.get(caller_id);
             node.filter(|node| Some(node.api.as_str()) == text(index))
@@ -60,12 +60,12 @@ impl Master {
             }
             Method::SetParam => {
                 let value = call.params().get(2)?;
-                // A different order of a struct's members is a different state.
+                // A struct whose members are in another order is another state.
                 let plain = !matches!(value, Value::Struct(_) | Value::Array(_));
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }
             Method::DeleteParam => !self.is_set(&name(1)?),
-            // Reads.
+            // A read changes nothing.
             _ => true,
         })
     }

@@ -1,25 +1,25 @@
-//! Decodes text as CPython's `xmlrpc.client.Unmarshaller` under expat does.
+//! Decodes XML-RPC as CPython's `xmlrpc.client.Unmarshaller` does with expat.
 //!
-//! That unmarshaller is a stack machine: it handles tags one by one and hardly checks their nesting. Clients
-//! depend on that leniency, so this is the same machine.
+//! That unmarshaller is a stack machine: it handles tags one by one and hardly checks how they nest. Clients
+//! depend on this leniency, so this decoder is the same machine.
 
 use std::borrow::Cow;
 
-use super::error::{DecodeError, NO_METHOD, NOTHING, TEXT_MOST};
+use super::error::{DecodeError, NO_METHOD, NOTHING, TEXT_CHARS_MAX};
 use super::number;
 use super::prolog::text_of;
 use super::scan::{Event, LineEnds, Scanner};
 use super::value::{Call, Reply, Struct, Value};
 
-/// Most levels of nested arrays and structs.
+/// Maximum nesting of arrays and structs.
 ///
-/// rosmaster accepts any depth (measured: 20,000), but returns at most 492 levels, its own `[code, message,
-/// value]` included; for anything deeper it answers a fault. So this limit keeps everything that can be read
-/// back, and bounds recursion over values, their drop included.
+/// rosmaster accepts any depth (20,000 levels were measured) but returns 492 levels at most, including its
+/// own `[code, message, value]`; for anything deeper it answers a fault. So this limit keeps everything that
+/// can be read back. It also bounds recursion over values, including when they are dropped.
 pub const MAX_DEPTH: usize = 512;
 
-/// Most open elements. A level takes three (`value`, `struct`, `member` or `value`, `array`, `data`). The
-/// rest is for the frame, and for clients that nest a little more.
+/// Maximum number of open elements. One level takes three (`value`, `struct`, `member` or `value`, `array`,
+/// `data`); the rest is for the envelope and for clients that nest a little more.
 const MAX_OPEN: usize = 4 * MAX_DEPTH;
 
 /// Decodes a request.
@@ -37,7 +37,7 @@ const MAX_OPEN: usize = 4 * MAX_DEPTH;
 ///
 /// # Errors
 ///
-/// Where CPython raises, and in the few cases listed at [`DecodeError`].
+/// Where CPython raises an exception, and in the few cases listed at [`DecodeError`].
 pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     let wanted = "call";
     let document = unmarshal(body, wanted, Writer::Any)?;
@@ -52,19 +52,22 @@ pub fn decode_call(body: &[u8]) -> Result<Call, DecodeError> {
     Ok(Call::new(method, document.values))
 }
 
-/// Decodes an answer as CPython's server meant it. That server does not escape a carriage return, which XML
-/// reads as a line feed, nor a date's text, in which XML would find references. So neither is interpreted
-/// here, and a master's values are read unchanged.
+/// Decodes an answer as CPython's server meant it.
+///
+/// That server does not escape a carriage return, which XML reads as a line feed, or the text of a date, in
+/// which XML would find references. So this function interprets neither, and a master's values are read
+/// unchanged.
 ///
 /// # Errors
 ///
-/// Where CPython raises, if there is not exactly one value, and in the few cases listed at [`DecodeError`].
+/// Where CPython raises an exception, if there is not exactly one value, and in the few cases listed at
+/// [`DecodeError`].
 pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     let wanted = "reply";
     let document = unmarshal(body, wanted, Writer::Python)?;
     let mut values = document.values.into_iter();
     let (Some(value), None) = (values.next(), values.next()) else {
-        let what = "it does not hold one value";
+        let what = "it does not hold exactly one value";
         return Err(DecodeError::Shape { wanted, what });
     };
     if !document.is_fault {
@@ -80,7 +83,7 @@ pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
             Ok(Reply::Fault { code, text })
         }
         (Some(_), Some(_)) => {
-            let what = "a fault with more than a number and a text";
+            let what = "a fault that is not just a number and a text";
             let at = body.len();
             Err(DecodeError::Unsupported { at, what })
         }
@@ -91,20 +94,20 @@ pub fn decode_reply(body: &[u8]) -> Result<Reply, DecodeError> {
     }
 }
 
-/// The machine's result.
+/// The result of decoding a whole document.
 struct Document {
     values: Vec<Value>,
     method: Option<String>,
     is_fault: bool,
 }
 
-/// Who wrote a document.
+/// The program that wrote a document.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 enum Writer {
     /// Any XML writer.
     #[default]
     Any,
-    /// CPython's server: it does not escape carriage returns and dates.
+    /// CPython's server, which does not escape carriage returns and dates.
     Python,
 }
 
@@ -123,7 +126,7 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
         match event {
             Event::Start(tag) => machine.start(tag.name().0, scanner.at())?,
             Event::End(tag) => machine.end(tag.name().0, scanner.at())?,
-            // Mostly there is one piece, which is borrowed when added to an empty text.
+            // There is mostly one piece; adding it to an empty text only borrows it.
             Event::Text(piece) => machine.text += piece,
             Event::Reference(reference, _) if machine.is_unescaped => {
                 machine.text += "&";
@@ -144,14 +147,14 @@ fn unmarshal(body: &[u8], wanted: &'static str, writer: Writer) -> Result<Docume
     })
 }
 
-/// The last of these elements; it decides for CPython.
+/// The kind of document. Like CPython, the decoder goes by the last such element.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Call,
     Fault,
 }
 
-/// The elements that CPython's unmarshaller knows; it ignores all others.
+/// The elements that CPython's unmarshaller knows. It ignores all others.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Tag {
     Value,
@@ -171,7 +174,7 @@ enum Tag {
 }
 
 impl Tag {
-    /// The element of this name, prefix removed.
+    /// The element with this name, without its namespace prefix.
     fn named(name: &str) -> Option<Self> {
         Some(match name {
             "value" => Self::Value,
@@ -193,7 +196,7 @@ impl Tag {
     }
 }
 
-/// The name without its prefix.
+/// Removes the namespace prefix from a name.
 fn local(name: &str) -> &str {
     name.rsplit_once(':').map_or(name, |(_, local)| local)
 }
@@ -203,14 +206,14 @@ struct Unmarshaller<'a> {
     kind: Option<Kind>,
     method: Option<String>,
     stack: Vec<Value>,
-    /// Length of the stack at the start of each open array and struct.
+    /// Length of the stack when each open array or struct began.
     marks: Vec<usize>,
     /// Character data since the last start tag.
     text: Cow<'a, str>,
-    /// A `<value>` is open without an element in it: an untyped string so far.
+    /// A `<value>` is open and has no element in it so far, so its text is an untyped string.
     is_bare: bool,
     writer: Writer,
-    /// References are text, because the writer does not escape this element's content.
+    /// References in this element are plain text, because the writer does not escape its content.
     is_unescaped: bool,
 }
 
@@ -267,14 +270,14 @@ impl Unmarshaller<'_> {
         Ok(())
     }
 
-    /// Names and values alternate on the stack.
+    /// Makes a struct of the names and values that alternate on the stack.
     fn end_struct(&mut self, at: usize) -> Result<Value, DecodeError> {
         let mark = self.marks.pop().unwrap_or_default();
         let mut members = Struct::with_capacity((self.stack.len() - mark) / 2);
         let mut items = self.stack.drain(mark..);
         while let Some(name) = items.next() {
             let Value::String(name) = name else {
-                let what = "a struct with a name that is no string";
+                let what = "a struct with a name that is not a string";
                 return Err(DecodeError::Unsupported { at, what });
             };
             let Some(value) = items.next() else {
@@ -288,7 +291,7 @@ impl Unmarshaller<'_> {
     }
 }
 
-/// The value of a leaf with this text.
+/// The value of a scalar element with this text.
 fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
     let (value, tag) = match tag {
         Tag::Text => return Ok(Value::String(text.to_owned())),
@@ -304,7 +307,7 @@ fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
         }
         Tag::Base64 if text.is_ascii() => (number::base64_bytes(text).map(Value::Base64), "base64"),
         Tag::Int | Tag::Double if !text.is_ascii() => {
-            let what = "a number beyond ASCII";
+            let what = "a number with non-ASCII characters";
             return Err(DecodeError::Unsupported { at, what });
         }
         Tag::Int => (number::int(text), "int"),
@@ -319,6 +322,6 @@ fn scalar(tag: Tag, text: &str, at: usize) -> Result<Value, DecodeError> {
 }
 
 fn bad_text(tag: &'static str, text: &str, at: usize) -> DecodeError {
-    let text = text.chars().take(TEXT_MOST).collect();
+    let text = text.chars().take(TEXT_CHARS_MAX).collect();
     DecodeError::BadText { at, tag, text }
 }

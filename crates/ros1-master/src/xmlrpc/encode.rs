@@ -1,4 +1,4 @@
-//! Encodes values as text: compact requests, and answers as CPython's server writes them.
+//! Encodes calls compactly, and answers exactly as CPython's server writes them.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -8,19 +8,19 @@ use std::slice;
 use super::number::repr;
 use super::value::{Call, Reply, Struct, Value};
 
-/// Deepest nesting that rosmaster can return. Its Python allows 1000 nested calls, and marshalling takes two
-/// a level. Measured with Python 3.11 on a real one, which marshals every reply from the same depth.
+/// Maximum nesting that rosmaster can return. Its Python allows 1000 nested calls, and encoding takes two per
+/// level. Measured with rosmaster on Python 3.11, which encodes every reply at the same stack depth.
 pub(crate) const MAX_REPLY_DEPTH: usize = 492;
 
-/// Bytes in one line of base64: 76 characters.
+/// Bytes of binary data per line of base64; they make 76 characters.
 const BASE64_LINE: usize = 57;
 
-/// Encodes a request compactly.
+/// Encodes a call compactly.
 ///
-/// Uses only forms that both CPython and roscpp's much stricter xmlrpcpp accept: untyped strings and `i4`, no
-/// self-closing elements except nil, no white space between tags. A carriage return is written as a
-/// reference, because XML reads a bare one as a line feed. Characters that XML lacks (a decoded document has
-/// none) are written unchanged, and the other side refuses them.
+/// Uses only forms that CPython and the much stricter xmlrpcpp of roscpp both accept: untyped strings and
+/// `i4`, no self-closing elements except nil, no white space between tags. A carriage return is written as a
+/// reference, because XML reads a bare one as a line feed. Characters that XML does not allow (a decoded
+/// document has none) are written unchanged, and the receiver refuses them.
 pub fn encode_call(call: &Call) -> Vec<u8> {
     let mut writer = Writer::request(&call.method);
     for param in &call.params {
@@ -32,11 +32,11 @@ pub fn encode_call(call: &Call) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Encodes an answer byte for byte like rosmaster: as `_marshaled_dispatch` of CPython's
+/// Encodes an answer byte for byte like rosmaster, that is like `_marshaled_dispatch` of CPython's
 /// `SimpleXMLRPCServer`.
 ///
-/// A value that rosmaster cannot marshal (nil, an integer beyond 32 bits, too many levels) becomes its fault
-/// for that. As there, a date's text is not escaped.
+/// A value that rosmaster cannot encode (nil, an integer beyond 32 bits, too many levels) becomes the fault
+/// that rosmaster answers in that case. As in rosmaster, the text of a date is not escaped.
 ///
 /// ```
 /// use ros1_master::xmlrpc::{Reply, Value, decode_reply, encode_reply};
@@ -51,11 +51,11 @@ pub fn encode_reply(reply: &Reply) -> Vec<u8> {
     }
 }
 
-/// As [`encode_reply`], for a method's result.
+/// Encodes the result of a method like [`encode_reply`].
 ///
 /// # Errors
 ///
-/// If rosmaster cannot marshal the value: the text of its fault.
+/// The text of rosmaster's fault, if rosmaster cannot encode the value.
 pub fn encode_result(value: &Value) -> Result<Vec<u8>, &'static str> {
     let mut writer = Writer::answer();
     writer.value(value);
@@ -65,7 +65,7 @@ pub fn encode_result(value: &Value) -> Result<Vec<u8>, &'static str> {
     }
 }
 
-/// Opens an answer.
+/// The start of every answer.
 const ANSWER: &str = "<?xml version='1.0'?>\n<methodResponse>\n";
 
 fn encode_fault(code: i32, text: &str) -> Vec<u8> {
@@ -81,24 +81,24 @@ fn encode_fault(code: i32, text: &str) -> Vec<u8> {
     writer.out.into_bytes()
 }
 
-/// Initial capacity for a long text, beyond 32 MiB. The C library maps such large memory separately, returns
-/// it when it is freed, and does not keep more of later freed memory because of it. Pages that are never
-/// written take no memory.
+/// Initial capacity for a long text: more than 32 MiB. The C library maps such large blocks separately and
+/// returns them as soon as they are freed, so they do not make it keep more freed memory later. Pages that
+/// are never written take no memory.
 const ROOM: usize = 33 << 20;
 
-/// A request or an answer whose only value is an array, encoded element by element: as text it takes a tenth
-/// of the memory of its values.
+/// A call or an answer whose only value is an array, encoded element by element. As text it takes a tenth of
+/// the memory that its values would take.
 pub struct ListWriter(Writer);
 
 impl ListWriter {
-    /// A request of `method`, as from [`encode_call`].
+    /// Starts a call of `method`, encoded like [`encode_call`].
     pub fn request(method: &str) -> Self {
         let mut writer = Writer::request(method);
         writer.raw("<param>");
         Self::open(writer)
     }
 
-    /// An answer, as from [`encode_reply`].
+    /// Starts an answer, encoded like [`encode_reply`].
     pub fn answer() -> Self {
         Self::open(Writer::answer())
     }
@@ -114,7 +114,7 @@ impl ListWriter {
         self.0.value_at(element, 1);
     }
 
-    /// The whole text.
+    /// Ends the array and returns the whole text.
     pub fn finish(mut self) -> Vec<u8> {
         self.0.line(CLOSE_ARRAY);
         match self.0.form {
@@ -136,7 +136,7 @@ enum Form {
     Python,
 }
 
-/// An array or struct being encoded.
+/// An array or struct that is being encoded.
 enum Open<'v> {
     Array(slice::Iter<'v, Value>),
     Struct {
@@ -148,7 +148,7 @@ enum Open<'v> {
 struct Writer {
     form: Form,
     out: String,
-    /// The first error that CPython would have raised. The text is useless after that.
+    /// The first error that CPython would have raised. The text must not be used after that.
     refusal: Option<&'static str>,
 }
 
@@ -188,7 +188,7 @@ impl Writer {
         self.out.push_str(text);
     }
 
-    /// A tag after which CPython breaks the line.
+    /// Writes a tag, and the line break that CPython writes after it.
     fn line(&mut self, text: &str) {
         self.out.push_str(text);
         if self.form == Form::Python {
@@ -224,7 +224,7 @@ impl Writer {
         self.value_at(value, 0);
     }
 
-    /// One value inside `outer` arrays, of any depth, without recursion.
+    /// Writes a value that lies inside `outer` arrays. Does not recurse, whatever its depth.
     fn value_at(&mut self, value: &Value, outer: usize) {
         let mut open: Vec<Open<'_>> = Vec::new();
         let mut next = Some(value);
@@ -322,18 +322,19 @@ impl Writer {
     }
 }
 
-/// The text of rosmaster's fault for this value inside `depth` arrays and structs of a reply.
+/// The text of rosmaster's fault for this value inside `depth` arrays and structs of a reply. `None` if
+/// rosmaster can encode it there.
 pub(crate) fn refusal(value: &Value, depth: usize) -> Option<&'static str> {
     match value {
         _ if depth > MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Nil => Some("<class 'TypeError'>:cannot marshal None unless allow_none is enabled"),
         Value::BigInt(_) => Some("<class 'OverflowError'>:int exceeds XML-RPC limits"),
-        // Python nests more function calls for these.
+        // Python makes more nested function calls for these types.
         Value::Double(_) | Value::DateTime(_) if depth >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         Value::Base64(_) if depth + 1 >= MAX_REPLY_DEPTH => Some(TOO_DEEP),
         _ => None,
     }
 }
 
-/// The fault for a reply with too many levels. rosmaster's text depends on where it failed.
+/// The fault for a reply with too many levels. rosmaster's own text depends on where it ran out of stack.
 pub(crate) const TOO_DEEP: &str = "<class 'RecursionError'>:maximum recursion depth exceeded";

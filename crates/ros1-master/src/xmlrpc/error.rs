@@ -1,70 +1,70 @@
-//! Why a document was not decoded.
+//! The reasons why a document cannot be decoded.
 
 use thiserror::Error;
 
-/// Most characters of a value's text in an error.
-pub(super) const TEXT_MOST: usize = 40;
-// What is wrong, where expat's own words for it are determined.
+/// Maximum length of a value's text in an error, in characters.
+pub(super) const TEXT_CHARS_MAX: usize = 40;
+// Reasons for which expat's own error text can be worked out.
 pub(super) const NO_ELEMENT: &str = "there is no element";
 pub(super) const NOT_CLOSED: &str = "an element is not closed";
 pub(super) const SECOND_ROOT: &str = "a second root element";
 pub(super) const TEXT_BEFORE_ROOT: &str = "text before the root element";
 pub(super) const TEXT_AFTER_ROOT: &str = "text after the root element";
-pub(super) const BAD_REFERENCE: &str = "a reference to nothing";
-pub(super) const LATE_DECLARATION: &str = "an XML declaration that is not at the start";
-pub(super) const OTHER_END: &str = "an end tag that closes another element";
-pub(super) const BAD_MARKUP: &str = "markup that is not closed or has no place here";
-/// Of a document without an element that CPython knows.
+pub(super) const BAD_REFERENCE: &str = "a reference to an unknown entity or character";
+pub(super) const LATE_DECLARATION: &str = "an XML declaration after the start of the document";
+pub(super) const OTHER_END: &str = "an end tag that does not match its start tag";
+pub(super) const BAD_MARKUP: &str = "markup that is not closed or not allowed here";
+/// The document has no element that CPython knows.
 pub(super) const NOTHING: &str = "it has no params, fault or methodName";
-/// Of parameters without a method.
-pub(super) const NO_METHOD: &str = "it names no method";
+/// The call has parameters but no method name.
+pub(super) const NO_METHOD: &str = "it has no method name";
 
-/// Why a document was not decoded: CPython would raise too, or would accept something that is deliberately
-/// not decoded here (see [`DecodeError::Unsupported`]).
+/// Why a document was not decoded: CPython would raise an exception too, or it would accept something that is
+/// deliberately not decoded here (see [`DecodeError::Unsupported`]).
 ///
-/// Never a reason to fail a call: the bytes can be forwarded unchanged, and the receiver decides.
+/// This is never a reason to fail a call: the body can be forwarded unchanged, and the receiver decides.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum DecodeError {
-    /// Expat refuses it too.
-    #[error("not well-formed XML at byte {at}: {what}; forward the body as it came")]
+    /// Not well-formed XML: expat refuses it too.
+    #[error("not well-formed XML at byte {at}: {what}; forward the body unchanged")]
     Syntax {
-        /// Byte in the body, not counting a byte order mark.
+        /// Position in the body in bytes, not counting a byte order mark.
         at: usize,
         what: &'static str,
     },
-    /// CPython would accept it, but no known ROS client sends it; not decoding is better than decoding
-    /// wrongly.
-    #[error("not decoded here: {what} at byte {at}; forward the body as it came")]
+    /// CPython would accept this, but no known ROS client sends it. Not decoding it is better than decoding
+    /// it wrongly.
+    #[error("unsupported: {what} at byte {at}; forward the body unchanged")]
     Unsupported { at: usize, what: &'static str },
     /// The XML declaration names another encoding than UTF-8, US-ASCII or ISO-8859-1.
-    #[error("encoding {name:?} is not decoded here; forward the body as it came")]
+    #[error("encoding {name:?} is not supported; forward the body unchanged")]
     Encoding { name: String },
     /// The bytes are not in the document's encoding.
-    #[error("byte {at} is not {encoding}; forward the body as it came")]
+    #[error("byte {at} is not valid {encoding}; forward the body unchanged")]
     NotText { at: usize, encoding: &'static str },
     /// Too many levels of arrays, structs or elements.
-    #[error("nested deeper than {limit} levels at byte {at}; forward the body as it came")]
+    #[error("nested deeper than {limit} levels at byte {at}; forward the body unchanged")]
     TooDeep { at: usize, limit: usize },
     /// A `<value>` holds an element that is not a type.
-    #[error("unknown type <{tag}> at byte {at}; forward the body as it came")]
+    #[error("unknown type <{tag}> at byte {at}; forward the body unchanged")]
     UnknownType {
-        /// Byte after the tag.
+        /// Position after the tag, in bytes.
         at: usize,
-        /// Its name without a prefix.
+        /// The tag's name without its namespace prefix.
         tag: String,
     },
-    /// The text of a value does not fit its type.
-    #[error("{text:?} is no {tag} (before byte {at}); forward the body as it came")]
+    /// A value's text does not fit its type.
+    #[error("{text:?} is not a valid {tag} (before byte {at}); forward the body unchanged")]
     BadText {
-        /// Byte after the end of the element.
+        /// Position after the end of the element, in bytes.
         at: usize,
         tag: &'static str,
-        /// The text, cut to a few characters.
+        /// The text, shortened.
         text: String,
     },
-    /// Well-formed, but not the expected call or reply.
-    #[error("not a {wanted}: {what}; forward the body as it came")]
+    /// Well-formed XML, but not the expected call or reply.
+    #[error("not a {wanted}: {what}; forward the body unchanged")]
     Shape {
         /// `call` or `reply`.
         wanted: &'static str,
@@ -73,8 +73,8 @@ pub enum DecodeError {
 }
 
 impl DecodeError {
-    /// The text of the fault with which rosmaster on Python 3 answers `body`, which was not decoded because of this;
-    /// none if it depends on versions, or is not known here.
+    /// The fault text with which rosmaster on Python 3 answers `body`, which was not decoded because of this
+    /// error. `None` if the text depends on the Python version or is not known here.
     pub fn fault(&self, body: &[u8]) -> Option<String> {
         let (class, text) = match self {
             Self::BadText { tag, text, .. } => match *tag {
@@ -116,10 +116,10 @@ impl DecodeError {
     }
 }
 
-/// Expat's words for `what` at byte `at`.
+/// Expat's error text for the problem `what` at byte `at`.
 fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
     let body = std::str::from_utf8(body).ok()?;
-    // Line ends are counted as expat counts them, and bytes as they are in the text.
+    // Positions are computed for plain line feeds only, and without a byte order mark.
     if body.contains(['\r', '\u{feff}']) {
         return None;
     }
@@ -156,28 +156,28 @@ fn expat_error(body: &[u8], at: usize, what: &str) -> Option<String> {
     Some(format!("{text}: line {line}, column {column}"))
 }
 
-/// Whether nothing precedes a root element but a declaration.
+/// Whether a root element may still follow: there is nothing yet, or only an XML declaration.
 fn is_before_root(text: &str) -> bool {
     text.trim_ascii().is_empty() || text.starts_with("<?xml ") && text.matches('<').count() == 1
 }
 
-/// What is between `begin`, with which `text` begins, and `end`.
+/// The part of `text` between `begin`, at its start, and the next `end`.
 fn inside<'t>(text: &'t str, begin: &str, end: &str) -> Option<&'t str> {
     Some(text.strip_prefix(begin)?.split_once(end)?.0)
 }
 
-/// Whether this is the name of an element in XML-RPC, or might be one.
+/// Whether this is, or might be, the name of an XML-RPC element.
 fn is_name(text: &str) -> bool {
     text.starts_with(|c: char| c.is_ascii_alphabetic())
         && text.bytes().all(|b| b.is_ascii_alphanumeric())
 }
 
-/// Whether a text begins with a name that ends with it or with a blank.
+/// Whether `text` starts with a name that is followed by white space or the end.
 fn is_word(text: &str) -> bool {
     text.split_ascii_whitespace().next().is_some_and(is_name)
 }
 
-/// Whether this is the number of a character, as `65` or `x41`.
+/// Whether this is a character number, such as `65` or `x41`.
 fn is_number(text: &str) -> bool {
     match text.strip_prefix('x') {
         Some(digits) => !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_hexdigit()),
@@ -185,9 +185,9 @@ fn is_number(text: &str) -> bool {
     }
 }
 
-/// Python's `repr(text)`; none if it may need an escape, or the text may have been cut.
+/// Python's `repr(text)`. `None` if the text may need an escape or may have been shortened.
 fn repr(text: &str) -> Option<String> {
     let is_plain = |c: char| c == ' ' || c.is_ascii_graphic() && !matches!(c, '\'' | '\\');
-    let is_whole = text.len() < TEXT_MOST;
+    let is_whole = text.len() < TEXT_CHARS_MAX;
     (is_whole && text.chars().all(is_plain)).then(|| format!("'{text}'"))
 }

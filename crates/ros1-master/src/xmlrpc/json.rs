@@ -1,11 +1,12 @@
-//! Values as JSON, for people's programs: what JSON lacks becomes text.
+//! XML-RPC values as JSON for other programs.
 
 use base64::Engine as _;
 use serde::{Serialize, Serializer};
 
 use super::{Struct, Value};
 
-/// Dates, binary data (as base64), integers beyond 32 bits and numbers that are none become text.
+/// Dates, binary data (as base64), integers beyond 32 bits, infinities and NaN become strings, because JSON
+/// lacks them.
 impl Serialize for Value {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {
@@ -37,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_value_has_a_form_in_json() {
+    fn every_value_can_be_written_as_json() {
         let values = Value::Array(vec![
             Value::Nil,
             true.into(),

@@ -1,12 +1,12 @@
-//! Numbers and binaries as Python reads and writes them.
+//! Numbers and binary data as Python reads and writes them.
 
 use super::value::Value;
 
-/// Most digits that Python's `int()` accepts in text (`sys.int_info.default_max_str_digits`, since 3.11.0;
-/// leading zeros count).
+/// Maximum number of digits that Python's `int()` accepts in text, including leading zeros
+/// (`sys.int_info.default_max_str_digits`, since Python 3.11.0).
 const MAX_DIGITS: usize = 4300;
 
-/// The characters that Python strips off a number, limited to ASCII and XML.
+/// The white space that Python strips from a number, as far as ASCII and XML have it.
 const SPACE: [char; 4] = [' ', '\t', '\n', '\r'];
 
 /// Python's `int(text)`, for ASCII text.
@@ -38,10 +38,10 @@ pub(super) fn int(text: &str) -> Option<Value> {
     })
 }
 
-/// Python's `float(text)`, for ASCII text. All `nan`s become the same one, because Python's text does not
-/// show their signs and payloads.
+/// Python's `float(text)`, for ASCII text. Every `nan` becomes the same one, because Python's text form does
+/// not show the sign and payload.
 pub(super) fn float(text: &str) -> Option<f64> {
-    // Without blanks and underscores, Rust accepts exactly what Python accepts.
+    // Rust accepts exactly what Python accepts, except for white space and underscores.
     let number: f64 = match text.parse() {
         Ok(number) => number,
         Err(_) => without_underscores(text.trim_matches(SPACE))?
@@ -51,7 +51,7 @@ pub(super) fn float(text: &str) -> Option<f64> {
     Some(if number.is_nan() { f64::NAN } else { number })
 }
 
-/// `text` without its underscores; none if one of them is not between two digits.
+/// `text` without its underscores. `None` if one of them is not between two digits.
 fn without_underscores(text: &str) -> Option<String> {
     let mut plain = String::with_capacity(text.len());
     let mut parts = text.split('_').peekable();
@@ -69,7 +69,7 @@ fn without_underscores(text: &str) -> Option<String> {
 }
 
 /// Python's `repr(number)`: the fewest digits that identify the number, with an exponent below 1e-4 and from
-/// 1e16 on.
+/// 1e16 up.
 pub(super) fn repr(number: f64) -> String {
     if number.is_nan() {
         return "nan".to_owned();
@@ -102,16 +102,17 @@ pub(super) fn repr(number: f64) -> String {
     format!("{sign}{digits}")
 }
 
-/// The fewest digits that identify the number, as `d.ddde-7`.
+/// The fewest digits that identify the number, such as `d.ddde-7`.
 ///
-/// If two texts of that length are equally near, Rust takes the upper and Python the even one
-/// (-823967287502993.25 is `…993.3` and `…993.2`). Rounding to that many digits gives Python's.
+/// If two texts of that length are equally near, Rust takes the upper one and Python the even one:
+/// -823967287502993.25 is `…993.3` in Rust and `…993.2` in Python. Rounding to that many digits gives
+/// Python's.
 fn shortest(number: f64) -> String {
     let shortest = format!("{number:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
     let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
-    // Two texts of up to 15 digits identify the same number only below 1e-307, and the numbers there have far
-    // too many digits to lie halfway.
+    // Below 1e-307 two texts of up to 15 digits can identify the same number, but numbers there have far too
+    // many digits to lie exactly between the two.
     if digits <= 15 {
         return shortest;
     }
@@ -123,8 +124,8 @@ fn shortest(number: f64) -> String {
     }
 }
 
-/// Python's `binascii.a2b_base64(text)`, lenient as in `base64.decodebytes`: characters outside the alphabet
-/// are skipped, and text after complete padding is ignored.
+/// Python's `binascii.a2b_base64(text)`, as lenient as `base64.decodebytes`: it skips characters outside the
+/// alphabet and ignores everything after complete padding.
 pub(super) fn base64_bytes(text: &str) -> Option<Vec<u8>> {
     let mut bytes = Vec::with_capacity(text.len() / 4 * 3);
     let mut place = 0_u8;

@@ -1,4 +1,4 @@
-//! The XML declaration and the document's encoding.
+//! The XML declaration and the encoding of a document.
 
 use std::borrow::Cow;
 
@@ -8,12 +8,13 @@ use quick_xml::reader::Reader;
 use super::error::DecodeError;
 use super::scan::{checked_attributes, is_in_xml};
 
-/// The document's text, without a byte order mark.
+/// The text of a document, without a byte order mark.
 ///
 /// # Errors
 ///
-/// An encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython every 8-bit
-/// codec), bytes that do not fit it, characters that XML lacks, or a bad declaration.
+/// For an encoding other than UTF-8, US-ASCII and ISO-8859-1 (expat also knows UTF-16, CPython all 8-bit
+/// codecs), for bytes that are not valid in it, for characters that XML does not allow, and for a bad
+/// declaration.
 pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
     let encoding = match Reader::from_reader(body).read_event() {
         Ok(Event::Decl(declaration)) => declared(&declaration)?,
@@ -35,17 +36,17 @@ pub(super) fn text_of(body: &[u8]) -> Result<Cow<'_, str>, DecodeError> {
         "ISO-8859-1" => body.iter().map(|&b| char::from(b)).collect(),
         _ => return Err(DecodeError::Encoding { name }),
     };
-    // A second mark is text, but quick-xml would skip it.
+    // A second byte order mark is text, but quick-xml would skip it.
     let second = text.starts_with('\u{feff}').then_some(0);
     if let Some(at) = second.or_else(|| text.find(|c| !is_in_xml(c))) {
-        let what = "a character that XML does not have";
+        let what = "a character that XML does not allow";
         return Err(DecodeError::Syntax { at, what });
     }
     Ok(text)
 }
 
-/// The document without its document type, if that is a name alone, which declares nothing; none if it has no such
-/// document type.
+/// The document without its document type, if that is just a name and so declares nothing. `None` if there is
+/// no such document type.
 pub fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
     const DOCTYPE: &[u8] = b"<!DOCTYPE";
     let declared = match body.starts_with(b"<?xml") {
@@ -72,7 +73,7 @@ pub fn without_doctype(body: &[u8]) -> Option<Vec<u8>> {
     })
 }
 
-/// The encoding in `<?xml version="…" encoding="…" standalone="…"?>`.
+/// The encoding named in `<?xml version="…" encoding="…" standalone="…"?>`.
 fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> {
     let tag = BytesStart::from_content(&**declaration, "xml".len());
     let attributes = checked_attributes(&tag, 0)?;
@@ -87,7 +88,7 @@ fn declared(declaration: &BytesDecl<'_>) -> Result<Option<String>, DecodeError> 
     });
     let has_version = attributes.first().is_some_and(|it| it.key.0 == "version");
     if !is_fine || !has_version {
-        let what = "an XML declaration that is not as it should be";
+        let what = "a malformed XML declaration";
         return Err(DecodeError::Syntax { at: 0, what });
     }
     let encoding = attributes.iter().find(|it| it.key.0 == "encoding");

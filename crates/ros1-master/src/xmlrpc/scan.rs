@@ -1,9 +1,9 @@
-//! XML as expat accepts it, as a sequence of events.
+//! Reads XML as expat accepts it, as a sequence of events.
 //!
-//! CPython reads XML-RPC with expat, so everything that expat refuses must be refused: a document decoded
-//! here but faulted by the master would be recorded as a write that never happened. quick-xml finds the
-//! markup; the XML rules that it does not check are checked here. What expat accepts but no XML-RPC client
-//! writes (a document type, names beyond ASCII) is refused as unsupported.
+//! CPython reads XML-RPC with expat, so this scanner must refuse everything that expat refuses: if rosrescue
+//! decoded a document that the master answers with a fault, it would record a write that never happened.
+//! quick-xml finds the markup; this module checks the XML rules that quick-xml does not. It refuses as
+//! unsupported what expat accepts but no XML-RPC client writes: a document type and non-ASCII names.
 
 use std::borrow::Cow;
 
@@ -18,26 +18,26 @@ use super::error::{
     SECOND_ROOT, TEXT_AFTER_ROOT, TEXT_BEFORE_ROOT,
 };
 
-/// One event. An empty element gives a start and an end.
+/// One event of the scanner. An empty element gives a start and an end.
 pub(super) enum Event<'a> {
     Start(BytesStart<'a>),
     End(BytesEnd<'a>),
-    /// A piece of text; its line ends are `\n` already unless they are kept.
+    /// A piece of text. Its line ends are already `\n`, unless [`LineEnds::Kept`] was chosen.
     Text(Cow<'a, str>),
-    /// A reference and its character.
+    /// A reference, and the character that it stands for.
     Reference(BytesRef<'a>, Cow<'static, str>),
 }
 
-/// How line ends in text are treated.
+/// What to do with line ends in text.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum LineEnds {
-    /// Each becomes `\n`, as XML requires.
+    /// Each line end becomes `\n`, as XML requires.
     Normal,
-    /// Unchanged.
+    /// Line ends stay unchanged.
     Kept,
 }
 
-/// Reads a document and checks it.
+/// Reads a document event by event and checks the rules of XML.
 pub(super) struct Scanner<'a> {
     reader: Reader<&'a [u8]>,
     /// Number of open elements.
@@ -48,7 +48,8 @@ pub(super) struct Scanner<'a> {
 }
 
 impl<'a> Scanner<'a> {
-    /// Starts at the beginning of `text`, which has only XML characters. `max_open` limits the open elements.
+    /// Starts at the beginning of `text`, all of whose characters must be allowed in XML. `max_open` limits
+    /// how many elements may be open at once.
     pub(super) fn new(text: &'a str, max_open: usize, line_ends: LineEnds) -> Self {
         let mut reader = Reader::from_str(text);
         let config = reader.config_mut();
@@ -63,12 +64,12 @@ impl<'a> Scanner<'a> {
         }
     }
 
-    /// Number of bytes read.
+    /// Position in the text, in bytes.
     pub(super) fn at(&self) -> usize {
         offset(self.reader.buffer_position())
     }
 
-    /// The next event; none at the end of a whole document.
+    /// The next event. `None` at the end of a complete document.
     pub(super) fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         loop {
             let at = self.at();
@@ -99,7 +100,7 @@ impl<'a> Scanner<'a> {
                 Markup::CData(_) | Markup::GeneralRef(_) if is_outside => {
                     "text outside of the root element"
                 }
-                // Searching for one character is much faster, and encoders write `&gt;`.
+                // Searching for one character is much faster, and most encoders write `&gt;`.
                 Markup::Text(text) if text.contains('>') && text.contains("]]>") => "]]> in text",
                 Markup::Text(text) => {
                     return Ok(Some(Event::Text(match self.line_ends {
@@ -120,7 +121,7 @@ impl<'a> Scanner<'a> {
                 Markup::Decl(_) if at == 0 => continue,
                 Markup::Decl(_) => LATE_DECLARATION,
                 Markup::PI(it) if it.target().eq_ignore_ascii_case("xml") => {
-                    "an XML declaration in capitals"
+                    "an XML declaration in upper case"
                 }
                 Markup::PI(it) => {
                     check_name(it.target(), at)?;
@@ -133,14 +134,14 @@ impl<'a> Scanner<'a> {
                 Markup::Eof if !is_outside => NOT_CLOSED,
                 Markup::Eof if !self.seen_root => NO_ELEMENT,
                 Markup::Eof => return Ok(None),
-                // Empty elements are reported as a start and an end.
+                // Empty elements arrive as a start and an end as well.
                 Markup::Comment(_) | Markup::Empty(_) => continue,
             };
             return Err(DecodeError::Syntax { at, what });
         }
     }
 
-    /// quick-xml's error and its position.
+    /// Converts quick-xml's error and adds the position.
     fn broken(&self, error: &Error) -> DecodeError {
         let what = match error {
             Error::IllFormed(IllFormedError::UnclosedReference) => "a reference without semicolon",
@@ -158,7 +159,7 @@ fn offset(position: u64) -> usize {
     usize::try_from(position).unwrap_or(usize::MAX)
 }
 
-/// The character of a reference.
+/// The character that a reference stands for. `None` if it is unknown.
 fn character(reference: &BytesRef<'_>) -> Option<Cow<'static, str>> {
     match reference.resolve_char_ref().ok()? {
         Some(character) => is_in_xml(character).then(|| character.to_string().into()),
@@ -166,7 +167,7 @@ fn character(reference: &BytesRef<'_>) -> Option<Cow<'static, str>> {
     }
 }
 
-/// The attributes of a tag or declaration at byte `at`.
+/// The attributes of a tag or declaration at byte `at`, checked for well-formedness.
 pub(super) fn checked_attributes<'t>(
     tag: &'t BytesStart<'_>,
     at: usize,
@@ -176,7 +177,8 @@ pub(super) fn checked_attributes<'t>(
     let check = |attribute: Attribute<'t>| {
         let name = attribute.key.0;
         check_name(name, at)?;
-        // quick-xml accepts a name directly after another value. Both are parts of `raw`.
+        // quick-xml accepts an attribute that directly follows the value of another one. `name` and the byte
+        // before it both lie in `raw`.
         let start = name.as_ptr().addr().wrapping_sub(raw.as_ptr().addr());
         let before = raw.as_bytes().get(..start).and_then(<[u8]>::last);
         if !before.is_some_and(|&byte| is_space(byte)) {
@@ -185,21 +187,23 @@ pub(super) fn checked_attributes<'t>(
         let value = unescape(&attribute.value).ok();
         let is_fine = value.is_some_and(|value| value.chars().all(is_in_xml));
         if !is_fine || attribute.value.contains('<') {
-            return Err(bad("an attribute with < or a reference to nothing"));
+            return Err(bad("an attribute with < or an unknown reference"));
         }
         Ok(attribute)
     };
     tag.attributes()
-        .map(|it| check(it.map_err(|_| bad("an attribute without = or quotes, or twice"))?))
+        .map(|it| {
+            check(it.map_err(|_| bad("an attribute that lacks = or quotes, or is repeated"))?)
+        })
         .collect()
 }
 
-/// Checks that this is an ASCII name.
+/// Checks that a name is there and is ASCII.
 fn check_name(name: &str, at: usize) -> Result<(), DecodeError> {
     let is_inner = |b: u8| b.is_ascii_digit() || b == b'-' || b == b'.';
     let is_name = |b: u8| b.is_ascii_alphabetic() || b == b'_' || b == b':' || is_inner(b);
     if !name.is_ascii() {
-        let what = "a name beyond ASCII";
+        let what = "a non-ASCII name";
         return Err(DecodeError::Unsupported { at, what });
     }
     if name.bytes().next().is_none_or(is_inner) || !name.bytes().all(is_name) {
@@ -213,7 +217,8 @@ fn is_space(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\n' | b'\r')
 }
 
-/// Whether XML 1.0 allows this character. Expat knows only the first plane's two non-characters.
+/// Whether XML 1.0 allows this character. Like expat, this knows only the two non-characters of the first
+/// plane.
 pub(super) fn is_in_xml(character: char) -> bool {
     matches!(character, '\t' | '\n' | '\r' | ' '..='\u{fffd}' | '\u{10000}'..)
 }

@@ -1,4 +1,4 @@
-//! One test a quirk. The same quirks are held against CPython itself in `tests/codec`.
+//! One test per quirk. `tests/codec` checks the same quirks against CPython itself.
 
 use super::number::repr;
 use super::{
@@ -6,7 +6,7 @@ use super::{
     encode_reply,
 };
 
-/// The only parameter of a call with this inside its `<value>`.
+/// The only parameter of a call that has `inside` between `<value>` and `</value>`.
 fn decoded(inside: &str) -> Result<Value, DecodeError> {
     let body = format!(
         "<methodCall><methodName>m</methodName><params><param><value>{inside}</value></param>\
@@ -34,7 +34,7 @@ fn is_bad(inside: &str) -> bool {
 }
 
 #[test]
-fn untyped_text_is_a_string_and_keeps_its_blanks() {
+fn untyped_text_is_a_string_and_keeps_its_white_space() {
     assert_eq!(value(""), text(""));
     assert_eq!(value(" \n a\t "), text(" \n a\t "));
     assert_eq!(value("<string/>"), text(""));
@@ -42,15 +42,15 @@ fn untyped_text_is_a_string_and_keeps_its_blanks() {
 }
 
 #[test]
-fn line_ends_become_line_feeds_unless_they_are_references() {
+fn line_ends_become_line_feeds_unless_written_as_references() {
     assert_eq!(value("a\r\nb\rc\r\r\n"), text("a\nb\nc\n\n"));
     assert_eq!(value("<![CDATA[a\r\nb\r]]>"), text("a\nb\n"));
     assert_eq!(value("a&#13;&#xA;b"), text("a\r\nb"));
 }
 
-/// As a master writes them, and therefore holds them.
+/// The master holds them as it writes them.
 #[test]
-fn a_reply_keeps_what_cpython_does_not_escape() {
+fn a_decoded_reply_keeps_the_characters_that_cpython_does_not_escape() {
     let date = |text: &str| Value::DateTime(text.to_owned());
     for value in [
         text("a\r\nb\rc\r\r\n"),
@@ -71,7 +71,7 @@ fn a_reply_keeps_what_cpython_does_not_escape() {
 }
 
 #[test]
-fn text_is_joined_over_references_sections_and_comments() {
+fn text_is_joined_across_references_cdata_sections_and_comments() {
     assert_eq!(
         value("a&lt;<![CDATA[<&]]]]><!-- c --><?p i?>&#x1F600;b"),
         text("a<<&]]\u{1f600}b")
@@ -79,7 +79,7 @@ fn text_is_joined_over_references_sections_and_comments() {
 }
 
 #[test]
-fn what_xml_does_not_allow_is_refused() {
+fn xml_that_is_not_well_formed_is_refused() {
     for inside in [
         "a & b",
         "&nbsp;",
@@ -127,7 +127,7 @@ fn a_document_type_is_refused() {
 }
 
 #[test]
-fn the_declared_encoding_counts() {
+fn text_is_read_in_the_encoding_that_the_document_declares() {
     let method = |document: &[u8]| decode_call(document).map(|call| call.method);
     let latin = b"<?xml version='1.0' encoding='iso-8859-1'?><methodName>\xe9</methodName>";
     assert_eq!(method(latin), Ok("é".to_owned()));
@@ -232,13 +232,13 @@ fn base64_is_read_leniently() {
 }
 
 #[test]
-fn a_date_is_text_without_outer_blanks() {
+fn a_date_is_kept_as_text_without_surrounding_white_space() {
     let date = value("<dateTime.iso8601>\u{a0} any <!-- c -->&lt; \n</dateTime.iso8601>");
     assert_eq!(date, Value::DateTime("any <".to_owned()));
 }
 
 #[test]
-fn a_struct_keeps_the_first_place_and_the_last_value_of_a_name() {
+fn a_repeated_struct_member_keeps_its_first_place_and_its_last_value() {
     let members = value(
         "<struct><member><name>b</name><value>1</value></member>\
          <member><name>a</name><value>2</value></member>\
@@ -249,7 +249,7 @@ fn a_struct_keeps_the_first_place_and_the_last_value_of_a_name() {
 }
 
 #[test]
-fn a_struct_takes_names_and_values_in_turn_wherever_they_stand() {
+fn a_struct_pairs_names_and_values_in_turn_however_they_are_nested() {
     let expected = Value::Struct(Struct::from([("a".to_owned(), text("1"))]));
     for inside in [
         "<name>a</name><value>1</value>",
@@ -266,7 +266,7 @@ fn a_struct_takes_names_and_values_in_turn_wherever_they_stand() {
 }
 
 #[test]
-fn an_unknown_element_is_refused_right_inside_a_value_only() {
+fn an_unknown_element_is_refused_only_directly_inside_a_value() {
     assert!(matches!(
         decoded("<ex:serializable>1</ex:serializable>"),
         Err(DecodeError::UnknownType { tag, .. }) if tag == "serializable"
@@ -299,7 +299,7 @@ fn a_call_has_the_last_method_name_and_all_values() {
 }
 
 #[test]
-fn a_reply_has_one_value_or_a_whole_fault() {
+fn a_reply_has_exactly_one_value_or_a_complete_fault() {
     let fault = Reply::Fault {
         code: -3,
         text: "<class 'X'>:\u{e9} & so on".to_owned(),
@@ -328,7 +328,7 @@ fn a_reply_has_one_value_or_a_whole_fault() {
 }
 
 #[test]
-fn depth_is_limited_and_the_limit_can_be_reached() {
+fn values_may_nest_as_deep_as_the_limit_and_no_deeper() {
     let tower = |levels| "<array><value>".repeat(levels) + &"</value></array>".repeat(levels);
     assert!(decoded(&tower(MAX_DEPTH)).is_ok());
     assert!(matches!(
@@ -341,7 +341,7 @@ fn depth_is_limited_and_the_limit_can_be_reached() {
 }
 
 #[test]
-fn a_call_is_written_compactly_and_as_xmlrpcpp_can_read_it() {
+fn a_call_is_encoded_compactly_in_forms_that_xmlrpcpp_can_read() {
     let members = Struct::from([("k".to_owned(), Value::Struct(Struct::new()))]);
     let call = Call::new(
         "m",
@@ -386,7 +386,7 @@ fn a_call_is_written_compactly_and_as_xmlrpcpp_can_read_it() {
 }
 
 #[test]
-fn a_reply_is_written_in_the_layout_of_cpython() {
+fn a_reply_is_encoded_in_cpythons_layout() {
     let members = Struct::from([("a&b".to_owned(), Value::Base64(vec![0; 58]))]);
     let elements = vec![Value::Int(1), text("<\r>"), Value::Struct(members)];
     let written = encode_reply(&Reply::Value(Value::Array(elements)));
@@ -402,7 +402,7 @@ fn a_reply_is_written_in_the_layout_of_cpython() {
 }
 
 #[test]
-fn what_cannot_be_returned_becomes_a_fault() {
+fn a_value_that_rosmaster_cannot_return_becomes_its_fault() {
     let big = Value::BigInt("2147483648".to_owned());
     let fault = |value| decode_reply(&encode_reply(&Reply::Value(value)));
     let of = |text: &str| {
@@ -447,7 +447,7 @@ fn doubles_are_written_as_python_writes_them() {
         (f64::NAN, "nan"),
         (f64::INFINITY, "inf"),
         (f64::NEG_INFINITY, "-inf"),
-        // Halfway between two shortest texts, 0.2 and 0.3.
+        // Halfway between two texts of the shortest length, which end in 0.2 and 0.3.
         (f64::from_bits(0x4307_6b26_abd3_448a), "823967287502993.2"),
     ] {
         assert_eq!(repr(number), text);

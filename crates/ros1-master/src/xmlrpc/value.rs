@@ -1,4 +1,4 @@
-//! The values of XML-RPC, as CPython's `xmlrpc` package understands them.
+//! XML-RPC values, as CPython's `xmlrpc` package understands them.
 
 use std::{
     ops::{Deref, DerefMut},
@@ -10,21 +10,21 @@ use indexmap::IndexMap;
 /// The members of a [`Struct`].
 type Members = IndexMap<String, Value>;
 
-/// A struct. Keeps the order of its keys, like a Python dict.
+/// An XML-RPC struct. It keeps the order of its keys, like a Python dict.
 ///
-/// A clone shares its members until one of the two is changed. Then these members are copied, and structs
-/// within them stay shared. So a copy of a large parameter tree costs nothing, and a change of the tree while
-/// there is a copy costs as much as the namespaces on the way to it have members.
+/// A clone shares its members until one of the two is changed. Only then are these members copied; structs
+/// inside them stay shared. So copying a large parameter tree is free, and changing the tree while a copy
+/// exists costs as much as copying the members of the namespaces on the way to the change.
 #[derive(Clone, Debug, Default)]
 pub struct Struct(Arc<Members>);
 
 impl Struct {
-    /// Without members.
+    /// A struct without members.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Without members, and with room for `count`.
+    /// An empty struct with room for `count` members.
     pub fn with_capacity(count: usize) -> Self {
         Self(Arc::new(Members::with_capacity(count)))
     }
@@ -44,7 +44,7 @@ impl DerefMut for Struct {
     }
 }
 
-/// With the order of the members.
+/// Compares members and their order.
 impl PartialEq for Struct {
     fn eq(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0) || self.iter().eq(other.iter())
@@ -59,7 +59,7 @@ impl FromIterator<(String, Value)> for Struct {
     }
 }
 
-/// For tests.
+/// A short form for tests and examples.
 impl From<&[(&str, Value)]> for Struct {
     fn from(members: &[(&str, Value)]) -> Self {
         let members = members.iter().cloned();
@@ -95,26 +95,26 @@ impl<'a> IntoIterator for &'a Struct {
 
 /// One XML-RPC value.
 ///
-/// Values are equal if their wire forms are: doubles with the same bits, so `nan` equals `nan` and `-0.0`
-/// differs from `0.0`; `1`, `1.0` and `true` all differ. Structs are equal only with the same order of keys,
-/// because replies show it.
+/// Two values are equal if they look the same on the wire: doubles with the same bits, so `nan` equals `nan`
+/// and `-0.0` differs from `0.0`; `1`, `1.0` and `true` all differ. Structs must have their keys in the same
+/// order, because replies show it.
 #[derive(Clone, Debug)]
 pub enum Value {
-    /// `<nil/>`: rosmaster accepts it inside values but can never return it.
+    /// `<nil/>`. rosmaster accepts it inside values but can never return it.
     Nil,
     /// `<boolean>`.
     Bool(bool),
-    /// `<int>` or `<i4>`: fits 32 bits.
+    /// `<int>` or `<i4>`: an integer that fits into 32 bits.
     Int(i32),
-    /// An integer beyond 32 bits, in canonical decimal: rosmaster accepts it but can never return it.
+    /// An integer beyond 32 bits, in canonical decimal form. rosmaster accepts it but can never return it.
     BigInt(String),
     /// `<double>`.
     Double(f64),
-    /// `<string>`, or text without a type.
+    /// `<string>`, or text without a type element.
     String(String),
-    /// `<dateTime.iso8601>`: its text, which CPython does not parse.
+    /// `<dateTime.iso8601>`: the text, which CPython does not parse.
     DateTime(String),
-    /// `<base64>`: the decoded bytes.
+    /// `<base64>`, decoded.
     Base64(Vec<u8>),
     /// `<array>`.
     Array(Vec<Self>),
@@ -153,7 +153,7 @@ impl Value {
         size
     }
 
-    /// Whether it uses about more than so many bytes. Looks no further than that.
+    /// Whether it uses more than about this many bytes of memory. Stops counting there.
     pub fn is_larger_than(&self, mut bytes: usize) -> bool {
         !self.visit_sizes(&mut |part| {
             let rest = bytes.checked_sub(part);
@@ -162,7 +162,7 @@ impl Value {
         })
     }
 
-    /// Passes the sizes of all parts to `visit` as long as it returns true. Returns whether it always did.
+    /// Passes the size of each part to `visit` until that returns false. Returns whether all were accepted.
     fn visit_sizes(&self, visit: &mut impl FnMut(usize) -> bool) -> bool {
         let within = match self {
             Self::BigInt(text) | Self::String(text) | Self::DateTime(text) => text.len(),
@@ -186,7 +186,7 @@ impl Value {
         }
     }
 
-    /// The name of the Python type with which CPython decodes it.
+    /// Name of the Python type to which CPython decodes this value.
     pub(crate) fn python_type(&self) -> &'static str {
         match self {
             Self::Nil => "NoneType",
@@ -259,7 +259,7 @@ impl<T: Into<Self>> From<Vec<T>> for Value {
     }
 }
 
-/// One request: a method and its parameters.
+/// An XML-RPC call: a method name and parameters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Call {
     /// The method's name, such as `registerPublisher`.
@@ -269,7 +269,7 @@ pub struct Call {
 }
 
 impl Call {
-    /// A call of `method` with `params`.
+    /// Creates a call of `method` with `params`.
     pub fn new(method: impl Into<String>, params: Vec<Value>) -> Self {
         Self {
             method: method.into(),
@@ -277,13 +277,13 @@ impl Call {
         }
     }
 
-    /// `system.multicall` of `calls`, in order.
+    /// Creates a `system.multicall` of `calls`, in order.
     pub fn multicall(calls: impl IntoIterator<Item = Self>) -> Self {
         let entries = calls.into_iter().map(Self::into_entry);
         Self::new("system.multicall", vec![Value::Array(entries.collect())])
     }
 
-    /// This call as an entry of a multicall.
+    /// Converts this call to an entry of a multicall.
     pub fn into_entry(self) -> Value {
         Value::Struct(Struct::from([
             ("methodName".to_owned(), Value::String(self.method)),
@@ -292,7 +292,7 @@ impl Call {
     }
 }
 
-/// One answer.
+/// The answer to an XML-RPC call.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reply {
     /// The method's result.

@@ -23,7 +23,7 @@ fn words(a: &Master, b: &Master) -> Vec<String> {
 }
 
 #[test]
-fn every_difference_is_said_once() {
+fn every_difference_is_listed_once() {
     let publish =
         |node, topic, kind, api| call(Method::RegisterPublisher, &[node, topic, kind, api]);
     let serve = |node, api| call(Method::RegisterService, &[node, "/s", "rosrpc://h:1", api]);
@@ -50,7 +50,7 @@ fn every_difference_is_said_once() {
         "node /gone at http://g:1/ only in A: publishes /only, /too; subscribes /t",
         "node /moved is at http://m:1/ in A and at http://m:2/ in B",
         "/n watches the parameter /k only in A",
-        "service /s is of /n at rosrpc://h:1 in A and of /moved at rosrpc://h:1 in B",
+        "service /s is provided by /n at rosrpc://h:1 in A and by /moved at rosrpc://h:1 in B",
         "topic /t has the type x/Y in A and x/Z in B",
     ];
     assert_eq!(found, expected);
@@ -59,7 +59,7 @@ fn every_difference_is_said_once() {
 }
 
 #[test]
-fn parameters_are_compared_one_by_one_whatever_their_order() {
+fn parameters_are_compared_one_by_one_in_any_order() {
     let set = |key: &str, value: Value| {
         Request::new(Method::SetParam, [Value::from("/n"), key.into(), value])
     };

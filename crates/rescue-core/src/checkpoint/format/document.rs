@@ -1,4 +1,4 @@
-//! The document: which value stands under which key.
+//! The document: defines which value stands under which key.
 
 use indexmap::IndexMap;
 
@@ -7,7 +7,7 @@ use super::{Checkpoint, EncodeError, Entry, Session, frame, yaml};
 use crate::master::{Displaced, ServiceEntry, Snapshot, SnapshotNode};
 use crate::xmlrpc::{Call, Struct, Value};
 
-/// The document up to and including the line `journal:`.
+/// Writes the document up to and including the line `journal:`.
 pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeError> {
     let Checkpoint {
         seq,
@@ -89,7 +89,7 @@ pub(super) fn write_snapshot(checkpoint: &Checkpoint) -> Result<Vec<u8>, EncodeE
     Ok(std::mem::take(out))
 }
 
-/// A key whose entries take lines of their own.
+/// Writes a key whose entries each take several lines.
 fn section<T>(
     out: &mut Vec<u8>,
     title: &str,
@@ -104,7 +104,7 @@ fn section<T>(
     });
 }
 
-/// A key whose entries take one line each; `write` ends the line.
+/// Writes a key whose entries each take one line; `write` ends the line.
 fn section_of_lines<T>(
     out: &mut Vec<u8>,
     title: &str,
@@ -131,7 +131,7 @@ fn text_line(out: &mut Vec<u8>, key: &str, text: &str) {
 }
 
 fn names(out: &mut Vec<u8>, ids: &[String]) {
-    // Cannot fail: texts do not nest.
+    // This cannot fail, because texts do not nest.
     let _ = flow_list(out, ids, |out, id| {
         quoted(out, id);
         Ok(())
@@ -168,7 +168,7 @@ fn session_members(session: &Session) -> Vec<(&'static str, Value)> {
         ("cluster_seq", session.cluster_seq),
         ("port", session.port.into()),
     ];
-    // A missing count is read as 0.
+    // A count that is missing is read as 0.
     let counts = counts.into_iter().filter(|(_, count)| *count > 0);
     members.extend(counts.map(|(name, count)| (name, integer(count))));
     members
@@ -178,7 +178,7 @@ fn integer(count: u64) -> Value {
     i32::try_from(count).map_or_else(|_| Value::BigInt(count.to_string()), Value::Int)
 }
 
-/// A record's line without its check.
+/// Writes the line of a record without its check sum.
 pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
     out.extend_from_slice(b"- {seq: ");
     decimal(out, seq);
@@ -210,7 +210,7 @@ pub(super) fn write_record(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result
 /// Reverses [`write_snapshot`].
 pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
     let Value::Struct(mut document) = yaml::read(yaml)? else {
-        return Err("it is no mapping".to_owned());
+        return Err("it is not a mapping".to_owned());
     };
     let document = &mut document;
     let seq = count(document, "seq")?.ok_or("`seq` is missing")?;
@@ -246,7 +246,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
             .into_iter()
             .map(|call| read_call(&mut structure(call).ok_or("`pending` has a malformed entry")?))
             .collect::<Result<_, _>>()?,
-        Some(_) => return Err("`pending` is no list".to_owned()),
+        Some(_) => return Err("`pending` is not a list".to_owned()),
     };
     let displaced = match document.swap_remove("displaced") {
         None => Vec::new(),
@@ -254,7 +254,7 @@ pub(super) fn read_snapshot(yaml: &str) -> Result<Checkpoint, String> {
             .into_iter()
             .map(|node| read_displaced(node).ok_or("`displaced` has a malformed entry"))
             .collect::<Result<_, _>>()?,
-        Some(_) => return Err("`displaced` is no list".to_owned()),
+        Some(_) => return Err("`displaced` is not a list".to_owned()),
     };
     Ok(Checkpoint {
         seq,
@@ -289,14 +289,14 @@ fn read_displaced(value: Value) -> Option<Displaced> {
     })
 }
 
-/// Reverses [`write_record`]; the caller has read the number.
+/// Reverses [`write_record`], after the caller has read the number.
 pub(super) fn read_record(line: &str) -> Result<Entry, String> {
     let entries = match yaml::read(line)? {
         Value::Array(entries) => entries,
         _ => Vec::new(),
     };
     let Ok([Value::Struct(mut entry)]) = <[Value; 1]>::try_from(entries) else {
-        return Err("it is no record".to_owned());
+        return Err("it is not a record".to_owned());
     };
     if entry.contains_key("session") {
         return read_session(members(&mut entry, "session")?).map(Entry::Session);
@@ -310,7 +310,7 @@ fn read_call(members: &mut Struct) -> Result<Call, String> {
     let method = text(members, "call")?;
     match members.shift_remove("params") {
         Some(Value::Array(params)) => Ok(Call { method, params }),
-        _ => Err("`params` is no list".to_owned()),
+        _ => Err("`params` is not a list".to_owned()),
     }
 }
 
@@ -342,16 +342,16 @@ fn count(members: &Struct, key: &str) -> Result<Option<u64>, String> {
     };
     match count {
         Some(count) => Ok(Some(count)),
-        None => Err(format!("`{key}` is no count")),
+        None => Err(format!("`{key}` is not a count")),
     }
 }
 
 fn members(document: &mut Struct, key: &str) -> Result<Struct, String> {
-    // Moved, not cloned; the order of the rest does not matter.
+    // Taken out rather than cloned. The order of the remaining keys does not matter.
     document
         .swap_remove(key)
         .and_then(structure)
-        .ok_or_else(|| format!("`{key}` is no mapping"))
+        .ok_or_else(|| format!("`{key}` is not a mapping"))
 }
 
 fn entries<T>(
@@ -372,7 +372,7 @@ fn text(members: &mut Struct, key: &str) -> Result<String, String> {
     members
         .shift_remove(key)
         .and_then(string)
-        .ok_or_else(|| format!("`{key}` is no text"))
+        .ok_or_else(|| format!("`{key}` is not a text"))
 }
 
 fn string(value: Value) -> Option<String> {

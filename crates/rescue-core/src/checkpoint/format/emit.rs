@@ -1,24 +1,26 @@
 //! Encodes values as YAML.
 //!
-//! One emitter for both styles. Every string and key is double-quoted on one line. Numbers take a form that
-//! YAML 1.1 and 1.2 resolve alike. Types that YAML lacks go into `!!pairs`, which no XML-RPC value uses.
-//! serde-saphyr's writer is not used: it has no integers beyond 128 bits, spreads texts over several lines,
-//! and takes four times as long for a record (1.1 us against 0.25 us).
+//! One emitter for both styles. Every string and key is double-quoted on one line. Numbers have a form that
+//! YAML 1.1 and 1.2 resolve alike. Types that YAML lacks are written as `!!pairs`, which no XML-RPC value
+//! uses otherwise. serde-saphyr's writer is not used because it has no integers beyond 128 bits, spreads
+//! texts over several lines, and takes four times as long for a record (1.1 us instead of 0.25 us).
 
 use std::io::Write;
 
 use super::{DEPTH_MAX, EncodeError};
 use crate::xmlrpc::{Struct, Value};
 
-/// Deeper structs are written in one line: indentation would take more space than content.
+/// Structs below this level are written in one line, because indentation would take more space than content.
 const BLOCK_LEVELS_MAX: usize = 32;
-/// YAML 1.1 and 1.2 look for the `:` of an implicit key within 1,024 characters only.
+/// Maximum length of a key. YAML 1.1 and 1.2 look for the `:` of an implicit key only within 1,024
+/// characters.
 const KEY_BYTES_MAX: usize = 1_000;
-/// CPython refuses to read longer decimal integers (`sys.get_int_max_str_digits`, 4,300).
+/// Maximum length of a decimal integer. CPython refuses to read longer ones (`sys.get_int_max_str_digits`,
+/// 4,300).
 const INT_DIGITS_MAX: usize = 4_000;
-/// Kinds of `!!pairs`.
+/// The kind of a `!!pairs` entry that holds a date.
 pub(super) const DATE_TIME: &str = "dateTime.iso8601";
-/// Another kind; see [`DATE_TIME`].
+/// The kind of a `!!pairs` entry that holds a large integer.
 pub(super) const BIG_INT: &str = "int";
 
 /// Writes `members` in block style, one line each, indented by `indent` columns.
@@ -144,7 +146,7 @@ pub(super) fn flow_list<T>(
     Ok(())
 }
 
-/// Writes a type that YAML lacks.
+/// Writes a value of a type that YAML lacks.
 fn pair(out: &mut Vec<u8>, kind: &str, text: &str) {
     out.extend_from_slice(b"!!pairs [{");
     quoted(out, kind);
@@ -159,7 +161,7 @@ pub(super) fn decimal(out: &mut Vec<u8>, number: impl std::fmt::Display) {
     let _ = write!(out, "{number}");
 }
 
-/// Whether plain `digits` read back as the same [`Value::BigInt`].
+/// Whether plain `digits` are read back as the same [`Value::BigInt`].
 fn is_plain_big_int(digits: &str) -> bool {
     let magnitude = digits.strip_prefix('-').unwrap_or(digits);
     (10..=INT_DIGITS_MAX).contains(&magnitude.len())
@@ -168,8 +170,8 @@ fn is_plain_big_int(digits: &str) -> bool {
         && digits.parse::<i32>().is_err()
 }
 
-/// YAML 1.1 requires a point in every float and a sign in every exponent. Writes the fewest digits that read
-/// back as the same bits; every NaN is `.nan`, as it is one `nan` on the wire.
+/// Writes a double with the fewest digits that are read back as the same bits. YAML 1.1 requires a point in
+/// every float and a sign in every exponent. Every NaN is `.nan`, because it is one `nan` on the wire.
 fn double(out: &mut Vec<u8>, number: f64) {
     if number.is_nan() {
         return out.extend_from_slice(b".nan");
@@ -191,7 +193,7 @@ fn double(out: &mut Vec<u8>, number: f64) {
     }
 }
 
-/// `20240131T12:00:00`, as Python writes it, converted to a YAML timestamp.
+/// Converts `20240131T12:00:00`, as Python writes a date, to a YAML timestamp. `None` for any other text.
 pub(super) fn timestamp(text: &str) -> Option<String> {
     let number = |range: std::ops::Range<usize>| {
         let digits = text.get(range)?;
@@ -221,7 +223,7 @@ pub(super) fn date_time(stamp: &str) -> Option<String> {
     Some(format!("{}T{time}", date.replace('-', "")))
 }
 
-/// Writes `text` double-quoted on one line, exact for every reader.
+/// Writes `text` double-quoted on one line, so that every reader reads it back exactly.
 pub(super) fn quoted(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
     let plain = text
@@ -250,13 +252,13 @@ pub(super) fn quoted(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
 }
 
-/// A byte that needs no escape in a double-quoted scalar.
+/// Whether a byte needs no escape in a double-quoted scalar.
 fn is_plain(byte: u8) -> bool {
     matches!(byte, b' '..=b'~') && byte != b'"' && byte != b'\\'
 }
 
-/// Whether a character beyond ASCII is written unescaped: not if PyYAML refuses it, if YAML 1.1 breaks lines
-/// at it, or if it is invisible.
+/// Whether a non-ASCII character is written unescaped. It is not if PyYAML refuses it, if YAML 1.1 breaks
+/// lines at it, or if it is invisible.
 fn is_shown(character: char) -> bool {
     !matches!(character,
         '\u{0}'..='\u{a0}' | '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}'

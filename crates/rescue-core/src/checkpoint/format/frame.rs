@@ -1,4 +1,4 @@
-//! Check sums, and finding the whole parts of a damaged file.
+//! Check sums, and how to find the whole parts of a damaged file.
 //!
 //! ```text
 //! # rosrescue checkpoint v1 generation=G seq=S snapshot=LENGTH crc32c=C header=H
@@ -6,9 +6,10 @@
 //! - {seq: 8, call: "setParam", params: [...]} #H R
 //! ```
 //!
-//! S is the number of the last record in the snapshot. C is the check sum of the snapshot, H of the first
-//! line before it, R of the record's line before it. All are CRC-32C in eight lower-case hexadecimal digits. Every
-//! record repeats H, the *stamp*: it exposes a whole line that a disk brings back from an older file.
+//! S is the number of the last record in the snapshot. C is the check sum of the snapshot, H that of the
+//! first line before it, and R that of the record's line before it. All are CRC-32C in eight lower-case
+//! hexadecimal digits. Every record repeats H, the *stamp*, so that a whole line that a disk brings back from
+//! an older file is noticed.
 
 use std::io::{BufRead, Write};
 use std::ops::Range;
@@ -18,30 +19,30 @@ use super::{
     document,
 };
 
-/// The format written by this version.
+/// The version of the format that this program writes.
 pub const FORMAT_VERSION: u32 = 1;
 
 const MAGIC: &str = "# rosrescue checkpoint v";
-/// The first line is shorter than this, whatever its numbers.
+/// Maximum length of the first line, whatever its numbers.
 const HEADER_BYTES_MAX: usize = 256;
-/// A record's check: ` #` and eight digits, a blank and eight digits.
+/// Length of a record's check sums: ` #`, eight digits, a blank and eight digits.
 const CHECK_BYTES: usize = 19;
 const RECORD_START: &[u8] = b"- {seq: ";
 
-/// Counting continues from a file's numbers of generations and records. No count exceeds this: a higher
-/// number was never written, and adding to it could overflow.
+/// Maximum number of a generation or a record. Counting continues from the numbers in a file; a higher number
+/// was never written, and adding to it could overflow.
 const COUNT_MAX: u64 = u64::MAX / 2;
 
 /// Ties a file's records to its snapshot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp(u32);
 
-/// Puts the first line in front of a snapshot.
+/// Puts the first line before a snapshot.
 pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Encoded {
     let crc = crc32c::crc32c(snapshot);
     let length = snapshot.len();
     let mut bytes = Vec::with_capacity(length + HEADER_BYTES_MAX);
-    // Cannot fail: it writes to a vector.
+    // This cannot fail, because it writes to a vector.
     let _ = write!(
         bytes,
         "{MAGIC}{FORMAT_VERSION} generation={generation} seq={seq} snapshot={length} \
@@ -53,7 +54,7 @@ pub(super) fn frame_snapshot(snapshot: &[u8], seq: u64, generation: u64) -> Enco
     Encoded { bytes, stamp }
 }
 
-/// Appends a record's line without its check.
+/// Appends the line of a record without its check sums.
 pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), EncodeError> {
     let start = out.len();
     let written = document::write_record(out, seq, entry);
@@ -63,7 +64,7 @@ pub fn push_body(out: &mut Vec<u8>, seq: u64, entry: &Entry) -> Result<(), Encod
     written
 }
 
-/// Appends the check to the body that starts at `start`, and ends the line.
+/// Appends the check sums to the record that starts at `start`, and ends the line.
 pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
     out.extend_from_slice(b" #");
     push_hex(out, stamp.0);
@@ -73,10 +74,10 @@ pub fn seal(out: &mut Vec<u8>, start: usize, stamp: Stamp) {
     out.push(b'\n');
 }
 
-/// Belongs to no file.
+/// The stamp of records that belong to no file.
 const NO_FILE: Stamp = Stamp(0);
 
-/// Appends a record's line that belongs to no file.
+/// Appends the line of a record that belongs to no file.
 pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError> {
     let start = out.len();
     push_body(out, record.seq, &record.entry)?;
@@ -84,19 +85,19 @@ pub fn push_record(out: &mut Vec<u8>, record: &Record) -> Result<(), EncodeError
     Ok(())
 }
 
-/// Reads lines of [`push_record`].
+/// Reads lines that were written by [`push_record`].
 ///
 /// # Errors
 ///
-/// Why they are not what was written.
+/// If the lines are not what was written; the text says why.
 pub fn read_records(lines: &[u8]) -> Result<Vec<Record>, String> {
     let lines = lines
         .strip_suffix(b"\n")
-        .ok_or("the last line has no end")?;
+        .ok_or("the last line is incomplete")?;
     let lines = lines.split(|byte| *byte == b'\n');
     let records = lines.map(|line| {
         let line = open_line(line).filter(|(_, stamp, _)| *stamp == NO_FILE);
-        let (seq, _, body) = line.ok_or("a line is no record, or damaged")?;
+        let (seq, _, body) = line.ok_or("a line is not a record, or is damaged")?;
         let body = std::str::from_utf8(body).map_err(|error| error.to_string())?;
         let entry = document::read_record(body)?;
         Ok(Record { seq, entry })
@@ -115,7 +116,7 @@ fn push_hex(out: &mut Vec<u8>, number: u32) {
     );
 }
 
-/// Eight lower-case digits and nothing else.
+/// Reads exactly eight lower-case hexadecimal digits.
 fn hex(digits: &[u8]) -> Option<u32> {
     let digits = <[u8; 8]>::try_from(digits).ok()?;
     digits.iter().try_fold(0, |number: u32, digit| {
@@ -128,26 +129,26 @@ fn hex(digits: &[u8]) -> Option<u32> {
     })
 }
 
-/// The number of a generation or a record.
+/// Reads the number of a generation or a record.
 pub(super) fn count(digits: &str) -> Option<u64> {
     digits.parse().ok().filter(|count| *count <= COUNT_MAX)
 }
 
-/// The first line's content.
+/// The content of the first line.
 #[derive(Clone, Copy, Debug)]
 pub struct Header {
     pub generation: u64,
-    /// Number of the last record that the snapshot contains.
+    /// The number of the last record in the snapshot.
     pub seq: u64,
-    /// Bytes of the snapshot.
+    /// Length of the snapshot in bytes.
     snapshot: u64,
     crc: u32,
     stamp: Stamp,
-    /// Bytes of the line with its line feed.
+    /// Length of the line in bytes, with its line feed.
     length: usize,
 }
 
-/// A line with a valid check.
+/// A record's line whose check sums are right.
 #[derive(Debug)]
 pub struct Line<'a> {
     pub seq: u64,
@@ -155,7 +156,7 @@ pub struct Line<'a> {
     body: &'a [u8],
 }
 
-/// A file split into its parts, its YAML not read yet.
+/// A file split into its parts. The YAML has not been read yet.
 #[derive(Debug)]
 pub struct Framed<'a> {
     pub header: Option<Header>,
@@ -163,7 +164,7 @@ pub struct Framed<'a> {
     pub lines: Vec<Line<'a>>,
     pub torn: Option<Range<usize>>,
     pub damaged: Vec<Damage>,
-    /// Whether damage follows the last whole line, so that it is unknown what is missing.
+    /// Whether damage follows the last whole line, so that an unknown number of records may be missing.
     pub end_lost: bool,
 }
 
@@ -186,7 +187,7 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, DecodeError> {
     })
 }
 
-/// Splits a file and verifies every check sum.
+/// Splits a file into its parts and verifies all check sums.
 ///
 /// # Errors
 ///
@@ -222,7 +223,7 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     if hex(digits) != Some(stamp) {
         return Ok(None);
     }
-    // The line is verified from here on.
+    // The check sum of the line is right from here on.
     let Some((version, fields)) = std::str::from_utf8(checked)
         .ok()
         .and_then(|line| line.strip_prefix(MAGIC)?.split_once(' '))
@@ -252,9 +253,9 @@ fn read_header(bytes: &[u8]) -> Result<Option<Header>, DecodeError> {
     Ok(header)
 }
 
-/// Whether a file without a whole first line and without a whole record is a damaged checkpoint and not
-/// another program's file: it is empty or begins with zeros, as after a crash of the machine, or most of the
-/// first line's start or of the document's frame remains.
+/// Whether a file without a whole first line and without a whole record is a damaged checkpoint rather than
+/// another program's file. It is if it is empty, begins with zeros (as after a crash of the machine), or
+/// still has most of the start of the first line or of the document's frame.
 fn resembles(bytes: &[u8]) -> bool {
     let contains = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
     let differing = bytes
@@ -268,7 +269,7 @@ fn resembles(bytes: &[u8]) -> bool {
 }
 
 impl<'a> Framed<'a> {
-    /// A file without whole parts.
+    /// A file of which no part is whole.
     pub fn unreadable(bytes: &'a [u8]) -> Self {
         let (lines, damaged) = (Vec::new(), Vec::new());
         Self {
@@ -305,8 +306,8 @@ impl<'a> Framed<'a> {
             .map_err(|why| SnapshotError::Content { why })
     }
 
-    /// The records with numbers above `after`. A line with a valid check but invalid content is added to
-    /// `damaged`.
+    /// The records with numbers above `after`. A line whose check sums are right but whose content is not
+    /// valid is added to `damaged`.
     pub fn records(&self, after: u64, damaged: &mut Vec<Damage>) -> Vec<Record> {
         let lines = self.lines.iter().filter(|line| line.seq > after);
         lines
@@ -320,7 +321,7 @@ impl<'a> Framed<'a> {
                         entry,
                     }),
                     Err(why) => {
-                        let why = format!("record {} does not make sense: {why}", line.seq);
+                        let why = format!("record {} is not valid: {why}", line.seq);
                         damaged.push(Damage {
                             offset: line.offset,
                             why,
@@ -332,8 +333,8 @@ impl<'a> Framed<'a> {
             .collect()
     }
 
-    /// Finds the journal's whole lines and describes the damage to the others. If the first line is lost, the
-    /// journal's start is unknown, but no line of a snapshot looks like a record.
+    /// Finds the whole lines of the journal and describes the damage to the others. If the first line is
+    /// damaged, it is unknown where the journal starts, but no line of a snapshot looks like a record.
     fn scan_lines(&mut self) {
         let start = match self.header {
             Some(header) => usize::try_from(header.snapshot)
@@ -342,13 +343,13 @@ impl<'a> Framed<'a> {
         };
         let mut stamp = self.header.map(|header| header.stamp);
         let mut offset = start;
-        // Start of the bytes after the last whole line, and whether they look like a torn append.
+        // Where the bytes after the last whole line start, and whether they look like an incomplete append.
         let mut tail: Option<(usize, bool)> = None;
         let mut tail_damage: Vec<Damage> = Vec::new();
         let mut rest = self.bytes.get(start..).unwrap_or_default();
         while !rest.is_empty() {
             let at = offset;
-            // Cannot fail: it reads from memory. This is the fastest way to find the line's end.
+            // This cannot fail, because it reads from memory. It is the fastest way to find the end of the line.
             let line_length = (&mut &*rest).skip_until(b'\n').unwrap_or(rest.len());
             let (line, behind) = rest.split_at(line_length);
             (rest, offset) = (behind, offset + line_length);
@@ -375,12 +376,9 @@ impl<'a> Framed<'a> {
                     tail = None;
                     continue;
                 }
-                Some((seq, ..)) => (
-                    format!("record {seq} belongs to another life of the file"),
-                    true,
-                ),
+                Some((seq, ..)) => (format!("record {seq} belongs to an earlier file"), true),
                 None if complete && !text.contains(&0) => {
-                    ("a record's check sum does not hold".to_owned(), false)
+                    ("a record's check sum does not match".to_owned(), false)
                 }
                 None => ("a record is incomplete".to_owned(), true),
             };
@@ -400,7 +398,7 @@ impl<'a> Framed<'a> {
     }
 }
 
-/// The number, stamp and body of a line with a valid check.
+/// The number, stamp and body of a line whose check sums are right.
 fn open_line(line: &[u8]) -> Option<(u64, Stamp, &[u8])> {
     let (checked, digits) = line.split_last_chunk::<8>()?;
     let checked = checked.strip_suffix(b" ")?;

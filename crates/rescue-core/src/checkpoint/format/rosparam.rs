@@ -1,13 +1,13 @@
-//! Parameters as YAML for `rosparam load`.
+//! Converts parameters to YAML for `rosparam load`.
 
 use super::{EncodeError, emit};
 use crate::xmlrpc::{Struct, Value};
 
-/// The longest form of a value for people, in characters.
+/// Maximum length of a value that is shown to the user, in characters.
 const SHOWN: usize = 100;
 
-/// What `rosparam load` makes of the tree, and what it cannot carry: a sentence for each parameter that is left out
-/// or changed.
+/// The parameter tree as YAML that `rosparam load` reads correctly, and a sentence for each parameter that is
+/// left out or changed because rosparam cannot carry it.
 ///
 /// # Errors
 ///
@@ -23,7 +23,7 @@ pub fn for_rosparam(tree: &Struct) -> Result<(Vec<u8>, Vec<String>), EncodeError
     Ok((yaml, left_out))
 }
 
-/// `value` in one line for people, and as it is written in a checkpoint, but shortened.
+/// `value` in one line for the user: as it is written in a checkpoint, but shortened.
 pub fn shown(value: &Value) -> String {
     let mut line = Vec::new();
     if emit::flow(&mut line, value, 0).is_err() {
@@ -42,11 +42,11 @@ fn carried(tree: &Struct, path: &str, left_out: &mut Vec<String>) -> Struct {
         let name = format!("{path}/{key}");
         let odd_name = key.is_empty() || key.contains('/') || key.starts_with('~');
         let why = match value {
-            _ if odd_name => Some("rosparam takes its key for another name"),
+            _ if odd_name => Some("rosparam would take its key for another name"),
             // rosparam reads `_ns` as the namespace of a whole document.
-            _ if path.is_empty() && key == "_ns" => Some("rosparam takes it for a namespace"),
+            _ if path.is_empty() && key == "_ns" => Some("rosparam would take it for a namespace"),
             Value::Struct(members) if members.is_empty() => {
-                Some("rosparam sets no empty namespace")
+                Some("rosparam cannot set an empty namespace")
             }
             Value::Struct(members) => {
                 let members = carried(members, &name, left_out);
@@ -65,13 +65,13 @@ fn carried(tree: &Struct, path: &str, left_out: &mut Vec<String>) -> Struct {
     kept
 }
 
-/// Why rosparam cannot send this value.
+/// Why rosparam cannot send this value. `None` if it can.
 fn refusal(value: &Value) -> Option<&'static str> {
     match value {
         Value::Nil => Some("it holds null, which rosparam cannot send"),
         Value::BigInt(_) => Some("it holds an integer beyond 32 bits, which rosparam cannot send"),
         Value::DateTime(text) if emit::timestamp(text).is_none() => {
-            Some("it holds a date that is none in the calendar")
+            Some("it holds a date that is not in the calendar")
         }
         Value::Array(elements) => elements.iter().find_map(refusal),
         Value::Struct(members) => members.values().find_map(refusal),
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn what_rosparam_cannot_carry_is_left_out_and_named() {
+    fn parameters_that_rosparam_cannot_carry_are_left_out_and_named() {
         let odd = tree(&[
             ("x/y", 1.into()),
             ("", 2.into()),
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_value_is_shortened_for_people() {
+    fn a_long_value_is_shortened_for_display() {
         assert_eq!(shown(&"ü".into()), "\"ü\"");
         let long = shown(&"ü".repeat(1000).into());
         assert_eq!(long.chars().count(), SHOWN + 1);

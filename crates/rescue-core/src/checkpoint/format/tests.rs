@@ -1,4 +1,4 @@
-//! Damage to a file of a realistic size, looked at before its YAML is.
+//! Damage to a file of realistic size, examined before its YAML is read.
 
 use super::*;
 use crate::xmlrpc::Value;
@@ -26,10 +26,10 @@ fn file() -> (Vec<u8>, Vec<usize>) {
     (bytes, starts)
 }
 
-/// Without optimization a seventh of the places is all the patience there is; seven and 61 are
-/// prime, so that every position in a line and in a byte has its turn.
+/// A debug build tries only every seventh place, to save time. 7 and 61 are prime, so every position in a
+/// line and in a byte is tried at some point.
 const CUT_STEP: usize = if cfg!(debug_assertions) { 7 } else { 1 };
-/// See [`CUT_STEP`].
+/// A debug build flips only every 61st bit; see [`CUT_STEP`].
 const FLIP_STEP: usize = if cfg!(debug_assertions) { 61 } else { 16 };
 
 #[test]
@@ -70,16 +70,16 @@ fn assert_flips_noticed(step: usize) {
     }
 }
 
-/// Flips each [`FLIP_STEP`]th bit; all of them with `ROSRESCUE_FLIP_STEP=1 cargo test --release flipped`.
+/// Flips every [`FLIP_STEP`]th bit; all bits with `ROSRESCUE_FLIP_STEP=1 cargo test --release flipped`.
 #[test]
-fn bits_of_a_large_file_flipped_are_noticed() {
+fn every_flipped_bit_in_a_large_file_is_noticed() {
     let step = std::env::var("ROSRESCUE_FLIP_STEP").map(|step| step.parse().unwrap());
     assert_flips_noticed(step.unwrap_or(FLIP_STEP));
 }
 
-/// A whole file, as far as its check sums say, whose numbers are at the end of all numbers.
+/// The check sums say that the file is whole, but its numbers are the highest that there are.
 #[test]
-fn numbers_that_cannot_be_counted_on_are_damage() {
+fn numbers_too_high_to_continue_counting_are_damage() {
     let checkpoint = |seq| Checkpoint {
         seq,
         ..Checkpoint::default()

@@ -1,7 +1,9 @@
-//! Decodes YAML to values.
+//! Converts YAML to values.
 //!
-//! Reads the events of serde-saphyr's parser and does not use serde: serde's data model lacks scalar styles,
-//! tags, and integers beyond 64 bits, which distinguish the values. It accepts only what `emit` writes: no
+//! Reads the events of serde-saphyr's parser and does not use serde, because serde's data model lacks scalar
+//! styles, tags, and integers beyond 64 bits, which distinguish the values. It accepts only what `emit`
+//! writes: no anchors, no aliases, no other tags. So no text can expand to more than its own length. No
+//! function recurses.
 //! anchors, no aliases, no other tags. So no text can build more than its own length. Nothing recurses.
 
 use std::borrow::Cow;
@@ -14,7 +16,7 @@ use crate::xmlrpc::{Struct, Value};
 
 const TAG_PREFIX: &str = "tag:yaml.org,2002:";
 
-/// A collection that is not complete yet.
+/// A collection that has not been read completely.
 enum Open {
     Array {
         elements: Vec<Value>,
@@ -79,18 +81,18 @@ pub(super) fn read(text: &str) -> Result<Value, String> {
             | Event::StreamEnd
             | Event::DocumentStart(false, None)
             | Event::DocumentEnd => continue,
-            _ => return Err(at("something that is never written")),
+            _ => return Err(at("an unexpected element")),
         };
         match open.last_mut() {
             Some(Open::Array { elements, .. }) => elements.push(done),
             Some(Open::Struct { members, key }) => match key.take() {
                 None => match done {
                     Value::String(name) => *key = Some(name),
-                    _ => return Err(at("a key that is no text")),
+                    _ => return Err(at("a key that is not a text")),
                 },
                 Some(name) => {
                     if members.insert(name, done).is_some() {
-                        return Err(at("the value of a key that is there twice"));
+                        return Err(at("a value for a key that is there twice"));
                     }
                 }
             },
@@ -126,7 +128,7 @@ fn scalar(text: Cow<'_, str>, style: ScalarStyle, tag: Option<&Tag>) -> Option<V
 
 fn plain(text: &str) -> Option<Value> {
     Some(match text {
-        // The parser reports `~` where nothing follows a key. That is the journal, whose lines are read
+        // The parser reports `~` where nothing follows a key. Here that is the journal, whose lines are read
         // separately.
         "null" | "~" => Value::Nil,
         "true" => Value::Bool(true),
@@ -143,7 +145,7 @@ fn plain(text: &str) -> Option<Value> {
             } else if first.is_ascii_digit() && magnitude.contains('.') {
                 Value::Double(text.parse().ok()?)
             } else if first.is_ascii_lowercase() && text == magnitude {
-                // Only the document's own keys are plain words.
+                // Only the keys of the document itself are plain words.
                 Value::String(text.to_owned())
             } else {
                 return None;

@@ -1,7 +1,7 @@
 use super::*;
 use crate::replay::{Bears, Inspection, NotAMaster, Token, difference};
 
-/// Looks at `master` as rosrescue does over the wire.
+/// Reads the state of `master` in the way rosrescue does over the network.
 fn look(master: &mut Master, previous: &Master) -> Master {
     let token = Token::new("m", 1);
     let reply = master.apply(&Inspection::call(&token)).reply;
@@ -36,7 +36,7 @@ fn busy() -> Master {
 }
 
 #[test]
-fn a_look_shows_everything_but_what_only_the_previous_state_knows() {
+fn an_inspection_reads_everything_that_a_master_shows() {
     let mut master = busy();
     let found = look(&mut master.clone(), &Master::default());
     let mut blind = master.snapshot();
@@ -54,7 +54,7 @@ fn a_look_shows_everything_but_what_only_the_previous_state_knows() {
 }
 
 #[test]
-fn what_changed_since_is_believed_to_the_master() {
+fn an_inspection_believes_the_master_about_changes() {
     let previous = busy();
     let mut master = busy();
     for call in [
@@ -69,12 +69,12 @@ fn what_changed_since_is_believed_to_the_master() {
         master.apply(&call);
     }
     let found = look(&mut master.clone(), &previous);
-    // `/s` is another process now: its subscriptions of old are not its own.
+    // `/s` is another process now, so the subscriptions of the old one are not its own.
     assert_eq!(found, master);
 }
 
 #[test]
-fn an_empty_master_is_empty_and_bears_no_token() {
+fn an_empty_master_shows_no_state_and_no_token() {
     let token = Token::new("m", 1);
     let mut master = Master::default();
     master.set_identity(42, "http://h/".to_owned());
@@ -94,7 +94,7 @@ fn an_empty_master_is_empty_and_bears_no_token() {
     }
     master.apply(&set("/a", 1));
     assert!(!look(&mut master).is_empty());
-    // Also while it bears an earlier number.
+    // A later number is found even while the master also bears an earlier one.
     let [session, _] = Token::new("m", 12).leave();
     master.apply(&session);
     assert_eq!(look(&mut master).bears(), Bears::Later(12));
@@ -105,7 +105,7 @@ fn an_empty_master_is_empty_and_bears_no_token() {
 }
 
 #[test]
-fn poisoned_params_come_from_the_previous_state() {
+fn parameters_that_the_master_cannot_return_come_from_the_previous_state() {
     let mut master = busy();
     master.apply(&set("/bad", vec![Value::Nil]));
     let previous = master.clone();
@@ -113,7 +113,7 @@ fn poisoned_params_come_from_the_previous_state() {
 }
 
 #[test]
-fn what_vanishes_between_the_looks_is_left_out() {
+fn a_node_that_vanishes_during_an_inspection_is_left_out() {
     let mut master = busy();
     let token = Token::new("m", 1);
     let first = Inspection::decode(&master.apply(&Inspection::call(&token)).reply, &token).unwrap();
@@ -128,7 +128,7 @@ fn what_vanishes_between_the_looks_is_left_out() {
 }
 
 #[test]
-fn what_is_no_master_is_said_to_be_none() {
+fn a_server_that_is_not_a_master_is_reported_as_such() {
     let form = |reply| Inspection::decode(&reply, &Token::new("m", 1)).unwrap_err();
     assert!(matches!(
         form(Reply::Value(1.into())),

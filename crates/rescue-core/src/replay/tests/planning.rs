@@ -9,14 +9,14 @@ fn token() -> Token {
     Token::new("m", 1)
 }
 
-/// The multicall that the plan sends.
+/// The multicall that a plan sends.
 fn sent(plan: &Plan) -> Request {
     let call = decode_call(plan.request()).unwrap();
     assert_eq!(plan.request(), &encode_call(&call));
     call.into()
 }
 
-/// Runs the plan on a model of the new master: what that holds then, and what it has sent.
+/// Runs a plan on a model of the new master. Returns that master and the callbacks that it has sent.
 fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     let mut master = found.clone();
     let outcome = master.apply(&sent(plan));
@@ -33,7 +33,7 @@ fn run(plan: &Plan, found: &Master) -> (Master, Vec<Notice>) {
     (master, outcome.notices)
 }
 
-/// Brings the state to an empty master, which must hold it then and have sent nothing.
+/// Brings `target` to an empty master, and checks that the master then holds it and has sent no callback.
 fn restores(target: &Master) -> Plan {
     let plan = Plan::new(target, &Master::default(), &token());
     let (master, notices) = run(&plan, &Master::default());
@@ -55,7 +55,7 @@ fn count(plan: &Plan, method: &str) -> usize {
 }
 
 #[test]
-fn an_empty_state_needs_only_reads_and_the_token() {
+fn restoring_an_empty_state_takes_only_reads_and_the_token() {
     let plan = restores(&Master::default());
     let names = [
         "getSystemState",
@@ -69,7 +69,7 @@ fn an_empty_state_needs_only_reads_and_the_token() {
 }
 
 #[test]
-fn a_whole_state_comes_back_to_the_last_order() {
+fn a_whole_state_is_restored_with_the_order_of_every_list() {
     let master = after([
         subscribe("/late", "/x", "a/B"),
         publish("/one", "/t", "a/B"),
@@ -91,7 +91,7 @@ fn a_whole_state_comes_back_to_the_last_order() {
 }
 
 #[test]
-fn only_addresses_that_the_master_had_before_are_asked_for() {
+fn only_addresses_that_the_master_already_had_are_read_back() {
     let target = after([publish("/one", "/t", "a/B"), provide("/one", "/s")]);
     assert_eq!(count(&restores(&target), "lookupNode"), 0);
     assert_eq!(count(&restores(&target), "lookupService"), 0);
@@ -103,8 +103,8 @@ fn only_addresses_that_the_master_had_before_are_asked_for() {
 }
 
 #[test]
-fn types_out_of_their_natural_order_cost_one_helper_each() {
-    // `/late` was subscribed before anything was published: its type stands first.
+fn each_topic_type_out_of_order_takes_one_helper_registration() {
+    // `/late` got its subscriber before anything was published, so its type comes first.
     let master = after([
         subscribe("/s", "/late", "a/B"),
         publish("/p", "/early", "a/B"),
@@ -117,7 +117,7 @@ fn types_out_of_their_natural_order_cost_one_helper_each() {
 }
 
 #[test]
-fn types_without_a_topic_come_back_the_star_too() {
+fn types_of_topics_without_nodes_are_restored_including_the_star() {
     let mut master = after([
         publish("/p", "/gone", "a/B"),
         publish("/p", "/star", "*"),
@@ -131,7 +131,7 @@ fn types_without_a_topic_come_back_the_star_too() {
 }
 
 #[test]
-fn nodes_that_lost_their_services_stay_known() {
+fn nodes_whose_services_were_taken_over_stay_known() {
     let mut master = after([
         provide("/a", "/s"),
         provide("/b", "/s"),
@@ -144,7 +144,7 @@ fn nodes_that_lost_their_services_stay_known() {
 }
 
 #[test]
-fn names_that_no_node_should_have_come_back() {
+fn malformed_node_names_are_restored() {
     let master = after([
         publish("/n", "//", "a/B"),
         publish("/a b/c", "t", "a/B"),
@@ -159,7 +159,7 @@ fn names_that_no_node_should_have_come_back() {
 }
 
 #[test]
-fn poison_stays_behind_and_is_named_by_key() {
+fn unreturnable_parameters_are_left_out_and_named_by_key() {
     let master = after([
         set("/good", 1),
         set("/ns/nil", vec![Value::Nil]),
@@ -174,9 +174,9 @@ fn poison_stays_behind_and_is_named_by_key() {
     assert_eq!(restored, after([set("/good", 1), set("/ns/fine", 2)]));
 }
 
-/// Whatever a master holds, it can be brought to exactly another state, and no node hears of it.
+/// A master in any state can be brought to exactly any other state, and no node notices.
 #[test]
-fn a_state_is_replaced_in_silence() {
+fn a_state_is_replaced_without_any_callback() {
     let roscore = roscore();
     let other = after([
         publish("/p", "/t", "a/B"),
@@ -197,7 +197,7 @@ fn a_state_is_replaced_in_silence() {
         (&other, &Master::default()),
     ] {
         let mut wanted = target.snapshot();
-        // Types stay for ever.
+        // rosmaster never forgets a topic type.
         for (topic, topic_type) in found.topic_types() {
             let known = wanted.topic_types.entry(topic.clone());
             known.or_insert(topic_type.clone());
@@ -219,7 +219,7 @@ fn a_state_is_replaced_in_silence() {
 }
 
 #[test]
-fn tokens_are_not_brought_over() {
+fn tokens_are_not_restored() {
     let mut master = after([publish("/p", "/t", "a/B")]);
     let bare = master.clone();
     master.apply(&Token::new("old", 1).leave()[0]);
@@ -228,7 +228,7 @@ fn tokens_are_not_brought_over() {
     assert_eq!(plan.skipped(), []);
 }
 
-/// A roscore that came back by itself, with a `/rosout` of its own.
+/// A roscore that was started again by someone else, with a `/rosout` of its own.
 fn roscore() -> Master {
     after([
         set("/run_id", "new"),
@@ -254,7 +254,7 @@ fn roscore() -> Master {
 }
 
 #[test]
-fn what_the_new_master_holds_stays_and_nobody_is_bumped() {
+fn the_state_of_a_new_master_stays_and_no_node_is_shut_down() {
     let nodes = ["/a", "/b", "/c"];
     let mut target = after([
         set("/run_id", "old"),
@@ -269,7 +269,7 @@ fn what_the_new_master_holds_stays_and_nobody_is_bumped() {
     let (master, notices) = run(&plan, &roscore());
     assert_eq!(master.api_of("/rosout"), Some("http://new"));
     assert!(matches!(plan.skipped(), [Skipped::Node { caller_id, .. }] if caller_id == "/rosout"));
-    // One complete list for the new subscriber, and nothing else.
+    // The new subscriber gets one complete list, and nothing else is sent.
     let complete = Notice::PublisherUpdate {
         to: "http://new".to_owned(),
         topic: "/rosout".to_owned(),
@@ -285,7 +285,7 @@ fn what_the_new_master_holds_stays_and_nobody_is_bumped() {
 }
 
 #[test]
-fn a_state_that_is_there_already_is_not_registered_again() {
+fn registrations_that_the_master_already_has_are_not_repeated() {
     let target = after([
         publish("/p", "/t", "a/B"),
         subscribe("/s", "/t", "a/B"),
@@ -307,7 +307,7 @@ fn a_state_that_is_there_already_is_not_registered_again() {
 }
 
 #[test]
-fn a_service_that_somebody_has_in_the_new_master_stays_with_him() {
+fn a_service_keeps_the_provider_that_it_has_in_the_new_master() {
     let target = after([provide("/lost", "/s"), provide("/old", "/s")]);
     let found = after([provide("/new", "/s")]);
     let plan = Plan::new(&target, &found, &token());
@@ -319,7 +319,7 @@ fn a_service_that_somebody_has_in_the_new_master_stays_with_him() {
 }
 
 #[test]
-fn params_are_merged_namespace_by_namespace() {
+fn parameters_are_merged_namespace_by_namespace() {
     let target = after([
         set("/ns/ours", 1),
         set("/both", 1),
@@ -337,7 +337,7 @@ fn params_are_merged_namespace_by_namespace() {
 }
 
 #[test]
-fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
+fn verification_finds_every_kind_of_deviation_and_shows_no_values() {
     let target = after([publish("/p", "/t", "a/B"), set("/secret", "s3cret")]);
     let plan = Plan::new(&target, &Master::default(), &token());
     let mut other = after([publish("/q", "/t", "a/B")]);
@@ -355,9 +355,9 @@ fn a_verification_finds_every_kind_of_deviation_and_shows_no_value() {
     assert!(plan.verify(&Reply::Value(Value::Array(vec![]))).is_err());
 }
 
-/// As of a topic that came and went while the master hung.
+/// The type of a topic that came and went while the master did not answer.
 #[test]
-fn a_type_without_a_topic_keeps_its_place_in_a_master_that_is_emptied_first() {
+fn a_type_without_nodes_keeps_its_place_in_a_master_that_is_emptied_first() {
     let mut target = after([
         publish("/p", "/old", "a/B"),
         publish("/p", "/gone", "a/B"),
@@ -369,9 +369,9 @@ fn a_type_without_a_topic_keeps_its_place_in_a_master_that_is_emptied_first() {
     assert_eq!(plan.expected(), &target);
 }
 
-/// As of topics that were registered with another type while the master hung.
+/// The types of topics that were registered with another type while the master did not answer.
 #[test]
-fn a_type_that_has_changed_is_changed_in_a_master_that_is_emptied_first() {
+fn a_changed_type_is_corrected_in_a_master_that_is_emptied_first() {
     let before = [
         publish("/p", "/published", "a/B"),
         publish("/p", "/subscribed", "a/B"),
@@ -392,8 +392,8 @@ fn a_type_that_has_changed_is_changed_in_a_master_that_is_emptied_first() {
 }
 
 #[test]
-fn a_refusal_in_other_words_is_as_predicted() {
-    // Some members have slashes in their names, and somebody subscribes there.
+fn a_refusal_with_another_text_counts_as_predicted() {
+    // Some members have slashes in their names, and a node subscribes to one of them.
     let target = after([set("/k", tree([("x/y", 1.into())]))]);
     let found = after([watch("/n", "/k/x/y")]);
     let plan = Plan::new(&target, &found, &token());
@@ -419,7 +419,7 @@ fn a_refusal_in_other_words_is_as_predicted() {
 }
 
 #[test]
-fn a_difference_is_told_in_words_without_values() {
+fn differences_are_described_without_parameter_values() {
     let a = after([
         publish("/p", "/t", "a/B"),
         set("/k", "s3cret"),
@@ -440,7 +440,7 @@ fn a_difference_is_told_in_words_without_values() {
 }
 
 #[test]
-fn a_star_is_left_out_where_its_subscribers_would_be_told_of_a_helper() {
+fn the_type_star_is_left_out_if_subscribers_would_be_notified_of_a_helper() {
     let mut target = after([publish("/p", "/star", "*"), publish("/p", "/t", "a/B")]);
     target.apply(&call("unregisterPublisher", &["/p", "/star", &api("/p")]));
     let found = after([subscribe("/s", "/star", "*")]);
@@ -452,8 +452,8 @@ fn a_star_is_left_out_where_its_subscribers_would_be_told_of_a_helper() {
 }
 
 #[test]
-fn no_helper_takes_the_name_of_a_node() {
-    // Only `/o d` itself can say this topic, by `~`: as a helper it would bump itself.
+fn a_helper_never_takes_the_name_of_a_node() {
+    // Only `/o d` itself can name this topic, as `~`. A helper with that name would displace the node.
     let mut target = after([publish("/o d", "/t", "a/B"), subscribe("/o d", "~", "a/B")]);
     target.apply(&call("unregisterSubscriber", &["/o d", "~", &api("/o d")]));
     let plan = Plan::new(&target, &Master::default(), &token());
@@ -466,7 +466,7 @@ fn no_helper_takes_the_name_of_a_node() {
 }
 
 #[test]
-fn that_there_once_was_a_service_is_brought_along() {
+fn a_restored_master_answers_as_one_that_once_had_a_service() {
     let gone = call("unregisterService", &["/s", "/add", "rosrpc://h/s"]);
     let mut before = after([
         provide("/s", "/add"),
@@ -477,7 +477,7 @@ fn that_there_once_was_a_service_is_brought_along() {
     assert_eq!(count(&plan, "registerService"), 1);
     let (mut successor, _) = run(&plan, &Master::default());
     assert_eq!(successor.apply(&gone), before.apply(&gone));
-    // Once more: the successor's successor.
+    // The same holds when the restored master is restored again.
     let (mut successor, _) = run(&restores(&successor), &Master::default());
     assert_eq!(successor.apply(&gone), before.apply(&gone));
 }

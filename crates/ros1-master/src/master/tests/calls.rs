@@ -1,11 +1,11 @@
-//! Calls as nodes make them, and what a master answers to them.
+//! Tests of the model alone. `tests/differential` checks that it equals a real rosmaster.
 
 use crate::{
     master::{Entry, Master, Method, Notice, Request},
     xmlrpc::{Reply, Struct, Value},
 };
 
-/// A call with text parameters.
+/// A call whose parameters are all strings.
 pub(crate) fn call(method: &str, params: &[&str]) -> Request {
     Request::new(Method::named(method), params.iter().copied())
 }
@@ -46,7 +46,7 @@ pub(crate) fn api(node: &str) -> String {
     format!("http://h{node}")
 }
 
-/// A master after these calls.
+/// A master that has run these calls.
 pub(crate) fn after(calls: impl IntoIterator<Item = Request>) -> Master {
     let mut master = Master::default();
     for call in calls {
@@ -55,16 +55,16 @@ pub(crate) fn after(calls: impl IntoIterator<Item = Request>) -> Master {
     master
 }
 
-/// Code, message and value of the answer.
+/// Code, message and value of the answer to `call`.
 pub(crate) fn answer(master: &mut Master, call: &Request) -> (i32, String, Value) {
     match master.apply(call).reply {
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(code), Value::String(message), value] => {
                 (*code, message.clone(), value.clone())
             }
-            other => panic!("no answer of a master: {other:?}"),
+            other => panic!("not a master's answer: {other:?}"),
         },
-        other => panic!("no answer of a master: {other:?}"),
+        other => panic!("not a master's answer: {other:?}"),
     }
 }
 
@@ -77,7 +77,7 @@ pub(crate) fn notices(master: &mut Master, call: &Request) -> Vec<Notice> {
     master.apply(call).notices
 }
 
-/// The multicall with a malformed entry at its end.
+/// Adds a malformed entry at the end of a multicall.
 pub(crate) fn malformed(call: Request) -> Request {
     let mut entries = call.into_entries();
     entries.push(Entry::Malformed("malformed".into()));

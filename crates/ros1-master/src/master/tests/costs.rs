@@ -1,9 +1,9 @@
-//! What a call may cost: no more than a master that answers it, however it is made.
+//! What a call may cost: never more than it costs a master, however the call is made.
 
 use super::*;
 use crate::master::NoticeSink;
 
-/// Whom a value goes to, and where it lies in memory.
+/// Records the receivers of a value, and where the value lies in memory.
 #[derive(Default)]
 struct Lent(Vec<(usize, String, *const Value)>);
 
@@ -14,7 +14,7 @@ impl NoticeSink for Lent {
 }
 
 #[test]
-fn the_value_of_a_parameter_is_not_copied_for_its_subscribers() {
+fn a_parameter_value_is_not_copied_for_each_subscriber() {
     let watched = |key: &'static str| (0..5000).map(move |node| watch(&format!("/n{node}"), key));
     let mut master = after(watched("/k").chain(watched("/k/x/y")));
     let inner = tree([("y", "text".into())]);
@@ -32,7 +32,7 @@ fn the_value_of_a_parameter_is_not_copied_for_its_subscribers() {
 
 /// The keys of all members together would take 100 GB.
 #[test]
-fn a_long_name_is_not_repeated_for_every_member_in_it() {
+fn the_name_of_a_namespace_is_not_repeated_for_each_member() {
     let name = "x".repeat(1_000_000);
     let members = (0..100_000).map(|index| (index.to_string(), Value::Int(index)));
     let members = Value::Struct(members.collect());

@@ -1,4 +1,4 @@
-//! Reads that the model answers to the byte as rosmaster does, and calls that it leaves to the master.
+//! Which reads the model answers byte for byte as rosmaster does, and which it leaves to the master.
 
 use super::*;
 use crate::xmlrpc::MAX_DEPTH;
@@ -8,7 +8,7 @@ fn master() -> Master {
 }
 
 #[test]
-fn a_read_is_answered_as_by_apply() {
+fn an_exact_answer_equals_that_of_apply() {
     let mut master = master();
     let reads = [
         call("getParam", &["/c", "/a"]),
@@ -33,7 +33,7 @@ fn a_read_is_answered_as_by_apply() {
 }
 
 #[test]
-fn what_may_differ_from_the_master_is_not_answered_exactly() {
+fn there_is_no_exact_answer_where_rosmasters_may_differ() {
     let mut master = master();
     let get = call("getParam", &["/c", "/a"]);
     let with = |other: Request| Request::multicall([get.clone(), other]);
@@ -54,7 +54,7 @@ fn what_may_differ_from_the_master_is_not_answered_exactly() {
 }
 
 #[test]
-fn a_state_that_is_kept_otherwise_is_not_answered_exactly() {
+fn there_is_no_exact_answer_about_a_state_that_is_kept_differently() {
     let get = call("getParam", &["/c", "/a"]);
     let deep = "/x".repeat(513);
     let nested = (0..MAX_DEPTH / 3).fold(Value::Int(1), |inner, _| vec![inner].into());
@@ -73,7 +73,7 @@ fn a_state_that_is_kept_otherwise_is_not_answered_exactly() {
 }
 
 #[test]
-fn what_shows_the_order_of_dictionaries_is_not_answered_exactly_for_one_that_has_none() {
+fn there_is_no_exact_answer_that_shows_dictionary_order_for_a_master_without_one() {
     let tree = Value::Struct(Struct::from_iter([
         ("b".to_owned(), 1.into()),
         ("a".to_owned(), 2.into()),

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_parameter_in_the_way_becomes_a_namespace_and_empty_ones_stay() {
+fn a_value_in_the_way_becomes_a_namespace_and_empty_namespaces_stay() {
     let mut master = after([set("/a", 1), set("/a/b/c", 2)]);
     master.apply(&call("deleteParam", &["/n", "/a/b/c"]));
     let names = answer(&mut master, &call("getParamNames", &["/n"])).2;
@@ -13,7 +13,7 @@ fn a_parameter_in_the_way_becomes_a_namespace_and_empty_ones_stay() {
 }
 
 #[test]
-fn deleting_below_a_value_changes_nothing() {
+fn deleting_a_key_below_a_value_changes_nothing() {
     let texts = |texts: [&str; 2]| Value::from(texts.to_vec());
     for (value, is_absent) in [
         (1.into(), false),
@@ -33,7 +33,7 @@ fn deleting_below_a_value_changes_nothing() {
 
 #[test]
 fn reading_a_relative_key_forgets_its_first_part() {
-    // Only a caller without a leading slash can resolve to such a key.
+    // Only a caller id without a leading slash can resolve to such a key.
     let mut master = Master::default();
     master.apply(&Request::new(
         Method::SetParam,
@@ -49,7 +49,7 @@ fn reading_a_relative_key_forgets_its_first_part() {
 }
 
 #[test]
-fn a_search_looks_for_the_first_part_only() {
+fn search_param_requires_only_the_first_part_of_the_key() {
     let mut master = after([set("/pr2/robot/base", 1), set("/robot/arm", 1)]);
     let mut search =
         |caller: &str, key: &str| answer(&mut master, &call("searchParam", &[caller, key]));
@@ -65,7 +65,7 @@ fn a_search_looks_for_the_first_part_only() {
 }
 
 #[test]
-fn param_updates_reach_those_above_below_and_at_the_key() {
+fn param_updates_go_to_subscribers_above_below_and_at_the_key() {
     let mut master = after([
         watch("/root", "/"),
         watch("/exact", "/a"),
@@ -81,7 +81,7 @@ fn param_updates_reach_those_above_below_and_at_the_key() {
         key: key.to_owned(),
         value: value.clone(),
     };
-    // The setter, `/set`, is left out; the root and exact ones come first.
+    // `/set`, which made the change, is left out. The root and the exact keys come first.
     assert_eq!(
         told,
         [
@@ -91,14 +91,14 @@ fn param_updates_reach_those_above_below_and_at_the_key() {
             update("/leaf", "/a/b/", &2.into()),
         ]
     );
-    // A scalar over the parent of a subscribed key tells nobody below.
+    // Setting a scalar above a subscribed key notifies nobody below.
     assert_eq!(notices(&mut master, &set("/a", 1)).len(), 2);
     let told = notices(&mut master, &call("deleteParam", &["/set", "/a"]));
     assert_eq!(told.len(), 5);
 }
 
 #[test]
-fn what_cannot_be_returned_poisons_its_parents() {
+fn an_unreturnable_value_makes_the_namespaces_above_it_unreadable() {
     let mut master = after([
         set("/a", vec![Value::Nil]),
         set("/b", Value::BigInt("-5000000000".into())),
@@ -110,7 +110,7 @@ fn what_cannot_be_returned_poisons_its_parents() {
 }
 
 #[test]
-fn a_multicall_shows_a_namespace_as_it_is_at_the_end() {
+fn a_multicall_returns_a_namespace_as_it_is_after_the_last_entry() {
     let mut master = after([set("/a", tree([("x", 1.into())]))]);
     let get = call("getParam", &["/n", "/a"]);
     let calls = [
@@ -133,7 +133,7 @@ fn a_multicall_shows_a_namespace_as_it_is_at_the_end() {
 }
 
 #[test]
-fn no_key_and_no_value_makes_the_tree_deeper_than_the_stack() {
+fn no_key_or_value_makes_the_tree_too_deep_for_the_stack() {
     let deep = (0..511).fold(Value::Int(1), |value, _| Value::Array(vec![value]));
     let long = "/a".repeat(100_000);
     let mut master = after([
@@ -157,9 +157,9 @@ fn no_key_and_no_value_makes_the_tree_deeper_than_the_stack() {
     );
 }
 
-/// `ns_join` lets such a name stand alone, whatever it is below.
+/// `ns_join` does not join such a name to the namespace above it.
 #[test]
-fn members_whose_names_begin_with_a_slash_may_have_any_characters() {
+fn member_names_that_start_with_a_slash_may_have_any_characters() {
     for name in ["/€", "~€", "/", "/€/€"] {
         let members = tree([(name, tree([("€", 1.into())])), ("b", 2.into())]);
         let mut master = Master::default();

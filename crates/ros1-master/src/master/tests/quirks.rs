@@ -1,9 +1,9 @@
-//! One test for each thing that is not as one would think.
+//! One test for each behaviour of rosmaster that is not what one would expect.
 
 use super::*;
 
 #[test]
-fn checks_complain_in_rosmasters_words_and_order() {
+fn checks_refuse_in_rosmasters_words_and_order() {
     let mut master = Master::default();
     for (call, text) in [
         (call("getPid", &[]), "missing required caller_id parameter"),
@@ -67,7 +67,7 @@ fn checks_complain_in_rosmasters_words_and_order() {
 }
 
 #[test]
-fn errors_carry_the_methods_own_value() {
+fn a_refusal_returns_the_error_value_of_its_method() {
     let mut master = Master::default();
     let mut value = |method: &str| answer(&mut master, &call(method, &[])).2;
     assert_eq!(value("getPid"), Value::Int(-1));
@@ -81,7 +81,7 @@ fn errors_carry_the_methods_own_value() {
 }
 
 #[test]
-fn a_node_with_another_address_bumps_the_old_one_without_telling_subscribers() {
+fn a_node_at_another_address_displaces_the_old_one_without_telling_subscribers() {
     let mut master = after([
         publish("/n", "/t", "a/B"),
         subscribe("/n", "/u", "a/B"),
@@ -102,7 +102,7 @@ fn a_node_with_another_address_bumps_the_old_one_without_telling_subscribers() {
 }
 
 #[test]
-fn a_node_whose_service_was_taken_stays_known_for_ever() {
+fn a_node_whose_service_was_taken_over_stays_known_forever() {
     let mut master = after([provide("/a", "/s"), provide("/b", "/s")]);
     assert_eq!(
         message(
@@ -119,7 +119,7 @@ fn a_node_whose_service_was_taken_stays_known_for_ever() {
 }
 
 #[test]
-fn a_service_keeps_its_place_when_it_changes_hands() {
+fn a_service_keeps_its_place_in_the_list_when_another_node_takes_it_over() {
     let master = after([
         provide("/a", "/s"),
         provide("/a", "/r"),
@@ -130,7 +130,7 @@ fn a_service_keeps_its_place_when_it_changes_hands() {
 }
 
 #[test]
-fn unregistering_from_a_master_that_never_had_a_service_says_so() {
+fn unregister_service_has_another_message_if_there_never_was_a_service() {
     let mut master = after([publish("/n", "/t", "a/B")]);
     let unregister = call("unregisterService", &["/n", "/s", "rosrpc://h"]);
     assert_eq!(
@@ -167,7 +167,7 @@ fn topic_types_outlive_topics_and_only_publishers_change_them() {
 }
 
 #[test]
-fn subscribers_are_told_at_every_registration_and_only_at_real_unregistrations() {
+fn subscribers_are_notified_of_every_registration_but_only_of_effective_unregistrations() {
     let mut master = after([subscribe("/s", "/t", "a/B")]);
     let told = |publishers: &[&str]| {
         [Notice::PublisherUpdate {
@@ -191,7 +191,7 @@ fn subscribers_are_told_at_every_registration_and_only_at_real_unregistrations()
 }
 
 #[test]
-fn a_malformed_entry_faults_the_whole_multicall_after_the_ones_before_it_ran() {
+fn a_malformed_entry_fails_the_whole_multicall_after_earlier_entries_have_run() {
     let mut master = Master::default();
     let list = vec![
         set("/a", 1).into_entry(),
@@ -205,7 +205,7 @@ fn a_malformed_entry_faults_the_whole_multicall_after_the_ones_before_it_ran() {
 }
 
 #[test]
-fn methods_that_are_none_fault() {
+fn unknown_methods_are_answered_with_a_fault() {
     let mut master = Master::default();
     for method in ["nope", "uri", "param_update_task"] {
         let reply = master.apply(&call(method, &["/n"])).reply;
@@ -214,7 +214,7 @@ fn methods_that_are_none_fault() {
 }
 
 #[test]
-fn a_snapshot_brings_back_the_whole_state_and_refuses_what_cannot_be() {
+fn a_snapshot_restores_the_whole_state_and_impossible_states_are_refused() {
     use crate::master::InvalidSnapshot;
     let master = after([
         provide("/a", "/s"),
@@ -250,7 +250,7 @@ fn a_snapshot_brings_back_the_whole_state_and_refuses_what_cannot_be() {
 }
 
 #[test]
-fn unregistering_everything_a_node_has_makes_the_master_forget_it() {
+fn a_node_without_any_registration_is_forgotten() {
     let calls = [
         publish("/ns/n", "t", "a/B"),
         subscribe("/ns/n", "~u", "a/B"),
@@ -268,9 +268,10 @@ fn unregistering_everything_a_node_has_makes_the_master_forget_it() {
     assert_eq!(master.unregister_calls("/nobody"), []);
 }
 
-/// rosmaster 1.14.3 and before: 0 in place of an empty list or name, and who sets a parameter is told of it.
+/// rosmaster 1.14.3 and before answers 0 in place of an empty list or name, and notifies the node that sets a
+/// parameter as well.
 #[test]
-fn an_old_master_refuses_and_notifies_in_its_own_way() {
+fn rosmaster_1_14_3_and_before_refuses_and_notifies_differently() {
     let value = |old, call: &Request| {
         let mut master = Master::default();
         master.set_old(Some(old));

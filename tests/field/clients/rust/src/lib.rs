@@ -1,4 +1,4 @@
-//! What the nodes share. What they do and say is in `tests/field/clients/measure.py`.
+//! What the nodes have in common. `tests/field/clients/measure.py` describes what they do and print.
 
 use std::fmt::{Debug, Display};
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ pub const TICK: Duration = Duration::from_millis(100);
 
 rosrust::rosmsg_include!(std_msgs / String, std_srvs / Trigger);
 
-/// The only argument.
+/// The name of the node, which is the only argument.
 pub fn name() -> String {
     std::env::args().nth(1).expect("usage: PROGRAM NAME")
 }
@@ -19,7 +19,7 @@ pub fn say(what: impl Display) {
     println!("{what}");
 }
 
-/// Says how the call `number` of a kind ended, and after how many milliseconds.
+/// Prints how call `number` of a kind ended, and after how many milliseconds.
 pub fn outcome<E: Debug>(what: &str, number: i32, start: Instant, result: Result<(), E>) {
     let ms = start.elapsed().as_millis();
     match result {
