@@ -180,7 +180,7 @@ fn certificates_and_users_are_made_as_the_document_says() {
 fn rosrescue_runs_as_the_document_says_and_hands_over() {
     let document = Document::new();
     let [core, _, _, check] = document.section("rosrescue");
-    let [look] = document.section("Seeing it, and trying it");
+    let [look] = document.section("Try it");
     let said = run(&[
         three_etcd(&document),
         on(&ALL, &core),
