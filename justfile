@@ -12,7 +12,7 @@ quick:
 test:
     tests/run.sh
 
-# Print the tables of benches/results.md
+# The tables of benches/results.md
 bench:
     cargo bench --bench pauses
     cargo bench --bench table1
@@ -22,3 +22,7 @@ bench:
 # Show a rescue with a real rosmaster and nodes
 quickstart:
     examples/quickstart.sh
+
+# The documents as a book with search: target/book/index.html (needs mdBook: cargo install mdbook)
+docs:
+    packaging/build-book.sh

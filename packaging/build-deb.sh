@@ -42,6 +42,10 @@ gzip -9n "$assets"/man/*.1
 for shell in bash zsh fish; do
     "$program" completions "$shell" >"$assets/completions/$shell"
 done
+# The documents, and a book of them if there is an mdBook.
+packaging/build-book.sh >/dev/null || [ $? = 3 ]
+mv target/book-source "$assets/doc"
+[ ! -d target/book ] || mv target/book "$assets/doc/html"
 # Nobody's robot yet: a user that systemd makes for it, and all addresses.
 fill() {
     sed -e "s|@ORIGIN@|Of the package rosrescue. \`rosrescue install\` makes one for your robot, which goes before it.|" \

@@ -181,7 +181,7 @@ fn certificates_and_users_can_be_made_as_documented() {
 fn rosrescue_can_be_run_and_handed_over_as_documented() {
     let document = Document::new();
     let [core, _, _, check] = document.section("rosrescue");
-    let [look] = document.section("Seeing it, and trying it");
+    let [look] = document.section("Try it");
     let said = run(&[
         three_etcd(&document),
         on(&ALL, &core),

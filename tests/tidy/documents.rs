@@ -1,11 +1,11 @@
 //! Documents say what the program says, and name what there is.
 
-use std::{collections::BTreeSet, fs, process::Command};
+use std::{collections::BTreeSet, fs, path::Path, process::Command};
 
 use super::{blocks::documents, commands::quoted, read, root, rust_files, source_folders, sources};
 
-/// The most bytes of the README. Nobody reads a longer one.
-const README_BYTES_MOST: usize = 8 << 10;
+/// The most bytes of documents: people read no more. The last is all of `docs` without the decisions and the help.
+const BYTES_MOST: [(&str, usize); 2] = [("README.md", 8 << 10), ("docs", 170 << 10)];
 
 /// What `rosrescue ARGUMENTS` prints at a width of 100, without any setting of this computer.
 fn printed(arguments: &[&str]) -> String {
@@ -58,12 +58,90 @@ fn the_documents_have_the_help_as_the_program_prints_it() {
 }
 
 #[test]
-fn the_readme_stays_short() {
-    let bytes = read("README.md").len();
-    assert!(
-        bytes <= README_BYTES_MOST,
-        "the README has {bytes} bytes; move something to docs"
-    );
+fn documents_stay_short() {
+    for (name, most) in BYTES_MOST {
+        let counted = documents().into_iter().filter(|document| {
+            let path = document.strip_prefix(root()).unwrap();
+            path == Path::new(name)
+                || path.parent() == Some(Path::new(name)) && !path.ends_with("cli.md")
+        });
+        let bytes: usize = counted.map(|document| read(document).len()).sum();
+        assert!(bytes <= most, "{name} has {bytes} bytes, more than {most}");
+    }
+}
+
+/// The sentences of a document's prose. A block of commands is none, and a cell of a table is one at least.
+fn sentences(text: &str) -> Vec<String> {
+    let mut fenced = false;
+    let mut paragraphs = vec![String::new()];
+    for line in text.lines() {
+        let start = line.trim_start();
+        fenced ^= start.starts_with("```");
+        if fenced || start.starts_with("```") || line.starts_with("    ") {
+            paragraphs.push(String::new());
+            continue;
+        }
+        let is_new = ["* ", "|", "#"].iter().any(|mark| start.starts_with(mark))
+            || start.starts_with(|c: char| c.is_ascii_digit());
+        for (cell, number) in start.split('|').zip(0..) {
+            if start.is_empty() || is_new || number > 0 {
+                paragraphs.push(String::new());
+            }
+            let last = paragraphs.last_mut().unwrap();
+            *last += " ";
+            *last += cell.trim();
+        }
+    }
+    let ends = [". ", "? ", "! ", ".** ", ".) "];
+    let mut sentences = paragraphs;
+    for end in ends {
+        let split = sentences.iter().flat_map(|text| text.split(end));
+        sentences = split.map(str::to_owned).collect();
+    }
+    sentences
+}
+
+/// What is between backticks is one word, and so is an address.
+fn words(sentence: &str) -> usize {
+    let spoken: String = sentence.split('`').step_by(2).collect::<Vec<_>>().join("X");
+    let spoken = spoken
+        .split("](")
+        .map(|part| part.split_once(')').map_or(part, |(_, rest)| rest));
+    let spoken: String = spoken.collect::<Vec<_>>().join(" ");
+    let is_word = |word: &&str| word.contains(char::is_alphanumeric);
+    spoken.split_whitespace().filter(is_word).count()
+}
+
+#[test]
+fn sentences_are_short() {
+    assert_eq!(sentences("One. Two\nthree.\n* Four | five").len(), 4);
+    for document in ["README.md", "ROS_MASTER_URI.md"] {
+        for sentence in sentences(&read(document)) {
+            let words = words(&sentence);
+            assert!(
+                words <= 30,
+                "{document} has a sentence of {words} words: {sentence}"
+            );
+        }
+    }
+}
+
+/// `packaging/build-book.sh` adds the decisions.
+#[test]
+fn every_document_is_in_the_table_of_contents() {
+    let contents = read("docs/SUMMARY.md");
+    for document in documents() {
+        let path = document.strip_prefix(root()).unwrap();
+        let is_decision = path.starts_with("docs/decisions") && !path.ends_with("README.md");
+        if is_decision || path.ends_with("SUMMARY.md") {
+            continue;
+        }
+        let path = path.strip_prefix("docs").map_or_else(
+            |_| format!("](../{})", path.display()),
+            |path| format!("]({})", path.display()),
+        );
+        assert!(contents.contains(&path), "docs/SUMMARY.md lacks {path}");
+    }
 }
 
 /// `tests/robot/documents.rs` compares its lines with those of a new one.
@@ -171,6 +249,13 @@ fn links_in_documents_lead_somewhere() {
                 _ => document.parent().unwrap().join(target),
             };
             assert!(path.exists(), "{} links to {link}", document.display());
+            assert!(
+                [".md", ".png", ".svg"]
+                    .iter()
+                    .any(|end| target.is_empty() || target.ends_with(end)),
+                "{} links to {link}, which is not in the book: name it in backticks",
+                document.display()
+            );
             assert!(
                 anchor.is_empty() || anchors(&read(&path)).contains(anchor),
                 "{} links to {link}, which has no such heading",

@@ -72,6 +72,13 @@ fn the_package_can_be_installed_upgraded_removed_and_purged_without_a_trace() {
             /usr/share/fish/vendor_completions.d/rosrescue.fish /usr/share/bash-completion/completions/rosrescue
         ls /usr/lib/systemd/system/rosrescue.* /usr/share/doc/rosrescue/copyright
         dpkg --verify rosrescue
+        cd /usr/share/doc/rosrescue
+        find . -name '*.md' | while read -r document; do
+            grep -o '][(][^)#]*' "$document" | cut -c3- | grep -v '^https:' | grep . | while read -r link; do
+                test -e "$(dirname "$document")/$link" || echo "$document links to $link"
+            done
+        done
+        cd /
         echo ROS_IP=10.0.0.7 >>/etc/default/rosrescue
         dpkg -i /given/{new} >/dev/null
         dpkg -s rosrescue | grep ^Version
