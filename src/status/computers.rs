@@ -351,7 +351,7 @@ mod tests {
                 "etcd        NO ANSWER since THEN: no majority",
                 "not in etcd 3 changes of this computer",
                 "takeover    THEN from pc-3: in 2.04 s; 2 by this computer so far",
-                "lost        1 of the changes made alone: others had changed the same; the log names each",
+                "lost        1 of the changes made alone: others had changed the same. The log lists them",
             ]
         );
     }

@@ -189,7 +189,7 @@ fn one_computer_hands_over_to_nobody() {
     let robot = Robot::start(Mode::Core);
     let alone = Tool::rosrescue(&robot.scratch, robot.port(), &["handover"]);
     assert!(
-        alone.stderr.contains("it runs without --cluster"),
+        alone.stderr.contains("runs without --cluster"),
         "{alone:?}"
     );
     alone.ended(1);

@@ -36,7 +36,7 @@ fn who_has_the_port() {
             facts.masters = vec![process(7, "rosmaster", 11311)];
         },
     );
-    one(Problem, "port", "something that is no master", |facts| {
+    one(Problem, "port", "a program that is not a master", |facts| {
         port(facts).taken = taken(Server::Other);
     });
     one(
@@ -97,7 +97,7 @@ fn traps_of_ros_master_uri() {
             facts.master_host = None;
         },
     );
-    one(Problem, "ROS_MASTER_URI", "blanks", |facts| {
+    one(Problem, "ROS_MASTER_URI", "ends with a space", |facts| {
         uri(facts, "http://robot:11311/ ")
     });
     one(Problem, "ROS_MASTER_URI", "base has no address", |facts| {
@@ -126,7 +126,7 @@ fn traps_of_ros_master_uri() {
 #[test]
 fn traps_of_ros_ip_and_ros_hostname() {
     let ip = |facts: &mut Facts, ip: &str| facts.env.ip = Some(ip.to_owned());
-    one(Problem, "ROS_IP", "`10.0.0.7 ` has blanks", |facts| {
+    one(Problem, "ROS_IP", "`10.0.0.7 ` begins or ends", |facts| {
         ip(facts, "10.0.0.7 ");
         facts.own = nowhere("10.0.0.7 ");
     });
@@ -323,7 +323,7 @@ fn what_goes_past_rosrescue_is_warned_of() {
     one(
         Warning,
         "unprotected",
-        "takes connections from other computers",
+        "accepts connections from other computers",
         |facts| facts.behind = behind(&[], true),
     );
     one(
