@@ -22,10 +22,6 @@ impl SecondMaster {
             words.collect::<Vec<_>>()
         };
         let (mut arguments, environment) = (read("cmdline"), read("environ"));
-        if arguments[1] == "-c" {
-            // The rosmaster was a spare: its command line starts with interpreter and program text.
-            arguments.drain(..3);
-        }
         let place = arguments.iter().position(|word| word == "-p");
         if let Some(place) = place {
             arguments.drain(place..place + 2);

@@ -45,9 +45,6 @@ struct Options {
     /// Number of kills for each number of real rospy nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     real: usize,
-    /// Use a spare rosmaster
-    #[arg(long)]
-    spare: bool,
 }
 
 fn main() {
@@ -62,21 +59,18 @@ fn main() {
         .into_iter()
         .filter(|(_, kills)| *kills > 0)
         .map(|(kind, kills)| {
-            let measured = options
-                .nodes
-                .iter()
-                .map(|nodes| row(kind, *nodes, kills, options.spare));
+            let measured = options.nodes.iter().map(|nodes| row(kind, *nodes, kills));
             (kind, measured.collect())
         })
         .collect();
     table::print(&tables);
 }
 
-/// Kills the master of a robot with this many nodes again and again.
-fn row(kind: Kind, nodes: usize, kills: usize, spare: bool) -> Row {
+/// Kills the master of a robot with so many nodes again and again.
+fn row(kind: Kind, nodes: usize, kills: usize) -> Row {
     let mut row = Row::new(nodes);
     while row.kills() < kills {
-        let mut robot = Robot::start(kind, nodes, spare);
+        let mut robot = Robot::start(kind, nodes);
         for _ in 0..KILLS_A_LIFE.min(kills - row.kills()) {
             robot.settle();
             let best = limit::measure(&robot);

@@ -81,13 +81,11 @@ pub(crate) struct Robot {
 }
 
 impl Robot {
-    /// Starts rosrescue and its nodes, and waits until everything has registered.
-    pub(crate) fn start(kind: Kind, count: usize, spare: bool) -> Self {
+    /// Starts rosrescue and its nodes, and waits until all of it is there.
+    pub(crate) fn start(kind: Kind, count: usize) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
-        let rescue = Setup::core(&scratch, master_port)
-            .args(spare.then_some("--spare-master"))
-            .start();
+        let rescue = Setup::core(&scratch, master_port).start();
         let client = rescue.client();
         eventually("roscore's parameters are set", || {
             client.param("/rosdistro").is_some()

@@ -196,7 +196,10 @@ fn rosrescue_can_be_run_and_handed_over_as_documented() {
         said.contains("base-10.0.0.1 led, ") && said.contains("leads now, after"),
         "{said}"
     );
-    assert!(said.contains("base-10.0.0.1 (this one) follows"), "{said}");
+    assert!(
+        said.contains("base-10.0.0.1 (this one) is following"),
+        "{said}"
+    );
     assert!(said.contains("all 3 members of etcd answer"), "{said}");
     assert!(said.contains("etcd has the robot robot, "), "{said}");
 }

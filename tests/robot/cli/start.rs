@@ -115,9 +115,9 @@ fn variables_of_core_are_no_matter_of_proxy() {
 fn a_new_session_is_said_to_be_one() {
     let scratch = Scratch::new();
     let mut rescue = Setup::core(&scratch, free_port()).start();
-    rescue.wait_line("what it did", |line| line.contains("is served"));
+    rescue.wait_line("what it did", |line| line.contains("a new session started"));
     let said = rescue.output().join("\n");
-    assert!(!said.contains("given the whole state"), "{said}");
+    assert!(!said.contains("got the whole state"), "{said}");
 }
 
 /// The gate stays open although rosmaster closes what is idle for four seconds.

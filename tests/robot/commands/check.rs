@@ -110,7 +110,7 @@ fn a_forgotten_master_is_found_and_a_running_rosrescue_is_fine() {
     let nobody = format!("http://127.0.0.1:{}", free_port());
     let found = Found::by(check(&scratch, free).args(["--master", &nobody]));
     found.assert_no_problem();
-    assert!(found.said("master").contains("nobody answers"));
+    assert!(found.said("master").contains("no answer from"));
     let rescue = Setup::proxy(&scratch, port).start();
     let found = Found::by(&mut check(&scratch, rescue.port()));
     found.assert_no_problem();
@@ -195,7 +195,7 @@ fn something_else_at_the_port() {
         listener
     });
     let found = Found::by(&mut check(&scratch, port));
-    found.assert_problem("port", "something that is no master");
+    found.assert_problem("port", "a program that is not a master");
     drop(closing.join());
 }
 
@@ -204,7 +204,7 @@ fn traps_in_the_environment() {
     let scratch = Scratch::new();
     let port = free_port();
     for (key, value, subject, words) in [
-        ("ROS_IP", "127.0.0.1 ", "ROS_IP", "has blanks"),
+        ("ROS_IP", "127.0.0.1 ", "ROS_IP", "begins or ends with a space"),
         (
             "ROS_IP",
             "192.0.2.1",
@@ -239,7 +239,7 @@ fn traps_in_the_environment() {
             "ROS_MASTER_URI",
             "http://127.0.0.1:1",
             "ROS_MASTER_URI",
-            "has port 1, rosrescue",
+            "has port 1, but rosrescue",
         ),
         (
             "ROS_MASTER_URI",
@@ -356,7 +356,7 @@ fn the_hosts_file_and_the_units_of_this_computer() {
     assert!(
         found
             .said("host name")
-            .contains("robot is 127.0.1.1, which only this computer reaches"),
+            .contains("robot is 127.0.1.1, which other computers cannot reach"),
         "{:#}",
         found.report
     );

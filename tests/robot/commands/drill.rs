@@ -160,7 +160,7 @@ fn a_master_that_hangs_is_left_alive_by_a_proxy() {
     );
     assert!(
         robot.bare().master_pid().is_some(),
-        "the same master goes on"
+        "the same master continues"
     );
 }
 
@@ -244,7 +244,7 @@ fn an_interrupted_drill_leaves_nothing_behind() {
         assert!(names.contains("/rosrescue_drill_"), "{names}");
         drill.signal(which);
         assert_eq!(drill.wait_output().code(), Some(1));
-        assert!(drill.stderr().join(" ").contains("tidied up"));
+        assert!(drill.stderr().join(" ").contains("cleaned up"));
         robot.await_state(&before, "after an interrupted drill");
     }
     // One that is killed itself: the next takes its parameter away, a health check its registrations.
@@ -270,7 +270,7 @@ fn nothing_is_killed_without_consent_or_understanding() {
         assert!(said.contains(words), "{said}");
     };
     let master = robot.master_pid();
-    refused(&[], 2, "say --yes");
+    refused(&[], 2, "with --yes");
     refused(&["--yes", "--kill", "worker"], 2, "without a guardian");
     refused(
         &["--no-kill", "--topic", "/nothere"],
@@ -305,10 +305,10 @@ fn a_person_is_asked() {
     };
     let mut no = ask("n");
     no.wait_line("the question", |line| {
-        line.contains("Is the robot on the bench")
+        line.contains("Is the robot safe on the bench")
     });
     no.wait_line("that nothing happened", |line| {
-        line.contains("nothing was killed")
+        line.contains("killed nothing")
     });
     assert_eq!(robot.master_pid(), master);
     let mut yes = ask("y");

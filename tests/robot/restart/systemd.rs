@@ -81,7 +81,7 @@ fn with_a_socket_unit_systemd_replaces_the_guardian() {
         .wrapped(|own| activated(own, socket.into()))
         .at_port(port)
         .spawn();
-    manager.wait("STATUS=waiting for a first master: Nodes wait");
+    manager.wait("STATUS=waiting for a first master: Calls wait");
     manager.wait("WATCHDOG=1");
     assert!(!manager.has_heard("READY=1"));
     let mut master = Rosmaster::start_at(&scratch, master_port);
@@ -95,7 +95,7 @@ fn with_a_socket_unit_systemd_replaces_the_guardian() {
     assert_eq!(page["guarded"], true);
     assert_eq!(page["guarded_by"], "systemd");
     master.kill();
-    manager.wait("STATUS=standing in for the master: Nodes go on");
+    manager.wait("STATUS=standing in for the master: Nodes keep working");
 
     // After a crash, systemd starts the program again with the same socket.
     rescue.kill();

@@ -107,7 +107,7 @@ fn the_ros_that_is_installed() {
     one(
         Problem,
         "rosmaster",
-        "does not run with /usr/bin/python3: No module",
+        "fails with /usr/bin/python3: No module",
         |facts| {
             if let Some(Ok(program)) = &mut facts.rosmaster {
                 program.broken = Some("No module".to_owned());
@@ -139,7 +139,7 @@ fn the_master_of_a_proxy() {
             .push(unit("roscore.service", Kind::Roscore, true));
     };
     assert_eq!(said(|facts| proxy(facts, Server::Master(Some(9)))), []);
-    one(Warning, "master", "nobody answers", |facts| {
+    one(Warning, "master", "no answer from", |facts| {
         proxy(facts, Server::Nobody)
     });
     one(Problem, "master", "is not a ROS master", |facts| {
@@ -158,7 +158,7 @@ fn units_of_systemd() {
     one(
         Problem,
         "systemd",
-        "robot.service starts a master",
+        "robot.service starts another master",
         with(Kind::Roscore, true),
     );
     one(
@@ -168,15 +168,10 @@ fn units_of_systemd() {
         with(Kind::Roslaunch, true),
     );
     assert_eq!(said(with(Kind::Roscore, false)), []);
-    one(Note, "systemd", "no unit", |facts| facts.units.clear());
-    one(
-        Note,
-        "systemd",
-        "does not start with the computer",
-        |facts| {
-            facts.units[0].is_enabled = false;
-        },
-    );
+    one(Note, "systemd", "no rosrescue service", |facts| facts.units.clear());
+    one(Note, "systemd", "does not start at boot", |facts| {
+        facts.units[0].is_enabled = false;
+    });
 }
 
 #[test]
