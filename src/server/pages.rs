@@ -5,21 +5,18 @@
 //! | `/` | the page for a browser, the status as text for anybody else |
 //! | `/status.json` | the status as JSON, with the report of the last recovery |
 //! | `/state.json` | nodes, topics, services and parameters |
-//! | `/graph.svg` | the computation graph |
 //! | `/events` | what changes, as it happens |
 //! | `/metrics` | counters in Prometheus' text format |
 //! | `/live` | 200 while rosrescue runs |
 //! | `/ready` | 200 while calls are answered, by the master, the mirror or another computer, else 503 |
 
 mod events;
-mod graph;
 mod params;
 mod robot;
 pub(crate) mod status;
 
 use std::sync::Arc;
 
-use bytes::Bytes;
 use hyper::{
     HeaderMap, StatusCode, Uri,
     header::{
@@ -33,7 +30,6 @@ use tokio_util::sync::CancellationToken;
 
 use self::{
     events::Feed,
-    graph::{Drawn, Graph, Selection},
     params::Members,
     robot::Robot,
     status::Rate,
@@ -99,7 +95,6 @@ pub struct Pages {
 /// What pages share.
 #[derive(Debug)]
 pub(crate) struct Desk {
-    drawn: Drawn,
     feed: Feed,
     /// A whole state is made for one after the other.
     reading: Semaphore,
@@ -108,7 +103,6 @@ pub(crate) struct Desk {
 impl Default for Desk {
     fn default() -> Self {
         Self {
-            drawn: Drawn::default(),
             feed: Feed::default(),
             reading: Semaphore::new(1),
         }
@@ -134,13 +128,12 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         }
         "/" => text(StatusCode::OK, pages.status().to_string()),
         "/page.css" => reply(StatusCode::OK, "text/css", include_str!("pages/web/page.css")),
-        "/page.js" => reply(StatusCode::OK, "text/javascript", include_str!("pages/web/page.js")),
+        "/page.js" => script(include_str!("pages/web/page.js")),
+        "/graph.js" => script(include_str!("pages/web/graph.js")),
+        "/layout.js" => script(include_str!("pages/web/layout.js")),
+        "/dagre.js" => script(include_str!("pages/web/vendor/dagre.js")),
         "/status.json" => json(serde_json::to_string_pretty(&pages.status())),
         "/state.json" => state(server, Asked::read(uri)).await,
-        "/graph.svg" => {
-            let picture = pages.picture(Asked::read(uri).selection).await;
-            reply(StatusCode::OK, "image/svg+xml", picture)
-        }
         "/events" => {
             let mut events = events::listen(server);
             if events.status() == StatusCode::OK {
@@ -164,7 +157,7 @@ async fn answer(server: &Arc<Server>, uri: &Uri, headers: &HeaderMap) -> HttpRep
         ),
         _ => text(
             StatusCode::NOT_FOUND,
-            "no such page; there are /, /status.json, /state.json, /graph.svg, /events, /metrics, /live and /ready\n"
+            "no such page; there are /, /status.json, /state.json, /events, /metrics, /live and /ready\n"
                 .to_owned(),
         ),
     }
@@ -177,6 +170,10 @@ fn wants_html(headers: &HeaderMap) -> bool {
     accepted.any(|accepted| accepted.contains("text/html"))
 }
 
+fn script(text: &'static str) -> HttpReply {
+    reply(StatusCode::OK, "text/javascript", text)
+}
+
 fn json(text: serde_json::Result<String>) -> HttpReply {
     match text {
         Ok(json) => reply(StatusCode::OK, JSON, json + "\n"),
@@ -187,7 +184,6 @@ fn json(text: serde_json::Result<String>) -> HttpReply {
 /// What of a page is asked for.
 #[derive(Debug, Default)]
 struct Asked {
-    selection: Selection,
     /// Only the parameters of a namespace,
     params: Option<String>,
     /// or those with this in their names.
@@ -201,10 +197,6 @@ impl Asked {
         for (name, value) in form_urlencoded::parse(query.as_bytes()) {
             let value = value.chars().take(ASKED).collect();
             match &*name {
-                "filter" => asked.selection.filter = value,
-                "debug" => asked.selection.debug = value == "1",
-                "leaves" => asked.selection.leaves = value == "1",
-                "tall" => asked.selection.tall = value == "1",
                 "params" => asked.params = Some(value),
                 "search" => asked.search = Some(value),
                 _ => {}
@@ -284,14 +276,4 @@ async fn state(server: &Arc<Server>, asked: Asked) -> HttpReply {
     };
     let made = tokio::task::spawn_blocking(work).await;
     made.unwrap_or_else(|error| text(StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")))
-}
-
-impl Pages {
-    async fn picture(&self, selection: Selection) -> Bytes {
-        let robot = Robot::read(&self.ledger, &self.nodes);
-        self.desk
-            .drawn
-            .picture(Graph::new(&robot, &selection))
-            .await
-    }
 }

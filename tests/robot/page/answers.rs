@@ -53,7 +53,9 @@ fn a_browser_gets_the_page_and_curl_gets_text() {
     for (path, kind) in [
         ("/page.js", "text/javascript"),
         ("/page.css", "text/css"),
-        ("/graph.svg", "image/svg+xml"),
+        ("/graph.js", "text/javascript"),
+        ("/layout.js", "text/javascript"),
+        ("/dagre.js", "text/javascript"),
         ("/state.json", "application/json"),
     ] {
         let page = get(&client, path, &[]);
@@ -98,7 +100,6 @@ fn no_answer_holds_a_hidden_value() {
         "/state.json?search=pin",
         "/state.json?search=log",
         "/state.json?search=hunter2",
-        "/graph.svg?filter=hunter2",
     ] {
         let page = get(&client, path, &["Accept: text/html"]).text();
         assert!(

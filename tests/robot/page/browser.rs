@@ -115,7 +115,7 @@ fn the_page_shows_the_robot_and_follows_its_rescues() {
         "without a master",
         "to read it",
         "to restore it",
-        "nodes asked within",
+        "nodes checked after",
         "none lost",
     ] {
         eventually("the health check is over", || {
@@ -198,6 +198,33 @@ fn eighty_nodes_are_filtered_secrets_hidden_and_hostile_names_harmless() {
     open(&mut browser, &robot);
     let boxes = "document.querySelectorAll('#picture .node').length";
     browser.shows("all nodes are drawn", &format!("{boxes} === 82"));
+    browser.js("document.querySelector('#graph-debug').click()");
+    browser.shows("rosout is drawn on request", &draws("topic", "/rosout"));
+    browser.js("document.querySelector('#graph-debug').click()");
+    browser.shows(
+        "and hidden again",
+        &format!("!{}", draws("topic", "/rosout")),
+    );
+    let leaf = draws("topic", "/planner/n79/out");
+    assert_eq!(browser.js(&leaf), serde_json::Value::Null);
+    browser.js("document.querySelector('#graph-leaves').click()");
+    browser.shows("a topic without a subscriber, too", &leaf);
+    browser.js("document.querySelector('#graph-leaves').click()");
+    browser.shows("and not any more", &format!("!{leaf}"));
+    browser.shows(
+        "a person can read it",
+        "document.querySelector('#picture .node text').getBoundingClientRect().height > 8",
+    );
+    browser.js("document.querySelector('#zoom-all').click()");
+    let frame = "const frame = document.querySelector('#picture').getBoundingClientRect();";
+    let inside = "box.left >= frame.left - 1 && box.right <= frame.right + 1 && box.top >= frame.top - 1 \
+                  && box.bottom <= frame.bottom + 1";
+    let all =
+        "[...document.querySelectorAll('#picture .box')].map((of) => of.getBoundingClientRect())";
+    browser.shows(
+        "the whole graph fits",
+        &format!("(() => {{ {frame} return {all}.every((box) => {inside}) }})()"),
+    );
     let type_into = |browser: &mut Browser, field: &str, text: &str| {
         browser.js(&format!("document.querySelector('{field}').focus()"));
         browser.js(&format!(
@@ -306,8 +333,9 @@ fn sick_nodes_are_shown_as_such() {
         "document.querySelector('#sick').innerText === '1 dead, 1 unreachable'",
     );
     browser.shows(
-        "it is drawn, too",
-        "document.querySelector('#picture .unreachable[data-node=\"/silent\"]')",
+        "they are drawn, too",
+        "document.querySelector('#picture .unreachable[data-node=\"/silent\"]') && \
+         document.querySelector('#picture .dead[data-node=\"/dead\"]')",
     );
     assert_clean(&browser, &robot);
 }

@@ -1,8 +1,9 @@
 // The page of rosrescue. Names of nodes, topics and parameters come from the network: they are only ever set
 // as text, never as markup.
 
+import { abandon, draw, layOut, measure, select } from "/graph.js";
+
 const $ = (id) => document.getElementById(id);
-const SVG = "http://www.w3.org/2000/svg";
 /** Rows of a list; more are found by searching. */
 const ROWS = 300;
 /** Seconds without any event after which the connection counts as lost; there is one every 15. */
@@ -20,13 +21,13 @@ const CONDITIONS = {
   alone: ["bad", "ALONE: cut off from the other computers"],
   waiting: ["warn", "Waiting for a first master"],
 };
-const ROLES = { joining: "joins", following: "follows", catching_up: "takes over", leading: "leads", alone: "ALONE" };
+const ROLES = { joining: "joining", following: "following", catching_up: "taking over", leading: "leads", alone: "ALONE" };
 const OUTCOMES = {
-  begun: "a new session was begun",
-  injected: "a new master was given the whole state",
+  begun: "a new session started",
+  injected: "a new master got the whole state",
   adopted: "a running master was taken over",
-  reconciled: "the same master goes on, and was told what changed",
-  resumed: "the same master goes on",
+  reconciled: "the same master continues, and got the changes it missed",
+  resumed: "the same master continues",
 };
 
 /** What keeps a node from being called alive, the worst first. */
@@ -119,7 +120,7 @@ function connect() {
     readState();
   };
   source.onerror = () => {
-    setLink("lost", "no answer from rosrescue; trying again");
+    setLink("lost", "no answer from rosrescue, retrying");
     // The browser itself comes again after a lost connection, but not after a refusal.
     if (source.readyState === EventSource.CLOSED) setTimeout(refused, 2000);
   };
@@ -144,7 +145,7 @@ async function refused() {
     const answer = await fetch("/status.json");
     if (answer.ok) {
       status = await answer.json();
-      setLink("waiting", "many pages are open: every 2 s");
+      setLink("waiting", "many pages are open: updates every 2 s");
       now = { ...status, gate: status.open ? "open" : status.elsewhere ? "elsewhere" : "standing_in" };
       showStatus();
       showNow();
@@ -193,7 +194,7 @@ async function readState() {
       showCounts();
       const isOther = before?.registrations !== robot.registrations;
       if (isOther || JSON.stringify(before.params) !== JSON.stringify(robot.params)) showList();
-      if (isOther) readGraph();
+      if (isOther) showGraph();
     }
   } catch {
     // The next event asks again.
@@ -225,7 +226,7 @@ function showStatus() {
 
 function showNow() {
   const away = now.gate !== "open";
-  const texts = { open: "up", standing_in: "away", injecting: "coming back", elsewhere: "elsewhere", unknown: "not seen yet" };
+  const texts = { open: "up", standing_in: "down", injecting: "coming back", elsewhere: "elsewhere", unknown: "not seen yet" };
   say("master", texts[now.gate] ?? now.gate);
   const journal = now.journal ?? {};
   say("journal", plural(journal.records ?? 0, "record"));
@@ -243,13 +244,13 @@ function showComputers(cluster) {
   const led = leader && `${leader.name} since ${moment(leader.since)}, term ${leader.term}`;
   const isWell = cluster.role !== "alone" && leader && !leaderless;
   $("computers").dataset.is = isWell ? "" : "bad";
-  const leads = !leader ? "no leader is known" : leaderless ? `NO LEADER since ${moment(leaderless)}; the last was ${leader.name}` : `leader: ${led}`;
+  const leads = !leader ? "no leader" : leaderless ? `NO LEADER since ${moment(leaderless)}; the last was ${leader.name}` : `leader: ${led}`;
   say("computers-leader", cluster.role === "alone" ? `${cluster.name} is CUT OFF since ${moment(cluster.since)}; ${leads}` : leads);
   const notes = [
-    trouble && `etcd has not answered since ${moment(trouble.since)}: ${trouble.why}`,
+    trouble && `no answer from etcd since ${moment(trouble.since)}: ${trouble.why}`,
     cluster.uncommitted > 0 && `${plural(cluster.uncommitted, "change")} of ${cluster.name} not in etcd yet`,
     last && `last takeover by ${cluster.name}: ${moment(last.at)}${last.from ? ` from ${last.from}` : ""}${last.in_order ? ", in order" : ""}, in ${ms(1000 * last.seconds)}`,
-    cluster.lost_writes > 0 && `${plural(cluster.lost_writes, "change")} made while it was cut off did not hold: the log names each`,
+    cluster.lost_writes > 0 && `${plural(cluster.lost_writes, "change")} made while it was cut off lost against changes by others: the log names each`,
   ].filter(Boolean);
   say("computers-notes", notes.join("; "));
   const rows = cluster.computers.map((of) => {
@@ -258,7 +259,7 @@ function showComputers(cluster) {
     const led = of.role === "leading" && (leaderless || leader?.name !== of.name);
     const role = of.away ? "AWAY" : led ? "led" : ROLES[of.role] ?? of.role;
     const behind = of.away || of.role === "leading" ? "" : of.behind ? `${plural(of.behind, "record")} behind` : "has every record";
-    const heard = isThis ? "this computer" : of.heard ? `heard of at ${moment(of.heard)}` : "not heard of since the start";
+    const heard = isThis ? "this computer" : of.heard ? `last contact ${moment(of.heard)}` : "no contact since the start";
     const link = /^https?:/.test(of.uri) ? el("a", { href: of.uri }, of.name) : of.name;
     return el("tr", {}, ...[link, el("span", { class: "health", "data-is": is }, role), behind, heard, of.version].map((cell) => el("td", {}, cell)));
   });
@@ -293,13 +294,13 @@ function showRescues() {
   const rows = [];
   if (now && (now.gate === "standing_in" || now.gate === "injecting") && status?.standing_in_since) {
     const what = now.gate === "injecting"
-      ? "a new master is given the state"
-      : "there is no master: the mirror answers in its place";
+      ? "a new master gets the state"
+      : "no master: rosrescue answers in its place";
     rows.push(el("li", { class: "now" },
       el("time", {}, moment(status.standing_in_since)),
       el("div", { class: "track" }),
       el("span", { class: "total" }, span(robotTime() - status.standing_in_since)),
-      el("span", { class: "what" }, `under way: ${what}, ${plural(now.pending_writes ?? 0, "change")} to be handed over`)));
+      el("span", { class: "what" }, `in progress: ${what}; ${plural(now.pending_writes ?? 0, "change")} for the next master`)));
   }
   const longest = Math.max(...rescues.map((rescue) => rescue.phases.total_ms), 1);
   const row = (rescue) => rescueRow(rescue, longest);
@@ -332,17 +333,17 @@ function rescueRow(rescue, longest) {
     track.append(part);
   }
   const phases = `${ms(absence)} without a master, ${ms(inspection)} to read it, ${ms(injection)} to restore it` +
-    (check === null ? "" : `, nodes asked within ${ms(check)}`);
+    (check === null ? "" : `, nodes checked after ${ms(check)}`);
   track.setAttribute("aria-label", phases);
   const calls = rescue.unanswered
-    ? `${plural(rescue.answered, "call")} answered meanwhile, ${rescue.unanswered} in vain`
+    ? `${plural(rescue.answered, "call")} answered meanwhile, ${rescue.unanswered} timed out`
     : `${plural(rescue.answered, "call")} answered meanwhile, none lost`;
   const lists = [
     ["could not be restored", rescue.not_restored],
     ["differs", rescue.mismatches],
-    ["dead nodes taken out", rescue.removed],
-    ["corrected, as the nodes say", rescue.reconciled],
-    ["nodes that do not answer", rescue.unreachable],
+    ["unregistered dead nodes", rescue.removed],
+    ["corrected after asking the nodes", rescue.reconciled],
+    ["nodes without an answer", rescue.unreachable],
   ].filter(([, names]) => names?.length).map(([what, names]) => `${what}: ${names.join(", ")}`);
   const cause = rescue.cause + (rescue.ended ? ` (${rescue.ended})` : "");
   const words = [`${cause}: ${OUTCOMES[rescue.outcome] ?? rescue.outcome}`, calls, phases, ...lists];
@@ -382,47 +383,53 @@ function countCalls() {
 const picture = $("picture");
 let view = null;
 let whole = null;
-let drawing = 0;
-/** The smallest scale at which a picture is shown at first: one can read it. */
+/** The graph that is shown, as text, and where its boxes and lines are. */
+let last = {};
+let drawing = false;
+let redraw = false;
+/** The smallest scale at which a picture is shown at first: small enough to see much, large enough to read. */
 const least = () => (isTall() ? 0.75 : 0.4);
 
 const isTall = () => window.innerHeight > window.innerWidth;
 
-function graphQuery() {
-  const query = new URLSearchParams();
-  const filter = $("graph-filter").value.trim();
-  if (filter) query.set("filter", filter);
-  if ($("graph-leaves").checked) query.set("leaves", "1");
-  if ($("graph-debug").checked) query.set("debug", "1");
-  if (isTall()) query.set("tall", "1");
-  return query.size ? `/graph.svg?${query}` : "/graph.svg";
+/** Draws the graph, or draws it again when the drawing under way is done. */
+async function showGraph() {
+  if (!robot) return;
+  redraw = drawing;
+  if (drawing) return;
+  drawing = true;
+  const graph = measure(select(robot, {
+    filter: $("graph-filter").value.trim(),
+    leaves: $("graph-leaves").checked,
+    debug: $("graph-debug").checked,
+  }));
+  try {
+    const key = JSON.stringify([isTall(), graph.lines, graph.boxes.map(({ kind, name, ill }) => [kind, name, ill])]);
+    // A tall picture is as narrow as the screen of a phone.
+    const placed = key === last.key ? last.placed : await layOut(graph, isTall() ? 400 : 1240, 600);
+    last = { key, placed };
+    showPicture(draw(graph, placed));
+  } catch (error) {
+    last = {};
+    whole = null;
+    picture.style.height = "auto";
+    if (!redraw) picture.replaceChildren(el("p", { class: "quiet" }, error.message));
+  }
+  drawing = false;
+  if (redraw) showGraph();
 }
 
-async function readGraph() {
-  const url = graphQuery();
-  const number = ++drawing;
-  $("graph-file").href = url;
-  let text;
-  try {
-    const answer = await fetch(url);
-    if (!answer.ok) return;
-    text = await answer.text();
-  } catch {
-    return;
-  }
-  // A later one is on its way.
-  if (number !== drawing) return;
-  const parsed = new DOMParser().parseFromString(text, "image/svg+xml").documentElement;
-  if (parsed.namespaceURI !== SVG || parsed.localName !== "svg") return;
-  const svg = document.importNode(parsed, true);
-  const [x, y, width, height] = svg.getAttribute("viewBox").split(" ").map(Number);
-  const isSame = whole?.width === width && whole?.height === height;
-  whole = { x, y, width, height };
-  // On a wide screen as high as the graph needs, so that none of it is cut off.
-  const needed = height * Math.max(least(), Math.min(1, picture.clientWidth / width));
-  picture.style.height = isTall() ? "" : `max(min(62vh, 620px), ${Math.min(Math.ceil(needed), 1600)}px)`;
-  svg.removeAttribute("width");
-  svg.removeAttribute("height");
+function selectGraph() {
+  abandon();
+  showGraph();
+}
+
+function showPicture({ svg, size, ill }) {
+  const isSame = whole?.width === size.width && whole?.height === size.height;
+  whole = { ...size, ill };
+  // On a wide screen as high as the graph needs, so that all of it is visible.
+  const needed = Math.ceil(size.height * Math.max(least(), Math.min(1, picture.clientWidth / size.width)));
+  picture.style.height = `${Math.max(160, Math.min(needed, isTall() ? 0.6 * window.innerHeight : 1600))}px`;
   picture.replaceChildren(svg);
   if (isSame) show(view);
   else fit(least());
@@ -436,9 +443,12 @@ function fit(smallest = 0) {
   const scale = Math.max(smallest, Math.min(1, clientWidth / whole.width, clientHeight / whole.height));
   const width = clientWidth / scale;
   const height = clientHeight / scale;
-  // Of what is too long the beginning is shown.
-  const from = (start, length, shown) => start - Math.max(0, shown - length) / 2;
-  show({ x: from(whole.x, whole.width, width), y: from(whole.y, whole.height, height), width, height });
+  // What is too large is shown from its beginning, or around a node that needs attention.
+  const from = (start, length, shown, at) => {
+    if (shown >= length) return start - (shown - length) / 2;
+    return at === undefined ? start : Math.max(start, Math.min(at - shown / 2, start + length - shown));
+  };
+  show({ x: from(whole.x, whole.width, width, whole.ill?.x), y: from(whole.y, whole.height, height, whole.ill?.y), width, height });
 }
 
 function show(next) {
@@ -566,7 +576,7 @@ function showDetails() {
   const found = (kind === "node" ? robot.nodes : robot.topics).find((of) => of.name === name);
   const parts = [el("h3", {}, name)];
   if (!found) {
-    parts.push(el("p", {}, "It is not registered any more."));
+    parts.push(el("p", {}, "It is no longer registered."));
   } else if (kind === "node") {
     parts.push(
       el("p", {}, health(found), found.api ? ` ${found.api}` : "", found.pid ? `, process ${found.pid}` : ""),
@@ -586,13 +596,13 @@ function health(node) {
   const texts = {
     alive: "alive",
     unchecked: node.checked_at ? `not checked since ${moment(node.checked_at)}` : "not checked yet",
-    unreachable: "unreachable: kept, and asked again",
-    dead: node.removed_at ? `dead, taken out ${moment(node.removed_at)}` : "dead: its port refuses connections; still registered",
+    unreachable: "unreachable: still registered, retrying",
+    dead: node.removed_at ? `dead, unregistered ${moment(node.removed_at)}` : "dead: its port is closed; still registered",
   };
   return el("span", { class: "health", "data-is": node.health }, texts[node.health] ?? node.health);
 }
 
-const typeOf = (topic) => (topic.type === "*" ? "type not known" : topic.type);
+const typeOf = (topic) => (topic.type === "*" ? "unknown type" : topic.type);
 
 // ---- lists
 
@@ -732,9 +742,9 @@ for (const name of tabs) {
   });
 }
 $("list-filter").addEventListener("input", debounced(showList, 150));
-$("graph-filter").addEventListener("input", debounced(readGraph, 200));
-$("graph-leaves").addEventListener("change", readGraph);
-$("graph-debug").addEventListener("change", readGraph);
+$("graph-filter").addEventListener("input", debounced(selectGraph, 200));
+$("graph-leaves").addEventListener("change", selectGraph);
+$("graph-debug").addEventListener("change", selectGraph);
 $("zoom-in").addEventListener("click", () => zoom(1.4));
 $("zoom-out").addEventListener("click", () => zoom(1 / 1.4));
 $("zoom-all").addEventListener("click", () => fit());
@@ -745,7 +755,7 @@ setInterval(() => {
   countCalls();
   showTimes();
   if (Date.now() - heard > SILENCE * 1000) {
-    setLink("lost", "no answer from rosrescue; trying again");
+    setLink("lost", "no answer from rosrescue, retrying");
     connect();
   }
 }, 1000);
