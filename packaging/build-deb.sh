@@ -33,28 +33,15 @@ else
     program=$target/release/rosrescue
 fi
 
-# What is made of the command line's own definition, and of the units' templates.
+# What comes from the definition of the command line.
 assets=target/package
 rm -rf "$assets"
-mkdir -p "$assets/completions" "$assets/systemd"
+mkdir -p "$assets/completions"
 "$program" man "$assets/man"
 gzip -9n "$assets"/man/*.1
 for shell in bash zsh fish; do
     "$program" completions "$shell" >"$assets/completions/$shell"
 done
-# Nobody's robot yet: a user that systemd makes for it, and all addresses.
-fill() {
-    sed -e "s|@ORIGIN@|Of the package rosrescue. \`rosrescue install\` makes one for your robot, which goes before it.|" \
-        -e "s|@ACCOUNT@|DynamicUser=yes\nStateDirectory=rosrescue\nEnvironment=ROS_HOME=/var/lib/rosrescue|" \
-        -e '/@HARDENING@/ { r packaging/systemd/hardening.in' -e 'd }' \
-        -e "s|@ENVIRONMENT@|/etc/default/rosrescue|" -e "s|@COMMAND@|/usr/bin/rosrescue core|" \
-        -e "s|@TARGET@|multi-user.target|" -e "s|@LISTEN@|ListenStream=11311|" \
-        -e '/^@[A-Z]*@$/d' "$1"
-}
-for unit in service socket; do
-    fill "packaging/systemd/rosrescue.$unit.in" >"$assets/systemd/rosrescue.$unit"
-done
-
 # shellcheck disable=SC2086 # no version, no words
 CARGO_TARGET_DIR=$target "$deb" --quiet --locked --no-build --profile "$profile" --strip $fast \
     ${version:+--deb-version "$version"} --output "$target/deb/"

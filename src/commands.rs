@@ -19,7 +19,6 @@ mod running;
 mod status;
 mod terminal;
 mod top;
-mod uninstall;
 mod verify;
 mod wait;
 
@@ -101,7 +100,7 @@ pub fn run(tool: &Tool) -> ExitCode {
                 Tool::Restore(args) => restore::run(args).await,
                 Tool::Status(args) => status::run(args).await,
                 Tool::Top(args) => top::run(args).await,
-                Tool::Uninstall(args) => uninstall::run(args).await,
+                Tool::Uninstall(args) => install::undo(args).await,
                 Tool::Verify(args) => verify::run(args).await,
                 Tool::Wait(args) => wait::run(args).await,
             }

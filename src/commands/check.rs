@@ -9,7 +9,7 @@ mod launch;
 mod links;
 mod planting;
 mod ros;
-mod units;
+pub(in crate::commands) mod units;
 
 use std::{convert::Infallible, fmt, time::Duration};
 
@@ -28,7 +28,7 @@ pub(super) async fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     let facts = Facts::gather(args, master);
     let slow = async {
         tokio::time::sleep(Duration::from_secs(1)).await;
-        eprintln!("still looking: names that no name server knows take their time");
+        eprintln!("still checking: looking up unknown names takes long");
         std::future::pending::<Infallible>().await
     };
     let facts = tokio::select! {
@@ -109,7 +109,7 @@ impl fmt::Display for Report {
             }
         }
         match (self.problems, self.warnings) {
-            (0, 0) => writeln!(f, "Nothing stands in the way."),
+            (0, 0) => writeln!(f, "No problems found."),
             (problems, warnings) => {
                 let (problems, warnings) =
                     (counted(problems, "problem"), counted(warnings, "warning"));

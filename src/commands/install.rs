@@ -1,32 +1,37 @@
-//! `rosrescue install`: makes a service of systemd of it.
+//! `rosrescue install` runs rosrescue as a systemd service, and `rosrescue uninstall` undoes that.
+//!
+//! The units are static: the Debian package has them, and `install` writes them where the package is missing. What
+//! differs from robot to robot is in a drop-in beside each.
 
-pub(super) mod apply;
-pub(super) mod facts;
-mod found;
-pub(super) mod manifest;
-pub(super) mod place;
-pub(super) mod plan;
 mod units;
 
-use std::{collections::BTreeMap, fs, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    fmt, fs,
+    io::{self, IsTerminal, Write},
+    net::{SocketAddr, TcpListener},
+    path::{Path, PathBuf},
+    process::{self as system, Stdio},
+};
 
 use clap::{CommandFactory, FromArgMatches};
+use serde::Serialize;
 
-use self::{
-    manifest::Manifest,
-    place::Place,
-    plan::{Facts, Plan, Wanted},
-    units::Units,
+use self::units::{MARK, Robot};
+use super::{
+    Exit, Failure,
+    check::units::{self as others, Kind},
+    print,
 };
-use super::{Exit, Failure, print};
 use crate::{
-    cli::{Cli, Command, InstallArgs, ScopeArgs},
+    cli::{Cli, Command, InstallArgs, ScopeArgs, UninstallArgs},
     config::Config,
     process,
     server::listener,
 };
 
-/// ROS's variables that concern a master.
+const UNITS: [&str; 2] = ["rosrescue.service", "rosrescue.socket"];
+/// The variables of ROS that concern a master.
 const SETTINGS: [&str; 5] = [
     "ROS_MASTER_URI",
     "ROS_IP",
@@ -34,183 +39,518 @@ const SETTINGS: [&str; 5] = [
     "ROS_HOME",
     "ROS_LOG_DIR",
 ];
-/// What a ROS in an unusual place needs besides. `setup.bash` sets them.
+/// What a ROS in an unusual place needs as well. Its `setup.bash` sets them.
 const PATHS: [&str; 4] = ["PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "ROS_PACKAGE_PATH"];
 
-pub(super) async fn run(args: &InstallArgs) -> Result<Exit, Failure> {
-    let place = place(&args.scope)?;
-    let plan = plan(args, &place)?;
-    if args.scope.dry_run || !plan.obstacles.is_empty() {
-        print(&plan, &args.scope.output)?;
-        let good = plan.obstacles.is_empty();
-        return Ok(if good { Exit::Good } else { Exit::Bad });
-    }
-    carry_out(&plan, &place, &args.scope, true)
+/// One change of the computer.
+#[derive(Debug, Serialize)]
+#[serde(tag = "change", rename_all = "snake_case")]
+enum Change {
+    Write { path: PathBuf, text: String },
+    Remove { path: PathBuf },
+    Run { command: Vec<String> },
 }
 
-/// Asks and does it.
-pub(super) fn carry_out(
-    plan: &Plan,
-    place: &Place,
-    args: &ScopeArgs,
-    remembers: bool,
-) -> Result<Exit, Failure> {
-    needs_root(place)?;
-    if plan.changes.is_empty() {
-        // What was found may have changed all the same.
-        print(plan, &args.output)?;
-    } else if !apply::is_wanted(plan, args)? {
-        return Err(Failure::Failed("nothing was changed".to_owned()));
-    } else if args.yes {
-        print(plan, &args.output)?;
+/// All changes in their order, and what a person should know.
+#[derive(Debug, Default, Serialize)]
+struct Plan {
+    changes: Vec<Change>,
+    notes: Vec<String>,
+    /// Reasons not to carry it out.
+    obstacles: Vec<String>,
+}
+
+pub(super) async fn run(args: &InstallArgs) -> Result<Exit, Failure> {
+    let place = Place::of(&args.scope)?;
+    carry_out(&install(args, &place)?, &place, &args.scope)
+}
+
+pub(super) async fn undo(args: &UninstallArgs) -> Result<Exit, Failure> {
+    let place = Place::of(&args.scope)?;
+    carry_out(&uninstall(&place), &place, &args.scope)
+}
+
+/// Where the files are, and which systemd runs the service.
+struct Place {
+    /// A user's own service.
+    user: bool,
+    units: PathBuf,
+}
+
+impl Place {
+    fn of(args: &ScopeArgs) -> Result<Self, Failure> {
+        let (user, units) = (args.user, PathBuf::from("/etc/systemd/system"));
+        if !user {
+            return Ok(Self { user, units });
+        }
+        if rustix::process::geteuid().is_root() && std::env::var_os("SUDO_USER").is_some() {
+            let text = "--user: run it as yourself, without sudo";
+            return Err(Failure::Usage(text.to_owned()));
+        }
+        let folder = |name: &str| {
+            let folder = std::env::var_os(name).map(PathBuf::from);
+            folder.filter(|folder| folder.is_absolute())
+        };
+        let config = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
+        let config = config.ok_or_else(|| Failure::Usage("--user: HOME is not set".to_owned()))?;
+        let units = config.join("systemd/user");
+        Ok(Self { user, units })
     }
-    apply::apply(plan, place, remembers)?;
+
+    /// The units of the package: those of the computer, for the program of the package.
+    fn is_packaged(&self, program: &Path) -> bool {
+        let unit = Path::new("/usr/lib/systemd/system").join(UNITS[0]);
+        !self.user && program == Path::new("/usr/bin/rosrescue") && unit.exists()
+    }
+
+    /// The two units and their drop-ins.
+    fn files(&self) -> [PathBuf; 4] {
+        let [service, socket] = UNITS.map(|unit| self.units.join(unit));
+        let dropins = UNITS.map(|unit| self.units.join(format!("{unit}.d/install.conf")));
+        let [service_dropin, socket_dropin] = dropins;
+        [service, socket, service_dropin, socket_dropin]
+    }
+
+    fn systemctl(&self, words: &[&str]) -> Vec<String> {
+        let manager: &[&str] = match self.user {
+            true => &["systemctl", "--user"],
+            false => &["systemctl"],
+        };
+        let words = manager.iter().chain(words);
+        words.map(|&word| word.to_owned()).collect()
+    }
+
+    /// Whether systemctl says yes, such as to `is-active`.
+    fn is(&self, question: &str, unit: &str) -> bool {
+        let command = self.systemctl(&[question, "--quiet", unit]);
+        run_command(&command, Stdio::null()).is_ok_and(|status| status.success())
+    }
+
+    /// Whether a systemd runs that can start the service.
+    fn systemd_runs(&self) -> bool {
+        let run = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from);
+        Path::new("/run/systemd/system").exists()
+            && (!self.user || run.is_some_and(|run| run.join("systemd/private").exists()))
+    }
+
+    /// The option that starts or stops a unit at once, where systemd runs.
+    fn now(&self) -> &'static [&'static str] {
+        if self.systemd_runs() { &["--now"] } else { &[] }
+    }
+
+    fn other_units(&self) -> Vec<others::Unit> {
+        let user = [self.units.clone(), "/etc/systemd/user".into()];
+        let folders = if self.user { &user[..] } else { &[] };
+        others::in_folders(folders, !self.user)
+    }
+}
+
+fn install(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
+    let caller = caller_environment();
+    let core = vec!["core".to_owned()];
+    let command = if args.service.is_empty() {
+        &core
+    } else {
+        &args.service
+    };
+    let given = |names: &[&str]| {
+        let pairs = names
+            .iter()
+            .map(|&name| (name.to_owned(), caller.get(name).cloned()));
+        let pairs = pairs
+            .filter_map(|(name, value)| Some((name, value.filter(|value| !value.is_empty())?)));
+        pairs.collect::<Vec<_>>()
+    };
+    let mut settings: BTreeMap<_, _> = given(&SETTINGS).into_iter().collect();
+    let service = read_service(command, &settings)?;
+    let on_path = |path: &str| process::find_rosmaster_on(path.as_ref()).is_some();
+    if service.searches_rosmaster && !on_path(process::SERVICE_PATH) {
+        if !on_path(caller.get("PATH").map_or("", String::as_str)) {
+            let text = "found no rosmaster on the PATH or in /opt/ros: install ROS 1 or source its setup.bash, then \
+                        run this again";
+            return Err(Failure::Failed(text.to_owned()));
+        }
+        settings.extend(given(&PATHS));
+    }
+    let run_as = account(args, place, &caller)?;
+    let program = std::env::current_exe();
+    let program = program
+        .map_err(|error| Failure::Failed(format!("cannot find this program's file: {error}")))?;
+
+    let mut plan = Plan::default();
+    plan.obstacles
+        .extend(misplaced(&program).filter(|_| !place.user));
+    let (disabled, before) = plan.meet_others(place, &service);
+    let files = place.files();
+    let [unit, socket_unit, dropin, socket_dropin] =
+        files.each_ref().map(|path| fs::read_to_string(path).ok());
+    let old = dropin.unwrap_or_default();
+    let all_disabled = [&disabled[..], &units::disabled(&old)].concat();
+    let robot = Robot {
+        program: &program,
+        command,
+        run_as: run_as.as_deref(),
+        settings: &settings,
+        listen: &service.listen,
+        before: &before,
+        disabled: &all_disabled,
+    };
+    let [new_unit, new_socket_unit] = match place.is_packaged(&program) {
+        true => [None, None],
+        false => units::units(place.user).map(Some),
+    };
+    let (new, new_socket) = (robot.service(), robot.socket());
+    let is_socket_new = socket_dropin.as_ref() != Some(&new_socket);
+    let wanted = [
+        new_unit,
+        new_socket_unit,
+        Some(new.clone()),
+        Some(new_socket),
+    ];
+    let present = [unit, socket_unit, Some(old.clone()), socket_dropin];
+    for ((path, wanted), present) in files.into_iter().zip(wanted).zip(present) {
+        let present = present.filter(|text| !text.is_empty());
+        let is_ours = present.as_ref().is_none_or(|text| text.starts_with(MARK));
+        match wanted {
+            _ if !is_ours => plan.obstacles.push(format!(
+                "{} was not written by `rosrescue install`: move it away, then run this again",
+                path.display()
+            )),
+            Some(text) if present.as_ref() != Some(&text) => {
+                plan.changes.push(Change::Write { path, text })
+            }
+            None if present.is_some() => plan.changes.push(Change::Remove { path }),
+            _ => {}
+        }
+    }
+    let is_changed = !plan.changes.is_empty();
+    if is_changed && place.systemd_runs() {
+        plan.run(place.systemctl(&["daemon-reload"]));
+    }
+    for unit in &disabled {
+        plan.run(place.systemctl(&[&["disable"], place.now(), &[unit]].concat()));
+    }
+    let is_running = place.systemd_runs() && UNITS.iter().all(|unit| place.is("is-active", unit));
+    let is_enabled = UNITS.iter().all(|unit| place.is("is-enabled", unit));
+    if is_changed && is_running {
+        // Who runs what.
+        let key = |text: &str| {
+            let keys = ["User=", "ExecStart=/"];
+            let lines = text.lines();
+            let lines = lines.filter(|line| keys.iter().any(|key| line.starts_with(key)));
+            let words = lines.map(|line| line.split(' ').take(2).collect::<String>());
+            words.collect::<Vec<_>>()
+        };
+        plan.renew(place, is_socket_new || key(&old) != key(&new));
+    } else if !is_enabled || (!is_running && place.systemd_runs()) {
+        plan.start(place, &service, !disabled.is_empty());
+    }
+    if !place.systemd_runs() {
+        plan.notes
+            .push("systemd is not running here: the service starts at the next boot".to_owned());
+    }
+    let lingers = || {
+        caller
+            .get("USER")
+            .is_some_and(|user| Path::new("/var/lib/systemd/linger").join(user).exists())
+    };
+    if place.user && !lingers() {
+        plan.notes.push("the service runs while you are logged in. To run it from boot on: `loginctl enable-linger`".to_owned());
+    }
+    Ok(plan)
+}
+
+fn uninstall(place: &Place) -> Plan {
+    let mut plan = Plan::default();
+    let files = place.files();
+    let dropin = fs::read_to_string(&files[2]).unwrap_or_default();
+    let is_ours =
+        |path: &PathBuf| fs::read_to_string(path).is_ok_and(|text| text.starts_with(MARK));
+    let ours: Vec<_> = files.into_iter().filter(is_ours).collect();
+    if ours.is_empty() {
+        plan.notes
+            .push("`rosrescue install` has installed nothing here".to_owned());
+        return plan;
+    }
+    plan.run(place.systemctl(&[&["disable"], place.now(), &UNITS].concat()));
+    plan.changes
+        .extend(ours.into_iter().map(|path| Change::Remove { path }));
+    if place.systemd_runs() {
+        plan.run(place.systemctl(&["daemon-reload"]));
+    }
+    for unit in units::disabled(&dropin) {
+        plan.run(place.systemctl(&[&["enable"], place.now(), &[&unit]].concat()));
+    }
+    plan
+}
+
+/// Shows the plan, asks, and does it.
+fn carry_out(plan: &Plan, place: &Place, args: &ScopeArgs) -> Result<Exit, Failure> {
+    if args.dry_run || plan.changes.is_empty() || !plan.obstacles.is_empty() {
+        print(plan, &args.output)?;
+        return Ok(if plan.obstacles.is_empty() {
+            Exit::Good
+        } else {
+            Exit::Bad
+        });
+    }
+    if !place.user && !rustix::process::geteuid().is_root() {
+        let words: Vec<_> = std::env::args().skip(1).collect();
+        return Err(Failure::Usage(format!(
+            "a service of this computer needs root: run `sudo rosrescue {}`, or use --user for a service of your own",
+            words.join(" ")
+        )));
+    }
+    if args.yes {
+        print(plan, &args.output)?;
+    } else if args.output.json || !io::stdin().is_terminal() {
+        let text = "cannot ask here: look at the changes with --dry-run, then make them with --yes";
+        return Err(Failure::Usage(text.to_owned()));
+    } else {
+        eprint!("{plan}\nMake these changes? [y/N] ");
+        let _ = io::stderr().flush();
+        let mut answer = String::new();
+        let _ = io::stdin().read_line(&mut answer);
+        if !["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
+            return Err(Failure::Failed("changed nothing".to_owned()));
+        }
+    }
+    for change in &plan.changes {
+        change.make()?;
+    }
     Ok(Exit::Good)
 }
 
-pub(super) fn place(args: &ScopeArgs) -> Result<Place, Failure> {
-    if !args.user {
-        return Ok(Place::system());
+impl Plan {
+    fn run(&mut self, command: Vec<String>) {
+        self.changes.push(Change::Run { command });
     }
-    let env = |name: &str| std::env::var(name).ok();
-    let place =
-        Place::user(&env).ok_or_else(|| Failure::Usage("--user: HOME is not set".to_owned()))?;
-    if rustix::process::geteuid().is_root() && env("SUDO_USER").is_some() {
-        return Err(Failure::Usage(
-            "--user: as yourself, without sudo".to_owned(),
-        ));
+
+    /// Looks at the units that start a master or roslaunch. Returns those to disable, and those to start after ours.
+    fn meet_others(&mut self, place: &Place, service: &Service) -> (Vec<String>, Vec<String>) {
+        let (mut disabled, mut before) = (Vec::new(), Vec::new());
+        let all = place.other_units().into_iter();
+        for others::Unit { name, kind, .. } in all.filter(|unit| unit.is_enabled) {
+            match kind {
+                Kind::Roscore if !service.runs_rosmaster => self.obstacles.push(format!(
+                    "{name} starts a master at port 11311, which rosrescue needs: give the master another port, as \
+                     in `rosmaster --core -p 11312`, then run this again"
+                )),
+                Kind::Roscore => {
+                    self.notes.push(format!(
+                        "{name} starts a master: rosrescue replaces it, and uninstall enables it again"
+                    ));
+                    disabled.push(name);
+                }
+                Kind::Roslaunch => {
+                    self.notes.push(format!(
+                        "{name} runs roslaunch. It will start after rosrescue. Add `--wait` to its roslaunch, so \
+                         that it never starts a master (robot_upstart: `rosrun robot_upstart install --wait …`)"
+                    ));
+                    before.push(name);
+                }
+                Kind::Rosrescue => {}
+            }
+        }
+        (disabled, before)
     }
-    Ok(place)
+
+    fn start(&mut self, place: &Place, service: &Service, port_will_be_free: bool) {
+        let mut options = place.now().to_vec();
+        if !service.runs_rosmaster && place.systemd_runs() {
+            // A proxy has started when its master is there, which can take long.
+            options.push("--no-block");
+        }
+        self.run(place.systemctl(&[&["enable"], &options[..], &UNITS].concat()));
+        let in_use = |address: &SocketAddr| {
+            TcpListener::bind(address).is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
+        };
+        if place.systemd_runs() && !port_will_be_free && service.listen.iter().any(in_use) {
+            let port = service.listen.first().map_or(0, SocketAddr::port);
+            self.obstacles.push(format!(
+                "port {port} is in use: stop the robot and its roscore, then run this again"
+            ));
+        }
+    }
+
+    /// Gives the running service its new files.
+    fn renew(&mut self, place: &Place, anew: bool) {
+        if anew {
+            self.run(place.systemctl(&["stop", UNITS[1]]));
+            self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
+        } else {
+            // The next rosrescue takes the running master over. Calls wait for some 0.2 s.
+            self.run(place.systemctl(&["kill", "--signal=KILL", "--kill-who=main", UNITS[0]]));
+        }
+    }
 }
 
-fn needs_root(place: &Place) -> Result<(), Failure> {
-    if place.user || rustix::process::geteuid().is_root() {
-        return Ok(());
+impl Change {
+    fn make(&self) -> Result<(), Failure> {
+        match self {
+            Self::Write { path, text } => {
+                let folder = path.parent().unwrap_or(path);
+                let written = fs::create_dir_all(folder).and_then(|()| fs::write(path, text));
+                written.map_err(|error| {
+                    Failure::Failed(format!("cannot write {}: {error}", path.display()))
+                })
+            }
+            Self::Remove { path } => {
+                let removed = fs::remove_file(path);
+                // Its folder may hold other drop-ins.
+                if let Some(folder) = path
+                    .parent()
+                    .filter(|it| it.extension().is_some_and(|end| end == "d"))
+                {
+                    let _ = fs::remove_dir(folder);
+                }
+                removed.map_err(|error| {
+                    Failure::Failed(format!("cannot remove {}: {error}", path.display()))
+                })
+            }
+            Self::Run { command } => {
+                let said = command.join(" ");
+                match run_command(command, Stdio::inherit()) {
+                    Ok(status) if status.success() => Ok(()),
+                    Ok(status) => Err(Failure::Failed(format!(
+                        "`{said}` failed ({status}): see above, or `journalctl -u rosrescue`. `rosrescue uninstall` \
+                         undoes what was done"
+                    ))),
+                    Err(error) => Err(Failure::Failed(format!("`{said}`: {error}"))),
+                }
+            }
+        }
     }
-    let words: Vec<_> = std::env::args().skip(1).collect();
-    let words = words.join(" ");
-    Err(Failure::Usage(format!(
-        "a service of the computer needs root: `sudo rosrescue {words}`, or --user for a service of your own"
-    )))
 }
 
-fn plan(args: &InstallArgs, place: &Place) -> Result<Plan, Failure> {
-    let earlier = facts::earlier(place)?;
-    let caller = facts::caller_environment();
-    let before = earlier.clone().unwrap_or_default();
-    let mut settings = before.settings.clone();
-    let given = SETTINGS
-        .iter()
-        .filter_map(|name| Some(((*name).to_owned(), caller.get(*name)?.clone())));
-    settings.extend(given.filter(|(_, value)| !value.is_empty()));
-    let service = match (&*args.service, &*before.service) {
-        ([], []) => vec!["core".to_owned()],
-        ([], earlier) => earlier.to_vec(),
-        (given, _) => given.to_vec(),
-    };
-    let (config, rosmaster) = read_service(&service, &settings)?;
-    if rosmaster.is_needed && process::find_rosmaster_on(process::SERVICE_PATH.as_ref()).is_none() {
-        let path = caller.get("PATH").cloned().unwrap_or_default();
-        process::find_rosmaster_on(path.as_ref()).ok_or_else(|| {
-            Failure::Failed(
-                "there is no rosmaster on the PATH or in /opt/ros: install ROS 1, or `source` its setup.bash, and do this \
-                 again"
-                    .to_owned(),
-            )
-        })?;
-        let paths = PATHS
-            .iter()
-            .filter_map(|name| Some(((*name).to_owned(), caller.get(*name)?.clone())));
-        settings.extend(paths);
+impl fmt::Display for Plan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.changes.is_empty() {
+            writeln!(f, "nothing to change")?;
+        }
+        for change in &self.changes {
+            match change {
+                Change::Write { path, text } => {
+                    writeln!(f, "write   {}", path.display())?;
+                    for line in text.lines() {
+                        writeln!(f, "        {line}")?;
+                    }
+                }
+                Change::Remove { path } => writeln!(f, "remove  {}", path.display())?,
+                Change::Run { command } => writeln!(f, "run     {}", command.join(" "))?,
+            }
+        }
+        for note in &self.notes {
+            writeln!(f, "note    {note}")?;
+        }
+        for obstacle in &self.obstacles {
+            writeln!(f, "cannot  {obstacle}")?;
+        }
+        Ok(())
     }
-    let run_as = match (place.user, &args.run_as) {
-        (true, _) => None,
-        (false, Some(user)) => Some(user.clone()),
-        (false, None) => Some(before.run_as.clone().or_else(|| caller.get("SUDO_USER").cloned()).or_else(|| {
-            // Nothing is done: the caller sees what it would be.
-            let caller = caller.get("USER").or_else(|| caller.get("LOGNAME"));
-            caller.filter(|_| args.scope.dry_run).cloned()
-        }).ok_or_else(|| {
-            Failure::Usage("say who runs it, as in --run-as robot: sudo was not used, which would tell".to_owned())
-        })?),
-    };
-    let home = run_as.as_deref().map(facts::home_of).transpose()?;
-    let beside = if place.user {
-        Some(Place::system())
-    } else {
-        let home = home.map(|home| home.to_string_lossy().into_owned());
-        Place::user(&|name: &str| home.clone().filter(|_| name == "HOME"))
-    };
-    let port = config.listen.first().map_or(0, std::net::SocketAddr::port);
-    let found = facts::found(place, beside.as_ref(), port);
-    let launches = found
-        .iter()
-        .filter(|it| it.of_user == place.user && it.kind != found::Kind::Master);
-    let launches: Vec<_> = launches.map(|it| it.unit.clone()).collect();
-    let (program, copy) = program(place, &before)?;
-    let units = Units {
-        version: env!("CARGO_PKG_VERSION"),
-        program: &program,
-        service: &service,
-        run_as: run_as.as_deref(),
-        settings: &settings,
-        environment: place.environment,
-        listen: &config.listen,
-        before: &launches,
-    };
-    let unit = |name: &str, text: String| Wanted {
-        path: place.units.join(name),
-        content: text.into_bytes(),
-        mode: 0o644,
-    };
-    let mut wanted: Vec<_> = copy.into_iter().collect();
-    wanted.push(unit(plan::UNITS[0], units.socket()));
-    wanted.push(unit(plan::UNITS[1], units.service()));
-    let chosen = Manifest {
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        run_as,
-        service,
-        settings,
-        ..Manifest::default()
-    };
-    let paths = wanted.iter().map(|it| &it.path).chain(before.files.keys());
-    let facts = Facts {
-        place,
-        present: facts::present(paths),
-        wanted,
-        earlier,
-        found,
-        systemd_runs: facts::systemd_runs(place),
-        is_running: plan::UNITS.iter().all(|unit| facts::is_active(place, unit)),
-        is_enabled: plan::UNITS
-            .iter()
-            .all(|unit| facts::is_enabled(place, unit)),
-        port,
-        port_taken: facts::is_port_taken(&config.listen),
-        proxy: !rosmaster.is_own,
-    };
-    Ok(plan::install(&facts, chosen))
 }
 
-/// What a service has to do with a rosmaster.
-struct Rosmaster {
-    /// It runs one.
-    is_own: bool,
-    /// It has to find one.
-    is_needed: bool,
+fn run_command(words: &[String], errors: Stdio) -> io::Result<system::ExitStatus> {
+    let (program, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
+    let mut command = system::Command::new(program);
+    let command = command.args(arguments).stdin(Stdio::null());
+    command.stdout(Stdio::null()).stderr(errors).status()
 }
 
-/// What the service's command line means. The service has none of the caller's ROSRESCUE_ variables.
-fn read_service(
-    service: &[String],
-    settings: &BTreeMap<String, String>,
-) -> Result<(Config, Rosmaster), Failure> {
-    let usage = |why: String| Failure::Usage(format!("`{}`: {why}", service.join(" ")));
+/// The environment of the user who typed the command. sudo clears it, but sudo's own process still has it.
+fn caller_environment() -> BTreeMap<String, String> {
+    let own = std::env::vars_os()
+        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
+    let own: BTreeMap<_, _> = own.collect();
+    let parent = rustix::process::getppid().filter(|_| own.contains_key("SUDO_USER"));
+    let of_sudo = parent.and_then(|parent| {
+        let parent = PathBuf::from(format!("/proc/{}", parent.as_raw_pid()));
+        let name = fs::read_to_string(parent.join("comm")).ok()?;
+        (name.trim() == "sudo").then(|| fs::read(parent.join("environ")).ok())?
+    });
+    let Some(environ) = of_sudo else { return own };
+    let pairs = environ.split(|byte| *byte == 0).filter_map(|pair| {
+        let (name, value) = std::str::from_utf8(pair).ok()?.split_once('=')?;
+        Some((name.to_owned(), value.to_owned()))
+    });
+    // Only our own environment has sudo's words about the caller.
+    let of_caller = own.iter().filter(|(name, _)| name.starts_with("SUDO_"));
+    pairs
+        .chain(of_caller.map(|(name, value)| (name.clone(), value.clone())))
+        .collect()
+}
+
+/// The user that runs the service; none for a user's own.
+fn account(
+    args: &InstallArgs,
+    place: &Place,
+    caller: &BTreeMap<String, String>,
+) -> Result<Option<String>, Failure> {
+    if place.user {
+        return Ok(None);
+    }
+    let of_caller = || {
+        // A dry run needs no sudo.
+        let names = if args.scope.dry_run {
+            &["SUDO_USER", "USER", "LOGNAME"][..]
+        } else {
+            &["SUDO_USER"]
+        };
+        names.iter().find_map(|&name| caller.get(name).cloned())
+    };
+    let user = args.run_as.clone().or_else(of_caller).ok_or_else(|| {
+        Failure::Usage(
+            "name the user that runs the service, as in --run-as robot: only sudo tells it"
+                .to_owned(),
+        )
+    })?;
+    let nobody = || {
+        Failure::Usage(format!(
+            "--run-as: there is no user `{user}` on this computer"
+        ))
+    };
+    if user.starts_with('-') {
+        return Err(nobody());
+    }
+    let getent = ["getent", "passwd", &user].map(str::to_owned);
+    let status = run_command(&getent, Stdio::null());
+    let status = status.map_err(|error| Failure::Failed(format!("getent: {error}")))?;
+    status
+        .success()
+        .then_some(Some(user.clone()))
+        .ok_or_else(nobody)
+}
+
+/// Why the service of a computer must not run the program at this path: its owner could replace it.
+fn misplaced(program: &Path) -> Option<String> {
+    let folders = ["/usr", "/opt", "/bin"];
+    let is_safe = folders.iter().any(|folder| program.starts_with(folder));
+    let program = program.display();
+    (!is_safe).then(|| {
+        format!(
+            "{program} is not in a system folder: run `sudo install -m 755 {program} /usr/local/bin/`, then \
+             `sudo rosrescue install`"
+        )
+    })
+}
+
+/// What the command of a service means.
+struct Service {
+    listen: Vec<SocketAddr>,
+    /// `core`, which starts the master itself.
+    runs_rosmaster: bool,
+    /// It has to find rosmaster on the PATH.
+    searches_rosmaster: bool,
+}
+
+/// Reads the command of a service, which sees none of the caller's ROSRESCUE_ variables.
+fn read_service(words: &[String], settings: &BTreeMap<String, String>) -> Result<Service, Failure> {
+    let usage = |why: String| Failure::Usage(format!("`{}`: {why}", words.join(" ")));
     let command = Cli::command()
         .mut_args(|option| option.env(None::<&str>))
         .mut_subcommands(|command| command.mut_args(|option| option.env(None::<&str>)));
-    let words = std::iter::once("rosrescue").chain(service.iter().map(String::as_str));
-    let matches = command.try_get_matches_from(words).map_err(|error| {
+    let all = std::iter::once("rosrescue").chain(words.iter().map(String::as_str));
+    let matches = command.try_get_matches_from(all).map_err(|error| {
         let text = error.to_string();
         let lines = text.lines().take_while(|line| !line.is_empty());
         let said = lines.map(str::trim).collect::<Vec<_>>().join(" ");
@@ -223,73 +563,37 @@ fn read_service(
         .to_string_lossy()
         .into_owned();
     let local = listener::local_address();
+    let core = match &cli.command {
+        Some(Command::Core(args)) => args,
+        None => &cli.core,
+        Some(Command::Proxy(_)) => &cli.core,
+        Some(Command::Tool(_)) => return Err(usage("a service runs `core` or `proxy`".to_owned())),
+    };
     let (config, common, rosmaster) = match &cli.command {
         Some(Command::Proxy(args)) => (
             Config::proxy(args, &env, &hostname, local),
             &args.common,
             None,
         ),
-        Some(Command::Core(args)) => (
-            Config::core(args, &env, &hostname, local),
-            &args.common,
-            Some(&args.rosmaster),
+        _ => (
+            Config::core(core, &env, &hostname, local),
+            &core.common,
+            Some(&core.rosmaster),
         ),
-        None => {
-            let args = &cli.core;
-            (
-                Config::core(args, &env, &hostname, local),
-                &args.common,
-                Some(&args.rosmaster),
-            )
-        }
-        Some(Command::Tool(_)) => return Err(usage("a service runs `core` or `proxy`".to_owned())),
     };
     let files = [
         common.checkpoint.as_ref(),
         rosmaster.and_then(Option::as_ref),
     ];
     if let Some(file) = files.into_iter().flatten().find(|file| file.is_relative()) {
+        let file = file.display();
         return Err(usage(format!(
-            "write the whole path of {}: a service starts in /",
-            file.display()
+            "write the full path of {file}: a service starts in /"
         )));
     }
-    let config = config.map_err(|error| usage(error.to_string()))?;
-    let is_needed = rosmaster.is_some_and(Option::is_none);
-    Ok((
-        config,
-        Rosmaster {
-            is_own: rosmaster.is_some(),
-            is_needed,
-        },
-    ))
-}
-
-/// The program that the unit names, and the file that has to be there for it: a program in somebody's folder
-/// may be gone tomorrow.
-fn program(place: &Place, before: &Manifest) -> Result<(PathBuf, Option<Wanted>), Failure> {
-    let failed =
-        |error: std::io::Error| Failure::Failed(format!("this program's own file: {error}"));
-    let own = std::env::current_exe().map_err(failed)?;
-    let is_safe = ["/usr", "/opt", "/bin"]
-        .iter()
-        .any(|folder| own.starts_with(folder))
-        || own == place.program;
-    if is_safe && !before.files.contains_key(&own) {
-        return Ok((own, None));
-    }
-    let path = if is_safe {
-        own.clone()
-    } else {
-        place.program.clone()
-    };
-    let content = fs::read(&own).map_err(failed)?;
-    Ok((
-        path.clone(),
-        Some(Wanted {
-            path,
-            content,
-            mode: 0o755,
-        }),
-    ))
+    Ok(Service {
+        listen: config.map_err(|error| usage(error.to_string()))?.listen,
+        runs_rosmaster: rosmaster.is_some(),
+        searches_rosmaster: rosmaster.is_some_and(Option::is_none),
+    })
 }

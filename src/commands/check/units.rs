@@ -1,11 +1,11 @@
-//! Units of systemd that start a master. Judges nothing.
+//! Systemd units that start a master or roslaunch.
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
 
-/// Where units lie, the first before the others.
+/// The folders of the computer's units. The first ones override the others.
 const FOLDERS: [&str; 4] = [
     "/etc/systemd/system",
     "/run/systemd/system",
@@ -17,17 +17,17 @@ const MOST: u64 = 1 << 20;
 
 /// A unit that has to do with ROS.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Unit {
-    pub(super) name: String,
-    pub(super) kind: Kind,
-    /// Whether it starts with the computer.
-    pub(super) is_enabled: bool,
+pub(in crate::commands) struct Unit {
+    pub(in crate::commands) name: String,
+    pub(in crate::commands) kind: Kind,
+    /// Whether it starts at boot.
+    pub(in crate::commands) is_enabled: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(in crate::commands) enum Kind {
     Rosrescue,
-    /// It runs a roscore or a rosmaster.
+    /// It runs a roscore or a rosmaster at port 11311.
     Roscore,
     /// It runs roslaunch, which starts a master where it finds none.
     Roslaunch,
@@ -35,16 +35,17 @@ pub(super) enum Kind {
 
 /// All units that have to do with ROS, by name.
 pub(super) fn find() -> Vec<Unit> {
-    let mut folders: Vec<_> = FOLDERS.iter().map(PathBuf::from).collect();
-    if let Some(home) = std::env::var_os("HOME") {
-        folders.insert(0, Path::new(&home).join(".config/systemd/user"));
-    }
-    in_folders(&folders)
+    let home = std::env::var_os("HOME");
+    let users = home.map(|home| Path::new(&home).join(".config/systemd/user"));
+    in_folders(users.as_slice(), true)
 }
 
-fn in_folders(folders: &[PathBuf]) -> Vec<Unit> {
+/// The units in `folders`, and those of the computer if asked for.
+pub(in crate::commands) fn in_folders(folders: &[PathBuf], of_computer: bool) -> Vec<Unit> {
+    let computers = FOLDERS.iter().filter(|_| of_computer).map(PathBuf::from);
+    let folders: Vec<_> = folders.iter().cloned().chain(computers).collect();
     let mut units = Vec::<Unit>::new();
-    for folder in folders {
+    for folder in &folders {
         for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
             let is_unit = name.ends_with(".service") || name.ends_with(".socket");
@@ -53,7 +54,7 @@ fn in_folders(folders: &[PathBuf]) -> Vec<Unit> {
             }
             if let Some(kind) = kind_of(&read(&entry.path())) {
                 units.push(Unit {
-                    is_enabled: is_enabled(folders, &name),
+                    is_enabled: is_enabled(&folders, &name),
                     name,
                     kind,
                 });
@@ -111,9 +112,14 @@ fn words(text: &str) -> Option<Kind> {
         .flat_map(|line| line.split(|c: char| c.is_whitespace() || "/;'\"()".contains(c)))
         .collect();
     let has = |name: &str| names.contains(&name);
+    let port = names
+        .iter()
+        .position(|name| ["-p", "--port"].contains(name));
+    let port = port.and_then(|at| names.get(at + 1));
+    let is_elsewhere = port.is_some_and(|port| *port != "11311");
     match () {
         () if has("rosrescue") => Some(Kind::Rosrescue),
-        () if has("roscore") || has("rosmaster") => Some(Kind::Roscore),
+        () if has("roscore") || has("rosmaster") => (!is_elsewhere).then_some(Kind::Roscore),
         // With --wait it starts no master.
         () if has("roslaunch") && !has("--wait") => Some(Kind::Roslaunch),
         () => None,
@@ -158,6 +164,7 @@ mod tests {
                 "ExecStart=/usr/bin/roslaunch --wait a b.launch",
             ),
             ("other.service", "ExecStart=/usr/bin/other roscored"),
+            ("behind.service", "ExecStart=rosmaster --core -p 11312"),
             ("notes.txt", "ExecStart=roscore"),
         ] {
             fs::write(path(name), text).unwrap();
@@ -171,7 +178,7 @@ mod tests {
             is_enabled,
         };
         assert_eq!(
-            in_folders(&[folder.path().to_owned()]),
+            in_folders(&[folder.path().to_owned()], false),
             [
                 unit("core.service", Kind::Roscore, true),
                 unit("rescue.service", Kind::Rosrescue, false),

@@ -1,123 +1,100 @@
-//! The texts of the units, made of `packaging/systemd/*.in`. Pure.
+//! The texts of the systemd units and of the drop-ins that fit them to a robot. Pure.
 
-use std::{collections::BTreeMap, fmt::Write, net::SocketAddr, path::Path};
+use std::{collections::BTreeMap, net::SocketAddr, path::Path};
 
-const SERVICE: &str = include_str!("../../../packaging/systemd/rosrescue.service.in");
-const SOCKET: &str = include_str!("../../../packaging/systemd/rosrescue.socket.in");
-const HARDENING: &str = include_str!("../../../packaging/systemd/hardening.in");
+const SERVICE: &str = include_str!("../../../packaging/systemd/rosrescue.service");
+const SOCKET: &str = include_str!("../../../packaging/systemd/rosrescue.socket");
+/// The first line of every file that `rosrescue install` writes.
+pub(super) const MARK: &str = "# Written by `rosrescue install`.";
+/// Begins a line that names a unit that `rosrescue install` has disabled.
+const DISABLED: &str = "# Disabled: ";
+
+/// Texts of the two units. A user's systemd can apply neither the account nor the hardening of the computer's.
+pub(super) fn units(user: bool) -> [String; 2] {
+    let mut service = SERVICE.to_owned();
+    if user {
+        let common = SERVICE.split_once("\n# From here to [Install]:");
+        let (common, rest) = common.unwrap_or((SERVICE, ""));
+        let install = rest
+            .split_once("\n[Install]")
+            .map_or("", |(_, install)| install);
+        service = format!("{common}NoNewPrivileges=yes\n\n[Install]{install}")
+            .replace("/etc/default/rosrescue", "%E/rosrescue/environment")
+            .replace("multi-user.target", "default.target");
+    }
+    [service, SOCKET.to_owned()].map(|text| format!("{MARK}\n{text}"))
+}
 
 /// What differs from robot to robot.
 #[derive(Clone, Debug)]
-pub(super) struct Units<'a> {
-    pub(super) version: &'a str,
+pub(super) struct Robot<'a> {
     pub(super) program: &'a Path,
     /// `core` or `proxy`, with options.
-    pub(super) service: &'a [String],
-    /// Who runs it; none for a service of the user's own systemd.
+    pub(super) command: &'a [String],
+    /// The user that runs the service; none for a user's own systemd.
     pub(super) run_as: Option<&'a str>,
-    /// ROS's variables.
+    /// Environment variables of ROS.
     pub(super) settings: &'a BTreeMap<String, String>,
-    pub(super) environment: &'a str,
     pub(super) listen: &'a [SocketAddr],
-    /// Units that want a master when they start.
+    /// Units that need a master when they start.
     pub(super) before: &'a [String],
+    /// Units that rosrescue replaces.
+    pub(super) disabled: &'a [String],
 }
 
-impl Units<'_> {
+impl Robot<'_> {
+    /// The drop-in of the service.
     pub(super) fn service(&self) -> String {
-        let mut command = quoted(&self.program.to_string_lossy(), true);
-        for word in self.service {
-            let _ = write!(command, " {}", quoted(word, true));
+        let mut lines = vec![MARK.to_owned()];
+        let disabled = self.disabled.iter();
+        lines.extend(disabled.map(|unit| format!("{DISABLED}{unit}")));
+        if !self.before.is_empty() {
+            let before = self.before.join(" ");
+            lines.extend([
+                "[Unit]".to_owned(),
+                "# They run roslaunch, which then finds a master.".to_owned(),
+                format!("Before={before}"),
+            ]);
         }
-        let before = match self.before {
-            [] => String::new(),
-            units => format!(
-                "# They start roslaunch, which then finds a master.\nBefore={}",
-                units.join(" ")
-            ),
-        };
-        let settings = self.settings.iter().map(|(name, value)| {
-            let setting = quoted(&format!("{name}={value}"), false);
-            format!("Environment={setting}")
-        });
-        let settings = match settings.collect::<Vec<_>>() {
-            lines if lines.is_empty() => String::new(),
-            lines => format!(
-                "# As it was in the shell that installed it.\n{}",
-                lines.join("\n")
-            ),
-        };
-        fill(
-            SERVICE,
-            &[
-                ("ORIGIN", &self.origin()),
-                ("BEFORE", &before),
-                (
-                    "ACCOUNT",
-                    &self
-                        .run_as
-                        .map(|user| format!("User={user}"))
-                        .unwrap_or_default(),
-                ),
-                ("SETTINGS", &settings),
-                ("ENVIRONMENT", self.environment),
-                ("COMMAND", &command),
-                // A user's systemd may do none of this but the one.
-                (
-                    "HARDENING",
-                    self.run_as
-                        .map_or("NoNewPrivileges=yes", |_| HARDENING.trim_end()),
-                ),
-                (
-                    "TARGET",
-                    self.run_as
-                        .map_or("default.target", |_| "multi-user.target"),
-                ),
-            ],
-        )
+        lines.push("[Service]".to_owned());
+        if let Some(user) = self.run_as {
+            lines.extend(["DynamicUser=no".to_owned(), "StateDirectory=".to_owned()]);
+            lines.push(format!("User={user}"));
+        }
+        lines.extend(self.settings.iter().map(|(name, value)| {
+            format!("Environment={}", quoted(&format!("{name}={value}"), false))
+        }));
+        let program = self.program.to_string_lossy();
+        let words = [&*program].into_iter();
+        let words = words.chain(self.command.iter().map(String::as_str));
+        let words: Vec<_> = words.map(|word| quoted(word, true)).collect();
+        lines.push("ExecStart=".to_owned());
+        lines.push(format!("ExecStart={}\n", words.join(" ")));
+        lines.join("\n")
     }
 
+    /// The drop-in of the socket.
     pub(super) fn socket(&self) -> String {
-        let everywhere = self
-            .listen
-            .iter()
-            .all(|address| address.ip().is_unspecified());
-        let lines: Vec<_> = match self.listen {
-            [v4, _] if everywhere => vec![format!("ListenStream={}", v4.port())],
-            all => all
-                .iter()
-                .map(|address| format!("ListenStream={address}"))
-                .collect(),
+        let addresses = match self.listen {
+            [v4, v6] if v4.ip().is_unspecified() && v6.ip().is_unspecified() => {
+                vec![v4.port().to_string()]
+            }
+            all => all.iter().map(ToString::to_string).collect(),
         };
-        let lines = lines.join("\n");
-        fill(SOCKET, &[("ORIGIN", &self.origin()), ("LISTEN", &lines)])
-    }
-
-    fn origin(&self) -> String {
-        format!(
-            "Written by `rosrescue install` of {}. Changes belong into a drop-in: `systemctl edit`.",
-            self.version
-        )
+        let lines = addresses
+            .iter()
+            .map(|address| format!("ListenStream={address}\n"));
+        let lines: String = lines.collect();
+        format!("{MARK}\n[Socket]\nListenStream=\n{lines}")
     }
 }
 
-/// Puts values into the places of `template`. A line that is nothing but a place without a value is left out.
-fn fill(template: &str, values: &[(&str, &str)]) -> String {
-    let mut text = String::new();
-    for line in template.lines() {
-        let mut line = line.to_owned();
-        let mut vanishes = false;
-        for (name, value) in values {
-            let place = format!("@{name}@");
-            vanishes |= value.is_empty() && line == place;
-            line = line.replace(&place, value);
-        }
-        if !vanishes {
-            text.push_str(&line);
-            text.push('\n');
-        }
-    }
-    text
+/// The units that were disabled when this drop-in was written.
+pub(super) fn disabled(dropin: &str) -> Vec<String> {
+    let units = dropin
+        .lines()
+        .filter_map(|line| line.strip_prefix(DISABLED));
+    units.map(str::to_owned).collect()
 }
 
 /// One word of a unit's line. `$` is special in commands only.
@@ -143,71 +120,66 @@ fn quoted(word: &str, command: bool) -> String {
 mod tests {
     use super::*;
 
-    fn units<'a>(settings: &'a BTreeMap<String, String>, listen: &'a [SocketAddr]) -> Units<'a> {
-        Units {
-            version: "1.2.3",
-            program: Path::new("/usr/local/bin/rosrescue"),
-            service: &[],
-            run_as: Some("robot"),
-            settings,
-            environment: "/etc/default/rosrescue",
-            listen,
-            before: &[],
-        }
-    }
-
     #[test]
-    fn nothing_of_the_templates_is_left() {
+    fn drop_ins_fit_the_units_to_a_robot() {
         let settings = [("ROS_IP".to_owned(), "10.0.0.7".to_owned())].into();
-        let listen = [
-            "0.0.0.0:11311".parse().unwrap(),
-            "[::]:11311".parse().unwrap(),
-        ];
-        let service = [
-            "core".to_owned(),
-            "--checkpoint".to_owned(),
-            "/a b/100%$".to_owned(),
-        ];
-        let mut units = units(&settings, &listen);
-        units.service = &service;
-        for text in [units.service(), units.socket()] {
-            assert!(!text.contains('@') && !text.contains("\n\n\n"), "{text}");
-        }
-        let service = units.service();
+        let words = |words: &[&str]| {
+            words
+                .iter()
+                .map(|&word| word.to_owned())
+                .collect::<Vec<_>>()
+        };
+        let robot = Robot {
+            program: Path::new("/usr/local/bin/rosrescue"),
+            command: &words(&["core", "--checkpoint", "/a b/100%$"]),
+            run_as: Some("robot"),
+            settings: &settings,
+            listen: &["0.0.0.0:11411", "[::]:11411"].map(|address| address.parse().unwrap()),
+            before: &words(&["robot.service"]),
+            disabled: &words(&["roscore.service"]),
+        };
+        let service = robot.service();
         for line in [
+            "Before=robot.service",
             "User=robot",
             "Environment=ROS_IP=10.0.0.7",
             "ExecStart=/usr/local/bin/rosrescue core --checkpoint \"/a b/100%%$$\"",
-            "ProtectSystem=full",
-            "WantedBy=multi-user.target",
         ] {
             assert!(service.lines().any(|it| it == line), "{line}: {service}");
         }
-        assert!(units.socket().contains("\nListenStream=11311\n"));
+        assert_eq!(disabled(&service), ["roscore.service"]);
+        assert!(
+            robot
+                .socket()
+                .ends_with("\nListenStream=\nListenStream=11411\n")
+        );
+        let robot = Robot {
+            listen: &["127.0.0.1:1", "[::1]:1"].map(|address| address.parse().unwrap()),
+            ..robot
+        };
+        let socket = robot.socket();
+        assert!(socket.ends_with("\nListenStream=127.0.0.1:1\nListenStream=[::1]:1\n"));
     }
 
     #[test]
-    fn a_users_unit_asks_for_nothing_that_a_user_may_not() {
-        let (settings, before) = (BTreeMap::new(), ["robot.service".to_owned()]);
-        let listen = ["127.0.0.1:1".parse().unwrap(), "[::1]:1".parse().unwrap()];
-        let mut units = units(&settings, &listen);
-        units.run_as = None;
-        units.before = &before;
-        let service = units.service();
+    fn a_users_unit_asks_only_for_what_a_user_may_do() {
+        let [service, _] = units(true);
         for word in [
             "User=",
             "Protect",
             "Capability",
             "OOMScoreAdjust",
             "multi-user",
+            "/etc/",
         ] {
             assert!(!service.contains(word), "{word}: {service}");
         }
-        assert!(service.contains("\nBefore=robot.service\n"), "{service}");
-        assert!(
-            units
-                .socket()
-                .contains("\nListenStream=127.0.0.1:1\nListenStream=[::1]:1\n")
-        );
+        for word in [
+            "\nOOMPolicy=continue\n",
+            "\nWantedBy=default.target\n",
+            "=-%E/rosrescue",
+        ] {
+            assert!(service.contains(word), "{word}: {service}");
+        }
     }
 }

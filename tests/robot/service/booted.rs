@@ -251,16 +251,22 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
             .ends_with(" 7]\n")
     );
 
-    // A new version of it.
+    // Other options.
     let worker = robot.property("MainPID");
-    robot.run("sed -i 's/Written by/Written long ago by/' /etc/systemd/system/rosrescue.service");
+    robot.run(
+        "sed -i 's/^# Written by/# Mine, not written by/' /etc/systemd/system/rosrescue.service",
+    );
     let refused = robot.output(&format!("SUDO_USER=robot {PROGRAM} install --yes"));
     assert_eq!(refused.status.code(), Some(1), "{refused:?}");
     assert!(
-        String::from_utf8_lossy(&refused.stdout).contains("rosrescue.service was changed since")
+        String::from_utf8_lossy(&refused.stdout).contains("rosrescue.service was not written by")
     );
-    robot.run("sed -i 's/Written long ago by/Written by/' /etc/systemd/system/rosrescue.service");
-    robot.run(&format!("{PROGRAM} install --yes -- core -t 6"));
+    robot.run(
+        "sed -i 's/^# Mine, not written by/# Written by/' /etc/systemd/system/rosrescue.service",
+    );
+    robot.run(&format!(
+        "SUDO_USER=robot ROS_HOSTNAME=localhost {PROGRAM} install --yes -- core -t 6"
+    ));
     eventually("another worker", || {
         !["0", &worker].contains(&&*robot.property("MainPID"))
     });
@@ -271,7 +277,7 @@ fn a_service_is_installed_survives_deaths_and_is_taken_away_without_a_trace() {
             .ends_with(" 7]\n")
     );
 
-    robot.run("rm -r /etc/systemd/system/rosrescue.service.d");
+    robot.run("rm /etc/systemd/system/rosrescue.service.d/test.conf");
     robot.run(&format!("{PROGRAM} uninstall --yes"));
     assert_eq!(robot.files(), before);
     assert!(robot.try_run("pgrep -x rosrescue").is_err());

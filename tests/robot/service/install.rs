@@ -1,7 +1,7 @@
 //! What `rosrescue install` says and refuses, without a systemd: nothing is started here.
 
 use std::fs;
-use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::fs::symlink;
 use std::process::{Command, Output};
 
 use crate::support::Scratch;
@@ -41,7 +41,10 @@ fn what_makes_no_sense_is_said_in_a_sentence() {
         (&["--user", "--system"][..], "cannot be used with"),
         (&["--user", "--run-as", "root"], "cannot be used with"),
         (&nobody, "there is no user `nobody-of-this-name`"),
-        (&["--dry-run"], "say who runs it, as in --run-as robot"),
+        (
+            &[],
+            "name the user that runs the service, as in --run-as robot",
+        ),
         (
             &["--user", "--", "status"],
             "a service runs `core` or `proxy`",
@@ -50,10 +53,10 @@ fn what_makes_no_sense_is_said_in_a_sentence() {
         (&["--user", "--", "core", "--hold", "-3"], "--hold"),
         (
             &["--user", "--", "core", "--checkpoint", "here.yaml"],
-            "write the whole path of here.yaml",
+            "write the full path of here.yaml",
         ),
-        (&["--user"], "nobody can be asked here"),
-        (&["--user", "--json"], "nobody can be asked here"),
+        (&["--user"], "cannot ask here"),
+        (&["--user", "--json"], "cannot ask here"),
     ] {
         let output = rosrescue(&scratch, &[&["install"], arguments].concat());
         let said = said(&output, 2);
@@ -78,47 +81,38 @@ fn it_is_idempotent_and_leaves_foreign_files_alone() {
     assert!(!units.join("rosrescue.socket").exists());
     fs::remove_file(&service).unwrap();
 
-    let done = said(&rosrescue(&scratch, &install), 0);
-    assert!(
-        done.contains(".local/bin/rosrescue (this program"),
-        "{done}"
-    );
-    let text = fs::read_to_string(&service).unwrap();
-    assert!(text.contains("\nEnvironment=ROS_IP=127.0.0.1\n"), "{text}");
-    let socket = fs::read_to_string(units.join("rosrescue.socket")).unwrap();
+    said(&rosrescue(&scratch, &install), 0);
+    let read = |name: &str| fs::read_to_string(units.join(name)).unwrap();
+    let dropin = "rosrescue.service.d/install.conf";
+    for line in [
+        "Environment=ROS_IP=127.0.0.1",
+        &format!("ExecStart={PROGRAM} core"),
+    ] {
+        assert!(read(dropin).lines().any(|it| it == line), "{line}");
+    }
+    let socket = read("rosrescue.socket.d/install.conf");
     assert!(
         socket.contains("\nListenStream=127.0.0.1:11311\n"),
         "{socket}"
     );
-    let copy = scratch.path(".local/bin/rosrescue");
-    assert_eq!(copy.metadata().unwrap().permissions().mode() & 0o777, 0o755);
+    assert!(read("rosrescue.service").contains("\nWantedBy=default.target\n"));
     assert!(said(&rosrescue(&scratch, &install), 0).starts_with("nothing to change"));
 
-    // What is chosen stays chosen; what is changed by hand is nobody's to overwrite.
-    said(
-        &rosrescue(
-            &scratch,
-            &[&install[..], &["--", "core", "-p", "11399"]].concat(),
-        ),
-        0,
-    );
-    assert!(said(&rosrescue(&scratch, &install), 0).starts_with("nothing to change"));
-    assert!(
-        fs::read_to_string(&service)
-            .unwrap()
-            .contains("rosrescue core -p 11399\n")
-    );
+    let other = [&install[..], &["--", "core", "-p", "11399"]].concat();
+    said(&rosrescue(&scratch, &other), 0);
+    assert!(said(&rosrescue(&scratch, &other), 0).starts_with("nothing to change"));
+    assert!(read(dropin).contains("rosrescue core -p 11399\n"));
+    // A file that somebody has taken over stays.
     fs::write(&service, "# mine\n").unwrap();
     let refused = said(&rosrescue(&scratch, &install), 1);
     assert!(
-        refused.contains("rosrescue.service was changed since"),
+        refused.contains("rosrescue.service was not written by"),
         "{refused}"
     );
-    let left = said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 1);
-    assert!(left.contains("rosrescue.service stays"), "{left}");
-    assert!(service.exists() && !copy.exists());
+    said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 0);
+    assert!(service.exists() && !units.join("rosrescue.service.d").exists());
     let nothing = said(&rosrescue(&scratch, &["uninstall", "--user", "--yes"]), 0);
-    assert!(nothing.contains("nothing is installed here"), "{nothing}");
+    assert!(nothing.contains("has installed nothing here"), "{nothing}");
 }
 
 #[test]
@@ -148,15 +142,11 @@ fn units_that_start_a_master_are_found_and_the_plan_is_json() {
         .iter()
         .filter_map(|it| it["command"].as_array())
         .collect();
-    assert_eq!(commands[0].last().unwrap(), "old.service", "{json}");
+    let is_old = |command: &&&Vec<serde_json::Value>| command.last().unwrap() == "old.service";
+    let disables = commands.iter().find(is_old).unwrap();
+    assert_eq!(disables[2], "disable", "{json}");
     assert!(json.contains("Before=robot.service"), "{json}");
-    assert!(
-        plan["notes"][0]
-            .as_str()
-            .unwrap()
-            .contains("give roslaunch `--wait`"),
-        "{json}"
-    );
+    assert!(json.contains("Add `--wait` to its roslaunch"), "{json}");
 
     let proxy = [
         "install",
@@ -169,7 +159,7 @@ fn units_that_start_a_master_are_found_and_the_plan_is_json() {
     ];
     let refused = said(&rosrescue(&scratch, &proxy), 1);
     assert!(
-        refused.contains("old.service") && refused.contains("give it another port"),
+        refused.contains("old.service") && refused.contains("give the master another port"),
         "{refused}"
     );
 }
@@ -190,8 +180,8 @@ fn settings_of_whoever_calls_sudo_are_found() {
         .output()
         .unwrap();
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(said.contains("+ Environment=ROS_IP=10.0.0.7"), "{output:?}");
-    assert!(said.contains("+ User=root"), "{said}");
+    assert!(said.contains("  Environment=ROS_IP=10.0.0.7"), "{output:?}");
+    assert!(said.contains("  User=root"), "{said}");
 }
 
 #[test]
