@@ -1,8 +1,7 @@
-//! What it takes to bring a running master nearer to a checkpoint, by calls that anybody may make.
+//! The changes that give a running master the parameters of a checkpoint.
 
 use crate::{
-    checkpoint::compare::plain,
-    master::{self, Master, Method, Request},
+    master,
     xmlrpc::{Struct, Value},
 };
 
@@ -10,7 +9,7 @@ use crate::{
 /// addresses below `/roslaunch`.
 pub const OF_THE_SESSION: [&str; 2] = ["/run_id", "/roslaunch"];
 
-/// Something of the checkpoint that stays out, and why.
+/// A parameter of the checkpoint that is left out, and why.
 pub type LeftOut = (String, String);
 
 /// The changes of parameters.
@@ -23,21 +22,25 @@ pub struct Params {
     pub left_out: Vec<LeftOut>,
 }
 
-/// What is to be set so that `live` has all parameters of `file`, one by one; with `exact` also what is to be
-/// deleted so that it has no others.
-pub fn params(file: &Struct, live: &Struct, exact: bool) -> Params {
-    let mut found = Params::default();
-    found.below("", file, live, exact);
-    found
-}
-
 impl Params {
+    /// The changes that give `live` every parameter of `file`; with `exact` also the deletions that leave it no others.
+    pub fn between(file: &Struct, live: &Struct, exact: bool) -> Self {
+        let mut found = Self::default();
+        found.below("", file, live, exact);
+        found
+    }
+
+    /// Whether there is nothing to change.
+    pub fn is_empty(&self) -> bool {
+        self.set.is_empty() && self.delete.is_empty()
+    }
+
     fn below(&mut self, path: &str, file: &Struct, live: &Struct, exact: bool) {
         for (key, value) in file {
             let name = format!("{path}/{key}");
             if OF_THE_SESSION.contains(&name.as_str()) {
                 if live.get(key) != Some(value) {
-                    self.leave(name, "it belongs to the session that runs now");
+                    self.leave(name, "it belongs to the running session");
                 }
                 continue;
             }
@@ -52,7 +55,7 @@ impl Params {
                     self.below(&name, members, there, exact);
                 }
                 (value, _) if !master::is_readable(value) => {
-                    self.leave(name, "rosmaster could take it but never return it");
+                    self.leave(name, "rosmaster could store it but never return it");
                 }
                 (value, there) => self.set.push((name, there.cloned(), value.clone())),
             }
@@ -80,116 +83,6 @@ fn is_plain(key: &str) -> bool {
 /// Whether each member can be set by a call of its own.
 fn is_namespace(members: &Struct) -> bool {
     !members.is_empty() && members.keys().all(|key| is_plain(key))
-}
-
-/// A registration of a node.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Registration {
-    /// As in `/talker publishes /chatter`.
-    pub text: String,
-    /// The service and its address, for a service.
-    pub service: Option<(String, String)>,
-    pub call: Request,
-}
-
-/// A node of a checkpoint, with what a master lacks of it.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Absent {
-    pub node: String,
-    pub api: String,
-    /// In the order in which they are to be made.
-    pub registrations: Vec<Registration>,
-}
-
-/// The nodes of `file` that `live` does not know, or knows at the same address with fewer registrations. A node that
-/// is at another address now is left out: rosmaster would shut it down.
-pub fn absent(file: &Master, live: &Master) -> (Vec<Absent>, Vec<LeftOut>) {
-    let (mut absent, mut left_out) = (Vec::new(), Vec::new());
-    for (node, api) in file.nodes() {
-        let there = live.api_of(node);
-        if let Some(now) = there.filter(|now| *now != api) {
-            let why = format!("it is registered at {now} now, and was at {api}");
-            left_out.push((format!("node {node}"), why));
-            continue;
-        }
-        let registrations = missing(file, live, node, api, &mut left_out);
-        if !registrations.is_empty() {
-            absent.push(Absent {
-                node: node.to_owned(),
-                api: api.to_owned(),
-                registrations,
-            });
-        }
-    }
-    (absent, left_out)
-}
-
-fn missing(
-    file: &Master,
-    live: &Master,
-    node: &str,
-    api: &str,
-    left_out: &mut Vec<LeftOut>,
-) -> Vec<Registration> {
-    let mut found = Vec::new();
-    let mut add =
-        |text: String, service, name: Option<String>, call: &dyn Fn(&str) -> Request| match name {
-            Some(name) => found.push(Registration {
-                text,
-                service,
-                call: call(&name),
-            }),
-            None => left_out.push((text, "no name leads to it".to_owned())),
-        };
-    let named = |key: &str| master::name_for(key, node);
-    for (verb, method, held, there) in [
-        (
-            "publishes",
-            Method::RegisterPublisher,
-            file.publications(node).collect::<Vec<_>>(),
-            live.publications(node).collect::<Vec<_>>(),
-        ),
-        (
-            "subscribes",
-            Method::RegisterSubscriber,
-            file.subscriptions(node).collect(),
-            live.subscriptions(node).collect(),
-        ),
-    ] {
-        for topic in held.into_iter().filter(|topic| !there.contains(topic)) {
-            let topic_type = file.type_of(topic).unwrap_or("*");
-            add(
-                format!("{node} {verb} {topic}"),
-                None,
-                named(topic),
-                &|name| Request::new(method.clone(), [node, name, topic_type, api]),
-            );
-        }
-    }
-    // Whether a node that is known subscribes parameters cannot be read.
-    let watched = file.param_subscriptions(node);
-    for key in watched.filter(|_| live.api_of(node).is_none()) {
-        let text = format!("{node} watches the parameter {}", plain(key));
-        add(text, None, master::param_name_for(key, node), &|name| {
-            Request::new(Method::SubscribeParam, [node, api, name])
-        });
-    }
-    let mut taken = Vec::new();
-    for (service, at) in file.services_of(node) {
-        let text = format!("{node} provides {service}");
-        match live.provider_of(service) {
-            Some(now) if now == node => {}
-            Some(now) => taken.push((text, format!("{now} provides it now"))),
-            None => add(
-                text,
-                Some((service.to_owned(), at.to_owned())),
-                named(service),
-                &|name| Request::new(Method::RegisterService, [node, name, at, api]),
-            ),
-        }
-    }
-    left_out.extend(taken);
-    found
 }
 
 #[cfg(test)]
@@ -227,7 +120,7 @@ mod tests {
             ("other", 1.into()),
             ("emptied", space(&[("x", 1.into())])),
         ]);
-        let plan = params(&file, &live, false);
+        let plan = Params::between(&file, &live, false);
         let set = [
             ("/a/y", Some(5.into()), 2.into()),
             ("/was_value/z", None, 3.into()),
@@ -238,80 +131,9 @@ mod tests {
         assert_eq!(plan.delete, [""; 0]);
         let left: Vec<_> = plan.left_out.iter().map(|(what, _)| what).collect();
         assert_eq!(left, ["parameter /run_id", "parameter /never"]);
-        let exact = params(&file, &live, true);
+        let exact = Params::between(&file, &live, true);
         assert_eq!(exact.delete, ["/a/new", "/other"]);
         assert_eq!(exact.set.len(), plan.set.len() + 1);
         assert_eq!(exact.set[3].0, "/emptied");
-    }
-
-    fn call(method: Method, params: &[&str]) -> Request {
-        Request::new(method, params.iter().copied())
-    }
-
-    fn master(calls: &[Request]) -> Master {
-        let mut master = Master::default();
-        for call in calls {
-            master.apply(call);
-        }
-        master
-    }
-
-    #[test]
-    fn what_a_master_lacks_of_a_node_is_put_back_where_the_node_is() {
-        let publish = call(
-            Method::RegisterPublisher,
-            &["/p", "/t", "x/Y", "http://p:1/"],
-        );
-        let serve = call(
-            Method::RegisterService,
-            &["/p", "/s", "rosrpc://p:2", "http://p:1/"],
-        );
-        let taken = call(
-            Method::RegisterService,
-            &["/p", "/u", "rosrpc://p:2", "http://p:1/"],
-        );
-        let watch = call(Method::SubscribeParam, &["/p", "http://p:1/", "/k"]);
-        let moved = call(
-            Method::RegisterPublisher,
-            &["/m", "/t", "x/Y", "http://m:1/"],
-        );
-        let all = [publish.clone(), serve.clone(), taken, watch.clone(), moved];
-        let file = master(&all);
-        let live = master(&[
-            call(
-                Method::RegisterSubscriber,
-                &["/m", "/t", "x/Y", "http://m:9/"],
-            ),
-            call(
-                Method::RegisterService,
-                &["/v", "/u", "rosrpc://v:2", "http://v:1/"],
-            ),
-        ]);
-        let (found, left_out) = absent(&file, &live);
-        assert_eq!(found.len(), 1);
-        let texts: Vec<_> = found[0]
-            .registrations
-            .iter()
-            .map(|one| one.text.as_str())
-            .collect();
-        assert_eq!(
-            texts,
-            [
-                "/p publishes /t",
-                "/p watches the parameter /k",
-                "/p provides /s"
-            ]
-        );
-        let calls: Vec<_> = found[0]
-            .registrations
-            .iter()
-            .map(|one| one.call.clone())
-            .collect();
-        assert_eq!(calls, [publish, watch, serve]);
-        let left: Vec<_> = left_out.iter().map(|(what, _)| what).collect();
-        assert_eq!(left, ["/p provides /u", "node /m"]);
-        // With all of it nothing is left to do, and what cannot be read is not done again.
-        let (found, _) = absent(&file, &file);
-        assert_eq!(found, []);
     }
 }

@@ -1,12 +1,9 @@
-//! `rosrescue restore`: puts a checkpoint back into a running rosrescue, by calls that anybody may make. So the
+//! `rosrescue restore`: sets the parameters of a running robot to those of a checkpoint, by ordinary calls. So the
 //! master, the mirror, the journal and the nodes all hear of it.
-
-mod evidence;
 
 use std::{
     fmt,
     io::{self, IsTerminal, Write},
-    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -16,11 +13,11 @@ use super::{Exit, Failure, files, live::Live, print, running::Running};
 use crate::{
     checkpoint::{
         format::shown,
-        putback::{self, LeftOut, Params, Registration},
+        putback::{LeftOut, Params},
     },
     cli::RestoreArgs,
     hide::Hide,
-    master::{CALLER_ID, Displaced, Master, Method, Request},
+    master::{CALLER_ID, Method, Request},
     xmlrpc::Value,
 };
 
@@ -31,24 +28,39 @@ const BYTES_AT_ONCE: usize = 4 << 20;
 pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
     let file = files::read(&args.file, &args.read).await?;
     let mut live = Live::connect(&Running::find(&args.target)?).await?;
-    let work = Work::plan(&Arc::new(file.state.clone()), &mut live, args.exact).await?;
+    let now = live.state(&file.state).await?;
+    let params = Params::between(file.state.params(), now.params(), args.exact);
     let mut restored = Restored {
         file: file.path.display().to_string(),
         master: live.uri.clone(),
-        plan: work.in_words(&args.hide.hide_values),
+        plan: Plan::of(&params, &args.hide.hide_values),
         done: false,
         failed: Vec::new(),
     };
     let json = args.output.json;
-    let does = !args.plan && !work.is_empty();
+    let does = !args.plan && !params.is_empty();
     if !json || (does && !args.yes) {
         print(&restored, &args.output)?;
     }
     if does {
         if !(args.yes || agreed(json)?) {
-            return Err(Failure::Failed("nothing was done".to_owned()));
+            return Err(Failure::Failed("changed nothing".to_owned()));
         }
-        restored.failed = work.carry_out(&file.state, &mut live, args.exact).await?;
+        restored.failed = set(&params, &mut live).await?;
+        // The master's own words about what it refused say more.
+        if restored.failed.is_empty() {
+            let now = live.state(&file.state).await?;
+            let left = Params::between(file.state.params(), now.params(), args.exact);
+            let changed = left
+                .set
+                .iter()
+                .map(|(name, ..)| format!("{name} has another value again"));
+            let back = left
+                .delete
+                .iter()
+                .map(|name| format!("{name} is there again"));
+            restored.failed = changed.chain(back).collect();
+        }
         restored.done = restored.failed.is_empty();
         if !json {
             print(&Outcome(&restored), &args.output)?;
@@ -67,10 +79,10 @@ pub(super) async fn run(args: &RestoreArgs) -> Result<Exit, Failure> {
 /// Asks at the terminal, unless the output is `json` for a program.
 fn agreed(json: bool) -> Result<bool, Failure> {
     if json || !io::stdin().is_terminal() || !io::stderr().is_terminal() {
-        let why = "nothing was done: there is nobody to ask. --yes does it, --plan only says it";
+        let why = "cannot ask here: --plan shows the changes, --yes makes them";
         return Err(Failure::Usage(why.to_owned()));
     }
-    eprint!("Do this? [y/N] ");
+    eprint!("Set these parameters? [y/N] ");
     let _ = io::stderr().flush();
     let mut answer = String::new();
     let read = io::stdin().read_line(&mut answer);
@@ -78,146 +90,20 @@ fn agreed(json: bool) -> Result<bool, Failure> {
     Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
 }
 
-/// What is to be done.
-struct Work {
-    params: Params,
-    registrations: Vec<Registration>,
-    left_out: Vec<LeftOut>,
-}
-
-impl Work {
-    async fn plan(file: &Arc<Master>, live: &mut Live, exact: bool) -> Result<Self, Failure> {
-        let now = live.state(file).await?;
-        let params = putback::params(file.params(), now.params(), exact);
-        let (absent, mut left_out) = putback::absent(file, &now);
-        let mut registrations = evidence::of_living(file, &now, absent, &mut left_out).await;
-        registrations.sort_by_key(|one| rank(&one.call));
-        left_out.extend(params.left_out.iter().cloned());
-        Ok(Self {
-            params,
-            registrations,
-            left_out,
-        })
-    }
-
-    fn is_empty(&self) -> bool {
-        self.params.set.is_empty() && self.params.delete.is_empty() && self.registrations.is_empty()
-    }
-
-    fn in_words(&self, hide: &Hide) -> Plan {
-        let set = self.params.set.iter().map(|(name, was, is)| Set {
-            name: name.clone(),
-            from: was.as_ref().map(|was| shown(&hide.mask(name, was))),
-            to: shown(&hide.mask(name, is)),
-        });
-        let left_out = self.left_out.iter().map(|(what, why)| Left {
-            what: what.clone(),
-            why: why.clone(),
-        });
-        Plan {
-            set: set.collect(),
-            delete: self.params.delete.clone(),
-            register: self
-                .registrations
-                .iter()
-                .map(|one| one.text.clone())
-                .collect(),
-            left_out: left_out.collect(),
-        }
-    }
-
-    /// Does it, reads back, and returns what has not come about.
-    async fn carry_out(
-        &self,
-        file: &Master,
-        live: &mut Live,
-        exact: bool,
-    ) -> Result<Vec<String>, Failure> {
-        let mut failed = Vec::new();
-        let set = self.params.set.iter().map(|(name, _, value)| {
-            let params = [Value::from(CALLER_ID), name.as_str().into(), value.clone()];
-            (
-                format!("set {name}"),
-                Request::new(Method::SetParam, params),
-            )
-        });
-        let delete = self.params.delete.iter().map(|name| {
-            let call = Request::new(Method::DeleteParam, [CALLER_ID, name]);
-            (format!("delete {name}"), call)
-        });
-        make(live, set.chain(delete).collect(), &mut failed).await?;
-        let register = self.still_there(live, file, &mut failed).await?;
-        make(live, register, &mut failed).await?;
-        // What was refused is told with the master's own words.
-        if failed.is_empty() {
-            let now = live.state(file).await?;
-            let params = putback::params(file.params(), now.params(), exact);
-            failed.extend(
-                params
-                    .set
-                    .iter()
-                    .map(|(name, ..)| format!("{name} has another value again")),
-            );
-            failed.extend(
-                params
-                    .delete
-                    .iter()
-                    .map(|name| format!("{name} is there again")),
-            );
-            let (absent, _) = putback::absent(file, &now);
-            let lacking: Vec<_> = absent.iter().flat_map(|node| &node.registrations).collect();
-            let again = self
-                .registrations
-                .iter()
-                .filter(|one| lacking.contains(one));
-            failed.extend(again.map(|one| format!("{} is not so", one.text)));
-        }
-        Ok(failed)
-    }
-
-    /// The registrations of nodes that have not registered at another address since the plan was made: rosmaster
-    /// would shut them down.
-    async fn still_there(
-        &self,
-        live: &mut Live,
-        file: &Master,
-        failed: &mut Vec<String>,
-    ) -> Result<Vec<(String, Request)>, Failure> {
-        if self.registrations.is_empty() {
-            return Ok(Vec::new());
-        }
-        let now = live.state(file).await?;
-        let mut calls = Vec::new();
-        for Registration { text, call, .. } in &self.registrations {
-            match now.displaced_by(call) {
-                Some(Displaced { node, api, .. }) => {
-                    failed.push(format!("{text}: {node} is at {api} by now"));
-                }
-                None => calls.push((text.clone(), call.clone())),
-            }
-        }
-        Ok(calls)
-    }
-}
-
-/// Publishers come first: a subscriber hears of all of them at once.
-fn rank(call: &Request) -> u8 {
-    match call.method() {
-        Method::RegisterPublisher => 0,
-        Method::RegisterService => 1,
-        Method::RegisterSubscriber => 2,
-        _ => 3,
-    }
-}
-
-/// Makes calls, each with what it is for. Adds those that were refused to `failed`.
-async fn make(
-    live: &mut Live,
-    calls: Vec<(String, Request)>,
-    failed: &mut Vec<String>,
-) -> Result<(), Failure> {
-    let (total, mut done, mut said) = (calls.len(), 0, Instant::now());
-    let mut calls = calls.into_iter().peekable();
+/// Sets and deletes parameters. Returns the refused calls with their reasons.
+async fn set(params: &Params, live: &mut Live) -> Result<Vec<String>, Failure> {
+    let set = params.set.iter().map(|(name, _, value)| {
+        let params = [Value::from(CALLER_ID), name.as_str().into(), value.clone()];
+        let call = Request::new(Method::SetParam, params);
+        (format!("set {name}"), call)
+    });
+    let delete = params.delete.iter().map(|name| {
+        let call = Request::new(Method::DeleteParam, [CALLER_ID, name]);
+        (format!("delete {name}"), call)
+    });
+    let total = params.set.len() + params.delete.len();
+    let (mut failed, mut done, mut said) = (Vec::new(), 0, Instant::now());
+    let mut calls = set.chain(delete).peekable();
     while calls.peek().is_some() {
         let (mut texts, mut batch, mut bytes) = (Vec::new(), Vec::new(), 0);
         while batch.len() < CALLS_AT_ONCE
@@ -237,7 +123,7 @@ async fn make(
             said = Instant::now();
         }
     }
-    Ok(())
+    Ok(failed)
 }
 
 #[derive(Serialize)]
@@ -245,9 +131,9 @@ struct Restored {
     file: String,
     master: String,
     plan: Plan,
-    /// Whether it was done and read back.
+    /// Whether the parameters were set and read back.
     done: bool,
-    /// What was tried and is not so.
+    /// What was refused or has changed again.
     failed: Vec<String>,
 }
 
@@ -255,15 +141,32 @@ struct Restored {
 struct Plan {
     set: Vec<Set>,
     delete: Vec<String>,
-    /// Registrations of nodes that answer where they were.
-    register: Vec<String>,
     left_out: Vec<Left>,
+}
+
+impl Plan {
+    fn of(params: &Params, hide: &Hide) -> Self {
+        let set = params.set.iter().map(|(name, was, is)| Set {
+            name: name.clone(),
+            from: was.as_ref().map(|was| shown(&hide.mask(name, was))),
+            to: shown(&hide.mask(name, is)),
+        });
+        let left_out = params.left_out.iter().map(|(what, why): &LeftOut| Left {
+            what: what.clone(),
+            why: why.clone(),
+        });
+        Self {
+            set: set.collect(),
+            delete: params.delete.clone(),
+            left_out: left_out.collect(),
+        }
+    }
 }
 
 #[derive(Serialize)]
 struct Set {
     name: String,
-    /// None if it is not set now.
+    /// The value now; none if it is not set.
     from: Option<String>,
     to: String,
 }
@@ -288,19 +191,13 @@ impl fmt::Display for Restored {
         plan.delete
             .iter()
             .try_for_each(|name| writeln!(f, "delete {name}"))?;
-        plan.register
-            .iter()
-            .try_for_each(|text| writeln!(f, "register: {text}"))?;
         for Left { what, why } in &plan.left_out {
             writeln!(f, "left out: {what}: {why}")?;
         }
-        let (set, delete, register) = (plan.set.len(), plan.delete.len(), plan.register.len());
-        match set + delete + register {
+        let (set, delete) = (plan.set.len(), plan.delete.len());
+        match set + delete {
             0 => writeln!(f, "nothing to do"),
-            _ => writeln!(
-                f,
-                "to do: {set} parameters to set, {delete} to delete, {register} registrations to make"
-            ),
+            _ => writeln!(f, "{set} parameters to set, {delete} to delete"),
         }
     }
 }
@@ -316,8 +213,8 @@ impl fmt::Display for Outcome<'_> {
             .iter()
             .try_for_each(|sentence| writeln!(f, "failed: {sentence}"))?;
         match failed.len() {
-            0 => writeln!(f, "done, and read back"),
-            count => writeln!(f, "done but for {count}"),
+            0 => writeln!(f, "done and read back"),
+            count => writeln!(f, "done, except for {count}"),
         }
     }
 }

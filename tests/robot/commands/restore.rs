@@ -1,4 +1,4 @@
-//! `restore`: into a running rosrescue, for living nodes only, and to nobody's harm.
+//! `restore`: the parameters of a checkpoint for a running robot.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -6,8 +6,7 @@ use std::process::{Command, Stdio};
 use rosrescue::xmlrpc::Value;
 
 use crate::support::{
-    FakeNode, Library, Mode, Robot, Tool, alive, eventually, in_both_modes, params, ros_command,
-    tree,
+    FakeNode, Mode, Robot, Tool, eventually, in_both_modes, params, ros_command, tree,
 };
 
 fn run(robot: &Robot, arguments: &[&str]) -> Tool {
@@ -36,7 +35,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
         "set /gains/p: 3.0 -> 1.0",
         "set /gains/i: 2",
         "set /wifi/password: \"(hidden)\"",
-        "to do: 3 parameters to set, 0 to delete, 0 registrations to make",
+        "3 parameters to set, 0 to delete",
     ] {
         assert!(text.lines().any(|found| found == line), "{line}\n{text}");
     }
@@ -49,7 +48,7 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert_eq!(client.param("/gains/i"), None);
 
     let text = run(&robot, &["restore", "session-1", "--yes"]).ended(0);
-    assert!(text.ends_with("done, and read back"), "{text}");
+    assert!(text.ends_with("done and read back"), "{text}");
     let gains = tree! { "p" => 1.0, "d" => 1, "i" => 2 };
     assert_eq!(client.param("/gains"), Some(gains));
     assert_eq!(client.param("/wifi/password"), Some("geheim".into()));
@@ -78,136 +77,6 @@ fn parameters_are_put_back_and_only_on_request_deleted(mode: Mode) {
     assert_eq!(client.param("/run_id"), run_id);
     let text = run(&robot, &["restore", "session-1", "--yes", "--exact"]).ended(0);
     assert!(text.ends_with("nothing to do"), "{text}");
-}
-
-/// rospy and roscpp nodes of a session that was not restored.
-#[test]
-fn nodes_that_live_are_registered_again_and_nobody_else() {
-    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--restore", "never"]);
-    let nodes = [
-        robot.node(Library::Rospy, "talker", &[]),
-        robot.node(Library::Roscpp, "listener", &[]),
-        robot.node(Library::Roscpp, "server", &[]),
-        robot.node(
-            Library::Rospy,
-            "server",
-            &["__name:=pyserver", "who:=whoelse"],
-        ),
-    ];
-    nodes[1].wait_messages("/talker", 3);
-    let mut dead = robot.node(Library::Roscpp, "talker", &["__name:=dead"]);
-    let mut moved = robot.node(
-        Library::Rospy,
-        "talker",
-        &["__name:=moved", "chatter:=other"],
-    );
-    let before = robot.settled_state();
-    assert!(robot.rescue.terminate().success());
-    dead.kill();
-    moved.kill();
-    robot.rescue.start_again();
-    robot.rescue.wait_serving();
-    let moved = robot.node(
-        Library::Rospy,
-        "talker",
-        &["__name:=moved", "chatter:=elsewhere"],
-    );
-    assert!(!robot.state().knows("/talker"));
-
-    let plan = run(&robot, &["restore", "session-1", "--plan"]).ended(0);
-    for line in [
-        "register: /talker publishes /chatter",
-        "register: /listener subscribes /chatter",
-        "register: /server provides /who",
-        "register: /pyserver provides /whoelse",
-        "left out: node /dead: it is dead: nothing listens at http",
-        "left out: node /moved: it is registered at http",
-    ] {
-        assert!(
-            plan.lines().any(|found| found.starts_with(line)),
-            "{line}\n{plan}"
-        );
-    }
-    assert!(
-        !plan.contains("register: /moved") && !plan.contains("register: /dead"),
-        "{plan}"
-    );
-    assert!(!robot.state().knows("/talker"), "a plan changes nothing");
-
-    let count = nodes[1].messages("/talker").len();
-    run(&robot, &["restore", "session-1", "--yes"]).ended(0);
-    let after = robot.settled_state();
-    for name in ["/talker", "/listener", "/server", "/pyserver"] {
-        let of = |state: &crate::support::State| {
-            let api = state.nodes.iter().find(|(node, _)| node == name).cloned();
-            let lists = [&state.publishers, &state.subscribers, &state.services].map(|lists| {
-                let held = lists
-                    .iter()
-                    .filter(|(_, nodes)| nodes.iter().any(|node| node == name));
-                let mut held: Vec<_> = held.map(|(key, _)| key.clone()).collect();
-                held.sort();
-                held
-            });
-            (api, lists)
-        };
-        assert_eq!(of(&after), of(&before), "{name}");
-    }
-    assert!(!after.knows("/dead"));
-    assert!(alive(moved.pid()), "nobody is shut down");
-    assert!(nodes.iter().all(|node| alive(node.pid())));
-    nodes[1].wait_messages("/talker", count + 5);
-    let who = Tool::run(
-        &robot.scratch,
-        robot.port(),
-        "rosservice",
-        &["call", "/who"],
-    );
-    assert!(who.stdout.contains("/server"), "{who:?}");
-    let again = run(&robot, &["restore", "session-1", "--yes"]).ended(0);
-    assert!(again.ends_with("nothing to do"), "{again}");
-}
-
-/// An innocent node at the address of a dead one is not registered under the dead one's name: with the next
-/// registration of that name rosmaster would shut it down.
-#[test]
-fn another_node_at_the_same_address_is_left_alone() {
-    let mut robot = Robot::start_with(Mode::Core, &["--no-rosout", "--restore", "never"]);
-    let client = robot.client();
-    let gone = FakeNode::start("/gone");
-    let port = gone.port();
-    gone.publish(&client, "/scan", "x/Y");
-    let changed = FakeNode::start("/changed");
-    changed.publish(&client, "/a", "x/Y");
-    changed.publish(&client, "/b", "x/Y");
-    assert!(robot.rescue.terminate().success());
-    drop(gone);
-    robot.rescue.start_again();
-    robot.rescue.wait_serving();
-    // It has not registered, and says nothing of what the dead one published.
-    let innocent = FakeNode::start_at("/innocent", port);
-    innocent.claim_publication("/other", Some("x/Y"));
-    let plan = run(&robot, &["restore", "session-1", "--plan"]).ended(0);
-    assert!(
-        plan.contains("left out: node /gone: nothing shows that it is still the node at"),
-        "{plan}"
-    );
-    assert!(plan.contains("register: /changed publishes /a"), "{plan}");
-    // What the node itself denies is not registered; this one cannot say its name, so it is left out.
-    changed.claim_publication("/b", None);
-    let plan = run(&robot, &["restore", "session-1", "--plan"]).ended(0);
-    assert!(plan.contains("left out: node /changed:"), "{plan}");
-    innocent.publish(&client, "/other", "x/Y");
-    let plan = run(&robot, &["restore", "session-1", "--plan"]).ended(0);
-    assert!(
-        plan.contains("left out: node /gone: /innocent is registered at its address now"),
-        "{plan}"
-    );
-    run(&robot, &["restore", "session-1", "--yes"]).ended(0);
-    assert_eq!(
-        innocent.heard("shutdown").len() + changed.heard("shutdown").len(),
-        0
-    );
-    assert!(!robot.state().knows("/gone"));
 }
 
 /// The mirror takes it as it takes every write, and the next master is given it.
@@ -256,13 +125,13 @@ fn at_a_terminal_it_asks() {
     };
     let (status, text) = answer("n");
     assert!(
-        status == Some(1) && text.contains("Do this? [y/N]"),
+        status == Some(1) && text.contains("Set these parameters? [y/N]"),
         "{status:?} {text}"
     );
     assert_eq!(robot.client().param("/x"), None);
     let (status, text) = answer("y");
     assert!(
-        status == Some(0) && text.contains("done, and read back"),
+        status == Some(0) && text.contains("done and read back"),
         "{status:?} {text}"
     );
     assert_eq!(robot.client().param("/x"), Some(1.into()));
