@@ -1,5 +1,5 @@
-//! The command line. Every option has a default and a unit in its help, and an environment variable. Flags of
-//! commands that do not serve have none: consent must not be left over from an earlier command.
+//! The command line. Every option of `core` and `proxy` has an environment variable. Flags of the other commands have
+//! none: nobody consents by a variable that is left over from an earlier command.
 
 pub(crate) mod cluster;
 mod files;
@@ -24,9 +24,9 @@ pub use self::{
 
 /// Keeps a ROS 1 robot running when its master dies.
 ///
-/// Nodes point ROS_MASTER_URI at rosrescue; it forwards their calls to the real rosmaster, records
-/// what changes, and brings a restarted master back to the same state before it lets calls through.
-/// Without a command it is `rosrescue core`.
+/// Nodes call rosrescue as their master. It forwards their calls to the real rosmaster and records every
+/// change. When the master dies, rosrescue answers in its place and restores a new one.
+/// Without a command it runs `rosrescue core`.
 #[derive(Debug, Parser)]
 #[command(name = "rosrescue", version = env!("ROSRESCUE_VERSION"), max_term_width = 100)]
 #[command(args_conflicts_with_subcommands = true, disable_help_subcommand = true)]
@@ -40,7 +40,7 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Reads the command line and the environment; ends the process with what is wrong with them.
+    /// Reads the command line and the environment. Ends the process with a message if they are wrong.
     pub fn read() -> Self {
         let mut command = Self::command();
         let mut words: Vec<_> = std::env::args_os().collect();
@@ -52,7 +52,7 @@ impl Cli {
             .get(1)
             .is_some_and(|first| command.find_subcommand(first).is_some())
         {
-            // The options of the bare `rosrescue` are not meant, so neither are their variables.
+            // Another command has no use for the variables of the bare `rosrescue`.
             command = command.mut_args(|option| option.env(None::<&str>));
         }
         let matches = command.get_matches_from(words);
@@ -63,11 +63,11 @@ impl Cli {
 /// What to run.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Stand in for roscore: start, supervise and restore a rosmaster and rosout
+    /// Replace roscore: start rosmaster and rosout, watch them, and restore them when they die
     Core(Box<CoreArgs>),
-    /// Stand in front of a master that somebody else starts
+    /// Protect a master that something else starts
     Proxy(ProxyArgs),
-    /// What does not serve.
+    /// Another command.
     #[command(flatten)]
     Tool(Tool),
 }
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn every_option_but_a_flag_of_a_tool_has_an_environment_variable_and_each_a_help_text() {
+    fn only_options_have_environment_variables_and_flags_of_tools_have_none() {
         let cli = Cli::command();
         for command in std::iter::once(&cli).chain(cli.get_subcommands()) {
             for option in command.get_arguments().filter(|a| {
@@ -93,7 +93,7 @@ mod tests {
                 let name = option.get_id();
                 assert!(option.get_help().is_some(), "{name} has no help");
                 let serves = ["rosrescue", "core", "proxy"].contains(&command.get_name());
-                if !serves && !option.get_action().takes_values() && name != "json" {
+                if !serves && !option.get_action().takes_values() {
                     assert_eq!(option.get_env(), None, "{name}: consent by environment");
                     continue;
                 }
@@ -104,6 +104,35 @@ mod tests {
                     variable.to_string_lossy().starts_with("ROSRESCUE_"),
                     "{name}"
                 );
+            }
+        }
+    }
+
+    /// A person who asks for help wants to read it.
+    #[test]
+    fn the_help_of_core_is_short_and_plain() {
+        let cli = Cli::command();
+        let core = cli.find_subcommand("core").expect("core");
+        let shown: Vec<_> = core
+            .get_arguments()
+            .filter(|option| !option.is_hide_set())
+            .collect();
+        assert!(shown.len() <= 30, "{} options", shown.len());
+        let first = shown
+            .iter()
+            .filter(|option| option.get_help_heading().is_none());
+        assert!((10..=16).contains(&first.count()));
+        for command in cli.get_subcommands() {
+            let name = command.get_name();
+            for option in command.get_arguments() {
+                let help = option
+                    .get_help()
+                    .map(ToString::to_string)
+                    .unwrap_or_default();
+                for sentence in help.split([';', '[']).flat_map(|part| part.split(". ")) {
+                    let count = sentence.split_whitespace().count();
+                    assert!(count <= 25, "{name}: {count} words: {sentence}");
+                }
             }
         }
     }

@@ -63,9 +63,7 @@ pub enum UsageError {
         most: f64,
     },
     /// Proxy and master would have the same port on loopback.
-    #[error(
-        "--master-port {port} is the port that nodes use; the real master needs one of its own"
-    )]
+    #[error("--master-port {port} is the port that nodes use: the real master needs another one")]
     SamePort { port: u16 },
     /// Options of several computers do not fit together.
     #[error(transparent)]

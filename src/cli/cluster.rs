@@ -5,61 +5,60 @@ use std::{path::PathBuf, time::Duration};
 use clap::{Args, ValueEnum};
 use hyper::http::uri::Authority;
 
+/// Heading of the options for several computers.
+const COMPUTERS: &str = "Options with --cluster";
 /// The robot's name if none is given.
 pub(crate) const ROBOT: &str = "robot";
 /// Longest name of a robot or a computer. It is part of each key in etcd.
 const NAME_MOST: usize = 128;
 
-/// How this computer takes part in a cluster of several.
+/// The options for a robot with several computers that can lead.
 #[derive(Args, Clone, Debug)]
 pub struct ClusterArgs {
-    /// Run on several computers, of which one leads and another one takes over when it dies: the members of
-    /// etcd that they share and, after the last one, the robot's name, as in
-    /// http://a:2379,http://b:2379,http://c:2379/ROBOT
+    /// Run on several computers: one leads, and another takes over when it dies. Give the etcd members and the
+    /// robot's name, as in http://a:2379,http://b:2379,http://c:2379/ROBOT
     #[arg(long, env = "ROSRESCUE_CLUSTER", value_name = "URLS")]
     #[arg(value_parser = members)]
     pub cluster: Option<Members>,
-    /// Where the other computers reach this rosrescue, HOST or HOST:PORT [default: as in the ROS_MASTER_URI that
-    /// it prints]
-    #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST")]
+    /// Address where the other computers reach this one, HOST or HOST:PORT [default: that of its ROS_MASTER_URI]
+    #[arg(long, env = "ROSRESCUE_ADVERTISE", value_name = "HOST", help_heading = COMPUTERS)]
     #[arg(requires = "cluster")]
     pub advertise: Option<String>,
-    /// Unique name of this computer [default: made from the host name and the address where the others reach
-    /// it, as in arm-10.0.0.2]
-    #[arg(long, env = "ROSRESCUE_CLUSTER_NAME", value_name = "NAME")]
+    /// Unique name of this computer [default: host name and address, as in arm-10.0.0.2]
+    #[arg(long, env = "ROSRESCUE_CLUSTER_NAME", value_name = "NAME", help_heading = COMPUTERS)]
     #[arg(value_parser = name, requires = "cluster")]
     pub cluster_name: Option<String>,
-    /// After how long a silence of the leading computer another one takes over, in seconds from 0.5 to 60. All
-    /// computers need the same
-    #[arg(long, env = "ROSRESCUE_CLUSTER_TTL", value_name = "SECONDS")]
+    /// Take over when the leader has been silent for this long, in seconds from 0.5 to 60. Use the same value on
+    /// all computers
+    #[arg(long, env = "ROSRESCUE_CLUSTER_TTL", value_name = "SECONDS", help_heading = COMPUTERS)]
     #[arg(default_value = "2", value_parser = ttl, requires = "cluster")]
     pub cluster_ttl: Duration,
-    /// When a write is answered while this computer leads
-    #[arg(long, env = "ROSRESCUE_CLUSTER_SYNC", value_enum, requires = "cluster")]
+    /// When the leader answers a write
+    #[arg(long, env = "ROSRESCUE_CLUSTER_SYNC", value_enum, requires = "cluster", help_heading = COMPUTERS)]
     #[arg(default_value_t = ClusterSync::Always)]
     pub cluster_sync: ClusterSync,
-    /// What happens to writes while this computer is cut off from the others. Reads are answered
-    #[arg(long, env = "ROSRESCUE_ALONE", value_enum, requires = "cluster")]
+    /// What to do with writes while this computer is cut off from the others. It still answers reads
+    #[arg(long, env = "ROSRESCUE_ALONE", value_enum, requires = "cluster", help_heading = COMPUTERS)]
     #[arg(default_value_t = WhenCutOff::Serve)]
     pub alone: WhenCutOff,
-    /// The certificate of the authority that has signed those of etcd's members, in PEM form, for https
-    #[arg(long, env = "ROSRESCUE_CLUSTER_CA", value_name = "FILE")]
+    /// Certificate of the authority that signed the certificates of etcd, a PEM file, for https
+    #[arg(long, env = "ROSRESCUE_CLUSTER_CA", value_name = "FILE", help_heading = COMPUTERS)]
     #[arg(requires = "cluster")]
     pub cluster_ca: Option<PathBuf>,
-    /// This computer's certificate for etcd, in PEM form
-    #[arg(long, env = "ROSRESCUE_CLUSTER_CERT", value_name = "FILE")]
+    /// Certificate of this computer for etcd, a PEM file
+    #[arg(long, env = "ROSRESCUE_CLUSTER_CERT", value_name = "FILE", help_heading = COMPUTERS)]
     #[arg(requires_all = ["cluster_key", "cluster_ca"])]
     pub cluster_cert: Option<PathBuf>,
-    /// Its key, in PEM form
-    #[arg(long, env = "ROSRESCUE_CLUSTER_KEY", value_name = "FILE")]
+    /// Private key of this computer's certificate, a PEM file
+    #[arg(long, env = "ROSRESCUE_CLUSTER_KEY", value_name = "FILE", help_heading = COMPUTERS)]
     #[arg(requires = "cluster_cert")]
     pub cluster_key: Option<PathBuf>,
-    /// The user of etcd
-    #[arg(long, env = "ROSRESCUE_CLUSTER_USER", value_name = "NAME")]
+    /// User name for etcd
+    #[arg(long, env = "ROSRESCUE_CLUSTER_USER", value_name = "NAME", help_heading = COMPUTERS)]
     #[arg(requires_all = ["cluster_password_file", "cluster"])]
     pub cluster_user: Option<String>,
-    /// A file whose first line is the user's password
-    #[arg(long, env = "ROSRESCUE_CLUSTER_PASSWORD_FILE", value_name = "FILE")]
+    /// File with the password for etcd in its first line
+    #[arg(long, env = "ROSRESCUE_CLUSTER_PASSWORD_FILE", value_name = "FILE", help_heading = COMPUTERS)]
     #[arg(requires = "cluster_user")]
     pub cluster_password_file: Option<PathBuf>,
 }
@@ -67,18 +66,18 @@ pub struct ClusterArgs {
 /// When a write is answered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ClusterSync {
-    /// When a majority of etcd has it: no computer's death costs an answered write
+    /// After a majority of etcd has stored it: the death of a computer loses no answered write
     Always,
-    /// At once; a majority has it 200 ms later, which is what a death may cost
+    /// At once. etcd has it 200 ms later: the death of the leader can lose the writes in between
     Interval,
 }
 
 /// What a computer does with writes while it is cut off from the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum WhenCutOff {
-    /// They are answered, and sent to the leader afterwards; what others have changed meanwhile wins
+    /// Answer them, and send them to the leader afterwards. Changes by others win
     Serve,
-    /// They wait, and are closed after --hold
+    /// Writes wait, and fail after --hold
     Refuse,
 }
 

@@ -7,22 +7,22 @@ use clap::Args;
 use super::{HideArgs, OutputArgs, TargetArgs};
 use crate::hide::Hide;
 
-/// Where checkpoints are.
+/// The place of the checkpoints.
 #[derive(Args, Clone, Debug)]
 pub struct CheckpointArgs {
-    /// The checkpoint in use, beside which others are kept [default: that of the rosrescue that runs on this
-    /// computer, else latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log;
-    /// latest-chkpt-PORT.yaml if ROS_MASTER_URI has a port other than 11311]
+    /// The checkpoint in use; older ones are beside it [default: that of the rosrescue on this computer, else
+    /// latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log; latest-chkpt-PORT.yaml if ROS_MASTER_URI
+    /// has a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
 }
 
-/// How a checkpoint is read.
+/// How to read a checkpoint.
 #[derive(Args, Clone, Debug)]
 pub struct ReadArgs {
     #[command(flatten)]
     pub place: CheckpointArgs,
-    /// Use what is left of a damaged checkpoint; `rosrescue verify` says what that is
+    /// Use the readable part of a damaged checkpoint; `rosrescue verify` shows that part
     #[arg(long)]
     pub damaged: bool,
 }
@@ -30,7 +30,7 @@ pub struct ReadArgs {
 /// Options of `rosrescue inspect`.
 #[derive(Args, Clone, Debug)]
 pub struct InspectArgs {
-    /// A checkpoint: its path, or its name or number in `rosrescue history` [default: the one in use]
+    /// Checkpoint: a path, or a name or number from `rosrescue history` [default: the one in use]
     #[arg(value_name = "FILE")]
     pub file: Option<PathBuf>,
     #[command(flatten)]
@@ -44,7 +44,7 @@ pub struct InspectArgs {
 /// Options of `rosrescue verify`.
 #[derive(Args, Clone, Debug)]
 pub struct VerifyArgs {
-    /// A checkpoint: its path, or its name or number in `rosrescue history`
+    /// Checkpoint: a path, or a name or number from `rosrescue history`
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
     #[command(flatten)]
@@ -56,15 +56,14 @@ pub struct VerifyArgs {
 /// Options of `rosrescue diff`.
 #[derive(Args, Clone, Debug)]
 pub struct DiffArgs {
-    /// A checkpoint: its path, or its name or number in `rosrescue history`
+    /// Checkpoint: a path, or a name or number from `rosrescue history`
     #[arg(value_name = "A")]
     pub a: PathBuf,
-    /// The one to compare it with
+    /// Checkpoint to compare with
     #[arg(value_name = "B", required_unless_present = "live")]
     pub b: Option<PathBuf>,
-    /// Compare it with the running master, read by ordinary calls to rosrescue, on whatever computer: nodes and
-    /// their addresses, publishers, subscribers, services, types and parameters. Who watches parameters cannot be
-    /// read from a master
+    /// Compare with the running master, on any computer. Subscriptions to parameters are left out: a master does
+    /// not tell them
     #[arg(long, conflicts_with = "b")]
     pub live: bool,
     #[command(flatten)]
@@ -89,7 +88,7 @@ pub struct HistoryArgs {
 /// Options of `rosrescue report`.
 #[derive(Args, Clone, Debug)]
 pub struct ReportArgs {
-    /// The number of the rescue, as in `rosrescue status` and `rosrescue history` [default: the last one]
+    /// Number of the rescue in `rosrescue status` or `rosrescue history` [default: the last one]
     #[arg(value_name = "NUMBER")]
     pub number: Option<u64>,
     #[command(flatten)]
@@ -101,16 +100,16 @@ pub struct ReportArgs {
 /// Options of `rosrescue restore`.
 #[derive(Args, Clone, Debug)]
 pub struct RestoreArgs {
-    /// A checkpoint: its path, or its name or number in `rosrescue history`
+    /// Checkpoint: a path, or a name or number from `rosrescue history`
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
-    /// Only say what would be done
+    /// Only show the changes
     #[arg(long)]
     pub plan: bool,
-    /// Do not ask. Without a terminal nothing is done otherwise
+    /// Do not ask. Required without a terminal
     #[arg(short, long, conflicts_with = "plan")]
     pub yes: bool,
-    /// Also delete the parameters that the checkpoint does not have
+    /// Also delete the parameters that are not in the checkpoint
     #[arg(long)]
     pub exact: bool,
     #[command(flatten)]
@@ -126,10 +125,10 @@ pub struct RestoreArgs {
 /// Options of `rosrescue params`.
 #[derive(Args, Clone, Debug)]
 pub struct ParamsArgs {
-    /// A checkpoint: its path, or its name or number in `rosrescue history`
+    /// Checkpoint: a path, or a name or number from `rosrescue history`
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
-    /// Leave out parameters whose full name matches this regular expression, which ignores case [default: none]
+    /// Leave out parameters whose full name matches this regular expression. Case does not matter [default: none]
     #[arg(long, env = "ROSRESCUE_PARAMS_HIDE_VALUES", value_name = "REGEX")]
     pub hide_values: Option<Hide>,
     #[command(flatten)]

@@ -2,7 +2,7 @@
 
 use std::{fmt, str::FromStr};
 
-use clap::{Args, builder::FalseyValueParser};
+use clap::Args;
 
 use super::{OutputArgs, TargetArgs, cluster::name};
 
@@ -12,13 +12,12 @@ pub struct TopArgs {
     /// Which one.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// End after so many rounds, one a second [default: until q, Ctrl-C or a signal]
+    /// Stop after this many updates, one per second [default: until q, Ctrl-C or a signal]
     #[arg(long, env = "ROSRESCUE_TOP_COUNT", value_name = "COUNT")]
     #[arg(value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
-    /// Print one JSON object a line, once a second
-    #[arg(long, env = "ROSRESCUE_JSON")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    /// Print one JSON object per line, once a second
+    #[arg(long)]
     pub json: bool,
 }
 
@@ -28,11 +27,10 @@ pub struct HandoverArgs {
     /// Which one; any of the robot's computers will do.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// The computer that should lead: its name, the beginning of its name if no other name has it, or its address
-    /// [default: any that follows]
+    /// Computer that should lead: its name, the beginning of its name, or its address [default: any follower]
     #[arg(long, env = "ROSRESCUE_HANDOVER_TO", value_name = "NAME", value_parser = name)]
     pub to: Option<String>,
-    /// How long to wait until another computer leads, in seconds
+    /// Longest time to wait for the new leader, in seconds
     #[arg(
         long,
         env = "ROSRESCUE_HANDOVER_TIMEOUT",
@@ -52,12 +50,12 @@ pub struct WaitArgs {
     /// Which one.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// What to wait for: `answered` (calls are answered, by the master or in its place), `master` (they pass
-    /// to a master), `protected` (that, and changes are recorded), or a node's /NAME. Several: all of them
+    /// What to wait for: `answered` (rosrescue answers calls), `master` (a master is available), `protected`
+    /// (a master, and every change is recorded), or the /NAME of a node. With several, for all of them
     #[arg(long = "for", env = "ROSRESCUE_WAIT_FOR", value_name = "WHAT")]
     #[arg(value_delimiter = ',', num_args = 1.., default_value = "answered")]
     pub wanted: Vec<For>,
-    /// How long, in seconds; 0 for ever
+    /// Longest time to wait, in seconds; 0 for no limit
     #[arg(
         long,
         env = "ROSRESCUE_WAIT_TIMEOUT",
@@ -74,7 +72,7 @@ pub struct WaitArgs {
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse::<f64>().ok();
     let seconds = seconds.filter(|seconds| (0.0..=1e9).contains(seconds));
-    seconds.ok_or_else(|| "give a number of seconds, such as 30 or 0.5".to_owned())
+    seconds.ok_or_else(|| format!("\"{text}\" is not a number of seconds, such as 30 or 0.5"))
 }
 
 /// What `rosrescue wait` waits for.
@@ -100,7 +98,7 @@ impl FromStr for For {
             "protected" => Ok(Self::Protected),
             name if name.starts_with('/') && name.len() > 1 => Ok(Self::Node(name.to_owned())),
             _ => Err(
-                "give answered, master, protected, or a node's whole name, such as /talker"
+                "write answered, master, protected, or the full name of a node, such as /talker"
                     .to_owned(),
             ),
         }

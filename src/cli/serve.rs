@@ -12,6 +12,9 @@ use ipnet::IpNet;
 use super::{cluster::ClusterArgs, tools::HideArgs};
 use crate::checkpoint::session::Restore;
 
+/// Heading of the options that few robots need.
+const ADVANCED: &str = "Advanced options";
+
 /// Options of `rosrescue core`. The short ones are roscore's.
 #[derive(Args, Clone, Debug)]
 pub struct CoreArgs {
@@ -19,48 +22,50 @@ pub struct CoreArgs {
     #[arg(short, long, env = "ROSRESCUE_PORT", value_name = "PORT")]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]
     pub port: Option<u16>,
-    /// Print more: rosrescue's own log at level debug, unless --log says otherwise
+    /// Log more: rosrescue's own messages at level debug, unless --log says otherwise
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// Threads with which rosmaster notifies nodes. roscore has 3; more keep nodes that cannot be
-    /// reached from holding up the others, but each makes writes that notify slower
-    #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT")]
+    /// Number of rosmaster threads that notify nodes. roscore has 3. With more, an unreachable node delays the
+    /// others less
+    #[arg(short = 'w', long, env = "ROSRESCUE_NUMWORKERS", value_name = "COUNT", help_heading = ADVANCED)]
     #[arg(default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub numworkers: u32,
-    /// Socket timeout of rosmaster in seconds, for nodes that cannot be reached; 0 for none. It is
-    /// probed at least twice in this time, since it closes connections that are idle for longer
-    #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS")]
+    /// Socket timeout of rosmaster for unreachable nodes, in seconds; 0 for none
+    #[arg(short = 't', long, env = "ROSRESCUE_TIMEOUT", value_name = "SECONDS", help_heading = ADVANCED)]
     #[arg(default_value_t = 5.0)]
     pub timeout: f64,
-    /// Seconds a started rosmaster may take to listen. One that still uses the processor then is given
-    /// more time
-    #[arg(long, env = "ROSRESCUE_START_LIMIT", value_name = "SECONDS")]
+    /// Longest time for a started rosmaster to listen, in seconds. One that is still busy gets more
+    #[arg(
+        long,
+        env = "ROSRESCUE_START_LIMIT",
+        value_name = "SECONDS",
+        hide = true
+    )]
     #[arg(default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=3600))]
     pub start_limit: u64,
-    /// Port of the rosmaster behind the proxy, on loopback [default: a free one]
-    #[arg(long, env = "ROSRESCUE_MASTER_PORT", value_name = "PORT")]
+    /// Port of the rosmaster behind rosrescue, on loopback [default: a free one]
+    #[arg(long, env = "ROSRESCUE_MASTER_PORT", value_name = "PORT", hide = true)]
     #[arg(value_parser = clap::value_parser!(u16).range(1..))]
     pub master_port: Option<u16>,
     /// The rosmaster program [default: the one on the PATH, else in /opt/ros/*/bin]
-    #[arg(long, env = "ROSRESCUE_ROSMASTER", value_name = "FILE")]
+    #[arg(long, env = "ROSRESCUE_ROSMASTER", value_name = "FILE", help_heading = ADVANCED)]
     pub rosmaster: Option<PathBuf>,
-    /// Keep a second rosmaster that has loaded its program and takes over when the first one dies: 25 MB
-    /// more memory, and the new master is there in a fraction of the time. Not with --rosmaster
-    #[arg(long, env = "ROSRESCUE_SPARE_MASTER")]
+    /// Keep a second rosmaster loaded, which takes over when the first one dies. It needs 25 MB of memory
+    #[arg(long, env = "ROSRESCUE_SPARE_MASTER", hide = true)]
     #[arg(value_parser = FalseyValueParser::new())]
     pub spare_master: bool,
     /// Do not run rosout
     #[arg(long, env = "ROSRESCUE_NO_ROSOUT")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub no_rosout: bool,
-    /// Address to serve, instead of all addresses (loopback only if ROS_IP or ROS_HOSTNAME is)
+    /// Address to listen on [default: all addresses; loopback if ROS_IP or ROS_HOSTNAME is loopback]
     #[arg(long, env = "ROSRESCUE_LISTEN", value_name = "ADDR")]
     pub listen: Option<String>,
-    /// Of several computers.
+    /// The options for several computers.
     #[command(flatten)]
     pub cluster: ClusterArgs,
-    /// What both commands have.
+    /// The options of both commands.
     #[command(flatten)]
     pub common: CommonArgs,
 }
@@ -68,18 +73,18 @@ pub struct CoreArgs {
 /// Options of `rosrescue proxy`.
 #[derive(Args, Clone, Debug)]
 pub struct ProxyArgs {
-    /// The real master, http://HOST:PORT
+    /// Address of the real master, http://HOST:PORT
     #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
     pub master: String,
-    /// Address and port to serve, ADDR:PORT, ADDR, :PORT or PORT [default: all addresses, port of
+    /// Address and port to listen on: ADDR:PORT, ADDR, :PORT or PORT [default: all addresses, port of
     /// ROS_MASTER_URI, else 11311]
     #[arg(short, long, env = "ROSRESCUE_LISTEN", value_name = "ADDR:PORT")]
     pub listen: Option<String>,
-    /// Print more: rosrescue's own log at level debug, unless --log says otherwise
+    /// Log more: rosrescue's own messages at level debug, unless --log says otherwise
     #[arg(short, long, env = "ROSRESCUE_VERBOSE")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub verbose: bool,
-    /// What both commands have.
+    /// The options of both commands.
     #[command(flatten)]
     pub common: CommonArgs,
 }
@@ -87,43 +92,45 @@ pub struct ProxyArgs {
 /// Options of both commands.
 #[derive(Args, Clone, Debug)]
 pub struct CommonArgs {
-    /// The checkpoint file [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or ~/.ros/log;
-    /// latest-chkpt-PORT.yaml for a port other than 11311]
+    /// File that records the state of the master [default: latest-chkpt.yaml in $ROS_LOG_DIR, $ROS_HOME/log or
+    /// ~/.ros/log; latest-chkpt-PORT.yaml for a port other than 11311]
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
-    /// When to restore the state of the checkpoint at the start of rosrescue
+    /// When to restore the state of the checkpoint as rosrescue starts
     #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = Restore::Auto)]
     pub restore: Restore,
-    /// Most space for the checkpoints that are kept: of the last five sessions, and of the last twenty rescues,
-    /// in MiB; 0 for the last session alone. `rosrescue history` lists them
+    /// Most space for older checkpoints, of the last 5 sessions and 20 rescues, in MiB
     #[arg(
         long,
         env = "ROSRESCUE_HISTORY",
         value_name = "MIB",
-        default_value_t = 16
+        default_value_t = 16,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(..=1 << 20))]
     pub history: u64,
-    /// When the journal is forced to the disk; it survives kill -9 in any case
+    /// When to force the journal to the disk. It survives kill -9 in any case
     #[arg(long, env = "ROSRESCUE_SYNC", value_enum, default_value_t = SyncPolicy::Interval)]
     pub sync: SyncPolicy,
-    /// How often `--sync interval` does so, in milliseconds
+    /// How often `--sync interval` forces the journal to the disk, in milliseconds
     #[arg(
         long,
         env = "ROSRESCUE_SYNC_INTERVAL",
         value_name = "MS",
-        default_value_t = 200
+        default_value_t = 200,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=60_000))]
     pub sync_interval: u64,
-    /// How long a call that only a master can answer, such as one that cannot be decoded, waits for one
-    /// to come back before its connection is closed, in seconds
+    /// How long a call that only a master can answer waits for one to come back, in seconds. Then its
+    /// connection is closed
     #[arg(
         long,
         env = "ROSRESCUE_HOLD",
         allow_negative_numbers = true,
         value_name = "SECONDS",
-        default_value_t = 8.0
+        default_value_t = 8.0,
+        help_heading = ADVANCED
     )]
     pub hold: f64,
     /// Pause between two probes of the master, in milliseconds
@@ -131,52 +138,55 @@ pub struct CommonArgs {
         long,
         env = "ROSRESCUE_PROBE_INTERVAL",
         value_name = "MS",
-        default_value_t = 1000
+        default_value_t = 1000,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub probe_interval: u64,
-    /// Time in which the master must answer a probe, in milliseconds
+    /// Longest time for the master to answer a probe, in milliseconds
     #[arg(
         long,
         env = "ROSRESCUE_PROBE_TIMEOUT",
         value_name = "MS",
-        default_value_t = 500
+        default_value_t = 500,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub probe_timeout: u64,
-    /// Number of unanswered probes in a row after which the master is taken for hung. rosrescue kills
-    /// it only if its process shows that it hangs
+    /// Number of unanswered probes in a row after which the master counts as hung. rosrescue kills it only if
+    /// its process shows that it hangs
     #[arg(
         long,
         env = "ROSRESCUE_PROBE_COUNT",
         value_name = "COUNT",
-        default_value_t = 3
+        default_value_t = 3,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub probe_count: u32,
-    /// Time a write waits for the master before rosrescue answers it, in milliseconds. It grows while
-    /// the master is late again and again
+    /// How long a write waits for the master before rosrescue answers it, in milliseconds. The time grows while
+    /// the master is often late
     #[arg(
         long,
         env = "ROSRESCUE_STAND_IN_AFTER",
         value_name = "MS",
-        default_value_t = 100
+        default_value_t = 100,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=3_600_000))]
     pub stand_in_after: u64,
-    /// Time in which a node must answer a notification or the health check, in milliseconds
+    /// Longest time for a node to answer a notification or a health check, in milliseconds
     #[arg(
         long,
         alias = "census-timeout",
         env = "ROSRESCUE_NODE_TIMEOUT",
         value_name = "MS",
-        default_value_t = 3000
+        default_value_t = 3000,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(10..=600_000))]
     pub node_timeout: u64,
-    /// Take out nodes that have died, so that they do not stay registered for ever: every node is asked so
-    /// often whether it lives, in seconds, and any other node registered with the port of a node that registers
-    /// is taken out first. 0 for only after a recovery, as ROS has it
+    /// Unregister dead nodes: check every node at this interval, in seconds. With 0, only after a rescue, as in ROS
     #[arg(
         long,
         env = "ROSRESCUE_REAP_DEAD_NODES",
@@ -185,8 +195,8 @@ pub struct CommonArgs {
     )]
     #[arg(allow_negative_numbers = true)]
     pub reap_dead_nodes: f64,
-    /// Networks and addresses that may call, as in 10.0.0.0/24 or fd00::/64; all others are refused but
-    /// this computer, which always may [default: everybody]
+    /// Networks and addresses that may call, as in 10.0.0.0/24 or fd00::/64. This computer always may
+    /// [default: all]
     #[arg(
         long,
         env = "ROSRESCUE_ALLOW",
@@ -195,8 +205,8 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = network)]
     pub allow: Vec<IpNet>,
-    /// Networks and addresses that may change anything; of others that may call only reads are taken. Every
-    /// node changes something when it starts [default: everybody who may call]
+    /// Networks and addresses that may make changes; others that may call can only read. Every node makes
+    /// changes when it starts [default: all that may call]
     #[arg(
         long,
         env = "ROSRESCUE_ALLOW_WRITE",
@@ -205,39 +215,37 @@ pub struct CommonArgs {
     )]
     #[arg(value_parser = network)]
     pub allow_write: Vec<IpNet>,
-    /// How often the mirror is compared with the master, for writes that reached it past the proxy,
-    /// in seconds; 0 for never (it is compared at each connect and after each doubt anyway)
+    /// How often to check whether someone changed the master directly, in seconds; 0 for only when in doubt
     #[arg(
         long,
         env = "ROSRESCUE_RESYNC_INTERVAL",
         value_name = "SECONDS",
-        default_value_t = 0.0
+        default_value_t = 0.0,
+        hide = true
     )]
     #[arg(allow_negative_numbers = true)]
     pub resync_interval: f64,
-    /// Who answers calls that only read while there is a master. The mirror is several times faster and
-    /// sees every write that was acknowledged; what it would not answer to the byte as the master does is
-    /// forwarded. Choose the master where somebody calls it past rosrescue
-    /// [default: mirror for core, master for proxy]
-    #[arg(long, env = "ROSRESCUE_READS", value_enum)]
+    /// Who answers reads while there is a master. The mirror, rosrescue's own copy, is several times faster.
+    /// Choose the master if programs call it directly [default: mirror for core, master for proxy]
+    #[arg(long, env = "ROSRESCUE_READS", value_enum, help_heading = ADVANCED)]
     pub reads: Option<Reads>,
-    /// Connections to the master for calls that only read
+    /// Number of connections to the master for reads
     #[arg(
         long,
         env = "ROSRESCUE_MASTER_CONNECTIONS",
         value_name = "COUNT",
-        default_value_t = 4
+        default_value_t = 4,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=64))]
     pub master_connections: u32,
-    /// Connections that clients may hold at the same time; more wait. Half of them may be idle, but
-    /// no more than 2000: the one that has been idle for longest gives way. A low `ulimit -n` leaves
-    /// fewer, but always 16 if so many are given
+    /// Most connections of clients at the same time; more wait. Half of them, 2000 at most, may be idle
     #[arg(
         long,
         env = "ROSRESCUE_MAX_CONNECTIONS",
         value_name = "COUNT",
-        default_value_t = 10_000
+        default_value_t = 10_000,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     pub max_connections: u32,
@@ -246,20 +254,20 @@ pub struct CommonArgs {
         long,
         env = "ROSRESCUE_MAX_BODY",
         value_name = "MIB",
-        default_value_t = 64
+        default_value_t = 64,
+        hide = true
     )]
     #[arg(value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub max_body: u64,
-    /// Of what the page shows.
+    /// The values that the page does not show.
     #[command(flatten)]
     pub hide: HideArgs,
-    /// Run as a single process, without a guardian that keeps the port and starts rosrescue again
-    /// when it dies: for a debugger, or under a supervisor that does so. A socket unit of systemd
-    /// takes the guardian's place by itself
+    /// Run without the guardian process, which keeps the port open and restarts rosrescue. A systemd socket
+    /// unit replaces the guardian by itself
     #[arg(long, env = "ROSRESCUE_NO_GUARDIAN")]
     #[arg(value_parser = FalseyValueParser::new())]
     pub no_guardian: bool,
-    /// Form of the log on stderr
+    /// Format of the log on stderr
     #[arg(long, env = "ROSRESCUE_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     pub log_format: LogFormat,
     /// What to log, in the syntax of tracing's EnvFilter [default: warn,rosrescue=info]
@@ -294,23 +302,23 @@ impl ValueEnum for Restore {
         let (name, help) = match self {
             Self::Auto => (
                 "auto",
-                "If the session goes on: same boot and no orderly stop, or a registered node still lives",
+                "If the session continues: since the same boot and without an orderly stop, or with a node still alive",
             ),
             Self::Always => ("always", "Always"),
-            Self::Never => ("never", "Never: the old file is kept under another name"),
+            Self::Never => ("never", "Never. The old file stays under another name"),
         };
         Some(PossibleValue::new(name).help(help))
     }
 }
 
-/// When the journal is forced to the disk.
+/// When rosrescue forces the journal to the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SyncPolicy {
-    /// Before a call is answered: survives a power cut whole
+    /// Before each answer: a power cut loses nothing
     Always,
-    /// Every --sync-interval: a power cut may cost that much
+    /// Every 200 ms: a power cut loses at most that
     Interval,
-    /// When the system likes
+    /// Leave it to the operating system
     Never,
 }
 
@@ -319,16 +327,16 @@ pub enum SyncPolicy {
 pub enum Reads {
     /// The mirror
     Mirror,
-    /// The master, as long as there is one
+    /// The master while it is available
     Master,
 }
 
 /// Form of the log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
-    /// A line a message
+    /// One line per message
     Text,
-    /// A JSON object a message
+    /// One JSON object per message
     Json,
 }
 

@@ -1,4 +1,4 @@
-//! Options of the commands that put rosrescue into a computer.
+//! Options of the commands that set up a computer.
 
 use std::path::PathBuf;
 
@@ -11,18 +11,16 @@ use super::OutputArgs;
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  sudo rosrescue install                     `core` from the next boot on, and now
+  rosrescue install --dry-run                show the changes
+  sudo rosrescue install                     run `core`, now and at every boot
   sudo rosrescue install -- core -p 11411    with options of `core`
   sudo rosrescue install -- proxy --master http://127.0.0.1:11312
-  rosrescue install --user                   without root, as a service of your own
-  rosrescue install --dry-run                what it would do
-
-What was chosen at an earlier installation stays, unless it is said otherwise.")]
+  rosrescue install --user                   without root, as a service of your own")]
 pub struct InstallArgs {
-    /// Where to.
+    /// Which service, and how.
     #[command(flatten)]
     pub scope: ScopeArgs,
-    /// User that runs the service [default: the one who called sudo]
+    /// User that runs the service [default: the user who called sudo]
     #[arg(
         long,
         env = "ROSRESCUE_RUN_AS",
@@ -30,7 +28,7 @@ pub struct InstallArgs {
         conflicts_with = "user"
     )]
     pub run_as: Option<String>,
-    /// What the service runs: `core` or `proxy` with options [default: core]
+    /// Command of the service: `core` or `proxy`, with options [default: core]
     #[arg(last = true, value_name = "COMMAND")]
     pub service: Vec<String>,
 }
@@ -38,24 +36,24 @@ pub struct InstallArgs {
 /// Options of `rosrescue uninstall`.
 #[derive(Args, Clone, Debug)]
 pub struct UninstallArgs {
-    /// Where from.
+    /// Which service, and how.
     #[command(flatten)]
     pub scope: ScopeArgs,
 }
 
-/// Which systemd is meant, and whether it is really to be done.
+/// Which systemd to use, and whether to make the changes.
 #[derive(Args, Clone, Debug)]
 pub struct ScopeArgs {
-    /// A service of this user alone, without root
+    /// Service of your own, without root
     #[arg(long, conflicts_with = "system")]
     pub user: bool,
-    /// A service of this computer; needs root [the default]
+    /// Service of this computer, which needs root [default]
     #[arg(long)]
     pub system: bool,
-    /// Only show what would be changed
+    /// Only show the changes
     #[arg(long)]
     pub dry_run: bool,
-    /// Do not ask. Needed where there is no terminal to ask at
+    /// Do not ask. Required without a terminal
     #[arg(short, long)]
     pub yes: bool,
     /// In which form.
@@ -66,13 +64,13 @@ pub struct ScopeArgs {
 /// Options of `rosrescue completions`.
 #[derive(Args, Clone, Debug)]
 pub struct CompletionsArgs {
-    /// The shell
+    /// Shell
     pub shell: Shell,
 }
 
 /// Options of `rosrescue man`.
 #[derive(Args, Clone, Debug)]
 pub struct ManArgs {
-    /// Write every page into this folder, instead of rosrescue(1) to stdout
+    /// Folder for all pages [default: print rosrescue(1)]
     pub folder: Option<PathBuf>,
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand, ValueEnum, builder::FalseyValueParser};
+use clap::{Args, Subcommand, ValueEnum};
 
 use super::{
     ClusterArgs, DiffArgs, HandoverArgs, HistoryArgs, InspectArgs, ParamsArgs, ReportArgs,
@@ -11,50 +11,49 @@ use super::{
 };
 use crate::hide::{self, Hide};
 
-/// A command that looks at a rosrescue, a checkpoint or this computer.
+/// The commands other than `core` and `proxy`.
 #[derive(Debug, Subcommand)]
 pub enum Tool {
-    /// Look for what will trouble the robot, before it drives
+    /// Check the robot's setup for problems
     Check(CheckArgs),
     /// Print a completion script for a shell
     Completions(CompletionsArgs),
-    /// Say in words how two checkpoints differ, or a checkpoint and the running master. Exit status 1 if they do
+    /// Show how two checkpoints differ, or a checkpoint and the running master. Exit status 1 if they differ
     Diff(DiffArgs),
-    /// Kill the master on purpose while watching calls, topics and nodes, and give a verdict
+    /// Test the robot: kill the master on purpose, and report what calls, topics and nodes noticed
     Drill(DrillArgs),
-    /// With --cluster: let another computer lead, and wait until it does
+    /// With --cluster: make another computer the leader
     Handover(HandoverArgs),
-    /// List the checkpoints that are kept: of the last sessions, and of rescues
+    /// List the past sessions and rescues
     History(HistoryArgs),
-    /// Say what a checkpoint holds, also beside a running rosrescue
+    /// Show what a checkpoint contains
     Inspect(InspectArgs),
-    /// Make a service of systemd of it, which starts with the computer
+    /// Install rosrescue as a systemd service that starts at boot
     Install(InstallArgs),
-    /// Print the manual page, or write all of them into a folder
+    /// Print the manual page, or write all manual pages into a folder
     Man(ManArgs),
     /// Print the parameters of a checkpoint, for `rosparam load`
     Params(ParamsArgs),
-    /// Show the report of a rescue: cause, duration, and what was done
+    /// Show the report of a rescue: its cause, duration and result
     Report(ReportArgs),
-    /// Put a checkpoint back into a running rosrescue: its parameters, and the registrations of its nodes that are
-    /// alive. First says what it would do
+    /// Set the parameters of the running robot to those of a checkpoint
     Restore(RestoreArgs),
-    /// Say how the running rosrescue is, in ten lines
+    /// Show the status of the running rosrescue
     Status(StatusArgs),
-    /// Show live what goes on: calls a second, slowest callers, nodes, rescues
+    /// Show calls, callers, nodes and rescues live
     Top(TopArgs),
-    /// Take back what `rosrescue install` has done
+    /// Undo `rosrescue install`
     Uninstall(UninstallArgs),
-    /// Check that a checkpoint is whole. If it is damaged, say what can still be used, with exit status 1
+    /// Check a checkpoint for damage. Exit status 1 if it is damaged
     Verify(VerifyArgs),
-    /// Wait until calls are answered, for start scripts
+    /// Wait until rosrescue answers calls, for start scripts
     Wait(WaitArgs),
 }
 
 /// Which running rosrescue is meant.
 #[derive(Args, Clone, Debug)]
 pub struct TargetArgs {
-    /// The running rosrescue, http://HOST:PORT [default: ROS_MASTER_URI, else http://localhost:11311]
+    /// Address of the running rosrescue, http://HOST:PORT [default: ROS_MASTER_URI, else http://localhost:11311]
     #[arg(long, env = "ROSRESCUE_URI", value_name = "URI")]
     pub uri: Option<String>,
 }
@@ -63,16 +62,15 @@ pub struct TargetArgs {
 #[derive(Args, Clone, Debug)]
 pub struct OutputArgs {
     /// Print the result as one JSON object
-    #[arg(long, env = "ROSRESCUE_JSON")]
-    #[arg(value_parser = FalseyValueParser::new())]
+    #[arg(long)]
     pub json: bool,
 }
 
 /// Which values of parameters are not shown.
 #[derive(Args, Clone, Debug)]
 pub struct HideArgs {
-    /// Hide the values of parameters whose full name matches this regular expression, which ignores case;
-    /// an empty one hides nothing
+    /// Hide the values of parameters whose full name matches this regular expression. Case does not matter, and
+    /// an empty expression hides nothing
     #[arg(long, env = "ROSRESCUE_HIDE_VALUES", value_name = "REGEX", default_value = hide::DEFAULT)]
     pub hide_values: Hide,
 }
@@ -105,11 +103,11 @@ pub struct CheckArgs {
     /// Check for `proxy` in front of this master, http://HOST:PORT, instead of for `core`
     #[arg(short, long, env = "ROSRESCUE_MASTER", value_name = "URI")]
     pub master: Option<String>,
-    /// Ask the nodes of the running robot instead: is each subscriber connected to each publisher of its
-    /// topics? Exit status 1 if a link is missing
+    /// Check the connections of the running robot instead: ask every subscriber whether it is connected to each
+    /// publisher. Exit status 1 if a connection is missing
     #[arg(long)]
     pub live: bool,
-    /// Several computers, as `core` is told of them.
+    /// The cluster options of `core`.
     #[command(flatten)]
     pub cluster: ClusterArgs,
     /// In which form.
@@ -123,11 +121,11 @@ pub struct DrillArgs {
     /// Which one.
     #[command(flatten)]
     pub target: TargetArgs,
-    /// What is killed: each time with SIGKILL
+    /// What to kill, with SIGKILL
     #[arg(long, env = "ROSRESCUE_DRILL_KILL", value_enum, default_value_t = Victim::Master)]
     pub kill: Victim,
-    /// How often. More than five deaths within a minute are a crash loop, so from the sixth on the
-    /// drill waits for the minute to pass
+    /// How many times to kill. From the sixth time on the drill waits, because six deaths within a minute are a
+    /// crash loop
     #[arg(
         long,
         env = "ROSRESCUE_DRILL_TIMES",
@@ -136,10 +134,10 @@ pub struct DrillArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub times: u32,
-    /// Stop the master with SIGSTOP instead of killing it, so that it hangs
+    /// Make the master hang with SIGSTOP instead of killing it
     #[arg(long, conflicts_with_all = ["kill", "no_kill"])]
     pub hang: bool,
-    /// Kill nothing: only watch, for --seconds
+    /// Kill nothing, only watch for --seconds
     #[arg(long, conflicts_with_all = ["kill", "times"])]
     pub no_kill: bool,
     /// How long --no-kill watches, in seconds
@@ -151,7 +149,7 @@ pub struct DrillArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=86_400))]
     pub seconds: u32,
-    /// How long a recovery may take before the drill has failed, in seconds
+    /// Longest time for a rescue before the drill fails, in seconds
     #[arg(
         long,
         env = "ROSRESCUE_DRILL_LIMIT",
@@ -160,7 +158,7 @@ pub struct DrillArgs {
     )]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=3600))]
     pub limit: u32,
-    /// A topic to watch, as a subscriber; may be repeated [default: up to three that carry messages]
+    /// Topic to watch as a subscriber; may be repeated [default: up to three topics with messages]
     #[arg(
         long,
         env = "ROSRESCUE_DRILL_TOPIC",
@@ -168,7 +166,7 @@ pub struct DrillArgs {
         value_delimiter = ','
     )]
     pub topic: Vec<String>,
-    /// Do not ask before anything is killed
+    /// Do not ask before killing
     #[arg(short, long)]
     pub yes: bool,
     /// In which form.
@@ -183,6 +181,6 @@ pub enum Victim {
     Master,
     /// rosrescue's worker
     Worker,
-    /// Both at once
+    /// Both at the same time
     Both,
 }

@@ -97,7 +97,7 @@ pub(super) async fn run(args: &DrillArgs) -> Result<Exit, Failure> {
 }
 
 fn interrupted() -> Failure {
-    Failure::Failed("interrupted: there is no verdict; the drill has tidied up".to_owned())
+    Failure::Failed("interrupted: no verdict. The drill has cleaned up".to_owned())
 }
 
 /// Says what will be killed, and asks.
@@ -116,18 +116,17 @@ async fn agree(args: &DrillArgs, target: &Target) -> Result<(), Failure> {
     }
     if !std::io::stdin().is_terminal() {
         return Err(Failure::Usage(
-            "nothing is killed without consent: say --yes, or run the drill on a terminal, or with \
-             --no-kill"
+            "cannot ask here: run the drill with --yes, at a terminal, or with --no-kill"
                 .to_owned(),
         ));
     }
-    eprint!("Is the robot on the bench, and should it begin? [y/N] ");
+    eprint!("Is the robot safe on the bench? Start the drill? [y/N] ");
     let _ = std::io::stderr().flush();
     let mut answer = String::new();
     let read = std::io::stdin().read_line(&mut answer);
     match read.is_ok() && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str()) {
         true => Ok(()),
-        false => Err(Failure::Failed("nothing was killed".to_owned())),
+        false => Err(Failure::Failed("killed nothing".to_owned())),
     }
 }
 
@@ -162,7 +161,7 @@ impl Drill<'_> {
         stop: &CancellationToken,
     ) -> Result<Verdict, Failure> {
         let start = Instant::now();
-        eprintln!("watching what is normal, and which topics carry messages");
+        eprintln!("watching normal operation, and finding topics with messages");
         let api = self.target.api.clone();
         self.remove_left_behind().await?;
         let before = Robot::read(&api).await.map_err(Failure::Failed)?;
@@ -214,7 +213,7 @@ impl Drill<'_> {
         let difference = match after {
             Ok(after) => before.compare(&meanwhile, &after, &self.node.heard.changed()),
             Err(why) => robot::Difference {
-                lost: vec![format!("the state could not be read at the end: {why}")],
+                lost: vec![format!("cannot read the state at the end: {why}")],
                 new: Vec::new(),
             },
         };
@@ -234,7 +233,7 @@ impl Drill<'_> {
                 let published = topic.has_publishers();
                 self.topics.push(topic);
                 if !published {
-                    let what = format!("--topic: nobody publishes {name}");
+                    let what = format!("--topic: no node publishes {name}");
                     return Err(Failure::Usage(what));
                 }
             }
@@ -305,7 +304,7 @@ impl Drill<'_> {
         let done = done.unwrap_or_else(|_| Err(format!("no answer in {} s", TIDY_LIMIT.as_secs())));
         done.map_err(|why| {
             format!(
-                "the drill could not tidy up: {why}. {} goes with the next health check, its \
+                "the drill could not clean up: {why}. The next health check removes {}. Remove its \
                  parameter with `rosparam delete {}`",
                 self.node.name,
                 self.key()

@@ -95,8 +95,8 @@ pub(super) async fn find(file: &Path, place: &CheckpointArgs) -> Result<PathBuf,
     };
     listed.iter().enumerate().find_map(named).ok_or_else(|| {
         Failure::Usage(format!(
-            "there is no file `{wanted}`, and no checkpoint of that name or number beside `{}`; `rosrescue history` \
-             lists them",
+            "there is no file `{wanted}`, and no checkpoint with that name or number beside `{}`. `rosrescue history` \
+             lists the checkpoints",
             present.display()
         ))
     })
@@ -139,7 +139,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
     let metadata = fs::metadata(path)
         .map_err(|error| Failure::Usage(format!("cannot read `{shown}`: {error}")))?;
     if metadata.is_dir() {
-        let why = format!("`{shown}` is a folder: give the checkpoint in it");
+        let why = format!("`{shown}` is a folder: give the checkpoint file in it");
         return Err(Failure::Usage(why));
     }
     if metadata.len() > LARGE && io::stderr().is_terminal() {
@@ -149,7 +149,7 @@ pub(super) fn open(path: &Path) -> Result<Opened, Failure> {
         Failure::Usage(match error {
             OpenError::NotACheckpoint { .. } => format!("`{shown}` is not a rosrescue checkpoint"),
             OpenError::NewerVersion { version, .. } => format!(
-                "`{shown}` was written in checkpoint format {version} by a newer rosrescue: use that one"
+                "`{shown}` has checkpoint format {version} of a newer rosrescue: use that one"
             ),
             other => other.without_advice(),
         })
@@ -195,7 +195,7 @@ pub(super) async fn read(file: &Path, args: &ReadArgs) -> Result<Opened, Failure
             .first()
             .map_or("records are missing", String::as_str);
         return Err(Failure::Usage(format!(
-            "`{path}` is damaged: {why}. `rosrescue verify` says what is left of it, and --damaged uses that"
+            "`{path}` is damaged: {why}. `rosrescue verify` shows the readable part, and --damaged uses it"
         )));
     }
     for sentence in &opened.damage {

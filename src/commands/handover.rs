@@ -71,12 +71,12 @@ impl fmt::Display for Outcome {
             ),
             (Some(_), _) => write!(
                 f,
-                "nobody has taken over: {from} leads as before, after {seconds:.2} s"
+                "no other computer took over: {from} still leads after {seconds:.2} s"
             ),
             (None, _) => write!(
                 f,
-                "nobody has taken over: {from} led, and nobody leads now, after {seconds:.2} s; \
-                 `rosrescue status` says more"
+                "no other computer took over: {from} led, and no computer leads after {seconds:.2} s; see \
+                 `rosrescue status`"
             ),
         }
     }
@@ -110,8 +110,8 @@ pub(super) async fn run(args: &HandoverArgs) -> Result<Exit, Failure> {
 async fn computers(running: &Running) -> Result<Computers, Failure> {
     running.status().await?.cluster.ok_or_else(|| {
         Failure::Failed(format!(
-            "the rosrescue at {} is not one of several computers, it runs without --cluster: there is \
-             nobody to hand over to",
+            "the rosrescue at {} runs without --cluster: there is no other \
+             computer to hand over to",
             running.address
         ))
     })
@@ -138,7 +138,7 @@ fn leader(now: &Computers) -> Result<&Leader, Failure> {
     }
     now.leads().ok_or_else(|| {
         Failure::Failed(
-            "no computer leads now, so none can hand over; `rosrescue status` says more".to_owned(),
+            "no computer leads now, so none can hand over; see `rosrescue status`".to_owned(),
         )
     })
 }
@@ -148,7 +148,7 @@ async fn ask(running: &Running, wanted: Option<&str>, timeout: f64) -> Result<()
     let limit =
         Duration::try_from_secs_f64(timeout).map_or(ANSWER_LIMIT, |limit| limit.max(ANSWER_LIMIT));
     let params = [CALLER, wanted.unwrap_or_default()].map(Value::from);
-    let refused = |why: &str| Failure::Failed(format!("the leader does not hand over: {why}"));
+    let refused = |why: &str| Failure::Failed(format!("the leader refused the handover: {why}"));
     match running.call(METHOD, params.into(), limit).await? {
         Reply::Value(Value::Array(answer)) => match answer.as_slice() {
             [Value::Int(1), ..] => Ok(()),
@@ -212,9 +212,9 @@ mod tests {
             ("a", Some("b"), Some("b"), true, "a led, b leads now, after"),
             ("a", Some("a"), Some("a"), true, "a leads already"),
             ("a", Some("c"), Some("b"), false, "c leads now, and not b,"),
-            ("a", Some("a"), None, false, "a leads as before"),
-            ("a", Some("a"), Some("b"), false, "a leads as before"),
-            ("a", None, None, false, "nobody leads now"),
+            ("a", Some("a"), None, false, "a still leads"),
+            ("a", Some("a"), Some("b"), false, "a still leads"),
+            ("a", None, None, false, "no computer leads"),
         ] {
             let (good, said) = said(from, to, wanted);
             assert_eq!(good, handed_over, "{said}");

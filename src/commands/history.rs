@@ -54,8 +54,8 @@ pub(super) async fn run(args: &HistoryArgs) -> Result<Exit, Failure> {
 
 fn what(name: &str) -> &'static str {
     match name.split('-').next() {
-        Some("rescue") => "what a new master was given",
-        Some("session") => "the end of an earlier session",
+        Some("rescue") => "restored in a rescue",
+        Some("session") => "end of an earlier session",
         _ => "the checkpoint in use",
     }
 }
@@ -109,11 +109,7 @@ struct Row {
 impl fmt::Display for History {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.kept.is_empty() {
-            return writeln!(
-                f,
-                "there is no checkpoint at {}, and none is kept beside it",
-                self.checkpoint
-            );
+            return writeln!(f, "no checkpoint at {} or beside it", self.checkpoint);
         }
         for row in &self.kept {
             let (name, written, what) = (&row.name, &row.written, row.what);

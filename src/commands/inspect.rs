@@ -180,7 +180,7 @@ impl fmt::Display for Inspected {
         }
         let end = match session.closed {
             true => "stopped in order",
-            false => "runs, or was not stopped in order",
+            false => "running, or not stopped in order",
         };
         writeln!(
             f,

@@ -27,9 +27,7 @@ pub(super) async fn run(args: &ParamsArgs) -> Result<Exit, Failure> {
     } else {
         for name in OF_THE_SESSION {
             if tree.shift_remove(name.trim_start_matches('/')).is_some() {
-                left_out.push(format!(
-                    "{name} is left out: it belongs to the session of then"
-                ));
+                left_out.push(format!("left out {name}: it belongs to that session"));
             }
         }
         let (yaml, not_carried) =
@@ -63,7 +61,7 @@ fn without(tree: &Struct, path: &str, hide: &Hide, left_out: &mut Vec<String>) -
             value if hide.mask(&name, value) == *value => {
                 drop(kept.insert(key.clone(), value.clone()))
             }
-            _ => left_out.push(format!("{name} is left out: it is hidden")),
+            _ => left_out.push(format!("left out {name}: it is hidden")),
         }
     }
     kept

@@ -179,7 +179,7 @@ impl fmt::Display for Top {
         }
         writeln!(
             head,
-            "{:.1} calls a second, {} in all; {} answered without the master, {} in vain",
+            "{:.1} calls per second, {} in all; {} answered by rosrescue, {} timed out",
             self.calls_per_second, self.calls, self.calls_without_master, self.calls_unanswered
         )?;
         let Counts {

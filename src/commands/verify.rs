@@ -48,7 +48,7 @@ impl fmt::Display for Verified {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let verdict = match (self.whole, self.exact) {
             (true, _) => "is whole",
-            (false, true) => "is damaged, and nothing is lost",
+            (false, true) => "is damaged, but nothing is lost",
             (false, false) => "is damaged",
         };
         writeln!(f, "{} {verdict}", self.file)?;
@@ -64,13 +64,13 @@ impl fmt::Display for Verified {
         if let Some(torn) = &self.torn {
             writeln!(
                 f,
-                "torn     {torn}: normal after a crash, or while it is written; nothing that was confirmed is in it"
+                "torn     {torn}: normal after a crash or during a write. It contains nothing that was confirmed"
             )?;
         }
         if !self.whole && (self.snapshot, self.records) != (None, 0) {
             writeln!(
                 f,
-                "to do    the options --damaged of inspect, diff, params and restore use what is left"
+                "to do    use --damaged with inspect, diff, params or restore to use the readable part"
             )?;
         }
         Ok(())

@@ -36,16 +36,12 @@ impl fmt::Display for Waited {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { uri, seconds, .. } = self;
         match self.met {
-            true => write!(f, "{uri}: it is so, after {seconds:.1} s"),
-            false => write!(
-                f,
-                "{uri}: not so after {seconds:.1} s: {}{}",
-                self.missing.join(", "),
-                self.why
-                    .iter()
-                    .map(|why| format!(". {why}"))
-                    .collect::<String>()
-            ),
+            true => write!(f, "ready after {seconds:.1} s: {uri}"),
+            false => {
+                let missing = self.missing.join(", ");
+                write!(f, "timed out after {seconds:.1} s, waiting for {missing}")?;
+                self.why.iter().try_for_each(|why| write!(f, ": {why}"))
+            }
         }
     }
 }

@@ -53,7 +53,7 @@ pub enum ClusterError {
     /// Neither host name nor address make a name.
     #[error(
         "no name for this computer can be made from its host name, `{hostname}`, and its address, {address}; \
-         give it a name of its own with --cluster-name"
+         give it a unique name with --cluster-name"
     )]
     Name { hostname: String, address: String },
     /// The advertised address leads each computer to itself.
@@ -64,7 +64,7 @@ pub enum ClusterError {
     Loopback { address: String, endpoint: String },
     /// etcd's certificate cannot be checked.
     #[error(
-        "--cluster {endpoint}: https needs the certificate of the authority that has signed etcd's; \
+        "--cluster {endpoint}: https needs the certificate of the authority that signed the certificates of etcd: \
          give its file with --cluster-ca"
     )]
     NoAuthority { endpoint: String },

@@ -213,9 +213,9 @@ impl Computers {
             write!(f, "{head:<12}{}", computer.name)?;
             match (computer.name == self.name, computer.heard) {
                 (true, _) => writeln!(f, " (this one) {}", computer.doing(self.leads()))?,
-                (false, None) => writeln!(f, " is AWAY, and was not heard of since the start")?,
+                (false, None) => writeln!(f, " is AWAY, no contact since the start")?,
                 (false, Some(heard)) if computer.away => {
-                    writeln!(f, " is AWAY, last heard of {}", ago(heard))?;
+                    writeln!(f, " is AWAY, last contact {}", ago(heard))?;
                 }
                 (false, Some(_)) => writeln!(f, " {}", computer.doing(self.leads()))?,
             }
@@ -254,7 +254,7 @@ impl Computers {
         if self.lost_writes > 0 {
             writeln!(
                 f,
-                "lost        {} of the changes made alone: others had changed the same; the log names each",
+                "lost        {} of the changes made alone: others had changed the same. The log lists them",
                 self.lost_writes
             )?;
         }
@@ -275,9 +275,9 @@ impl Computer {
     /// A computer that is cut off may have heard last that another one leads.
     fn doing(&self, leader: Option<&Leader>) -> String {
         let doing = match self.role {
-            Role::Joining => "joins",
-            Role::Following => "follows",
-            Role::CatchingUp => "takes over",
+            Role::Joining => "is joining",
+            Role::Following => "is following",
+            Role::CatchingUp => "is taking over",
             Role::Leading => {
                 let leads = leader.is_some_and(|leader| leader.name == self.name);
                 return if leads { "leads" } else { "led" }.to_owned();
@@ -323,8 +323,8 @@ mod tests {
             [
                 "leader      pc-1 at http://pc-1:11311/, since THEN, term 7",
                 "computers   pc-1 leads",
-                "            pc-2 (this one) follows, 2 records behind",
-                "            pc-3 is AWAY, last heard of THEN",
+                "            pc-2 (this one) is following, 2 records behind",
+                "            pc-3 is AWAY, last contact THEN",
             ]
         );
         facts.leaderless = Some(Instant::now());
@@ -345,9 +345,9 @@ mod tests {
             lines(&facts),
             [
                 "leader      NONE since THEN; the last was pc-1, term 7",
-                "computers   pc-1 is AWAY, and was not heard of since the start",
-                "            pc-2 (this one) follows, 2 records behind",
-                "            pc-3 is AWAY, and was not heard of since the start",
+                "computers   pc-1 is AWAY, no contact since the start",
+                "            pc-2 (this one) is following, 2 records behind",
+                "            pc-3 is AWAY, no contact since the start",
                 "etcd        NO ANSWER since THEN: no majority",
                 "not in etcd 3 changes of this computer",
                 "takeover    THEN from pc-3: in 2.04 s; 2 by this computer so far",
@@ -393,7 +393,7 @@ mod tests {
         );
         assert_eq!(
             computers.line(),
-            "pc-1 leads; pc-2 follows, 2 records behind; pc-3 is AWAY"
+            "pc-1 leads; pc-2 is following, 2 records behind; pc-3 is AWAY"
         );
     }
 }

@@ -156,25 +156,23 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
             (name, since) = (Name::Unprotected, facts.disk.unprotected_since());
         }
         text += &format!(
-            " Changes are not recorded, so a crash of rosrescue itself would lose them: {reason}."
+            " Changes are not recorded, and a crash of rosrescue would lose them: {reason}."
         );
         action.get_or_insert_with(|| {
-            "free or repair the disk; recording begins again by itself.".to_owned()
+            "free space on the disk or repair it. Recording then resumes by itself.".to_owned()
         });
     }
     match facts.guarded {
         Guarded::NoLonger(pid) => {
             text += &format!(
-                " The guardian, process {pid}, has ended: if rosrescue dies now, nobody starts it again."
+                " The guardian, process {pid}, has ended: if rosrescue dies now, nothing restarts it."
             );
-            action.get_or_insert_with(|| {
-                "start rosrescue anew when the robot is at rest.".to_owned()
-            });
+            action.get_or_insert_with(|| "restart rosrescue when the robot is at rest.".to_owned());
         }
         Guarded::Stopped(pid) => {
             text += &format!(
-                " The guardian, process {pid}, is stopped: if rosrescue dies now, calls wait until it is \
-                 continued."
+                " The guardian, process {pid}, is stopped: if rosrescue dies now, calls wait until it \
+                 continues."
             );
             action.get_or_insert_with(|| {
                 format!("continue the guardian: `fg`, `bg` or `kill -CONT {pid}`.")
@@ -185,7 +183,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     if matches!(name, Name::Protected | Name::Following) {
         text += match facts.bypassing.is_empty() {
             true => " Every change is recorded.",
-            false => " Every change that comes through rosrescue is recorded.",
+            false => " Every change through rosrescue is recorded.",
         };
     }
     if !facts.bypassing.is_empty() {
@@ -194,10 +192,8 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
             count => (format!("{count} clients"), "talk"),
         };
         let who = some(&facts.bypassing);
-        text += &format!(" {count} {verb} to the master directly, unprotected: {who}.");
-        action.get_or_insert_with(|| {
-            "start it again with the ROS_MASTER_URI of rosrescue.".to_owned()
-        });
+        text += &format!(" {count} {verb} directly to the master, unprotected: {who}.");
+        action.get_or_insert_with(|| "restart it with the ROS_MASTER_URI of rosrescue.".to_owned());
     }
     Condition {
         name,
@@ -210,46 +206,42 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
 fn nodes_notice(now: &Situation, facts: &Facts) -> (String, Option<String>) {
     let master = &now.master;
     let open = now.gate.is_open();
-    let starts_it = format!("start the master at {master}, if nothing else does.");
+    let starts_it = format!("start the master at {master}, unless something else starts it.");
     match (now.gate, facts.mode) {
-        (State::Unknown, Mode::Core) => (
-            "Nodes wait: their calls are held until the first master is known.".to_owned(),
-            None,
-        ),
+        (State::Unknown, Mode::Core) => ("Calls wait for the first master.".to_owned(), None),
         (State::Unknown, Mode::Proxy) => (
-            format!(
-                "Nodes wait: their calls are held, because no master was ever seen at {master}."
-            ),
+            format!("Calls wait, because no master has answered at {master} yet."),
             Some(format!(
                 "start the master at {master}, or correct --master."
             )),
         ),
-        (State::Elsewhere, _) => ("Nodes wait for another computer.".to_owned(), None),
+        (State::Elsewhere, _) => ("Calls wait for another computer.".to_owned(), None),
         _ if facts.crash_loop.is_some() => {
             let text = match open {
-                true => "Nodes run as usual: the master answers, but it keeps dying",
+                true => "Nodes work as usual: the master answers, but it keeps dying",
                 false => {
-                    "Nodes go on: rosrescue answers in the place of the master, which keeps dying"
+                    "Nodes keep working: rosrescue answers in place of the master, which keeps dying"
                 }
             };
             let output = match facts.mode {
-                Mode::Core => "read why in ….rosmaster-output.log beside the checkpoint",
-                Mode::Proxy => "read why in the log of what starts it",
+                Mode::Core => "find the reason in ….rosmaster-output.log beside the checkpoint",
+                Mode::Proxy => "find the reason in the log of the program that starts it",
             };
             let text = format!(
-                "{text}, {} times so far; this is over when one lives for 10 s.",
+                "{text}, {} times so far. The crash loop ends when a master runs for 10 s.",
                 facts.deaths
             );
             (text, Some(format!("{output}.")))
         }
-        (State::Open { .. }, _) => ("Nodes run as usual: the master answers.".to_owned(), None),
+        (State::Open { .. }, _) => ("Nodes work as usual: the master answers.".to_owned(), None),
         (_, Mode::Core) => (
-            "Nodes go on: rosrescue answers in the master's place and starts a new one.".to_owned(),
+            "Nodes keep working: rosrescue answers in place of the master and starts a new one."
+                .to_owned(),
             None,
         ),
         (_, Mode::Proxy) => (
             format!(
-                "Nodes go on: rosrescue answers in the place of the master at {master}, which is away."
+                "Nodes keep working: rosrescue answers in place of the master at {master}, which is down."
             ),
             Some(starts_it),
         ),
@@ -279,12 +271,12 @@ mod tests {
         assert!(good.is_good(), "{good:?}");
         assert_eq!(
             good.line(),
-            "protected: Nodes run as usual: the master answers. Every change is recorded."
+            "protected: Nodes work as usual: the master answers. Every change is recorded."
         );
         assert_eq!(of(State::Unknown, None, &facts).name, Name::Waiting);
         let away = of(State::StandingIn, None, &facts);
         assert_eq!(away.name, Name::StandingIn);
-        assert!(away.text.starts_with("Nodes go on"), "{away:?}");
+        assert!(away.text.starts_with("Nodes keep working"), "{away:?}");
         assert!(away.action.unwrap().contains("http://robot:11312/"));
 
         facts.crash_loop = Some(Instant::now());
@@ -293,14 +285,14 @@ mod tests {
         let between = of(OPEN, None, &facts);
         assert_eq!(between.name, Name::CrashLoop);
         assert!(
-            between.text.starts_with("Nodes run as usual"),
+            between.text.starts_with("Nodes work as usual"),
             "{between:?}"
         );
         assert!(between.text.contains("7 times"), "{between:?}");
 
         let line = of(OPEN, Some("the disk\nis full"), &facts).line();
         assert!(
-            line.starts_with("UNPROTECTED: Nodes run as usual"),
+            line.starts_with("UNPROTECTED: Nodes work as usual"),
             "{line}"
         );
         assert!(line.contains("the disk is full") && line.contains("7 times"));
@@ -325,7 +317,7 @@ mod tests {
         let condition = of(OPEN, None, &facts);
         assert_eq!(condition.name, Name::Protected);
         assert!(!condition.is_good());
-        let said = "1 client talks to the master directly, unprotected: rosout (process 7).";
+        let said = "1 client talks directly to the master, unprotected: rosout (process 7).";
         assert!(condition.text.contains(said), "{condition:?}");
         assert!(!condition.text.contains("Every change is recorded"));
         assert!(condition.action.unwrap().contains("ROS_MASTER_URI"));

@@ -11,9 +11,9 @@ use crate::{clock, master::Counts};
 pub(crate) static AWAY: Pair = Pair::new();
 
 /// The cause of a report when rosrescue itself was started.
-pub(crate) const STARTED: &str = "rosrescue was started";
+pub(crate) const STARTED: &str = "rosrescue started";
 /// The same, if the one before had died.
-pub(crate) const DIED: &str = "rosrescue itself died and was started again";
+pub(crate) const DIED: &str = "rosrescue itself died and restarted";
 /// The cause of the first one after another computer has led.
 pub(crate) const TAKEN_OVER: &str = "this computer took over";
 /// The cause of the first one of a computer that was cut off from the leader.
@@ -45,11 +45,11 @@ impl Outcome {
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Begun => "a new session is served by a new master",
-            Self::Injected => "a new master was given the whole state",
-            Self::Adopted => "a running master was taken over with all that it holds",
-            Self::Reconciled => "the same master goes on, and was told what changed meanwhile",
-            Self::Resumed => "the same master goes on, unchanged",
+            Self::Begun => "a new session started with a new master",
+            Self::Injected => "a new master got the whole state",
+            Self::Adopted => "a running master was taken over with its state",
+            Self::Reconciled => "the same master continues, and got the changes it missed",
+            Self::Resumed => "the same master continues, unchanged",
         })
     }
 }
@@ -130,10 +130,10 @@ impl Report {
         let lists: [(_, &[String]); 6] = [
             ("could not be restored", &self.not_restored),
             ("differs from what was restored", &self.mismatches),
-            ("dead nodes taken out", &self.removed),
-            ("corrected, as the nodes say", &self.reconciled),
-            ("nodes that do not answer", &self.unreachable),
-            ("topics told once more", &self.told_again),
+            ("unregistered dead nodes", &self.removed),
+            ("corrected after asking the nodes", &self.reconciled),
+            ("nodes without an answer", &self.unreachable),
+            ("topics announced again", &self.told_again),
         ];
         lists.into_iter().filter(|(_, list)| !list.is_empty())
     }
@@ -141,10 +141,10 @@ impl Report {
     /// What nodes noticed.
     fn felt(&self) -> String {
         match (self.answered, self.unanswered) {
-            (0, 0) => "no call came meanwhile".to_owned(),
-            (answered, 0) => format!("{answered} calls were answered meanwhile, none was lost"),
+            (0, 0) => "no calls meanwhile".to_owned(),
+            (answered, 0) => format!("{answered} calls answered meanwhile, none lost"),
             (answered, lost) => {
-                format!("{answered} calls were answered meanwhile, {lost} waited in vain")
+                format!("{answered} calls answered meanwhile, {lost} timed out")
             }
         }
     }
@@ -227,10 +227,10 @@ impl fmt::Display for Report {
         if let Some(ended) = &self.ended {
             write!(f, " ({ended})")?;
         }
-        writeln!(f, "; after {total_ms:.0} ms {}", self.outcome)?;
+        writeln!(f, "; {} after {total_ms:.0} ms", self.outcome)?;
         writeln!(
             f,
-            "  {absence_ms:.0} ms until a master listened, {inspection_ms:.0} ms to read it, \
+            "  {absence_ms:.0} ms without a master, {inspection_ms:.0} ms to read it, \
              {injection_ms:.0} ms to restore it; {}",
             self.felt()
         )?;

@@ -145,7 +145,7 @@ impl Status {
     fn nodes_line(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let lists = [
             (&self.dead_nodes, "dead but registered"),
-            (&self.unreachable, "without an answer"),
+            (&self.unreachable, "not answering"),
             (&self.unchecked_nodes, "not checked"),
         ];
         write!(f, "nodes       {} alive", self.alive_nodes)?;
@@ -204,7 +204,7 @@ impl fmt::Display for Status {
             died(self.worker_restarts),
             self.guarded_by
         )?;
-        writeln!(f, "serves      {}", self.uri)?;
+        writeln!(f, "address     {}", self.uri)?;
         if self.elsewhere {
             writeln!(f, "master      none on this computer")?;
         } else {
@@ -217,7 +217,7 @@ impl fmt::Display for Status {
         self.nodes_line(f)?;
         writeln!(
             f,
-            "calls       {}, {:.1} a second; {} answered without the master, {} in vain",
+            "calls       {}, {:.1} per second; {} answered by rosrescue, {} timed out",
             self.counter("calls"),
             self.calls_per_second,
             self.counter("calls_without_master"),
@@ -236,7 +236,7 @@ impl fmt::Display for Status {
         if self.pending_writes > 0 {
             writeln!(
                 f,
-                "pending     {} changes that the next master will be told",
+                "pending     {} changes for the next master",
                 self.pending_writes
             )?;
         }

@@ -195,7 +195,10 @@ fn rosrescue_runs_as_the_document_says_and_hands_over() {
         said.contains("base-10.0.0.1 led, ") && said.contains("leads now, after"),
         "{said}"
     );
-    assert!(said.contains("base-10.0.0.1 (this one) follows"), "{said}");
+    assert!(
+        said.contains("base-10.0.0.1 (this one) is following"),
+        "{said}"
+    );
     assert!(said.contains("all 3 members of etcd answer"), "{said}");
     assert!(said.contains("etcd has the robot robot, "), "{said}");
 }

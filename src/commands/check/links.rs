@@ -196,7 +196,7 @@ impl Found {
         {
             let what = format!("{subscriber} is not connected to {topic} of {publisher}");
             let todo =
-                format!("start {subscriber} again; if it comes back, compare the message types");
+                format!("restart {subscriber}; if that does not help, compare the message types");
             all.push(finding(Severity::Problem, what, todo));
         }
         for Link {
@@ -217,8 +217,7 @@ impl Found {
                 counted(silent.len(), "node"),
                 some(&silent)
             );
-            let todo =
-                "see `rosrescue status`: dead nodes stay registered until they are started again";
+            let todo = "see `rosrescue status`: dead nodes stay registered until they restart";
             all.push(finding(Severity::Warning, what, todo.to_owned()));
         }
         let seen = format!(

@@ -49,7 +49,7 @@ impl Api {
             let value = match (sign, value) {
                 (_, Some(value)) => Ok(value),
                 (Sign::Alive, None) => Err("was refused".to_owned()),
-                (Sign::Dead, None) => Err("found nobody listening".to_owned()),
+                (Sign::Dead, None) => Err("found no listener".to_owned()),
                 (Sign::Silent, None) if took >= LIMIT => {
                     Err(format!("had no answer in {} s", LIMIT.as_secs()))
                 }

@@ -35,7 +35,7 @@ impl Drill<'_> {
             let pause = fifth.map(|then| DEATHS_WITHIN.saturating_sub(then.elapsed()));
             if let Some(pause) = pause.filter(|pause| !pause.is_zero()) {
                 eprintln!(
-                    "waiting {} s: more deaths now would be a crash loop",
+                    "waiting {} s, because more deaths now would be a crash loop",
                     pause.as_secs()
                 );
                 sleep(pause).await;
@@ -70,7 +70,7 @@ impl Drill<'_> {
                 recovered_ms,
             });
             if failed {
-                eprintln!("calls do not pass again: the drill ends");
+                eprintln!("calls do not pass again: the drill stops");
                 break;
             }
             sleep(AFTER).await;

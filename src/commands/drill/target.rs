@@ -41,8 +41,8 @@ impl Target {
     async fn master(&self, status: &Status) -> Result<u32, Failure> {
         if status.elsewhere {
             return Err(Failure::Usage(
-                "another computer has the master: run the drill there (`rosrescue status` says which \
-                 one), or with --no-kill"
+                "another computer has the master: run the drill there (`rosrescue status` shows which \
+                 one), or use --no-kill"
                     .to_owned(),
             ));
         }
@@ -50,7 +50,7 @@ impl Target {
             MasterUri::parse(&status.master).map_err(|error| Failure::Failed(error.to_string()))?;
         if !is_here(&address).await {
             return Err(Failure::Usage(format!(
-                "the master at {} is not on this computer: run the drill there, or with --no-kill",
+                "the master at {} is not on this computer: run the drill there, or use --no-kill",
                 status.master
             )));
         }

@@ -112,7 +112,7 @@ impl fmt::Display for Verdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let verdict = if self.passed { "PASSED" } else { "FAILED" };
         let what = match self.kills.as_slice() {
-            [] => "nothing was killed".to_owned(),
+            [] => "killed nothing".to_owned(),
             all @ [first, ..] => {
                 let names: Vec<_> = first.killed.iter().map(|(name, _)| *name).collect();
                 let how = match first.signal {

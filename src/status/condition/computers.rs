@@ -30,8 +30,8 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
         (Role::CatchingUp, ..) => Notice {
             name: Name::NoLeader,
             since: of.leaderless.unwrap_or(of.since),
-            text: "Nodes go on: this computer takes over, and reads the rest of the journal from etcd. \
-                   Reads are answered, writes wait for that."
+            text: "Nodes keep working: this computer is taking over, and reads the rest of the journal from etcd. \
+                   It answers reads; writes wait."
                 .to_owned(),
             action: None,
         },
@@ -40,7 +40,7 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
             name: Name::NoLeader,
             since: of.since,
             text: format!(
-                "Nodes wait: this computer does not know the others yet{}.",
+                "Calls wait: this computer does not know the others yet{}.",
                 etcd(of)
             ),
             action: look_at_etcd(of, of.since),
@@ -58,9 +58,7 @@ fn following(of: &ClusterFacts, leader: &LeaderFacts) -> Notice {
     Notice {
         name: Name::Following,
         since: of.since.max(leader.since),
-        text: format!(
-            "Nodes run as usual: calls are forwarded to the leader, {name} at {uri}.{trouble}"
-        ),
+        text: format!("Nodes work as usual: the leader, {name} at {uri}, answers.{trouble}"),
         action: None,
     }
 }
@@ -73,7 +71,7 @@ fn no_leader(of: &ClusterFacts) -> Notice {
         name: Name::NoLeader,
         since,
         text: format!(
-            "Nodes go on: reads are answered, writes wait for the next leader{}.{}",
+            "Nodes keep working: reads are answered, writes wait for the next leader{}.{}",
             etcd(of),
             last.unwrap_or_default()
         ),
@@ -83,9 +81,9 @@ fn no_leader(of: &ClusterFacts) -> Notice {
 
 fn alone(gate: State, of: &ClusterFacts) -> Notice {
     let kept = match of.uncommitted {
-        0 => "nothing so far".to_owned(),
-        1 => "1 change so far".to_owned(),
-        changes => format!("{changes} changes so far"),
+        0 => "none so far".to_owned(),
+        1 => "1 so far".to_owned(),
+        changes => format!("{changes} so far"),
     };
     let why = match (&of.etcd, &of.leader) {
         (None, Some(leader)) if leader.name != of.name => {
@@ -95,11 +93,11 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
     };
     let notice = match gate {
         State::Elsewhere | State::Unknown => {
-            "Reads are answered, writes wait and are closed (--alone refuse)".to_owned()
+            "Reads are answered; writes wait, and fail after --hold (--alone refuse)".to_owned()
         }
         _ => format!(
-            "Nodes of this computer go on: calls are answered here, and what they change is kept \
-             ({kept}) for the leader, but for what others change meanwhile"
+            "The nodes of this computer keep working. Their changes ({kept}) go to the leader later, except \
+             where others change the same"
         ),
     };
     Notice {
@@ -110,12 +108,11 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
             match (&of.etcd, &of.leader) {
                 // Nothing has come from etcd since the start.
                 (Some(_), None) => {
-                    "see that a majority of etcd runs, and that --cluster has its addresses and its port for \
-                     clients; `rosrescue check --cluster URLS` tries each."
+                    "make sure that a majority of etcd runs, and that --cluster has its addresses and client port. \
+                     `rosrescue check --cluster URLS` tries each."
                 }
                 _ => {
-                    "bring back the network between the computers, and a majority of etcd; the rest goes by \
-                     itself."
+                    "restore the network between the computers and a majority of etcd. The rest follows by itself."
                 }
             }
             .to_owned(),
@@ -133,14 +130,14 @@ pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     };
     let mut text = " This computer leads".to_owned();
     if !here.is_empty() {
-        text += &format!("; in its place could {}", names(&here));
+        text += &format!("; these could take over: {}", names(&here));
     }
     text.push('.');
     let mut action = None;
     if here.is_empty() {
-        text += " No other one could take over";
+        text += " No other computer could take over";
         if !away.is_empty() {
-            text += &format!(": nothing is heard of {}", names(&away));
+            text += &format!(": no contact with {}", names(&away));
             action = Some(format!("bring back {}.", names(&away)));
         }
         text.push('.');
@@ -159,7 +156,7 @@ fn etcd(of: &ClusterFacts) -> String {
 
 fn look_at_etcd(of: &ClusterFacts, since: Instant) -> Option<String> {
     (of.etcd.is_some() || since.elapsed() > PATIENCE).then(|| {
-        "see that a majority of etcd runs and that this computer reaches it where --cluster says."
+        "make sure that a majority of etcd runs, and that this computer reaches it at the addresses of --cluster."
             .to_owned()
     })
 }
@@ -195,8 +192,8 @@ mod tests {
         assert!(well.is_good(), "{well:?}");
         assert_eq!(
             well.line(),
-            "following the leader: Nodes run as usual: calls are forwarded to the leader, pc-1 at \
-             http://pc-1:11311/. Every change is recorded."
+            "following the leader: Nodes work as usual: the leader, pc-1 at http://pc-1:11311/, answers. \
+             Every change is recorded."
         );
         cluster.etcd = trouble();
         let line = of(State::Elsewhere, &cluster).line();
@@ -236,9 +233,9 @@ mod tests {
         assert!(
             serving
                 .line()
-                .starts_with("ALONE: Nodes of this computer go on")
+                .starts_with("ALONE: The nodes of this computer keep working")
         );
-        assert!(serving.text.contains("3 changes"), "{serving:?}");
+        assert!(serving.text.contains("3 so far"), "{serving:?}");
         assert!(
             serving.text.contains("(the leader, pc-1, does not answer)"),
             "{serving:?}"
@@ -253,7 +250,7 @@ mod tests {
             "{refusing:?}"
         );
         let action = |of: Condition| of.action.unwrap();
-        assert!(action(refusing).contains("bring back the network"));
+        assert!(action(refusing).contains("restore the network"));
         // The options may be wrong, not the network.
         cluster.leader = None;
         let never = action(of(OPEN, &cluster));
@@ -266,13 +263,16 @@ mod tests {
         cluster.role = Role::Leading;
         let well = of(OPEN, &cluster);
         assert!(well.is_good(), "{well:?}");
-        assert!(well.text.contains("in its place could pc-1."), "{well:?}");
+        assert!(
+            well.text.contains("these could take over: pc-1."),
+            "{well:?}"
+        );
         assert_eq!(of(State::StandingIn, &cluster).name, Name::StandingIn);
         cluster.members.retain(|member| member.name != "pc-1");
         let last = of(OPEN, &cluster);
         assert!(!last.is_good() && last.action.unwrap().contains("pc-3"));
         cluster.members.retain(|member| member.name == "pc-2");
         let first = of(OPEN, &cluster);
-        assert!(first.is_good() && first.text.contains("No other one could take over."));
+        assert!(first.is_good() && first.text.contains("No other computer could take over."));
     }
 }

@@ -131,7 +131,7 @@ fn each_rescue_leaves_a_report_beside_the_checkpoint() {
     let path = reports(&robot).pop().unwrap();
     eventually("it is whole", || {
         let text = fs::read_to_string(&path).unwrap();
-        text.contains("signal 9") && text.contains("a new master was given the whole state")
+        text.contains("signal 9") && text.contains("a new master got the whole state")
     });
     assert_eq!(
         fs::metadata(&path).unwrap().permissions().mode() & 0o777,

@@ -356,7 +356,7 @@ fn the_hosts_file_and_the_units_of_this_computer() {
     assert!(
         found
             .said("host name")
-            .contains("robot is 127.0.1.1, which only this computer reaches"),
+            .contains("robot is 127.0.1.1, which other computers cannot reach"),
         "{:#}",
         found.report
     );

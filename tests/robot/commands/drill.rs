@@ -160,7 +160,7 @@ fn a_master_that_hangs_is_left_alive_by_a_proxy() {
     );
     assert!(
         robot.bare().master_pid().is_some(),
-        "the same master goes on"
+        "the same master continues"
     );
 }
 
@@ -308,7 +308,7 @@ fn a_person_is_asked() {
         line.contains("Is the robot on the bench")
     });
     no.wait_line("that nothing happened", |line| {
-        line.contains("nothing was killed")
+        line.contains("killed nothing")
     });
     assert_eq!(robot.master_pid(), master);
     let mut yes = ask("y");

@@ -129,11 +129,14 @@ fn it_waits_until_another_computer_leads_and_says_which() {
         "{text}"
     );
     assert!(
-        text.contains("\n            pc-2 (this one) follows\n"),
+        text.contains("\n            pc-2 (this one) is following\n"),
         "{text}"
     );
     let text = shown(&["top", "--count", "1"]);
-    assert!(text.contains("\ncomputers: pc-1 follows; pc-2"), "{text}");
+    assert!(
+        text.contains("\ncomputers: pc-1 is following; pc-2"),
+        "{text}"
+    );
 
     let good = ran(&done, Some((3, "pc-2", 8)), &[]).ended(0);
     assert!(
@@ -151,13 +154,16 @@ fn it_waits_until_another_computer_leads_and_says_which() {
 
     let back = ran(&done, Some((2, "pc-1", 9)), &[]).ended(1);
     assert!(
-        back.contains("nobody has taken over: pc-1 leads as before"),
+        back.contains("no other computer took over: pc-1 still leads"),
         "{back}"
     );
     let other = ran(&done, Some((2, "pc-3", 8)), &["--to", "pc-2"]).ended(1);
     assert!(other.contains("pc-3 leads now, and not pc-2"), "{other}");
     let nobody = ran(&done, None, &["--timeout", "1.2"]);
-    assert!(nobody.stdout.contains("nobody leads now"), "{nobody:?}");
+    assert!(
+        nobody.stdout.contains("no computer leads after"),
+        "{nobody:?}"
+    );
     assert!(
         nobody.stderr.contains("nobody leads after 1 s"),
         "{nobody:?}"
@@ -167,7 +173,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
     assert!(
         refused
             .stderr
-            .contains("the leader does not hand over: pc-3 is too far behind")
+            .contains("the leader refused the handover: pc-3 is too far behind")
     );
     refused.ended(1);
 

@@ -83,7 +83,7 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     });
     assert!(run(&robot, &["params", "rescue-2"]).contains("\"before\": 2"));
     let text = run(&robot, &["history"]);
-    assert!(text.contains("what a new master was given"), "{text}");
+    assert!(text.contains("restored in a rescue"), "{text}");
     assert_eq!(text.lines().count(), 2 * history(&robot).len());
     // Only its owner may read them.
     use std::os::unix::fs::PermissionsExt;

@@ -24,7 +24,7 @@ fn a_link_that_was_broken_is_found_and_named() {
     // Four of /chatter, and those of /rosout.
     eventually("all links are there", || {
         let checked = check(&[]);
-        checked.exit() == 0 && checked.stdout.ends_with("Nothing stands in the way.")
+        checked.exit() == 0 && checked.stdout.ends_with("No problems found.")
     });
     let all = check(&["--json"]).json(0);
     let seen = all["findings"][0]["what"].as_str().unwrap().to_owned();

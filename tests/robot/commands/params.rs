@@ -51,7 +51,7 @@ fn rosparam_loads_what_params_prints() {
 
     let hidden = run(&["params", "present", "--hide-values", "secret"]);
     assert!(
-        hidden.stderr.contains("/secret is left out: it is hidden"),
+        hidden.stderr.contains("left out /secret: it is hidden"),
         "{hidden:?}"
     );
     assert!(!hidden.ended(0).contains("secret"));

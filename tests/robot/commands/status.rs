@@ -17,7 +17,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     let good = Tool::rosrescue(scratch, port, &["status"]);
     assert_eq!(good.exit(), 0, "{good:?}");
     assert!(good.stdout.starts_with("protected, since "), "{good:?}");
-    assert!(good.stdout.contains("Nodes run as usual"), "{good:?}");
+    assert!(good.stdout.contains("Nodes work as usual"), "{good:?}");
     assert!(good.stdout.lines().count() <= 10, "{good:?}");
     // The page is the same.
     let first = |text: &str| text.lines().nth(1).map(str::to_owned);
@@ -34,7 +34,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
             .starts_with("standing in for the master, since "),
         "{away:?}"
     );
-    assert!(away.stdout.contains("Nodes go on"), "{away:?}");
+    assert!(away.stdout.contains("Nodes keep working"), "{away:?}");
     assert!(
         away.stdout
             .contains("\nto do       start the master at http://"),
@@ -55,9 +55,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
         "{after:?}"
     );
     assert!(
-        after
-            .stdout
-            .contains("a new master was given the whole state"),
+        after.stdout.contains("a new master got the whole state"),
         "{after:?}"
     );
     let json = Tool::rosrescue(&robot.scratch, port, &["status", "--json"]).json(0);
@@ -138,6 +136,6 @@ fn it_says_that_nodes_wait_for_a_first_master() {
     let rescue = Setup::proxy(&scratch, free_port()).spawn();
     eventually("the status says so", || {
         let ran = Tool::rosrescue(&scratch, rescue.port(), &["status"]);
-        ran.exit() == 1 && ran.stdout.contains("Nodes wait") && ran.stdout.contains("\nto do ")
+        ran.exit() == 1 && ran.stdout.contains("Calls wait") && ran.stdout.contains("\nto do ")
     });
 }

@@ -36,7 +36,7 @@ fn what_goes_past_rosrescue_is_named_until_it_ends() {
     // roscpp keeps its connection for 30 s.
     eventually("it is named", || bypassing() == [who.clone()]);
     let shown = Tool::rosrescue(&scratch, rescue.port(), &["status"]).ended(1);
-    let said = format!("1 client talks to the master directly, unprotected: {who}.");
+    let said = format!("1 client talks directly to the master, unprotected: {who}.");
     assert!(
         shown.contains(&said) && shown.contains("\nto do "),
         "{shown}"
@@ -45,7 +45,7 @@ fn what_goes_past_rosrescue_is_named_until_it_ends() {
     let found = check();
     let uri = format!("http://127.0.0.1:{}", master.port);
     assert!(
-        found.contains(&format!("{who} talks to the master at {uri}/ directly")),
+        found.contains(&format!("{who} talks directly to the master at {uri}/")),
         "{found:?}"
     );
     let by_environment = |it: &String| {

@@ -41,7 +41,7 @@ fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
     assert_eq!(after["last_rescues"][0], before["last_rescues"][0]);
     assert_eq!(
         after["last_rescues"][2]["cause"],
-        "rosrescue itself died and was started again"
+        "rosrescue itself died and restarted"
     );
     for (field, count) in [("deaths", 1), ("worker_restarts", 2), ("rescues", 3)] {
         assert_eq!(after[field], count, "{field}");
@@ -78,7 +78,7 @@ fn rescues_before_the_death_of_rosrescue_are_still_told(mode: Mode) {
     assert_eq!(run(&robot, &["report"]), run(&robot, &["report", "4"]));
     let first = run(&robot, &["report", "1"]);
     assert!(
-        first.starts_with("1  ") && first.contains("dead nodes taken out: /dead"),
+        first.starts_with("1  ") && first.contains("unregistered dead nodes: /dead"),
         "{first}"
     );
     let history = run(&robot, &["history"]);

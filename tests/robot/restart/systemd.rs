@@ -81,7 +81,7 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
         .wrapped(|own| activated(own, socket.into()))
         .at_port(port)
         .spawn();
-    manager.wait("STATUS=waiting for a first master: Nodes wait");
+    manager.wait("STATUS=waiting for a first master: Calls wait");
     manager.wait("WATCHDOG=1");
     assert!(!manager.has_heard("READY=1"));
     let mut master = Rosmaster::start_at(&scratch, master_port);
@@ -95,7 +95,7 @@ fn a_socket_unit_takes_the_place_of_the_guardian() {
     assert_eq!(page["guarded"], true);
     assert_eq!(page["guarded_by"], "systemd");
     master.kill();
-    manager.wait("STATUS=standing in for the master: Nodes go on");
+    manager.wait("STATUS=standing in for the master: Nodes keep working");
 
     // A crash, and what systemd does then: the socket is the same.
     rescue.kill();

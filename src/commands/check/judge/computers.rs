@@ -17,11 +17,11 @@ impl Findings {
             None => return,
             Some(Ok(cluster)) => cluster,
             Some(Err(Unusable::Options(error))) => {
-                let todo = "correct the options: `core` does not start with them";
+                let todo = "correct the options: with these, `core` does not start";
                 return self.bad(SUBJECT, error.to_string(), todo);
             }
             Some(Err(Unusable::Etcd(error))) => {
-                let todo = "correct the options of etcd: `core` does not start with them";
+                let todo = "correct the options of etcd: with these, `core` does not start";
                 return self.bad(SUBJECT, error.to_string(), todo);
             }
         };
@@ -43,9 +43,9 @@ impl Findings {
             self.bad(
                 "--cluster-name",
                 format!(
-                    "another computer is called {name}, too: it is at {uri}, this one is at {own}"
+                    "another computer has the same name, {name}: it is at {uri}, this one is at {own}"
                 ),
-                "give this computer a name of its own with --cluster-name",
+                "give this computer a unique name with --cluster-name",
             );
         } else {
             self.ok(

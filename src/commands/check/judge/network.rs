@@ -13,8 +13,7 @@ use crate::ros_env;
 const SLOW: u128 = 1000;
 /// Of what goes past rosrescue.
 const BYPASS: &str = "unprotected";
-const AGAIN: &str =
-    "start it again with the ROS_MASTER_URI of rosrescue: what it writes is not recorded";
+const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 
 impl Findings {
     pub(super) fn port(&mut self, facts: &Facts) {
@@ -29,11 +28,7 @@ impl Findings {
         };
         if let Some(error) = error {
             let todo = "choose another port or address: --port, ROS_IP";
-            return self.bad(
-                "port",
-                format!("nobody can listen at {number}: {error}"),
-                todo,
-            );
+            return self.bad("port", format!("cannot listen at {number}: {error}"), todo);
         }
         let Some(taken) = taken else {
             return self.ok("port", format!("{number} is free"));
@@ -57,7 +52,7 @@ impl Findings {
                     self.note(
                         "port",
                         format!("the running rosrescue is {version}, this program is {own}"),
-                        "start rosrescue anew when the robot is at rest",
+                        "restart rosrescue when the robot is at rest",
                     );
                 }
                 if let Some(why) = unprotected {
@@ -75,15 +70,15 @@ impl Findings {
                     "port",
                     format!("{number} is in use by a master without rosrescue: {by}"),
                     format!(
-                        "end that roscore or roslaunch ({pid}Ctrl-C where it runs), or keep it and use \
+                        "stop that roscore or roslaunch ({pid}Ctrl-C where it runs), or keep it and use \
                          `rosrescue proxy`"
                     ),
                 );
             }
             _ => self.bad(
                 "port",
-                format!("{number} is in use by something that is no master: {by}"),
-                "end it, or choose another port with --port and in ROS_MASTER_URI",
+                format!("{number} is in use by a program that is not a master: {by}"),
+                "stop it, or choose another port with --port and in ROS_MASTER_URI",
             ),
         }
     }
@@ -108,8 +103,12 @@ impl Findings {
             }
         };
         if uri.trim() != uri {
-            let todo = "export it without blanks";
-            return self.bad(SUBJECT, format!("`{uri}` has blanks at its ends"), todo);
+            let todo = "export it without spaces";
+            return self.bad(
+                SUBJECT,
+                format!("`{uri}` begins or ends with a space"),
+                todo,
+            );
         }
         let Some(host) = &facts.master_host else {
             return;
@@ -126,7 +125,7 @@ impl Findings {
             Ok(addresses) if !host.is_here => self.bad(
                 SUBJECT,
                 format!(
-                    "{uri} is another computer ({}), and rosrescue would serve here",
+                    "{uri} is another computer ({}), but rosrescue would run here",
                     list(addresses)
                 ),
                 "check on that computer, or export the address of this one",
@@ -135,10 +134,10 @@ impl Findings {
                 Ok(Port { number, .. }) if *number != parsed.port => self.bad(
                     SUBJECT,
                     format!(
-                        "{uri} has port {}, rosrescue would serve {number}",
+                        "{uri} has port {}, but rosrescue would use {number}",
                         parsed.port
                     ),
-                    "nodes of this shell would miss it: use one port for both",
+                    "nodes from this shell would not find it: use the same port for both",
                 ),
                 _ => self.ok(SUBJECT, format!("{uri} is this computer")),
             },
@@ -151,7 +150,7 @@ impl Findings {
         match &facts.elsewhere {
             Some(Server::Rosrescue { version, .. }) => self.ok(
                 SUBJECT,
-                format!("{uri} is rosrescue {version} on another computer; here run nodes only"),
+                format!("{uri} is rosrescue {version} on another computer; only nodes run here"),
             ),
             _ => self.warn(
                 SUBJECT,
@@ -178,18 +177,22 @@ impl Findings {
             let Some(value) = value else { continue };
             if value.trim() != value {
                 let todo = format!("export {subject}={}", value.trim());
-                self.bad(subject, format!("`{value}` has blanks at its ends"), todo);
+                self.bad(
+                    subject,
+                    format!("`{value}` begins or ends with a space"),
+                    todo,
+                );
             } else if ros_env::bad_override(&|name| (name == subject).then(|| value.clone()))
                 .is_some()
             {
-                let todo = "write one, without port or http://, as in robot or 10.0.0.7";
+                let todo = "write one without port or http://, as in robot or 10.0.0.7";
                 self.bad(
                     subject,
                     format!("`{value}` is not a host name or an address"),
                     todo,
                 );
             } else if subject == "ROS_IP" && value.parse::<std::net::IpAddr>().is_err() {
-                let todo = "put names into ROS_HOSTNAME, and an address into ROS_IP";
+                let todo = "use ROS_HOSTNAME for a name, and ROS_IP for an address";
                 self.warn(subject, format!("`{value}` is not an address"), todo);
             }
         }
@@ -221,7 +224,7 @@ impl Findings {
         match &own.addresses {
             Err(why) => self.bad(
                 subject,
-                format!("{name} has no address ({why}): nobody reaches this computer's nodes"),
+                format!("{name} has no address ({why}): no other node reaches the nodes of this computer"),
                 format!("add `ADDRESS {name}` to /etc/hosts, or export ROS_IP=ADDRESS"),
             ),
             Ok(_) if !own.is_here => self.bad(
@@ -230,17 +233,17 @@ impl Findings {
                 format!("correct {name} in /etc/hosts, or export ROS_IP with an address of this computer"),
             ),
             Ok(_) if own.is_loopback() => {
-                let what = format!("{}, which only this computer reaches", leads(own));
-                let todo = "export ROS_IP with this computer's address in the network, before anything starts";
+                let what = format!("{}, which other computers cannot reach", leads(own));
+                let todo = "export ROS_IP with this computer's network address before anything starts";
                 match others {
                     Some(other) => {
-                        self.bad(subject, format!("{what}, and {other} takes part"), todo);
+                        self.bad(subject, format!("{what}, but {other} is part of the robot"), todo);
                     }
                     None if is_set => self.note(subject, what, ""),
                     None => self.warn(
                         subject,
                         format!("{what} (Debian's /etc/hosts)"),
-                        format!("fine for a robot of one computer; otherwise {todo}"),
+                        format!("fine for a robot with one computer; otherwise {todo}"),
                     ),
                 }
             }
@@ -264,7 +267,7 @@ impl Findings {
                 "{ip} is {how} ({}): when it changes, no node reaches this computer's nodes",
                 lease.interface
             ),
-            "give the interface a fixed address, or use ROS_HOSTNAME with a name that follows it",
+            "give the interface a fixed address, or use ROS_HOSTNAME with a name that follows the address",
         );
     }
 
@@ -286,7 +289,7 @@ impl Findings {
             self.warn(
                 "ROS_MASTER_URI",
                 format!("{} was started with ROS_MASTER_URI={uri}", named(process)),
-                "if it is a node of this robot, start it again with the URI of this robot",
+                "if it is a node of this robot, restart it with the URI of this robot",
             );
         }
     }
@@ -298,14 +301,16 @@ impl Findings {
         for who in &behind.bypassing {
             self.warn(
                 BYPASS,
-                format!("{who} talks to the master at {uri} directly"),
+                format!("{who} talks directly to the master at {uri}"),
                 AGAIN,
             );
         }
         if behind.is_open {
             self.warn(
                 BYPASS,
-                format!("the master at {uri} takes connections from other computers, which can go past rosrescue"),
+                format!(
+                    "the master at {uri} accepts connections from other computers, past rosrescue"
+                ),
                 "start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME",
             );
         }
@@ -320,7 +325,7 @@ impl Findings {
                     host.name,
                     host.took.as_millis()
                 ),
-                "add it to /etc/hosts: every new connection waits so long",
+                "add it to /etc/hosts: every new connection waits this long",
             );
         }
     }
@@ -349,7 +354,10 @@ impl Findings {
         if !known.is_empty() && known.len() == facts.node_hosts.len() {
             self.ok(
                 "nodes",
-                format!("all registered hosts have addresses: {}", known.join(", ")),
+                format!(
+                    "all hosts of the nodes have addresses: {}",
+                    known.join(", ")
+                ),
             );
         }
     }

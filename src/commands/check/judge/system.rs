@@ -39,11 +39,11 @@ impl Findings {
             return self.bad(
                 SUBJECT,
                 format!("{path} is in use by another rosrescue{who}"),
-                "end that one, or give this one another --checkpoint",
+                "stop it, or use another --checkpoint here",
             );
         }
         if disk.is_folder {
-            return self.bad(SUBJECT, format!("{path} is a folder"), "name a file in it");
+            return self.bad(SUBJECT, format!("{path} is a folder"), "give a file in it");
         }
         let (free, is_read_only) = match &disk.space {
             Ok(space) => *space,
@@ -77,17 +77,17 @@ impl Findings {
             _ => self.ok(SUBJECT, what),
         }
         if of == "tmpfs" || of == "ramfs" {
-            let todo = "it survives crashes, not a power cut; for that choose a place on a disk";
+            let todo = "a power cut loses it: choose a place on a disk";
             self.note(SUBJECT, format!("{folder} is in memory"), todo);
         } else if of.starts_with("nfs") || of == "cifs" || of.starts_with("fuse.sshfs") {
-            let todo = "choose a place on a disk of this computer: writes wait for the network";
+            let todo = "choose a disk of this computer: otherwise writes wait for the network";
             self.warn(
                 SUBJECT,
                 format!("{folder} is on another computer ({of})"),
                 todo,
             );
         } else if source.starts_with("/dev/mmcblk") {
-            let todo = "it wears out and may stall for seconds; --sync never spares it, at the cost of what a power cut takes";
+            let todo = "cards wear out and can stall for seconds. --sync never writes less, but a power cut loses more";
             self.note(
                 SUBJECT,
                 format!("{folder} is on an SD card or eMMC ({source})"),
@@ -109,11 +109,12 @@ impl Findings {
     pub(super) fn clock(&mut self, clock: &Clock) {
         let now = clock::wall_text(clock.now);
         if clock.now < EARLIEST {
-            let todo = "set it, or wait for the network: tf drops everything when it jumps";
+            let todo =
+                "set the clock, or wait for the network: tf drops all data when the clock jumps";
             self.bad("clock", format!("says {now}"), todo);
         } else if clock.now + BEHIND_FILES < clock.newest {
             let newest = clock::wall_text(clock.newest);
-            let todo = "set it: logs and tf will be wrong";
+            let todo = "set the clock: otherwise logs and tf are wrong";
             self.warn(
                 "clock",
                 format!("says {now}, before files of {newest}"),
@@ -125,7 +126,7 @@ impl Findings {
             self.note(
                 "clock",
                 format!("says {now}; no time service runs"),
-                "fine for one computer; with several tf needs chrony or systemd-timesyncd",
+                "fine for one computer. With several, tf needs chrony or systemd-timesyncd",
             );
         }
     }
@@ -133,15 +134,15 @@ impl Findings {
     pub(super) fn ros(&mut self, facts: &Facts) {
         match &facts.rosmaster {
             None => {}
-            Some(Err(why)) => self.bad("rosmaster", why.clone(), "without it core does not start"),
+            Some(Err(why)) => self.bad("rosmaster", why.clone(), "core needs it"),
             Some(Ok(program)) => {
                 let path = program.path.display();
                 let version = program.version.as_deref().unwrap_or("of unknown version");
                 match &program.broken {
                     Some(why) => self.bad(
                         "rosmaster",
-                        format!("{path} does not run with {}: {why}", program.interpreter),
-                        "take conda, pyenv or the venv off the PATH (conda deactivate), and source \
+                        format!("{path} fails with {}: {why}", program.interpreter),
+                        "remove conda, pyenv or the venv from the PATH (conda deactivate), and source \
                          ROS's setup.bash",
                     ),
                     None => {
@@ -153,7 +154,7 @@ impl Findings {
                 }
                 if !facts.has_rosout {
                     let todo = "apt-get install rosout (ros-noetic-rosout), or --no-rosout";
-                    self.warn("rosout", "is not installed: nobody collects /rosout", todo);
+                    self.warn("rosout", "is not installed: nothing collects /rosout", todo);
                 }
             }
         }
@@ -190,8 +191,8 @@ impl Findings {
             }
             Server::Nobody | Server::Silent => self.warn(
                 "master",
-                format!("nobody answers at {uri}"),
-                "start it: on its first start proxy lets calls wait until it has seen a master",
+                format!("no answer from {uri}"),
+                "start it: at its first start, proxy lets calls wait for a master",
             ),
         }
     }
@@ -209,8 +210,8 @@ impl Findings {
         if !others.is_empty() {
             self.warn(
                 "masters",
-                format!("others run on this computer: {}", others.join(", ")),
-                "if one is forgotten, end it: nodes that use it do not see those of rosrescue",
+                format!("other masters run on this computer: {}", others.join(", ")),
+                "stop those you do not need: their nodes do not see the nodes of rosrescue",
             );
         }
     }
@@ -222,33 +223,28 @@ impl Findings {
             match (unit.kind, unit.is_enabled) {
                 (Kind::Rosrescue, true) => {
                     own += 1;
-                    self.ok("systemd", format!("{name} starts with the computer"));
+                    self.ok("systemd", format!("{name} starts at boot"));
                 }
                 (Kind::Rosrescue, false) => {
                     let todo = format!("systemctl enable {name}");
-                    self.note(
-                        "systemd",
-                        format!("{name} does not start with the computer"),
-                        todo,
-                    );
+                    self.note("systemd", format!("{name} does not start at boot"), todo);
                 }
                 (Kind::Roscore, true) if facts.proxied.is_none() => {
                     let todo = format!("systemctl disable --now {name}");
-                    let what =
-                        format!("{name} starts a master with the computer, beside rosrescue");
+                    let what = format!("{name} starts another master at boot");
                     self.bad("systemd", what, todo);
                 }
                 (Kind::Roslaunch, true) => self.warn(
                     "systemd",
-                    format!("{name} runs roslaunch, which starts a master where it finds none"),
+                    format!("{name} runs roslaunch, which starts a master if it finds none"),
                     "add --wait to its roslaunch, and After=rosrescue.service to the unit",
                 ),
                 _ => {}
             }
         }
         if own == 0 && facts.units.iter().all(|unit| unit.kind != Kind::Rosrescue) {
-            let todo = "`rosrescue install` makes one, for a robot that starts by itself";
-            self.note("systemd", "rosrescue has no unit here", todo);
+            let todo = "`rosrescue install` adds one that starts at boot";
+            self.note("systemd", "there is no rosrescue service", todo);
         }
     }
 
@@ -260,25 +256,21 @@ impl Findings {
             self.warn(
                 SUBJECT,
                 format!("{}:{} sets ROS_MASTER_URI to {}", one.file.display(), one.line, one.uri),
-                "remove this <env>, if its nodes belong to this robot: they use that master, not rosrescue",
+                "remove this <env> if its nodes belong to this robot: they use that master, not rosrescue",
             );
         }
         if count > SETTINGS_MOST {
             let what = format!("{} more set ROS_MASTER_URI", count - SETTINGS_MOST);
-            self.warn(SUBJECT, what, "repair the first ones, and check again");
+            self.warn(SUBJECT, what, "fix the first ones, then check again");
         }
         let files = launches.files;
         if launches.is_cut {
-            let todo = "check again with a ROS_PACKAGE_PATH that has the robot's own packages only";
-            self.note(
-                SUBJECT,
-                format!("{files} were read, and there are more"),
-                todo,
-            );
+            let todo = "check again with only the robot's own packages in ROS_PACKAGE_PATH";
+            self.note(SUBJECT, format!("read {files}, and there are more"), todo);
         } else if count == 0 && files > 0 {
             self.ok(
                 SUBJECT,
-                format!("{files} were read; none sets another ROS_MASTER_URI"),
+                format!("read {files}; none sets another ROS_MASTER_URI"),
             );
         }
     }
@@ -290,7 +282,7 @@ impl Findings {
             true => self.warn(
                 "memory",
                 what,
-                "end something: the kernel kills what it likes",
+                "stop something: the kernel kills a program when memory runs out",
             ),
             false => self.ok("memory", what),
         }

@@ -50,14 +50,9 @@ fn who_has_the_port() {
             });
         },
     );
-    one(
-        Problem,
-        "port",
-        "nobody can listen at 11311: denied",
-        |facts| {
-            port(facts).error = Some("denied".to_owned());
-        },
-    );
+    one(Problem, "port", "cannot listen at 11311: denied", |facts| {
+        port(facts).error = Some("denied".to_owned());
+    });
     one(
         Note,
         "port",
@@ -121,7 +116,7 @@ fn traps_of_ros_master_uri() {
     one(
         Problem,
         "ROS_MASTER_URI",
-        "has port 11312, rosrescue would serve 11311",
+        "has port 11312, but rosrescue would use 11311",
         |facts| {
             uri(facts, "http://robot:11312/");
         },
@@ -167,7 +162,7 @@ fn traps_of_ros_ip_and_ros_hostname() {
     one(
         Problem,
         "ROS_IP",
-        "127.0.0.1, which only this computer reaches, and base takes part",
+        "127.0.0.1, which other computers cannot reach, but base is part of the robot",
         |facts| {
             ip(facts, "127.0.0.1");
             facts.own = host("127.0.0.1", "127.0.0.1", true);
@@ -198,7 +193,7 @@ fn names_that_lead_nowhere_or_elsewhere() {
     one(
         Warning,
         "host name",
-        "robot is 127.0.1.1, which only this computer reaches",
+        "robot is 127.0.1.1, which other computers cannot reach",
         |facts| {
             facts.own = host("robot", "127.0.1.1", true);
         },
@@ -251,7 +246,7 @@ fn another_computer_of_the_robot() {
     one(
         Problem,
         "host name",
-        "only this computer reaches, and base takes part",
+        "other computers cannot reach, but base is part of the robot",
         |facts| {
             elsewhere(facts);
             facts.own = host("arm", "127.0.1.1", true);
@@ -322,7 +317,7 @@ fn what_goes_past_rosrescue_is_warned_of() {
     one(
         Warning,
         "unprotected",
-        "rosout (process 9) talks to the master at http://robot:11312/ directly",
+        "rosout (process 9) talks directly to the master at http://robot:11312/",
         |facts| facts.behind = behind(&["rosout (process 9)"], false),
     );
     one(

@@ -107,7 +107,7 @@ fn the_ros_that_is_installed() {
     one(
         Problem,
         "rosmaster",
-        "does not run with /usr/bin/python3: No module",
+        "fails with /usr/bin/python3: No module",
         |facts| {
             if let Some(Ok(program)) = &mut facts.rosmaster {
                 program.broken = Some("No module".to_owned());
@@ -169,14 +169,9 @@ fn units_of_systemd() {
     );
     assert_eq!(said(with(Kind::Roscore, false)), []);
     one(Note, "systemd", "no unit", |facts| facts.units.clear());
-    one(
-        Note,
-        "systemd",
-        "does not start with the computer",
-        |facts| {
-            facts.units[0].is_enabled = false;
-        },
-    );
+    one(Note, "systemd", "does not start at boot", |facts| {
+        facts.units[0].is_enabled = false;
+    });
 }
 
 #[test]
