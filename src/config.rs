@@ -146,8 +146,6 @@ pub struct SupervisedConfig {
     pub port: Option<u16>,
     /// The program; none to search for it.
     pub rosmaster: Option<PathBuf>,
-    /// Whether another one waits for its death.
-    pub spare: bool,
     /// Its notifier threads.
     pub numworkers: u32,
     /// Its socket timeout in seconds; 0 for none.
@@ -183,7 +181,6 @@ impl Config {
         let master = MasterConfig::Supervised(SupervisedConfig {
             port: args.master_port,
             rosmaster: args.rosmaster.clone(),
-            spare: args.spare_master,
             numworkers: args.numworkers,
             timeout: seconds("--timeout", args.timeout, 3600.0)?.as_secs_f64(),
             rosout: !args.no_rosout,

@@ -28,7 +28,6 @@ mod output;
 mod pid_file;
 pub(crate) mod pidfd;
 mod rosout;
-mod spare;
 mod stat;
 
 use log_config::LogConfig;
@@ -36,7 +35,6 @@ pub(crate) use orphan::{Left, is_in_our_network};
 use output::Output;
 use pid_file::PidFile;
 pub(crate) use rosout::Rosout;
-pub(crate) use spare::{Spare, interpreter};
 pub(crate) use stat::Stat;
 
 /// How long a process may take to end after SIGINT, and again after SIGTERM.
@@ -118,18 +116,10 @@ impl Rosmaster {
         free_port().map_err(spawn_error)
     }
 
-    /// Makes `spare` a master on `port` of loopback, or starts one. It outlives rosrescue: dropping the child does
-    /// not end it.
-    pub(crate) async fn start(
-        &self,
-        spare: Option<Spare>,
-        port: u16,
-    ) -> Result<Child, ProcessError> {
+    /// Starts a master on `port` of loopback. It outlives rosrescue: dropping the child does not end it.
+    pub(crate) async fn start(&self, port: u16) -> Result<Child, ProcessError> {
         self.pid_file.clear().await;
-        let child = match spare.and_then(|spare| spare.go(port)) {
-            Some(child) => child,
-            None => self.spawn(port).await?,
-        };
+        let child = self.spawn(port).await?;
         if let Some(pid) = child.id() {
             self.pid_file.write(pid, port);
         }
@@ -141,11 +131,6 @@ impl Rosmaster {
         command.arg("--core").arg("-p").arg(port.to_string());
         command.stdin(Stdio::null());
         self.output.renew().await;
-        self.spawn_as(command).await
-    }
-
-    /// Runs `command` with rosmaster's further arguments and its environment. It prints to the present output.
-    async fn spawn_as(&self, mut command: Command) -> Result<Child, ProcessError> {
         command.arg("-w").arg(self.config.numworkers.to_string());
         if self.config.timeout > 0.0 {
             command.arg("-t").arg(self.config.timeout.to_string());
@@ -188,6 +173,16 @@ pub(crate) fn find_rosmaster(given: Option<&Path>) -> Result<PathBuf, ProcessErr
         }),
         None => find_program("rosmaster", &["bin"]).ok_or(ProcessError::NoRosmaster),
     }
+}
+
+/// The interpreter and its arguments in the first line of `program`, if it is a Python script.
+pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
+    let text = std::fs::read(program).ok()?;
+    let line = text.split(|byte| *byte == b'\n').next()?;
+    let words = std::str::from_utf8(line).ok()?.strip_prefix("#!")?;
+    let words: Vec<_> = words.split_whitespace().map(str::to_owned).collect();
+    let is_python = |word: &String| word.rsplit('/').next()?.strip_prefix("python").map(drop);
+    words.last().and_then(is_python).map(|()| words)
 }
 
 /// A command that runs `python` silently with the paths of the ROS that has `program`.

@@ -21,10 +21,6 @@ impl SecondMaster {
             words.collect::<Vec<_>>()
         };
         let (mut arguments, environment) = (read("cmdline"), read("environ"));
-        if arguments[1] == "-c" {
-            // It was a spare: interpreter, program text, and only then the rosmaster.
-            arguments.drain(..3);
-        }
         let place = arguments.iter().position(|word| word == "-p");
         if let Some(place) = place {
             arguments.drain(place..place + 2);

@@ -43,9 +43,6 @@ struct Options {
     /// Kills for each number of real rospy nodes; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 3)]
     real: usize,
-    /// With a spare rosmaster
-    #[arg(long)]
-    spare: bool,
 }
 
 fn main() {
@@ -60,10 +57,7 @@ fn main() {
         .into_iter()
         .filter(|(_, kills)| *kills > 0)
         .map(|(kind, kills)| {
-            let measured = options
-                .nodes
-                .iter()
-                .map(|nodes| row(kind, *nodes, kills, options.spare));
+            let measured = options.nodes.iter().map(|nodes| row(kind, *nodes, kills));
             (kind, measured.collect())
         })
         .collect();
@@ -71,10 +65,10 @@ fn main() {
 }
 
 /// Kills the master of a robot with so many nodes again and again.
-fn row(kind: Kind, nodes: usize, kills: usize, spare: bool) -> Row {
+fn row(kind: Kind, nodes: usize, kills: usize) -> Row {
     let mut row = Row::new(nodes);
     while row.kills() < kills {
-        let mut robot = Robot::start(kind, nodes, spare);
+        let mut robot = Robot::start(kind, nodes);
         for _ in 0..KILLS_A_LIFE.min(kills - row.kills()) {
             robot.settle();
             let best = limit::measure(&robot);

@@ -82,12 +82,10 @@ pub(crate) struct Robot {
 
 impl Robot {
     /// Starts rosrescue and its nodes, and waits until all of it is there.
-    pub(crate) fn start(kind: Kind, count: usize, spare: bool) -> Self {
+    pub(crate) fn start(kind: Kind, count: usize) -> Self {
         let scratch = Scratch::new();
         let master_port = free_port();
-        let rescue = Setup::core(&scratch, master_port)
-            .args(spare.then_some("--spare-master"))
-            .start();
+        let rescue = Setup::core(&scratch, master_port).start();
         let client = rescue.client();
         eventually("`rosversion` has been asked", || {
             client.param("/rosdistro").is_some()

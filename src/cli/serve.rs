@@ -51,10 +51,6 @@ pub struct CoreArgs {
     /// The rosmaster program [default: the one on the PATH, else in /opt/ros/*/bin]
     #[arg(long, env = "ROSRESCUE_ROSMASTER", value_name = "FILE", help_heading = ADVANCED)]
     pub rosmaster: Option<PathBuf>,
-    /// Keep a second rosmaster loaded, which takes over when the first one dies. It needs 25 MB of memory
-    #[arg(long, env = "ROSRESCUE_SPARE_MASTER", hide = true)]
-    #[arg(value_parser = FalseyValueParser::new())]
-    pub spare_master: bool,
     /// Do not run rosout
     #[arg(long, env = "ROSRESCUE_NO_ROSOUT")]
     #[arg(value_parser = FalseyValueParser::new())]

@@ -102,7 +102,7 @@ fn left_for(
     serving.map(Left::Serving)
 }
 
-/// Whether the command line of the process `pid` gives `port` as rosmaster's. That of a spare does not.
+/// Whether the command line of the process `pid` gives `port` as rosmaster's.
 fn is_told(pid: u32, port: u16) -> bool {
     let command_line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     let words: Vec<_> = command_line.split(|byte| *byte == 0).collect();
@@ -223,7 +223,6 @@ mod tests {
         let config = SupervisedConfig {
             port: None,
             rosmaster: Some("/bin/sleep".into()),
-            spare: false,
             numworkers: 1,
             timeout: 0.0,
             rosout: false,

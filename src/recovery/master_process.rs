@@ -1,20 +1,14 @@
 //! The supervised rosmaster: our child, or one that an earlier rosrescue left running.
 
-use std::time::Duration;
-
-use tokio::{sync::mpsc, task::JoinHandle, time::Instant};
+use tokio::sync::mpsc;
 
 use crate::{
     ledger::Ledger,
     limit::{Pair, alarm, all_clear, rarely},
-    process::{self, Left, ProcessError, Rosmaster, Spare},
+    process::{self, Left, ProcessError, Rosmaster},
     ros_env::MasterUri,
     upstream::Upstream,
-    wait,
 };
-
-/// A spare is started so long after a master: a recovery and the health check need the processor.
-const SPARE_AFTER: Duration = Duration::from_secs(2);
 
 /// That the master has ended or is killed, and that one is started.
 static ENDED: Pair = Pair::new();
@@ -35,11 +29,6 @@ pub(crate) struct MasterProcess {
     /// Our child, until it is called for the first time.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
-    spare: Option<Spare>,
-    /// When to start one.
-    spare_at: Option<Instant>,
-    /// The one that is being started.
-    coming_spare: Option<JoinHandle<Option<Spare>>>,
     /// How the last master ended, until it is reported.
     end: Option<String>,
     /// Whether the present one was killed by us.
@@ -57,9 +46,6 @@ impl MasterProcess {
             starting: None,
             new: None,
             ends: mpsc::channel(4),
-            spare: None,
-            spare_at: None,
-            coming_spare: None,
             end: None,
             killed: false,
         };
@@ -68,7 +54,6 @@ impl MasterProcess {
             Some(Left::Serving(pid)) => {
                 tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
                 this.current = Some(pid);
-                this.spare_at = Some(Instant::now() + SPARE_AFTER);
                 pid
             }
             Some(Left::Starting(pid)) => {
@@ -119,7 +104,6 @@ impl MasterProcess {
             None => self.start(ledger, upstream).await?,
         };
         self.current = Some(pid);
-        self.spare_at = Some(Instant::now() + SPARE_AFTER);
         Ok(())
     }
 
@@ -136,7 +120,7 @@ impl MasterProcess {
             // Recorded before it runs: if rosrescue dies now, the next one can find the master.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
-        let mut child = self.rosmaster.start(self.spare.take(), port).await?;
+        let mut child = self.rosmaster.start(port).await?;
         let pid = child.id().unwrap_or_default();
         all_clear!(info, ENDED, pid, port, "started rosmaster");
         self.watch(pid, async move {
@@ -180,22 +164,7 @@ impl MasterProcess {
 
     /// Returns when the master has ended. Cancel safe.
     pub(crate) async fn exited(&mut self) {
-        let how = loop {
-            let spare_at = self.spare_at;
-            tokio::select! {
-                how = gone(&mut self.ends.1, self.current) => break how,
-                () = wait::until(spare_at) => {
-                    self.spare_at = None;
-                    let rosmaster = self.rosmaster.clone();
-                    let coming = async move { rosmaster.spawn_spare().await };
-                    self.coming_spare = Some(tokio::spawn(coming));
-                }
-                spare = wait::for_some(self.coming_spare.as_mut()) => {
-                    self.coming_spare = None;
-                    self.spare = spare.ok().flatten();
-                }
-            }
-        };
+        let how = gone(&mut self.ends.1, self.current).await;
         let how = match std::mem::take(&mut self.killed) {
             true => format!("{how}, sent by rosrescue"),
             false => how,
@@ -225,9 +194,6 @@ impl MasterProcess {
 
     /// Stops the master in order.
     pub(crate) async fn stop(mut self) {
-        self.spare = None;
-        // One that is starting is ended, too.
-        self.coming_spare = None;
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
             process::stop(pid, gone(&mut self.ends.1, self.current)).await;
@@ -236,8 +202,6 @@ impl MasterProcess {
 
     /// Ends the master at once, so that it notifies no node any more. Returns when it is gone.
     pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
-        self.spare = None;
-        self.coming_spare = None;
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
             process::signal_process(pid, rustix::process::Signal::KILL);

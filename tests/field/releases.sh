@@ -92,7 +92,7 @@ for name; do
     begin=$(date +%s)
     # shellcheck disable=SC2086 # words are what is wanted
     run "$release" $force env $unordered ROSRESCUE_AWAY_SECONDS=60 \
-        "$(program robot)" --test-threads 2 --show-output paper:: outage::long master::hung recovery::spare_master \
+        "$(program robot)" --test-threads 2 --show-output paper:: outage::long master::hung \
         >"$log" 2>&1 || status=1
     # shellcheck disable=SC2086 # words are what is wanted
     run "$release" $force env $unordered \
@@ -109,7 +109,7 @@ for name; do
         "$(echo "${release%-*}" | sed 's/./\u&/') ${release#*-}, ${http%,}$(test -z "$force" || echo ' forced')" \
         "$version" "$python" \
         "$(count "$log" 'paper::cases|paper::case_2')" "$(count "$log" 'paper::case_3')" \
-        "$(count "$log" 'outage::long')" "$(count "$log" 'master::hung')" "$(count "$log" 'recovery::spare_master')" \
+        "$(count "$log" 'outage::long')" "$(count "$log" 'master::hung')" "–" \
         "0 of $(messages "$log")" "$(differences "$log.differential")" "$(date +%F)"
     echo "$name: $(grep '^test result' "$log"); $(($(date +%s) - begin)) s"
 done

@@ -64,7 +64,6 @@ mod recovery {
     mod liveness;
     mod no_shutdown;
     mod reconciliation;
-    mod spare_master;
     mod taken_port;
     mod two_robots;
     mod unreachable;

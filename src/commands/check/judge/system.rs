@@ -20,7 +20,7 @@ const NO_INODES: u64 = 10;
 /// With fewer open files connections of clients become scarce; with fewer still rosrescue hardly works.
 const FEW_FILES: u64 = 4096;
 const TOO_FEW_FILES: u64 = 256;
-/// A rosmaster and rosrescue with a spare take some 60 MB.
+/// rosmaster and rosrescue take some 40 MB.
 const LITTLE_MEMORY: u64 = 200 << 20;
 /// More settings in launch files than this hide the other findings.
 const SETTINGS_MOST: usize = 10;
