@@ -312,6 +312,7 @@ function showRescues() {
   }
   $("rescues-list").replaceChildren(...rows);
   $("rescues-none").hidden = rows.length > 0;
+  say("rescues-none", "None needed so far.");
   $("rescues-key").hidden = rows.length === 0;
   say("rescues-count", status?.rescues ? `${status.rescues} since the start` : "");
 }
