@@ -28,12 +28,7 @@ use serde::Serialize;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
-use self::{
-    events::Feed,
-    params::Members,
-    robot::Robot,
-    status::Rate,
-};
+use self::{events::Feed, params::Members, robot::Robot, status::Rate};
 use super::{
     Server,
     clients::Clients,
