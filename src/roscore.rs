@@ -117,7 +117,7 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
     if version.is_none() {
         tracing::warn!(
-            "the parameter {key} is not set: `rosversion {argument}` gave no answer; set it, if a node needs it"
+            "the parameter {key} is not set: `rosversion {argument}` did not answer; set it yourself if a node needs it"
         );
     }
     version.map(|version| set(key, &version))
@@ -130,7 +130,7 @@ static ENDED: Pair = Pair::new();
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!(
-            "no rosout is installed, so /rosout is not collected: apt-get install rosout, or --no-rosout"
+            "rosout is not installed, so /rosout is not collected; run `apt-get install rosout`, or use --no-rosout"
         );
         return;
     };
@@ -158,11 +158,11 @@ async fn keep_rosout(roscore: &Roscore) {
                         pid,
                         how,
                         last_words,
-                        "rosout has ended, and is started again"
+                        "rosout has ended and is restarted"
                     );
                 }
                 Err(error) => {
-                    alarm!(warn, ENDED, %error, "cannot start rosout, and tries again; /rosout is not collected meanwhile")
+                    alarm!(warn, ENDED, %error, "cannot start rosout; retrying; /rosout is not collected meanwhile")
                 }
             },
         }

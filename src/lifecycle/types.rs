@@ -115,7 +115,7 @@ impl Cause {
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
             Self::Late => "the master answered late",
-            Self::Stopping => "rosrescue stops",
+            Self::Stopping => "rosrescue is stopping",
         }
     }
 }

@@ -67,7 +67,7 @@ impl Output {
             warn,
             file = %self.path.display(),
             error,
-            "cannot create the file for a process's output; the process starts without it"
+            "cannot create the output file of a child process; it starts without one"
         );
     }
 

@@ -45,7 +45,7 @@ impl Script {
     }
 }
 
-const STARVED: Action = Action::Spare("it gets too little of the processor");
+const STARVED: Action = Action::Spare("it gets too little CPU time");
 const BUSY: Action = Action::Spare("it is busy");
 
 #[test]

@@ -389,7 +389,7 @@ fn no_other_computer_shuts_the_master_down() {
     eventually("the master has tried", || {
         let log = rescue.output();
         log.iter()
-            .any(|line| line.contains("registered at our address"))
+            .any(|line| line.contains("registered at rosrescue's address"))
     });
     // And everything else passes.
     let body = encode_call("setParam", params!["/far", "/far", 1]);

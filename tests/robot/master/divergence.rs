@@ -40,7 +40,7 @@ fn a_refusal_that_the_mirror_did_not_expect_is_believed() {
     let reply = client.call("deleteParam", params!["/n", "/a"]).unwrap();
     assert_eq!(code(&reply), Some(-1));
     assert_eq!(divergences(&client), 1);
-    eventually("the mirror is made anew", || mirrored(&client) == 0);
+    eventually("the mirror is rebuilt", || mirrored(&client) == 0);
     robot.crash_master();
     assert_eq!(client.param("/a"), None);
     assert_eq!(client.param("/b"), None);

@@ -242,8 +242,8 @@ fn workers_that_have_served_are_started_again_at_once_however_many_die() {
     worker_after(&scratch, dead);
     assert!(client.master_pid().is_some());
     let said = rescue.stderr().join("\n");
-    assert_eq!(said.matches("started at once").count(), 5, "{said}");
-    assert_eq!(said.matches("again and again").count(), 3, "{said}");
+    assert_eq!(said.matches("restarting it at once").count(), 5, "{said}");
+    assert_eq!(said.matches("the worker keeps dying").count(), 3, "{said}");
     assert_eq!(said.matches("pause=0ns").count(), 3, "{said}");
 }
 
@@ -265,7 +265,7 @@ fn a_guardian_that_is_stopped_does_not_count_as_one() {
     let mut rescue = setup.guarded().start();
     let client = rescue.client();
     let by = || status(&client)["guarded_by"].as_str().unwrap().to_owned();
-    assert!(by().contains("which nothing starts again"), "{}", by());
+    assert!(by().contains("which nothing restarts"), "{}", by());
     crate::support::stop(rescue.pid());
     rescue.wait_line("that it is stopped", |line| line.contains("unguarded"));
     assert_eq!(status(&client)["guarded"], false);
@@ -311,7 +311,7 @@ fn an_orderly_stop_ends_everything() {
         assert_eq!(rescue.wait().code(), Some(0), "{signals:?}");
         assert_eq!(scratch.survivors(), vec![], "{signals:?}");
         let said = rescue.stderr().join("\n");
-        assert!(said.contains("closed in order"), "{said}");
+        assert!(said.contains("stopped cleanly"), "{said}");
         assert!(!said.contains("unguarded"), "{said}");
     }
 }
@@ -389,7 +389,7 @@ fn errors_of_the_start_are_said_once_and_end_it() {
         (
             &["core", "-p", &free, "--rosmaster", "/nonexistent"],
             1,
-            "is not a program that can be run",
+            "is not an executable program",
         ),
         (
             &["proxy", "--master", "m:1"],
@@ -425,8 +425,8 @@ fn a_worker_outlives_its_guardian_and_says_so() {
     assert!(page["guarded_by"].as_str().unwrap().contains("has ended"));
     signal(worker, Signal::TERM);
     eventually("it ends", || !alive(worker));
-    eventually("that it has been closed in order", || {
-        rescue.stderr().join("\n").contains("closed in order")
+    eventually("that it has been stopped cleanly", || {
+        rescue.stderr().join("\n").contains("stopped cleanly")
     });
 }
 

@@ -11,7 +11,7 @@ use crate::ros_env;
 
 /// A name that takes longer to look up delays every call to its node.
 const SLOW: u128 = 1000;
-/// Of what goes past rosrescue.
+/// Of what bypasses rosrescue.
 const BYPASS: &str = "unprotected";
 const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 

@@ -220,7 +220,7 @@ fn another_computer_of_the_robot() {
         facts.master_host = Some(host("base", "10.0.0.9", false));
         facts.elsewhere = Some(rosrescue(None));
         facts.elsewhere_host = Some(host("base", "10.0.0.9", false));
-        facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+        facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
         facts.disk.refused = Some("denied".to_owned());
         facts.units.clear();
     };

@@ -99,9 +99,9 @@ fn the_ros_that_is_installed() {
     one(
         Problem,
         "rosmaster",
-        "no rosmaster is on the PATH",
+        "there is no rosmaster on the PATH",
         |facts| {
-            facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+            facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
         },
     );
     one(
