@@ -76,7 +76,7 @@ pub enum RunError {
         "--master {master} leads back to this rosrescue: give the address of the real rosmaster, and serve another address with --listen"
     )]
     Loop { master: MasterUri },
-    /// Two computers have the same name. They would depose each other for ever.
+    /// Two computers have the same name. They would depose each other forever.
     #[error(
         "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give this one a unique name with --cluster-name"
     )]

@@ -32,7 +32,7 @@ mod rosout;
 mod stat;
 
 use log_config::LogConfig;
-pub(crate) use orphan::{Left, is_in_our_network};
+pub(crate) use orphan::{Orphan, is_in_our_network};
 use output::Output;
 use pid_file::PidFile;
 pub(crate) use rosout::Rosout;

@@ -136,7 +136,7 @@ impl Driver {
     /// Lets the mirror stand in, if it may, and returns the first actions. `restored` tells whether
     /// the mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
-        let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
+        let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
         let actions = self
             .lifecycle
             .on(Instant::now(), Input::Start { left, restored });

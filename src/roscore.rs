@@ -139,7 +139,7 @@ async fn keep_rosout(roscore: &Roscore) {
         let start = Instant::now();
         match living_rosout(roscore)
             .await
-            .or_else(|| block_in_place(|| rosout.left_behind()))
+            .or_else(|| block_in_place(|| rosout.find_orphan()))
         {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
@@ -194,7 +194,7 @@ async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
         // There may be an orphan that has not been found yet.
         0 => Rosout::find(&roscore.checkpoint)
-            .and_then(|rosout| block_in_place(|| rosout.left_behind())),
+            .and_then(|rosout| block_in_place(|| rosout.find_orphan())),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };

@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
     }
 
-    /// A start that is busy for five seconds and then waits for ever.
+    /// A start that is busy for five seconds and then waits forever.
     #[test]
     fn progress_of_long_ago_does_not_count() {
         let start = Instant::now();

@@ -33,7 +33,7 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 
 /// A rosmaster that an earlier rosrescue left running.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Left {
+pub(crate) enum Orphan {
     /// It listens at the expected port.
     Serving(u32),
     /// It was started for that port and does not listen yet, so it is still empty.
@@ -44,7 +44,7 @@ impl Rosmaster {
     /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`,
     /// and kills its other rosmasters, which are of no use. Blocks for long if all processes must
     /// be searched.
-    pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<Left> {
+    pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
         let owner = owner(&self.checkpoint);
         let last = self.pid_file.last();
         let all = match last {
@@ -61,9 +61,9 @@ impl Rosmaster {
             _ => is_told(pid, port),
         };
         if let Some(port) = port
-            && let Some(left) = left_for(port, &all, &owner, is_told)
+            && let Some(left) = choose(port, &all, &owner, is_told)
         {
-            let (Left::Serving(pid) | Left::Starting(pid)) = left;
+            let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
             self.pid_file.record(pid, port);
             return Some(left);
         }
@@ -84,17 +84,17 @@ impl Rosmaster {
 /// port is taken never listens. `is_told` tells whether a process was given a port. If none of
 /// `all` listens, another process of `owner` may, because a program given by `--rosmaster` may
 /// start another one.
-fn left_for(
+fn choose(
     port: u16,
     all: &[u32],
     owner: &OsStr,
     is_told: impl Fn(u32, u16) -> bool,
-) -> Option<Left> {
+) -> Option<Orphan> {
     let sockets = listeners::sockets(port);
     let mut known = all.iter().copied();
     if sockets.is_empty() {
         let starting = known.find(|pid| is_told(*pid, port));
-        return starting.map(Left::Starting);
+        return starting.map(Orphan::Starting);
     }
     let serving = known
         .find(|pid| listeners::holds_one(*pid, &sockets))
@@ -102,7 +102,7 @@ fn left_for(
             let mut others = listeners::at(port).into_iter();
             others.find(|pid| is_orphan(*pid, owner))
         });
-    serving.map(Left::Serving)
+    serving.map(Orphan::Serving)
 }
 
 /// Whether the command line of the process `pid` gives `port` as rosmaster's.
@@ -237,14 +237,14 @@ mod tests {
         rosmaster.pid_file.record(ended.id(), 1);
         ended.kill().unwrap();
         ended.wait().unwrap();
-        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
         assert!(Stat::of(orphan).is_some_and(Stat::is_alive), "not found");
 
         rosmaster.pid_file.record(orphan, 1);
-        let starting = Some(Left::Starting(orphan));
-        assert_eq!(rosmaster.left_behind(Some(1)), starting);
+        let starting = Some(Orphan::Starting(orphan));
+        assert_eq!(rosmaster.claim_orphan(Some(1)), starting);
         rosmaster.pid_file.remove();
-        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
         while Stat::of(orphan).is_some_and(Stat::is_alive) {
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -262,12 +262,12 @@ mod tests {
             .unwrap();
         let own = std::process::id();
         let pid = starting.id();
-        let left_for = |port, all: &[u32]| left_for(port, all, OsStr::new("nothing"), is_told);
-        assert_eq!(left_for(port, &[pid, own]), Some(Left::Serving(own)));
-        assert_eq!(left_for(port, &[pid]), None, "its port is taken");
+        let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), is_told);
+        assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
+        assert_eq!(choose(port, &[pid]), None, "its port is taken");
         drop(listener);
-        assert_eq!(left_for(port, &[own, pid]), Some(Left::Starting(pid)));
-        assert_eq!(left_for(1, &[own, pid]), None, "it is for another port");
+        assert_eq!(choose(port, &[own, pid]), Some(Orphan::Starting(pid)));
+        assert_eq!(choose(1, &[own, pid]), None, "it is for another port");
         starting.kill().unwrap();
         starting.wait().unwrap();
     }

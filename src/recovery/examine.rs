@@ -270,7 +270,7 @@ impl Examiner {
         tracing::debug!(
             writes = count,
             ?verdict,
-            "the master has caught up with the mirror with the mirror with the mirror with the mirror"
+            "the master has caught up with the mirror"
         );
         if verdict.is_ok() {
             self.ledger.delivered();

@@ -6,7 +6,7 @@ use tokio::sync::mpsc;
 use crate::{
     ledger::Ledger,
     limit::{Pair, alarm, all_clear, rarely},
-    process::{self, Left, ProcessError, Rosmaster},
+    process::{self, Orphan, ProcessError, Rosmaster},
     ros_env::MasterUri,
     upstream::Upstream,
 };
@@ -40,7 +40,7 @@ pub(crate) struct MasterProcess {
 impl MasterProcess {
     /// Starts masters with `rosmaster`. The last one was at `port`; `left` is what still runs of an
     /// earlier rosrescue.
-    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Left>) -> Self {
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Orphan>) -> Self {
         let mut this = Self {
             rosmaster,
             port,
@@ -53,12 +53,12 @@ impl MasterProcess {
         };
         let pid = match left {
             None => return this,
-            Some(Left::Serving(pid)) => {
+            Some(Orphan::Serving(pid)) => {
                 tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
                 this.current = Some(pid);
                 pid
             }
-            Some(Left::Starting(pid)) => {
+            Some(Orphan::Starting(pid)) => {
                 tracing::info!(
                     pid,
                     port,
@@ -81,7 +81,7 @@ impl MasterProcess {
     }
 
     /// Whether a master of an earlier rosrescue is running that may hold a state.
-    pub(crate) fn is_left(&self) -> bool {
+    pub(crate) fn is_orphan(&self) -> bool {
         self.current.is_some()
     }
 

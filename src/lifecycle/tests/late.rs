@@ -199,7 +199,7 @@ fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
         actions
     };
     assert_eq!(refuse(&mut script, Does::Work, 120), []);
-    // Then it waits for ever.
+    // Then it waits forever.
     let actions = refuse(&mut script, Does::Nothing, 2);
     assert_eq!(actions.first(), Some(&Action::Kill));
     script.feed(Input::Exited, &[Action::Spawn]);
