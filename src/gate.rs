@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn the_count_starts_anew_after_an_opening() {
+    async fn the_count_restarts_after_an_opening() {
         let (tx, mut rx) = gate();
         let start = Instant::now();
         let opener = async {

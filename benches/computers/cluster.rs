@@ -279,7 +279,7 @@ impl Cluster {
     }
 
     /// How often this computer has said that it is cut off.
-    pub(crate) fn times_alone(&self, index: usize) -> usize {
+    pub(crate) fn times_cut_off(&self, index: usize) -> usize {
         let lines = self.computers[index].rescue.output().into_iter();
         lines.filter(|line| line.contains("ALONE:")).count()
     }

@@ -31,7 +31,7 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// Whether the disk still owes an answer. It is not asked again before it has answered.
+    /// Whether the disk still owes an answer. Before that it gets no other work.
     asked: AtomicBool,
 }
 

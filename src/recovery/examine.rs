@@ -453,7 +453,7 @@ impl Examiner {
                 mismatches = ?examination.mismatches,
                 "the master does not hold what was restored to it; restoring again; please report this line"
             );
-            // What the master holds wins over what was expected; the rest is tried again.
+            // What the master holds wins over what was expected; the rest is retried.
             let first = self.first_look(connection).await?;
             let found = inspect::second(first, connection, plan.expected());
             let found = self.while_alive(found).await?;

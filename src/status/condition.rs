@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_past_rosrescue_is_not_protected() {
+    fn changes_that_bypass_rosrescue_are_not_protected() {
         let mut facts = Facts::new(Mode::Proxy);
         facts.bypassing = vec!["rosout (process 7)".to_owned()];
         let condition = of(OPEN, None, &facts);

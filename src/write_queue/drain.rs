@@ -28,7 +28,7 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Pause before an unsent batch is tried again while the gate stays open.
+/// Pause before an unsent batch is retried while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// How long a batch may continue after the gate has shut, before the mirror answers it. A killed
 /// master closes its connections within milliseconds; a master that only closed an idle connection

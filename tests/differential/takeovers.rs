@@ -40,7 +40,7 @@ pub(crate) fn script(seed: u64, calls: usize, takeovers: usize, nodes: usize) ->
     script
 }
 
-/// How a computer ceases to lead.
+/// How a computer stops leading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum End {
     /// It dies, and is switched on again at once.

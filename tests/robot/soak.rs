@@ -249,7 +249,7 @@ impl Writer {
         })
     }
 
-    fn begin_anew(&self, state: Own) {
+    fn restart_from(&self, state: Own) {
         *lock(&self.past) = Past {
             states: vec![state],
             ..Past::default()
@@ -359,7 +359,7 @@ impl Stage<'_> {
         }
         for writer in self.writers {
             let state = writer.state();
-            writer.begin_anew(state);
+            writer.restart_from(state);
         }
         self.count("silences");
         self.note_what_is_owed();
@@ -382,7 +382,7 @@ impl Stage<'_> {
             if found != writer.state() {
                 self.count("states that went back");
             }
-            writer.begin_anew(found);
+            writer.restart_from(found);
         }
         self.note_what_is_owed();
         self.go_on();

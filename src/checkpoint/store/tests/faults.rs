@@ -209,7 +209,7 @@ fn a_file_that_would_become_too_large_is_begun_anew() {
     assert_eq!(state(&open(&fs).unwrap().1.unwrap()), [1, 2]);
 }
 
-/// The previous generation gives way, the present one does not.
+/// The previous generation is dropped, the present one is not.
 #[test]
 fn a_full_disk_has_room_for_what_replaces_the_previous_generation() {
     let fs = SimFs::default();

@@ -309,7 +309,7 @@ impl Findings {
             self.warn(
                 BYPASS,
                 format!(
-                    "the master at {uri} accepts connections from other computers, past rosrescue"
+                    "the master at {uri} accepts connections from other computers, which can bypass rosrescue"
                 ),
                 "start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME",
             );

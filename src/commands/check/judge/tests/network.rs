@@ -306,7 +306,7 @@ fn addresses_that_may_change_and_nodes_of_another_master() {
 }
 
 #[test]
-fn what_goes_past_rosrescue_is_warned_of() {
+fn clients_that_bypass_rosrescue_are_reported() {
     let behind = |bypassing: &[&str], is_open| {
         Some(Behind {
             uri: MasterUri::parse("http://robot:11312").unwrap(),
