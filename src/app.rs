@@ -63,7 +63,7 @@ const REPORTS: Duration = Duration::from_secs(1);
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
-    #[error("cannot serve a socket: {0}")]
+    #[error("cannot serve a listening socket: {0}")]
     Listen(#[from] io::Error),
     /// The checkpoint cannot be used.
     #[error(transparent)]
@@ -73,14 +73,12 @@ pub enum RunError {
     Supervisor(#[from] ProcessError),
     /// The master's address leads back to this rosrescue.
     #[error(
-        "--master {master} is this rosrescue itself: give the address of the real rosmaster, and \
-         serve another one with --listen"
+        "--master {master} leads back to this rosrescue: give the address of the real rosmaster, and serve another address with --listen"
     )]
     Loop { master: MasterUri },
-    /// Two computers have the same name. They would depose each other for ever.
+    /// Two computers have the same name. They would depose each other forever.
     #[error(
-        "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give \
-         this one a name of its own with --cluster-name"
+        "another computer of this robot has the same name, `{name}`: it is at {uri}, this one is at {own}. Give this one a unique name with --cluster-name"
     )]
     Namesake {
         name: String,
@@ -90,7 +88,7 @@ pub enum RunError {
     /// Two computers have the same name and the same address.
     #[error(
         "another computer of this robot has the same name, `{name}`, and the same address, {uri}. Set ROS_IP on \
-         each computer to its own address; a name that is given with --cluster-name must be its own, too"
+         each computer to its own address; a name given with --cluster-name must be unique, too"
     )]
     Double { name: String, uri: String },
     /// The etcd options cannot be used.
@@ -428,14 +426,12 @@ async fn close(ledger: Arc<Ledger>) {
     match tokio::time::timeout(DISK_PATIENCE, closed).await {
         Ok(Some(Err(error))) => tracing::error!(
             %error,
-            "stopped, but the closing checkpoint could not be written: the next start takes this for \
-             a crash; free or repair the disk"
+            "stopped, but could not write the closing checkpoint: the next start treats this as a crash; free space on the disk or repair it"
         ),
-        Ok(Some(Ok(()))) => tracing::info!("closed in order"),
-        Ok(None) if !has_store => tracing::info!("closed in order"),
+        Ok(Some(Ok(()))) => tracing::info!("stopped cleanly"),
+        Ok(None) if !has_store => tracing::info!("stopped cleanly"),
         Ok(None) | Err(_) => tracing::error!(
-            "stopped without a closing checkpoint: the disk has not answered for {DISK_PATIENCE:?}. The next start \
-             takes this for a crash; repair the disk"
+            "stopped without a closing checkpoint: the disk has not answered for {DISK_PATIENCE:?}. The next start treats this as a crash; repair the disk"
         ),
     }
 }

@@ -24,13 +24,14 @@ mod files;
 use self::addresses::{advertised_host, listen_addresses, parse_address};
 pub use self::cluster::{ClusterConfig, ClusterError, ClusterSync, WhenCutOff};
 
-/// Name of the checkpoint in the log folder; the paper's tool uses it too. That of port 11311 only.
+/// Name of the checkpoint of port 11311 in the log folder. The tool of the ROS Rescue paper uses
+/// the same name.
 pub(crate) const CHECKPOINT_NAME: &str = "latest-chkpt.yaml";
 
 /// Shortest pause between two probes.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(10);
 
-/// A command line that is well formed but makes no sense. Exit status 2.
+/// A command line that parses but makes no sense. The exit status is 2.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum UsageError {
@@ -62,29 +63,29 @@ pub enum UsageError {
         given: f64,
         most: f64,
     },
-    /// Proxy and master would have the same port on loopback.
+    /// rosrescue and its master would have the same port on loopback.
     #[error("--master-port {port} is the port that nodes use: the real master needs another one")]
     SamePort { port: u16 },
-    /// Options of several computers do not fit together.
+    /// The cluster options do not fit together.
     #[error(transparent)]
     Cluster(#[from] ClusterError),
 }
 
-/// The configuration of rosrescue.
+/// The configuration of `rosrescue core` and `rosrescue proxy`.
 #[derive(Clone, Debug)]
 pub struct Config {
-    /// The addresses to serve. The first is required, the others are served if possible.
+    /// Addresses to serve. The first is required; the others are served if possible.
     pub listen: Vec<SocketAddr>,
-    /// The `ROS_MASTER_URI` for others.
+    /// The `ROS_MASTER_URI` announced to others.
     pub advertised: MasterUri,
     pub master: MasterConfig,
     pub checkpoint: PathBuf,
     /// Whether the user chose the checkpoint. Otherwise its name follows the served port.
     pub checkpoint_is_given: bool,
     pub restore: Restore,
-    /// Most space for the checkpoints that are kept, in bytes.
+    /// Most space for kept checkpoints, in bytes.
     pub history: u64,
-    /// When the journal is synced.
+    /// When the journal is synced to the disk.
     pub sync: SyncPolicy,
     /// Pause between two syncs with [`SyncPolicy::Interval`].
     pub sync_interval: Duration,
@@ -96,26 +97,26 @@ pub struct Config {
     pub probe_timeout: Duration,
     /// How long a node may take to answer the health check.
     pub node_timeout: Duration,
-    /// Pause between two health checks while all is well; none to disable them, and the eviction of nodes
-    /// whose ports other nodes register.
+    /// Pause between two health checks while all is well. None disables them, and also the eviction
+    /// of nodes whose port another node registers.
     pub reap_interval: Option<Duration>,
-    /// Who may call; none: everybody.
+    /// Networks that may call; none allows everybody.
     pub allow: Vec<IpNet>,
-    /// Who may change anything; none: everybody who may call.
+    /// Networks that may change state; none allows everybody who may call.
     pub allow_write: Vec<IpNet>,
-    /// Pause between two comparisons of the mirror with the master; none to disable them.
+    /// Pause between two comparisons of the mirror with the master; none disables them.
     pub resync_interval: Option<Duration>,
-    /// Who answers reads while there is a master.
+    /// Whether the mirror or the master answers reads while there is a master.
     pub reads: Reads,
     /// Most connections to the master for reads.
     pub master_connections: usize,
-    /// Most connections of clients.
+    /// Most connections from clients.
     pub max_connections: usize,
     /// Largest request body in bytes.
     pub max_body: usize,
-    /// Whose values the page does not show.
+    /// Which parameters' values the page hides.
     pub hide: Hide,
-    /// Several computers, of which one leads; none for this one alone.
+    /// The cluster of several computers; none for a single one.
     pub cluster: Option<ClusterConfig>,
 }
 
@@ -124,12 +125,13 @@ pub struct Config {
 pub enum MasterConfig {
     /// An external master at this address.
     External(MasterUri),
-    /// rosrescue runs it.
+    /// A master that rosrescue runs.
     Supervised(SupervisedConfig),
 }
 
 impl MasterConfig {
-    /// How long a connection to it may be idle, if known: the watched connection is renewed with each probe.
+    /// How long a connection to the master may stay idle, if known. The watched connection is
+    /// renewed with each probe.
     fn idle_limit(&self) -> Option<Duration> {
         let Self::Supervised(supervised) = self else {
             return None;
@@ -139,24 +141,25 @@ impl MasterConfig {
     }
 }
 
-/// How to run a rosmaster and rosout.
+/// How to run rosmaster and rosout.
 #[derive(Clone, Debug)]
 pub struct SupervisedConfig {
-    /// Its port; none for a free one.
+    /// The master's port; none for a free one.
     pub port: Option<u16>,
-    /// The program; none to search for it.
+    /// The rosmaster program; none to search for it.
     pub rosmaster: Option<PathBuf>,
-    /// Its notifier threads.
+    /// Number of notifier threads of the master.
     pub numworkers: u32,
-    /// Its socket timeout in seconds; 0 for none.
+    /// Socket timeout of the master in seconds; 0 for none.
     pub timeout: f64,
     pub rosout: bool,
-    /// The folder for its log, and for the log configuration that rosrescue writes for it.
+    /// Folder for the master's log and the log configuration that rosrescue writes for it.
     pub log_dir: PathBuf,
 }
 
 impl Config {
-    /// The configuration of `rosrescue core` with `args` in the environment `env` on the computer `hostname`.
+    /// The configuration of `rosrescue core` with `args` in the environment `env` on the computer
+    /// `hostname`.
     pub fn core(
         args: &CoreArgs,
         env: Lookup<'_>,
@@ -194,7 +197,7 @@ impl Config {
         Ok(Self { cluster, ..config })
     }
 
-    /// As [`Self::core`], for `rosrescue proxy`.
+    /// Like [`Self::core`], for `rosrescue proxy`.
     pub fn proxy(
         args: &ProxyArgs,
         env: Lookup<'_>,
@@ -224,7 +227,7 @@ impl Config {
         }
     }
 
-    /// Nodes reach rosrescue at `port`: the system may have chosen it.
+    /// Adapts the configuration to the served `port`, which the system may have chosen.
     pub fn serve_on(&mut self, port: u16) {
         self.advertised.port = port;
         if !self.checkpoint_is_given {
@@ -265,7 +268,7 @@ impl Config {
             interval.min((limit / 2).max(SHORTEST_INTERVAL))
         });
         let reads = args.reads.unwrap_or(match master {
-            // Nobody else knows the master's port.
+            // Only rosrescue knows the port of its own master, so nobody can change it directly.
             MasterConfig::Supervised(_) => Reads::Mirror,
             MasterConfig::External(_) => Reads::Master,
         });
@@ -289,7 +292,7 @@ impl Config {
                 interval,
                 count: args.probe_count,
                 patience: Duration::from_millis(args.stand_in_after),
-                // Only masters of our own are started.
+                // `proxy` starts no master, so no start can take too long.
                 start_limit: Duration::MAX,
             },
             probe_timeout: Duration::from_millis(args.probe_timeout),
@@ -317,7 +320,7 @@ impl Config {
     }
 }
 
-/// The checkpoint of the rosrescue at `port`: `given` on the command line, or the default.
+/// Path of the checkpoint of the rosrescue at `port`: `given` on the command line, or the default.
 pub(crate) fn checkpoint_path(given: Option<&Path>, port: u16, env: Lookup<'_>) -> PathBuf {
     given.map_or_else(
         || ros_env::log_dir(env).join(checkpoint_name(port)),
@@ -325,7 +328,7 @@ pub(crate) fn checkpoint_path(given: Option<&Path>, port: u16, env: Lookup<'_>) 
     )
 }
 
-/// Each port has a checkpoint of its own.
+/// Name of the default checkpoint of this port.
 fn checkpoint_name(port: u16) -> String {
     match port {
         ros_env::DEFAULT_MASTER_PORT => CHECKPOINT_NAME.to_owned(),
@@ -421,7 +424,7 @@ mod tests {
         let proxy = ["proxy", "--master", "http://m:1"];
         let proxy = config(&[&proxy[..], &given].concat()).unwrap().advertised;
         assert_eq!(proxy.to_string(), "http://127.0.0.3:4000/");
-        // A word of the environment comes first: there may be a NAT before us.
+        // The environment comes first, because a NAT may be in front of this computer.
         let cli = Cli::parse_from(["rosrescue", "--listen", "192.0.2.2", "-p", "1"]);
         let env = |name: &str| (name == "ROS_IP").then(|| "10.0.0.7".to_owned());
         let config = Config::core(&cli.core, &env, "robot", None).unwrap();

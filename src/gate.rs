@@ -1,8 +1,9 @@
-//! Whether calls pass to the master. Any task may read and wait; the only [`Tx`] is the recovery's.
+//! The gate: whether calls pass to the master. Any task may read it and wait for it; only the recovery holds the
+//! [`Tx`].
 //!
 //! `Driver::keep_shut` sets [`State::StandingIn`] and [`State::Unknown`], the driver [`State::Late`],
-//! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets [`State::Open`], and `app::cluster`, between the recoveries of
-//! two reigns, [`State::Elsewhere`].
+//! `Examiner::inject` and `Examiner::catch_up` set [`State::Injecting`], `Examiner::open_gate` sets
+//! [`State::Open`]. Between two of this computer's terms as leader, `app::cluster` sets [`State::Elsewhere`].
 
 use std::time::Duration;
 
@@ -166,7 +167,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn the_count_starts_anew_after_an_opening() {
+    async fn the_count_restarts_after_an_opening() {
         let (tx, mut rx) = gate();
         let start = Instant::now();
         let opener = async {

@@ -51,7 +51,7 @@ pub enum GuardianError {
     #[error("cannot start the worker process: {0}; --no-guardian runs rosrescue without one")]
     Spawn(#[from] io::Error),
     /// This cannot happen, because every descriptor gets its own number.
-    #[error("cannot pass the sockets on: {0}")]
+    #[error("cannot pass the sockets to the worker: {0}")]
     Handover(#[from] FdMappingCollision),
 }
 
@@ -81,11 +81,10 @@ pub fn run(listeners: &[TcpListener]) -> Result<i32, GuardianError> {
         if again_and_again || !pause.is_zero() {
             rarely!(
                 error, pid, how = %end, ?pause,
-                "the worker dies again and again; another one is started after the pause, and the port stays open. \
-                 The lines above say why; please report them"
+                "the worker keeps dying; restarting it after the pause; the port stays open. The lines above say why; please report them"
             );
         } else {
-            rarely!(warn, pid, how = %end, "the worker has ended; another one is started at once, and the port stays open");
+            rarely!(warn, pid, how = %end, "the worker has ended; restarting it at once; the port stays open");
         }
         let stop;
         count += 1;
@@ -128,7 +127,7 @@ fn wait(signals: &Receiver<i32>, pause: Duration) -> io::Result<Option<i32>> {
             Ok(signal) => return Ok(Some(signal)),
             Err(RecvTimeoutError::Timeout) => return Ok(None),
             Err(RecvTimeoutError::Disconnected) => {
-                return Err(io::Error::other("signals are not received any more"));
+                return Err(io::Error::other("signals are no longer received"));
             }
         }
     }

@@ -52,7 +52,7 @@ use crate::{
 };
 
 /// The answer does not count, because another incarnation has taken over or the mirror has changed
-/// since. The master must be asked again.
+/// since. The call must go to the master again.
 #[derive(Debug)]
 pub struct Superseded;
 

@@ -11,6 +11,13 @@ const BURST: u32 = 10;
 /// Time after which one more is allowed: some 300 a day.
 const REFILL: Duration = Duration::from_secs(300);
 
+/// Permission to do the limited thing now.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Pass {
+    /// Number of times that were left out before this one; none if there were none.
+    pub(crate) left_out: Option<u64>,
+}
+
 /// A rate limit for one thing.
 #[derive(Debug)]
 pub(crate) struct Limit(Mutex<Bucket>);
@@ -28,9 +35,8 @@ impl Limit {
         Self(Mutex::new(Bucket::FULL))
     }
 
-    /// Whether the thing may be done now. If so, also the number of times that were left out before
-    /// it; none if there are none.
-    pub(crate) fn pass(&self, now: Instant) -> Option<Option<u64>> {
+    /// Whether the thing may be done at `now`; none if it must be left out.
+    pub(crate) fn pass(&self, now: Instant) -> Option<Pass> {
         let mut bucket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         bucket.pass(now)
     }
@@ -43,7 +49,7 @@ impl Bucket {
         left_out: 0,
     };
 
-    fn pass(&mut self, now: Instant) -> Option<Option<u64>> {
+    fn pass(&mut self, now: Instant) -> Option<Pass> {
         let mut filled = *self.filled.get_or_insert(now);
         while self.left < BURST && now.duration_since(filled) >= REFILL {
             filled += REFILL;
@@ -59,7 +65,9 @@ impl Bucket {
         };
         self.left = left;
         let left_out = std::mem::take(&mut self.left_out);
-        Some((left_out > 0).then_some(left_out))
+        Some(Pass {
+            left_out: (left_out > 0).then_some(left_out),
+        })
     }
 }
 
@@ -87,7 +95,7 @@ impl Pair {
     }
 
     /// Like [`Limit::pass`], for an alarm.
-    pub(crate) fn alarm(&self, now: Instant) -> Option<Option<u64>> {
+    pub(crate) fn alarm(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         let passed = episode.bucket.pass(now);
         episode.told = Some(episode.told == Some(true) || passed.is_some());
@@ -96,10 +104,10 @@ impl Pair {
 
     /// Like [`Limit::pass`], for the all-clear. It passes if an alarm passed since the last
     /// all-clear. Without an alarm it is limited like any other line.
-    pub(crate) fn all_clear(&self, now: Instant) -> Option<Option<u64>> {
+    pub(crate) fn all_clear(&self, now: Instant) -> Option<Pass> {
         let mut episode = self.lock();
         match episode.told.take() {
-            Some(told) => told.then_some(None),
+            Some(told) => told.then_some(Pass { left_out: None }),
             None => episode.bucket.pass(now),
         }
     }
@@ -117,7 +125,7 @@ macro_rules! rarely {
     ($level:ident, $($line:tt)+) => {{
         static LIMIT: $crate::limit::Limit = $crate::limit::Limit::new();
         match LIMIT.pass(std::time::Instant::now()) {
-            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            Some(pass) => tracing::$level!(left_out = pass.left_out, $($line)+),
             None => tracing::debug!($($line)+),
         }
     }};
@@ -128,7 +136,7 @@ pub(crate) use rarely;
 macro_rules! alarm {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.alarm(std::time::Instant::now()) {
-            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            Some(pass) => tracing::$level!(left_out = pass.left_out, $($line)+),
             None => tracing::debug!($($line)+),
         }
     };
@@ -139,7 +147,7 @@ pub(crate) use alarm;
 macro_rules! all_clear {
     ($level:ident, $pair:path, $($line:tt)+) => {
         match $pair.all_clear(std::time::Instant::now()) {
-            Some(left_out) => tracing::$level!(left_out, $($line)+),
+            Some(pass) => tracing::$level!(left_out = pass.left_out, $($line)+),
             None => tracing::debug!($($line)+),
         }
     };
@@ -150,6 +158,11 @@ pub(crate) use all_clear;
 mod tests {
     use super::*;
 
+    /// The result of a limit that allows it, after `left_out` refusals.
+    fn passed(left_out: Option<u64>) -> Option<Pass> {
+        Some(Pass { left_out })
+    }
+
     #[test]
     fn a_line_that_comes_every_second_is_logged_some_300_times_a_day() {
         let limit = Limit::new();
@@ -157,9 +170,9 @@ mod tests {
         let mut logged = 0;
         let mut left_out = 0;
         for second in 0..86_400 {
-            if let Some(before) = limit.pass(start + Duration::from_secs(second)) {
+            if let Some(pass) = limit.pass(start + Duration::from_secs(second)) {
                 logged += 1;
-                left_out += before.unwrap_or(0);
+                left_out += pass.left_out.unwrap_or(0);
             }
         }
         assert_eq!(logged, 10 + 86_400 / 300 - 1);
@@ -181,17 +194,17 @@ mod tests {
         let pair = Pair::new();
         let now = Instant::now();
         for _ in 0..BURST {
-            assert_eq!(pair.alarm(now), Some(None));
-            assert_eq!(pair.all_clear(now), Some(None));
+            assert_eq!(pair.alarm(now), passed(None));
+            assert_eq!(pair.all_clear(now), passed(None));
         }
         for _ in 0..5 {
             assert_eq!((pair.alarm(now), pair.all_clear(now)), (None, None));
         }
         let later = now + REFILL;
-        assert_eq!(pair.alarm(later), Some(Some(5)), "so many were left out");
+        assert_eq!(pair.alarm(later), passed(Some(5)), "so many were left out");
         // The same trouble continues, and is not logged again.
         assert_eq!(pair.alarm(later), None);
-        assert_eq!(pair.all_clear(later), Some(None));
+        assert_eq!(pair.all_clear(later), passed(None));
     }
 
     #[test]
@@ -204,6 +217,6 @@ mod tests {
         assert_eq!(pair.alarm(now), None);
         pair.told();
         assert_eq!(pair.alarm(now), None);
-        assert_eq!(pair.all_clear(now), Some(None));
+        assert_eq!(pair.all_clear(now), passed(None));
     }
 }

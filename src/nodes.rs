@@ -394,7 +394,7 @@ async fn reap(nodes: Arc<Nodes>) {
             info,
             ?removed,
             ?reconciled,
-            "the regular health check has put the master right"
+            "the regular health check has corrected the master"
         );
     }
 }

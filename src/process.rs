@@ -1,4 +1,5 @@
-//! Child processes: finds, starts and ends rosmaster and rosout. It reports and never decides.
+//! Child processes: finds, starts and ends rosmaster and rosout. It reports what happens and never
+//! decides.
 
 use std::{
     ffi::OsStr,
@@ -31,7 +32,7 @@ mod rosout;
 mod stat;
 
 use log_config::LogConfig;
-pub(crate) use orphan::{Left, is_in_our_network};
+pub(crate) use orphan::{Orphan, is_in_our_network};
 use output::Output;
 use pid_file::PidFile;
 pub(crate) use rosout::Rosout;
@@ -50,18 +51,18 @@ const ROS_PREFIXES: &str = "/opt/ros";
 pub enum ProcessError {
     /// No rosmaster was found.
     #[error(
-        "no rosmaster is on the PATH or in /opt/ros/*/bin: install it (apt-get install \
+        "there is no rosmaster on the PATH or in /opt/ros/*/bin: install it (apt-get install \
          python3-rosmaster, or ros-noetic-rosmaster), source ROS's setup.bash, or name it with \
          --rosmaster"
     )]
     NoRosmaster,
-    /// `--rosmaster` names no program.
-    #[error("--rosmaster: `{}` is not a program that can be run", path.display())]
+    /// `--rosmaster` does not name a program.
+    #[error("--rosmaster: `{}` is not an executable program", path.display())]
     NotAProgram { path: PathBuf },
     /// The master's port is taken.
     #[error("--master-port: port {port} on loopback is in use; choose another one")]
     PortInUse { port: u16 },
-    /// The system refused to start it.
+    /// The system refused to start the program.
     #[error("cannot start `{}`: {source}", program.display())]
     Spawn { program: PathBuf, source: io::Error },
 }
@@ -70,11 +71,12 @@ pub enum ProcessError {
 pub(crate) struct Rosmaster {
     program: PathBuf,
     config: SupervisedConfig,
-    /// Stdout and stderr of the last one.
+    /// Stdout and stderr of the last rosmaster.
     output: Output,
-    /// The logging configuration for rosmaster; none if the user has one, or the kernel lacks such files.
+    /// The logging configuration for rosmaster; none if the user has one, or if the kernel lacks
+    /// such files.
     log_config: Option<LogConfig>,
-    /// The last one.
+    /// PID file of the last rosmaster.
     pid_file: PidFile,
     checkpoint: PathBuf,
 }
@@ -92,12 +94,13 @@ impl Rosmaster {
         })
     }
 
-    /// Whether it is ROS's own program, and no other one was given.
+    /// Whether it is ROS's own program rather than a program that the user chose.
     pub(crate) fn is_own(&self) -> bool {
         self.config.rosmaster.is_none()
     }
 
-    /// The port for a master: the given one, else `remembered` if free, else a free one.
+    /// Chooses the port for a master: the configured one, else `remembered` if it is free, else any
+    /// free one.
     pub(crate) fn choose_port(&self, remembered: Option<u16>) -> Result<u16, ProcessError> {
         if let Some(port) = self.config.port {
             return if is_free(port) {
@@ -137,7 +140,7 @@ impl Rosmaster {
         }
         add_ros_paths(&mut command, &self.program, 2);
         command.env(orphan::OWNER, orphan::owner(&self.checkpoint));
-        // Loopback only: nodes connect to rosrescue.
+        // The master listens on loopback only, because nodes connect to rosrescue.
         command.env("ROS_IP", Ipv4Addr::LOCALHOST.to_string());
         command.env_remove("ROS_HOSTNAME").env_remove("ROS_IPV6");
         if let Some(config) = &self.log_config {
@@ -150,7 +153,7 @@ impl Rosmaster {
             ),
             None => (Stdio::null(), Stdio::null()),
         };
-        // In a group of its own: rosrescue handles Ctrl-C in the terminal.
+        // The master gets its own process group, because rosrescue handles Ctrl-C in the terminal.
         command.stdout(stdout).stderr(stderr).process_group(0);
         start(command).map_err(|source| ProcessError::Spawn {
             program: self.program.clone(),
@@ -164,7 +167,7 @@ impl Rosmaster {
     }
 }
 
-/// The `given` rosmaster, or the one that is installed.
+/// The `given` rosmaster, or the installed one.
 pub(crate) fn find_rosmaster(given: Option<&Path>) -> Result<PathBuf, ProcessError> {
     match given {
         Some(path) if is_program(path) => Ok(path.to_owned()),
@@ -185,7 +188,8 @@ pub(crate) fn interpreter(program: &Path) -> Option<Vec<String>> {
     words.last().and_then(is_python).map(|()| words)
 }
 
-/// A command that runs `python` silently with the paths of the ROS that has `program`.
+/// A command that runs `python` without output, with the paths of the ROS installation that
+/// contains `program`.
 pub(crate) fn python(python: &Path, program: &Path) -> Command {
     let mut command = command(python);
     add_ros_paths(&mut command, program, 2);
@@ -193,31 +197,32 @@ pub(crate) fn python(python: &Path, program: &Path) -> Command {
     command
 }
 
-/// Runs `program`, without variables meant for rosrescue alone.
+/// A command that runs `program` without the variables that are meant for rosrescue alone.
 fn command(program: &Path) -> Command {
     let mut command = Command::new(program);
     handover::keep_from(command.as_std_mut());
     command
 }
 
-/// The endings of PID files behind the checkpoint's name.
+/// The suffixes of PID files after the checkpoint's name.
 pub(crate) const PID_FILES: [&str; 2] = [".rosmaster-pid", ".rosout-pid"];
 
-/// A file that belongs to `checkpoint`.
+/// Path of a file that belongs to `checkpoint`.
 pub(crate) fn beside(checkpoint: &Path, suffix: &str) -> PathBuf {
     let mut name = checkpoint.as_os_str().to_owned();
     name.push(suffix);
     PathBuf::from(name)
 }
 
-/// Starts `command`. Its program may be on a disk that answers late, so other tasks go on meanwhile. A stop cannot
-/// come in between: a process that nobody knows would stay.
+/// Starts `command`. Its program may be on a slow disk, so other tasks continue meanwhile. A stop
+/// cannot interrupt it, because nobody would know of the new process.
 fn start(mut command: Command) -> io::Result<Child> {
     block_in_place(|| command.spawn())
 }
 
-/// Adds the paths of a ROS in `/opt/ros`, which its programs need to find modules and libraries. `setup.bash`
-/// sets them in a shell, but a service lacks them. `depth`: how far below the ROS's folder the program is.
+/// Adds the paths of the ROS installation in `/opt/ros` that contains `program`, which its programs
+/// need to find modules and libraries. In a shell `setup.bash` sets them, but a service lacks them.
+/// `depth` is how many folders the program is below the installation.
 fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     let Some(prefix) = program
         .ancestors()
@@ -241,8 +246,8 @@ fn add_ros_paths(command: &mut Command, program: &Path, depth: usize) {
     }
 }
 
-/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with a pause after each. `ended` resolves when it has
-/// ended.
+/// Ends a process in order: SIGINT, SIGTERM, SIGKILL, with a pause after each. `ended` resolves
+/// when it has ended.
 pub(crate) async fn stop(pid: u32, ended: impl Future) {
     let mut ended = std::pin::pin!(ended);
     for signal in [Signal::INT, Signal::TERM, Signal::KILL] {
@@ -253,7 +258,7 @@ pub(crate) async fn stop(pid: u32, ended: impl Future) {
         tracing::warn!(
             pid,
             ?signal,
-            "a process did not end in time after this signal; it gets the next one"
+            "a process did not end in time after this signal; sending the next one"
         );
     }
 }
@@ -265,7 +270,7 @@ pub(crate) fn signal_process(pid: u32, signal: Signal) {
     }
 }
 
-/// Whether a process with this pid exists.
+/// Whether a process with this process id exists.
 pub(crate) fn is_alive(pid: u32) -> bool {
     i32::try_from(pid)
         .ok()
@@ -273,8 +278,8 @@ pub(crate) fn is_alive(pid: u32) -> bool {
         .is_some_and(|pid| test_kill_process(pid).is_ok())
 }
 
-/// Whether the process `pid` runs a program of this name, by its command line. A remembered pid may belong to
-/// another process by now.
+/// Whether the process `pid` runs a program of this name, according to its command line. A
+/// remembered process id may belong to another process by now.
 pub(crate) fn runs(pid: u32, name: &str) -> bool {
     let command_line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
     command_line.split(|byte| *byte == 0).any(|argument| {
@@ -295,7 +300,7 @@ pub(crate) fn is_of_any(pid: u32) -> bool {
     orphan::has_owner(pid) || parent_of(pid).is_some_and(is_rosrescue)
 }
 
-/// All processes that can be seen.
+/// All visible processes.
 pub(crate) fn all() -> impl Iterator<Item = u32> {
     let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten();
     processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
@@ -306,13 +311,13 @@ pub(crate) fn parent_of(pid: u32) -> Option<u32> {
     Stat::of(pid).map(|stat| stat.parent)
 }
 
-/// The name of the process `pid`; empty if there is none. At most 15 bytes.
+/// The name of the process `pid`, at most 15 bytes; empty if there is no such process.
 pub(crate) fn name_of(pid: u32) -> String {
     let name = std::fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
     name.trim_end().to_owned()
 }
 
-/// Whether the process `pid` runs rosrescue, also after its file was replaced.
+/// Whether the process `pid` runs rosrescue, even if its file was replaced.
 pub(crate) fn is_rosrescue(pid: u32) -> bool {
     let program = std::fs::read_link(format!("/proc/{pid}/exe")).unwrap_or_default();
     let name = program.file_name().unwrap_or_default();
@@ -334,11 +339,12 @@ pub(crate) fn describe(status: ExitStatus) -> String {
     match (status.code(), status.signal()) {
         (Some(code), _) => format!("exit status {code}"),
         (None, Some(signal)) => format!("signal {signal}"),
-        (None, None) => "an unknown end".to_owned(),
+        (None, None) => "in an unknown way".to_owned(),
     }
 }
 
-/// The output of `program`, if it ends within `limit`, as roslaunch's `command=` would take it.
+/// The output of `program`, if it ends within `limit`, in the form that roslaunch's `command=`
+/// would use.
 pub(crate) async fn output_of(
     program: &str,
     arguments: &[&str],
@@ -365,7 +371,7 @@ pub(crate) fn find_rosmaster_on(path: &OsStr) -> Option<PathBuf> {
     find_program_on(path, "rosmaster", &["bin"])
 }
 
-/// A program on the PATH, else in one of `folders` of an installed ROS.
+/// Finds a program on the PATH, or else in one of `folders` of a ROS installation.
 pub(crate) fn find_program(name: &str, folders: &[&str]) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     find_program_on(&path, name, folders)
@@ -381,7 +387,7 @@ fn find_program_on(path: &OsStr, name: &str, folders: &[&str]) -> Option<PathBuf
             .flatten()
             .map(|entry| entry.path())
             .collect();
-        // The last by name, as in kinetic, melodic, noetic.
+        // The last one by name wins, as in kinetic, melodic, noetic.
         distributions.sort();
         let candidates = distributions.iter().rev();
         let mut programs =

@@ -136,7 +136,7 @@ impl Driver {
     /// Lets the mirror stand in, if it may, and returns the first actions. `restored` tells whether
     /// the mirror comes from a checkpoint whose session continues.
     pub(crate) fn start(&mut self, restored: bool) -> Vec<Action> {
-        let left = self.process.as_ref().is_some_and(MasterProcess::is_left);
+        let left = self.process.as_ref().is_some_and(MasterProcess::is_orphan);
         let actions = self
             .lifecycle
             .on(Instant::now(), Input::Start { left, restored });
@@ -174,7 +174,7 @@ impl Driver {
             if matches!(input, Some(Input::SpawnFailed { .. }))
                 && let Some(error) = self.spawn_error.take()
             {
-                self.log_once(format!("cannot start a master, and tries again: {error}"));
+                self.log_once(format!("cannot start a master; retrying: {error}"));
             }
             if input == Some(Input::Stop) {
                 return Ok(self.process);
@@ -229,7 +229,7 @@ impl Driver {
             alarm!(
                 warn,
                 AWAY,
-                "the new master died while it was given the state; the next one is given it"
+                "the new master died while its state was being restored; the next master gets it"
             );
             self.lifecycle.on(Instant::now(), Input::Answered);
         }
@@ -248,7 +248,7 @@ impl Driver {
                 () = wait::for_some(self.ended.as_mut()) => {
                     if !self.examiner.gate.state().is_open() {
                         let master = self.examiner.upstream.address();
-                        self.log_waiting(&format!("{master} closes the connection unasked"));
+                        self.log_waiting(&format!("{master} closes the connection without a reason"));
                     }
                     return Input::ConnectionLost;
                 }
@@ -337,7 +337,7 @@ impl Driver {
             Action::StandIn => {
                 rarely!(
                     info,
-                    "the master is late with an answer; rosrescue answers for it until it does"
+                    "the master is slow to answer; rosrescue answers in its place until it does"
                 );
                 self.examiner.gate.set(State::Late);
             }
@@ -353,7 +353,7 @@ impl Driver {
             Action::Spare(why) => rarely!(
                 warn,
                 why,
-                "the master does not answer, and is not killed: there is no proof that it hangs"
+                "the master does not answer, but is not killed: there is no proof that it hangs"
             ),
             Action::OpenGate => self.open_gate(),
             Action::Spawn => return self.spawn().await,
@@ -378,15 +378,12 @@ impl Driver {
                         error,
                         CRASH_LOOP,
                         last_words,
-                        "crash loop: the master has died {deaths} times within a minute; nodes go on, \
-                         rosrescue answers in its place and starts the next one after growing pauses. \
-                         Its last words and master.log say why"
+                        "crash loop: the master has died {deaths} times within a minute; nodes keep running, rosrescue answers in its place and starts new masters after growing pauses. The master's last output and master.log say why it died"
                     ),
                     None => alarm!(
                         error,
                         CRASH_LOOP,
-                        "crash loop: the master has died {deaths} times within a minute; nodes go on, \
-                         rosrescue answers in its place. The log of what starts it says why"
+                        "crash loop: the master has died {deaths} times within a minute; nodes keep running, rosrescue answers in its place. The log of the program that starts the master says why it died"
                     ),
                 }
             }
@@ -395,7 +392,11 @@ impl Driver {
                     facts.crash_loop = None;
                     facts.calm_since = Some(Instant::now());
                 });
-                all_clear!(info, CRASH_LOOP, "the crash loop is over: the master lives");
+                all_clear!(
+                    info,
+                    CRASH_LOOP,
+                    "the crash loop is over: the master keeps running"
+                );
             }
         }
         None
@@ -447,7 +448,7 @@ impl Driver {
                     ));
                 } else {
                     self.log_once(format!(
-                        "the master at {master} could not be read or restored, and it is tried again: {error}"
+                        "could not read or restore the master at {master}; retrying: {error}"
                     ));
                 }
                 Some(input)
@@ -512,14 +513,13 @@ impl Driver {
                 warn,
                 AWAY,
                 cause,
-                "the master is away: nodes go on, rosrescue answers in its place and starts a new one"
+                "the master is away: nodes keep running, rosrescue answers in its place and starts a new one"
             ),
             None => alarm!(
                 warn,
                 AWAY,
                 cause,
-                "the master is away: nodes go on, rosrescue answers in its place. Start the master, if \
-                 nothing else does"
+                "the master is away: nodes keep running, rosrescue answers in its place. Start the master if nothing else does"
             ),
         }
         // The prepared injection is outdated.

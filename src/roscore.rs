@@ -117,7 +117,7 @@ async fn version(roscore: &Roscore, key: &str, argument: &str) -> Option<Request
     let version = process::output_of("rosversion", &[argument], VERSION_TIME).await;
     if version.is_none() {
         tracing::warn!(
-            "the parameter {key} is not set: `rosversion {argument}` gave no answer; set it, if a node needs it"
+            "the parameter {key} is not set: `rosversion {argument}` did not answer; set it yourself if a node needs it"
         );
     }
     version.map(|version| set(key, &version))
@@ -130,7 +130,7 @@ static ENDED: Pair = Pair::new();
 async fn keep_rosout(roscore: &Roscore) {
     let Some(rosout) = Rosout::find(&roscore.checkpoint) else {
         tracing::warn!(
-            "no rosout is installed, so /rosout is not collected: apt-get install rosout, or --no-rosout"
+            "rosout is not installed, so /rosout is not collected; run `apt-get install rosout`, or use --no-rosout"
         );
         return;
     };
@@ -139,7 +139,7 @@ async fn keep_rosout(roscore: &Roscore) {
         let start = Instant::now();
         match living_rosout(roscore)
             .await
-            .or_else(|| block_in_place(|| rosout.left_behind()))
+            .or_else(|| block_in_place(|| rosout.find_orphan()))
         {
             Some(pid) => {
                 roscore.rosout.store(pid, Ordering::Relaxed);
@@ -158,11 +158,11 @@ async fn keep_rosout(roscore: &Roscore) {
                         pid,
                         how,
                         last_words,
-                        "rosout has ended, and is started again"
+                        "rosout has ended and is restarted"
                     );
                 }
                 Err(error) => {
-                    alarm!(warn, ENDED, %error, "cannot start rosout, and tries again; /rosout is not collected meanwhile")
+                    alarm!(warn, ENDED, %error, "cannot start rosout; retrying; /rosout is not collected meanwhile")
                 }
             },
         }
@@ -194,7 +194,7 @@ async fn end_rosout(roscore: &Roscore) {
     let pid = match roscore.rosout.load(Ordering::Relaxed) {
         // There may be an orphan that has not been found yet.
         0 => Rosout::find(&roscore.checkpoint)
-            .and_then(|rosout| block_in_place(|| rosout.left_behind())),
+            .and_then(|rosout| block_in_place(|| rosout.find_orphan())),
         pid => Some(pid),
     };
     let Some(pid) = pid else { return };

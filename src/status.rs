@@ -131,7 +131,7 @@ impl Guarded {
 impl fmt::Display for Guarded {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Nobody => f.write_str("nobody (--no-guardian)"),
+            Self::Nobody => f.write_str("nothing (--no-guardian)"),
             Self::Systemd => f.write_str("systemd"),
             Self::Guardian {
                 pid,
@@ -139,17 +139,15 @@ impl fmt::Display for Guarded {
             } => write!(f, "process {pid}"),
             Self::Guardian { pid, .. } => write!(
                 f,
-                "process {pid}, which nothing starts again (`sudo rosrescue install` makes a service)"
+                "process {pid}, which nothing restarts (`sudo rosrescue install` sets up a service)"
             ),
             Self::Stopped(pid) => write!(
                 f,
-                "NOBODY: the guardian, process {pid}, is stopped; `fg`, `bg` or `kill -CONT {pid}` \
-                 continues it"
+                "NOTHING: the guardian, process {pid}, is stopped; resume it with `fg`, `bg` or `kill -CONT {pid}`"
             ),
             Self::NoLonger(pid) => write!(
                 f,
-                "NOBODY: the guardian, process {pid}, has ended; start rosrescue anew when the robot \
-                 is at rest"
+                "NOTHING: the guardian, process {pid}, has ended; restart rosrescue when the robot is at rest"
             ),
         }
     }

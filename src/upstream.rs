@@ -62,19 +62,19 @@ pub enum CallError {
     #[error("the call was not sent: {0}")]
     NotSent(hyper::Error),
     /// No byte was sent, because no connection could be made.
-    #[error("there is no connection for the call: {0}")]
+    #[error("could not connect for the call: {0}")]
     NotConnected(io::Error),
     /// The master may have run the call.
-    #[error("the master gave no reply: {0}")]
+    #[error("the master sent no reply: {0}")]
     MaybeSent(hyper::Error),
     /// The reply may come from another incarnation.
-    #[error("the reply does not count: {0}")]
+    #[error("the reply may come from another master: {0}")]
     Unverified(Box<VerifyError>),
     /// The reply's body ended early or exceeded a limit.
-    #[error("the master's reply is not whole: {0}")]
+    #[error("the master's reply is incomplete: {0}")]
     BrokenReply(Box<dyn std::error::Error + Send + Sync>),
     /// The reply is complete, but not XML-RPC. Only for calls made by rosrescue.
-    #[error("the master's reply is no XML-RPC (HTTP status {status}): {reason}")]
+    #[error("the master's reply is not XML-RPC (HTTP status {status}): {reason}")]
     NotXmlRpc { status: StatusCode, reason: String },
 }
 

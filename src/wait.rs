@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Sleeps until `deadline`, or for ever if there is none.
+/// Sleeps until `deadline`, or forever if there is none.
 pub(crate) async fn until(deadline: Option<Instant>) {
     match deadline {
         Some(deadline) => tokio::time::sleep_until(deadline).await,
@@ -12,7 +12,7 @@ pub(crate) async fn until(deadline: Option<Instant>) {
     }
 }
 
-/// Waits for `future`, or for ever if there is none. Cancel safe: the future stays with the caller.
+/// Waits for `future`, or forever if there is none. Cancel safe: the future stays with the caller.
 pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Output {
     match future {
         Some(future) => future.await,
@@ -20,7 +20,7 @@ pub(crate) async fn for_some<F: Future + Unpin>(future: Option<&mut F>) -> F::Ou
     }
 }
 
-/// Waits for the next tick of `interval`, or for ever if there is none. Cancel safe.
+/// Waits for the next tick of `interval`, or forever if there is none. Cancel safe.
 pub(crate) async fn tick(interval: &mut Option<tokio::time::Interval>) {
     match interval {
         Some(interval) => {

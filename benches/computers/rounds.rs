@@ -113,16 +113,16 @@ pub(crate) fn takeover(cluster: &mut Cluster, number: usize, led_etcd: bool) -> 
     let leader = cluster.leader();
     let callers = Callers::start(cluster, leader);
     let survivors = Cluster::followers(leader);
-    let times_alone = |cluster: &Cluster| -> usize {
+    let times_cut_off = |cluster: &Cluster| -> usize {
         survivors
             .iter()
-            .map(|index| cluster.times_alone(*index))
+            .map(|index| cluster.times_cut_off(*index))
             .sum()
     };
-    let alone = times_alone(cluster);
+    let alone = times_cut_off(cluster);
     let begin = cluster.kill(leader);
     let round = callers.end(cluster, begin);
-    let alone = times_alone(cluster) > alone;
+    let alone = times_cut_off(cluster) > alone;
     let said = cluster.said() * 1e3;
     cluster.start_again(leader);
     cluster.settle();

@@ -118,7 +118,7 @@ pub(super) struct Member {
     namesake: Option<String>,
     /// Looks for one since etcd's state has been read.
     namesakes: Option<namesake::Watch>,
-    /// Whether the session in etcd goes on, while that is found out.
+    /// Whether the session in etcd continues, while that is found out.
     deciding: Option<Deciding>,
     probe: Option<Flag>,
     probe_at: Option<Instant>,

@@ -106,14 +106,18 @@ impl Post {
         let process = match rosmaster {
             Some(rosmaster) => {
                 let starter = rosmaster.clone();
-                let left = spawn_blocking(move || rosmaster.left_behind(port)).await;
-                Some(MasterProcess::new(starter, port, left.unwrap_or_default()))
+                let orphan = spawn_blocking(move || rosmaster.claim_orphan(port)).await;
+                Some(MasterProcess::new(
+                    starter,
+                    port,
+                    orphan.unwrap_or_default(),
+                ))
             }
             None => None,
         };
-        let left = process.as_ref().is_some_and(MasterProcess::is_left);
+        let has_orphan = process.as_ref().is_some_and(MasterProcess::is_orphan);
         let (stop, halt) = ends;
-        let duties = rosout.map(|rosout| self.roscore(rosout, !left, stop.clone()));
+        let duties = rosout.map(|rosout| self.roscore(rosout, !has_orphan, stop.clone()));
         tokio::spawn(async move {
             stop.cancelled().await;
             if let Some(duties) = duties {
@@ -206,6 +210,6 @@ impl Duty {
 fn resume(error: JoinError) -> ! {
     match error.try_into_panic() {
         Ok(panic) => std::panic::resume_unwind(panic),
-        Err(_) => unreachable!("nobody aborts it"),
+        Err(_) => unreachable!("the task is never aborted"),
     }
 }

@@ -23,7 +23,7 @@ pub(super) fn take_over(config: &Config) {
     match copy_all(&old, own) {
         Ok(()) => tracing::warn!(
             from = %old.display(), to = %own.display(),
-            "copied the checkpoint of an earlier version: each port has a checkpoint of its own now. Remove the old one \
+            "copied the checkpoint of an earlier version, because each port now has its own checkpoint. Remove the old one \
              if no rosrescue serves port 11311"
         ),
         Err(error) => tracing::error!(

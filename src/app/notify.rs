@@ -105,8 +105,8 @@ impl Source {
                 warn,
                 STOPPED,
                 pid,
-                "unguarded: the guardian process is stopped, by Ctrl-Z perhaps; nodes run as usual, but if \
-                 rosrescue dies now, calls wait until it is continued: `fg`, `bg` or `kill -CONT {pid}`"
+                "unguarded: the guardian process is stopped, perhaps by Ctrl-Z; nodes run as usual, but if \
+                 rosrescue dies now, calls wait until the guardian is resumed: `fg`, `bg` or `kill -CONT {pid}`"
             ),
             (Guarded::Stopped(_), _) => all_clear!(
                 info,
@@ -175,8 +175,7 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source
     tracing::warn!(
         pid,
         "unguarded: the guardian process has ended; nodes run as usual, but if rosrescue dies now, \
-         connections are refused and nobody starts it again. Stop it and start it anew when the robot \
-         is at rest"
+         connections are refused and nothing restarts it. Restart rosrescue when the robot is at rest"
     );
 }
 
@@ -217,6 +216,6 @@ async fn report_status(told: Source, stop: CancellationToken) {
 async fn send(notify: impl FnOnce() -> io::Result<()> + Send + 'static) {
     let sent = tokio::task::spawn_blocking(notify).await;
     if let Err(error) = sent.map_err(io::Error::other).flatten() {
-        tracing::debug!(%error, "systemd is not told");
+        tracing::debug!(%error, "could not notify systemd");
     }
 }

@@ -92,7 +92,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         } = session::rebuild(loaded.checkpoint, loaded.records);
         if let Some(trouble) = trouble {
             tracing::error!(
-                "the checkpoint is damaged: its snapshot is no state of a master: {trouble}"
+                "the checkpoint is damaged: its snapshot is not a valid master state: {trouble}"
             );
         }
         let session = session.unwrap_or_default();
@@ -108,7 +108,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         }
         match session::decide(config.restore, evidence) {
             Decision::Restore(why) => {
-                story = format!("the session goes on ({why}): {}", mirror.counts());
+                story = format!("the session continues ({why}): {}", mirror.counts());
                 beginning = Some((mirror, session, pending, displaced));
             }
             Decision::Fresh(why) => {
@@ -120,7 +120,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
                 let kept;
                 (store, kept) = set_aside(store).await;
                 let kept = kept
-                    .map(|path| format!("; the checkpoint before is kept as {}", path.display()));
+                    .map(|path| format!("; the previous checkpoint is kept as {}", path.display()));
                 let kept = kept.unwrap_or_default();
                 story = format!("a new session begins ({why}{kept})");
             }
@@ -130,7 +130,7 @@ pub(super) async fn begin(config: &Config) -> Result<Beginning, RunError> {
         let (path, most) = (store.path().to_owned(), config.history);
         spawn_blocking(move || {
             if let Err(error) = history::trim(&path, most) {
-                tracing::debug!(%error, "the kept checkpoints cannot be listed");
+                tracing::debug!(%error, "cannot list the kept checkpoints");
             }
         });
     }
@@ -183,7 +183,7 @@ async fn set_aside(store: Option<Store>) -> (Option<Store>, Option<PathBuf>) {
     match wait::within(OPENING, work).await {
         Some((store, Ok(kept))) => (Some(store), kept),
         Some((store, Err(error))) => {
-            tracing::error!(%error, "the checkpoint of the session before could not be kept under another name");
+            tracing::error!(%error, "could not keep the previous session's checkpoint under another name");
             (Some(store), None)
         }
         None => {

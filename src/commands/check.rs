@@ -67,9 +67,9 @@ enum Severity {
 struct Finding {
     severity: Severity,
     subject: &'static str,
-    /// What is so.
+    /// What was found.
     what: String,
-    /// What to do; empty if nothing is to be done.
+    /// What to do; empty if there is nothing to do.
     todo: String,
 }
 

@@ -179,7 +179,7 @@ impl fmt::Display for Inspected {
             writeln!(f, "            {sentence}")?;
         }
         let end = match session.closed {
-            true => "stopped in order",
+            true => "stopped cleanly",
             false => "running, or not stopped in order",
         };
         writeln!(

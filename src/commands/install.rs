@@ -374,8 +374,8 @@ impl Plan {
     }
 
     /// Gives the running service its new files.
-    fn renew(&mut self, place: &Place, anew: bool) {
-        if anew {
+    fn renew(&mut self, place: &Place, restart: bool) {
+        if restart {
             self.run(place.systemctl(&["stop", UNITS[1]]));
             self.run(place.systemctl(&[&["start"], &UNITS[..]].concat()));
         } else {

@@ -25,7 +25,7 @@ struct Waited {
     uri: String,
     /// Whether all of it is so.
     met: bool,
-    /// What is not so yet.
+    /// The condition that is not met yet.
     missing: Vec<String>,
     /// Why, in a sentence.
     why: Option<String>,

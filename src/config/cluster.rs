@@ -1,4 +1,4 @@
-//! The options of several computers.
+//! The configuration of a robot with several computers.
 
 use std::{
     fmt, fs, io,
@@ -16,50 +16,52 @@ use crate::{
     ros_env::{DEFAULT_MASTER_PORT, MasterUri},
 };
 
-/// How this computer takes part in a cluster of several.
+/// How this computer takes part in a cluster.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ClusterConfig {
-    /// The members of etcd, `http://HOST:PORT` or `https://HOST:PORT` each.
+    /// The addresses of the etcd servers, each as `http://HOST:PORT` or `https://HOST:PORT`.
     pub endpoints: Vec<String>,
-    /// The robot's name: all its keys in etcd begin with it.
+    /// The robot's name. All its keys in etcd begin with it.
     pub robot: String,
-    /// This computer's name. No other one of the robot has it.
+    /// This computer's name, unique within the robot.
     pub name: String,
-    /// The host name, if the name is made from it and the address; none if the name is given.
+    /// The host name, if the computer's name is derived from host name and address; none if the
+    /// name was given.
     pub(super) hostname: Option<String>,
-    /// Where the other computers reach this rosrescue.
+    /// Address at which other computers reach this rosrescue.
     pub advertised: MasterUri,
-    /// How long the leader may be silent.
+    /// How long the leader may be silent before another computer takes over.
     pub ttl: Duration,
     /// When a write is answered.
     pub sync: ClusterSync,
     /// What happens to writes while this computer is cut off.
     pub alone: WhenCutOff,
-    /// Certificates in PEM form: etcd's authority, and this computer's own with its key.
+    /// PEM files: the certificate of etcd's authority, and this computer's own certificate and key.
     pub ca: Option<PathBuf>,
     pub cert: Option<PathBuf>,
     pub key: Option<PathBuf>,
-    /// Name and password of etcd's user.
+    /// Name and password of the etcd user.
     pub user: Option<(String, String)>,
 }
 
-/// Options of several computers that do not fit together.
+/// Cluster options that are invalid or do not fit together.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ClusterError {
     /// `--advertise` is not an address.
-    #[error("--advertise: `{given}` is no HOST or HOST:PORT, as in 10.0.0.7 or robot-7:11311")]
+    #[error(
+        "--advertise: `{given}` is not an address; write HOST or HOST:PORT, as in 10.0.0.7 or robot-7:11311"
+    )]
     Advertise { given: String },
-    /// Neither host name nor address make a name.
+    /// No computer name can be derived from the host name and the address.
     #[error(
         "no name for this computer can be made from its host name, `{hostname}`, and its address, {address}; \
          give it a unique name with --cluster-name"
     )]
     Name { hostname: String, address: String },
-    /// The advertised address leads each computer to itself.
+    /// The advertised address is a loopback address, which leads each computer to itself.
     #[error(
-        "with --cluster {endpoint} other computers must reach this rosrescue, and {address} is each computer \
-         itself: set ROS_IP to this computer's address in the network, or give it with --advertise"
+        "with --cluster {endpoint} other computers must reach this rosrescue, but {address} leads each computer to itself: set ROS_IP to this computer's address in the network, or use --advertise"
     )]
     Loopback { address: String, endpoint: String },
     /// etcd's certificate cannot be checked.
@@ -68,15 +70,15 @@ pub enum ClusterError {
          give its file with --cluster-ca"
     )]
     NoAuthority { endpoint: String },
-    /// The certificate would not be used.
-    #[error("--cluster-ca is for https, but --cluster says {endpoint}: write https://")]
+    /// A certificate is given, but an endpoint does not use https.
+    #[error("--cluster-ca needs https, but --cluster has {endpoint}: write https://")]
     NotHttps { endpoint: String },
     /// The password cannot be read.
     #[error("--cluster-password-file: {} cannot be used: {why}", path.display())]
     Password { path: PathBuf, why: String },
 }
 
-/// Without the password.
+/// Leaves out the password.
 impl fmt::Debug for ClusterConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ClusterConfig")
@@ -90,8 +92,8 @@ impl fmt::Debug for ClusterConfig {
 }
 
 impl ClusterConfig {
-    /// What `args` say on the computer `hostname`, whose rosrescue others reach at `usual`; none without
-    /// `--cluster`. Reads the file of the password.
+    /// The cluster configuration from `args` on the computer `hostname`, whose rosrescue is reached
+    /// at `usual`; none without `--cluster`. Reads the password file.
     pub(crate) fn new(
         args: &ClusterArgs,
         usual: &MasterUri,
@@ -156,7 +158,7 @@ impl ClusterConfig {
         }))
     }
 
-    /// What was as it usually is remains so: the usual address is `now`, and was `before`.
+    /// Replaces the default address `before` by `now`, wherever the user has not set another one.
     pub(super) fn follow(&mut self, before: &MasterUri, now: &MasterUri) {
         if self.advertised.host == before.host {
             self.advertised.host.clone_from(&now.host);
@@ -172,9 +174,9 @@ impl ClusterConfig {
     }
 }
 
-/// The name of the computer `hostname` that others reach at `advertised`. Copies of a disk have the same host name,
-/// and the same `/etc/machine-id`; only the address tells them apart. It is there as `arm-10.0.0.2`, or by itself if
-/// it is a name. A port other than 11311 follows.
+/// The default name of the computer `hostname` that is reached at `advertised`. Copies of a disk
+/// share the host name and `/etc/machine-id`, so the address is part of the name, as in
+/// `arm-10.0.0.2`. An advertised host name is used alone. A port other than 11311 is appended.
 fn default_name(hostname: &str, advertised: &MasterUri) -> Option<String> {
     let host = &advertised.host;
     let is_address = host.parse::<IpAddr>().is_ok() || host == "localhost";
@@ -190,7 +192,7 @@ fn default_name(hostname: &str, advertised: &MasterUri) -> Option<String> {
     name(&parts.join("-")).ok()
 }
 
-/// Whether `host` is the computer itself, on each computer.
+/// Whether `host` is a loopback address or name.
 fn is_loopback(host: &str) -> bool {
     let address = host.trim_start_matches('[').trim_end_matches(']');
     match address.parse::<IpAddr>() {
@@ -204,7 +206,7 @@ fn is_on_loopback(endpoint: &str) -> bool {
     uri.is_ok_and(|uri| uri.host().is_some_and(is_loopback))
 }
 
-/// `HOST`, which has `port`, or `HOST:PORT`.
+/// Parses `HOST`, which gets `port`, or `HOST:PORT`.
 fn advertised(given: &str, port: u16) -> Result<MasterUri, ClusterError> {
     let given_host = match given.parse::<Ipv6Addr>() {
         Ok(address) => format!("[{address}]"),

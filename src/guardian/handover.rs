@@ -51,8 +51,7 @@ pub const SERVES: u8 = b's';
 #[non_exhaustive]
 pub enum HandoverError {
     #[error(
-        "socket {number} that was passed to rosrescue is no TCP socket that listens: {source}; a \
-         socket unit needs ListenStream= with a port, and Accept=no"
+        "socket {number} that was passed to rosrescue is not a listening TCP socket: {source}; a socket unit needs ListenStream= with a port, and Accept=no"
     )]
     NotAListener { number: RawFd, source: io::Error },
     /// The link to the guardian is missing.
@@ -117,7 +116,7 @@ impl Sockets {
                     return Ok(None);
                 };
                 if !SockRef::from(&listener).is_listener()? {
-                    return Err(io::Error::other("it does not listen"));
+                    return Err(io::Error::other("it is not listening"));
                 }
                 listener.set_nonblocking(true)?;
                 Ok(Some(listener))

@@ -285,8 +285,7 @@ impl Voice {
             rarely!(
                 warn,
                 checkpoint = %path, kept = %kept.display(),
-                "somebody replaced or changed the checkpoint; what was there is kept under another name, \
-                 and a whole one is written"
+                "another program replaced or changed the checkpoint; its file is kept under another name, and a new checkpoint is written"
             );
         }
         let unprotected = self.ledger.unprotected();
@@ -297,10 +296,10 @@ impl Voice {
                 UNPROTECTED,
                 checkpoint = %path, reason,
                 "unprotected: nodes run as usual, but a crash of rosrescue itself would lose the state; \
-                 free or repair the disk, and recording begins again by itself"
+                 free space on the disk or repair it; recording resumes by itself"
             ),
             (None, Some(_)) => {
-                all_clear!(info, UNPROTECTED, checkpoint = %path, "protected again: a whole checkpoint is written")
+                all_clear!(info, UNPROTECTED, checkpoint = %path, "protected again: a complete checkpoint has been written")
             }
             _ => {}
         }

@@ -33,7 +33,9 @@ impl Rescues {
         // A full or broken disk gets no unnecessary writes.
         let fits = |store: &Seen| store.snapshot_bytes <= bytes_most && store.unprotected.is_none();
         let Some(Seen { path, .. }) = self.ledger.seen_store().filter(fits) else {
-            tracing::debug!("the state of this rescue is not kept: no room, or no working disk");
+            tracing::debug!(
+                "not keeping the state of this rescue: not enough space, or no working disk"
+            );
             return;
         };
         // The checkpoint is taken now, because the health check is about to unregister dead nodes.
@@ -41,8 +43,10 @@ impl Rescues {
         tokio::task::spawn_blocking(move || {
             let kept = history::keep_rescue(&path, number, checkpoint);
             match kept.and_then(|kept| history::trim(&path, bytes_most).map(|()| kept)) {
-                Ok(kept) => tracing::debug!(path = %kept.display(), "the rescue's state is kept"),
-                Err(error) => tracing::info!(%error, "the state of this rescue is not kept"),
+                Ok(kept) => {
+                    tracing::debug!(path = %kept.display(), "kept the state of this rescue")
+                }
+                Err(error) => tracing::info!(%error, "could not keep the state of this rescue"),
             }
         });
     }

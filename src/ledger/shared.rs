@@ -100,7 +100,7 @@ fn bytes_of(subjects: &[Subject]) -> usize {
 /// record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Agreed {
-    reign: u64,
+    times_led: u64,
     seq: u64,
 }
 
@@ -145,7 +145,7 @@ impl Ledger {
         drop(inner);
         self.agreed.send_modify(|agreed| {
             *agreed = Agreed {
-                reign: agreed.reign + 1,
+                times_led: agreed.times_led + 1,
                 seq: 0,
             }
         });
@@ -156,9 +156,9 @@ impl Ledger {
     /// whole.
     pub fn lead(&self, seq: u64, held: &Master) {
         let mut inner = self.lock();
-        let reign = self.agreed.borrow().reign;
+        let times_led = self.agreed.borrow().times_led;
         inner.shared = Shared::Here {
-            last: Agreed { reign, seq },
+            last: Agreed { times_led, seq },
             changes: Vec::new(),
             recent: Recent::from(seq),
         };
@@ -267,7 +267,7 @@ impl Ledger {
         let mut agreed = self.agreed.subscribe();
         // This cannot fail: the ledger owns the sender.
         let reached = agreed.wait_for(|reached| *reached >= place).await;
-        reached.is_ok_and(|reached| reached.reign == place.reign)
+        reached.is_ok_and(|reached| reached.times_led == place.times_led)
     }
 
     /// Applies and records the records of the computer that has the master.

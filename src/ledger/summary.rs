@@ -39,8 +39,7 @@ impl Inner {
                 method = method.name(),
                 mirror,
                 master,
-                "the mirror's reply differs from the master's, whose reply counts; the mirror is made \
-                 anew. Please report this line (it comes once for each method)"
+                "the mirror's reply differs from the master's, which counts; the mirror is rebuilt. Please report this line (it is logged once per method)"
             );
         }
     }

@@ -165,8 +165,7 @@ async fn ask(nodes: Arc<Nodes>, port: String, listening: Arc<HashSet<SocketAddr>
         rarely!(
             info,
             ?names,
-            "a registered node is dead: its port refuses connections. It stays registered until it is started \
-             again, unregistered, or found by a health check (--reap-dead-nodes)"
+            "a registered node is dead: its port refuses connections. It stays registered until it restarts, is unregistered, or fails a health check (--reap-dead-nodes)"
         );
     }
 }

@@ -204,7 +204,7 @@ pub(crate) fn shut_down(nodes: &Arc<Nodes>, displaced: Displaced) {
                     info,
                     node,
                     api,
-                    "telling a node to shut down: another has its name"
+                    "telling a node to shut down: another node has taken its name"
                 );
                 nodes.stats.notifications_sent.count();
                 client::ask(api, &master::shutdown(node), nodes.timeout).await;

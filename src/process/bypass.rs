@@ -248,8 +248,7 @@ pub(crate) async fn watch(upstream: Arc<Upstream>, board: Arc<Board>, uri: Strin
         for who in new {
             rarely!(
                 warn, %who,
-                "goes past rosrescue: it talks to the master directly, and what it writes is not recorded. Start it \
-                 again with ROS_MASTER_URI={uri}"
+                "a client bypasses rosrescue: it talks to the master directly, so its changes are not recorded. Restart it with ROS_MASTER_URI={uri}"
             );
         }
         board.update(|facts| {

@@ -1,9 +1,10 @@
 //! Orphans: rosmasters and rosouts that a killed rosrescue left running.
 //!
-//! They are identified by their process, not by their port: another program may have taken the port since,
-//! even another rosmaster. A [`PidFile`](super::PidFile) names the process that was started last. Without that
-//! file all processes are searched: each started process has the checkpoint's path in its environment. No other
-//! program sets that variable, and the kernel shows it as long as the process lives.
+//! They are identified by their process, not by their port, because another program may have taken
+//! the port since, even another rosmaster. A [`PidFile`](super::PidFile) names the process that was
+//! started last. Without that file all processes are searched: each process started by rosrescue
+//! has the checkpoint's path in its environment. No other program sets that variable, and the
+//! kernel shows it as long as the process lives.
 
 use std::{
     ffi::{OsStr, OsString},
@@ -16,13 +17,13 @@ use rustix::process::{PidfdFlags, Signal};
 
 use super::{Rosmaster, listeners, pid_file::Last, pidfd, runs, signal_process};
 
-/// The environment variable that identifies a process's owner.
+/// Environment variable that names the checkpoint of the rosrescue that started the process.
 pub(super) const OWNER: &str = "ROSRESCUE_OWNER";
 
 /// The value of [`OWNER`] for processes of `checkpoint`.
 pub(super) fn owner(checkpoint: &Path) -> OsString {
     let absolute = std::path::absolute(checkpoint).unwrap_or_else(|_| checkpoint.to_owned());
-    // The file may not exist yet.
+    // The checkpoint file may not exist yet.
     let folder = absolute.parent().and_then(|path| path.canonicalize().ok());
     match (folder, absolute.file_name()) {
         (Some(folder), Some(name)) => folder.join(name).into(),
@@ -32,7 +33,7 @@ pub(super) fn owner(checkpoint: &Path) -> OsString {
 
 /// A rosmaster that an earlier rosrescue left running.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Left {
+pub(crate) enum Orphan {
     /// It listens at the expected port.
     Serving(u32),
     /// It was started for that port and does not listen yet, so it is still empty.
@@ -40,9 +41,10 @@ pub(crate) enum Left {
 }
 
 impl Rosmaster {
-    /// The rosmaster that an earlier rosrescue with this checkpoint left running for `port`. Ends the others
-    /// if there is none: they are of no use. Blocks for long if it must be searched for.
-    pub(crate) fn left_behind(&self, port: Option<u16>) -> Option<Left> {
+    /// Finds the rosmaster that an earlier rosrescue with this checkpoint left running for `port`,
+    /// and kills its other rosmasters, which are of no use. Blocks for long if all processes must
+    /// be searched.
+    pub(crate) fn claim_orphan(&self, port: Option<u16>) -> Option<Orphan> {
         let owner = owner(&self.checkpoint);
         let last = self.pid_file.last();
         let all = match last {
@@ -59,9 +61,9 @@ impl Rosmaster {
             _ => is_told(pid, port),
         };
         if let Some(port) = port
-            && let Some(left) = left_for(port, &all, &owner, is_told)
+            && let Some(left) = choose(port, &all, &owner, is_told)
         {
-            let (Left::Serving(pid) | Left::Starting(pid)) = left;
+            let (Orphan::Serving(pid) | Orphan::Starting(pid)) = left;
             self.pid_file.record(pid, port);
             return Some(left);
         }
@@ -70,7 +72,7 @@ impl Rosmaster {
         for pid in all.into_iter().filter(|pid| runs(*pid, &name)) {
             tracing::info!(
                 pid,
-                "ending a rosmaster that was left behind and does not serve"
+                "killing a rosmaster that an earlier rosrescue left behind and that does not serve"
             );
             signal_process(pid, Signal::KILL);
         }
@@ -78,20 +80,21 @@ impl Rosmaster {
     }
 }
 
-/// The one of `all` that listens at `port`, or that will: a rosmaster whose port is taken never listens. `is_told`:
-/// whether a process was told a port. If none of `all` listens, another process of `owner` may: a program given by
-/// `--rosmaster` may start another one.
-fn left_for(
+/// Chooses from `all` the process that listens at `port` or will listen there: a rosmaster whose
+/// port is taken never listens. `is_told` tells whether a process was given a port. If none of
+/// `all` listens, another process of `owner` may, because a program given by `--rosmaster` may
+/// start another one.
+fn choose(
     port: u16,
     all: &[u32],
     owner: &OsStr,
     is_told: impl Fn(u32, u16) -> bool,
-) -> Option<Left> {
+) -> Option<Orphan> {
     let sockets = listeners::sockets(port);
     let mut known = all.iter().copied();
     if sockets.is_empty() {
         let starting = known.find(|pid| is_told(*pid, port));
-        return starting.map(Left::Starting);
+        return starting.map(Orphan::Starting);
     }
     let serving = known
         .find(|pid| listeners::holds_one(*pid, &sockets))
@@ -99,7 +102,7 @@ fn left_for(
             let mut others = listeners::at(port).into_iter();
             others.find(|pid| is_orphan(*pid, owner))
         });
-    serving.map(Left::Serving)
+    serving.map(Orphan::Serving)
 }
 
 /// Whether the command line of the process `pid` gives `port` as rosmaster's.
@@ -112,8 +115,8 @@ fn is_told(pid: u32, port: u16) -> bool {
         .any(|pair| pair == [b"-p", port.as_bytes()])
 }
 
-/// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes of other
-/// containers may be visible, and their checkpoint may have the same path.
+/// Living processes with this `owner` whose rosrescue is gone, in our network namespace. Processes
+/// of other containers may be visible, and their checkpoint may have the same path.
 pub(super) fn find(owner: &OsStr) -> Vec<u32> {
     super::all().filter(|pid| is_orphan(*pid, owner)).collect()
 }
@@ -149,8 +152,9 @@ fn network(process: &dyn std::fmt::Display) -> Option<PathBuf> {
     fs::read_link(format!("/proc/{process}/ns/net")).ok()
 }
 
-/// Whether the parent of `pid` is a rosrescue, so that it is no orphan. Our own parent does not count: a
-/// guardian starts no masters, but as the first process of a container it inherits those of dead workers.
+/// Whether the parent of `pid` is a rosrescue, so that `pid` is no orphan. Our own parent does not
+/// count: a guardian starts no masters, but as the first process of a container it inherits those
+/// of dead workers.
 fn has_rosrescue(pid: u32) -> bool {
     let parent = super::parent_of(pid);
     parent.is_some_and(|parent| parent != parent_id() && super::is_rosrescue(parent))
@@ -160,7 +164,7 @@ fn has_rosrescue(pid: u32) -> bool {
 ///
 /// # Errors
 ///
-/// The system's error: the process is gone, or the kernel is older than 5.3 and cannot watch it.
+/// If the process is gone, or if the kernel is older than 5.3 and cannot watch it.
 pub(super) async fn ended(pid: u32) -> io::Result<()> {
     let pid = i32::try_from(pid).map_err(io::Error::other)?;
     let process = pidfd::open(pid, PidfdFlags::empty())?;
@@ -177,7 +181,7 @@ mod tests {
     use super::*;
     use crate::{config::SupervisedConfig, process::Stat};
 
-    /// Runs `program` and gives the id of the process that it prints.
+    /// Runs `program` and returns the process id that it prints.
     fn pid_of(program: &str, owner: &OsStr) -> u32 {
         let output = Command::new("sh")
             .args(["-c", program])
@@ -201,7 +205,7 @@ mod tests {
             .env(OWNER, &owner)
             .spawn()
             .unwrap();
-        // This test's program is called after rosrescue, too.
+        // This test's program is named after rosrescue, too.
         assert_eq!(find(&owner), Vec::<u32>::new(), "its rosrescue lives");
         let orphan = pid_of("sleep 60 >/dev/null & echo $!", &owner);
         assert_eq!(find(&owner), [orphan]);
@@ -209,7 +213,7 @@ mod tests {
         let end = tokio::spawn(ended(orphan));
         signal_process(orphan, Signal::KILL);
         let end = tokio::time::timeout(Duration::from_secs(60), end).await;
-        end.expect("the end is told").unwrap().unwrap();
+        end.expect("the end is reported").unwrap().unwrap();
         assert_eq!(find(&owner), Vec::<u32>::new());
         kept.kill().unwrap();
         kept.wait().unwrap();
@@ -233,14 +237,14 @@ mod tests {
         rosmaster.pid_file.record(ended.id(), 1);
         ended.kill().unwrap();
         ended.wait().unwrap();
-        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
         assert!(Stat::of(orphan).is_some_and(Stat::is_alive), "not found");
 
         rosmaster.pid_file.record(orphan, 1);
-        let starting = Some(Left::Starting(orphan));
-        assert_eq!(rosmaster.left_behind(Some(1)), starting);
+        let starting = Some(Orphan::Starting(orphan));
+        assert_eq!(rosmaster.claim_orphan(Some(1)), starting);
         rosmaster.pid_file.remove();
-        assert_eq!(rosmaster.left_behind(Some(1)), None);
+        assert_eq!(rosmaster.claim_orphan(Some(1)), None);
         while Stat::of(orphan).is_some_and(Stat::is_alive) {
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -258,12 +262,12 @@ mod tests {
             .unwrap();
         let own = std::process::id();
         let pid = starting.id();
-        let left_for = |port, all: &[u32]| left_for(port, all, OsStr::new("nothing"), is_told);
-        assert_eq!(left_for(port, &[pid, own]), Some(Left::Serving(own)));
-        assert_eq!(left_for(port, &[pid]), None, "its port is taken");
+        let choose = |port, all: &[u32]| choose(port, all, OsStr::new("nothing"), is_told);
+        assert_eq!(choose(port, &[pid, own]), Some(Orphan::Serving(own)));
+        assert_eq!(choose(port, &[pid]), None, "its port is taken");
         drop(listener);
-        assert_eq!(left_for(port, &[own, pid]), Some(Left::Starting(pid)));
-        assert_eq!(left_for(1, &[own, pid]), None, "it is for another port");
+        assert_eq!(choose(port, &[own, pid]), Some(Orphan::Starting(pid)));
+        assert_eq!(choose(1, &[own, pid]), None, "it is for another port");
         starting.kill().unwrap();
         starting.wait().unwrap();
     }

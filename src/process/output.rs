@@ -31,7 +31,7 @@ pub(super) struct Output {
 struct Shared {
     /// The present file, readable and open for appending.
     file: Mutex<Option<File>>,
-    /// Whether the disk still owes an answer. It is not asked again before it has answered.
+    /// Whether the disk still owes an answer. Before that it gets no other work.
     asked: AtomicBool,
 }
 
@@ -67,7 +67,7 @@ impl Output {
             warn,
             file = %self.path.display(),
             error,
-            "cannot create the file for a process's output; the process starts without it"
+            "cannot create the output file of a child process; it starts without one"
         );
     }
 

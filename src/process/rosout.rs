@@ -42,7 +42,7 @@ impl Rosout {
 
     /// Finds the rosout that an earlier rosrescue with this checkpoint left running. It may not
     /// have registered yet. Blocks for long if all processes must be searched.
-    pub(crate) fn left_behind(&self) -> Option<u32> {
+    pub(crate) fn find_orphan(&self) -> Option<u32> {
         match self.pid_file.last() {
             Last::Running { pid, .. } => Some(pid).filter(|pid| orphan::is_in_our_network(*pid)),
             Last::Ended => None,

@@ -267,7 +267,11 @@ impl Examiner {
         let reply = connection.predicted(plan.request().clone(), plan.answer());
         let raw = within(CATCH_UP_LIMIT, reply).await?;
         let verdict = verdict(&plan, &raw)?;
-        tracing::debug!(writes = count, ?verdict, "the master has caught up");
+        tracing::debug!(
+            writes = count,
+            ?verdict,
+            "the master has caught up with the mirror"
+        );
         if verdict.is_ok() {
             self.ledger.delivered();
         }
@@ -294,9 +298,7 @@ impl Examiner {
             Supervision::Theirs => {
                 rarely!(
                     warn,
-                    "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or \
-                     it does not close them; what they do from now on may be lost. Restart the master, if \
-                     this comes again"
+                    "calls of closed connections have been running in the master for {SETTLE_LIMIT:?}, or it does not close its connections; what these calls still change may be lost. Restart the master if this happens again"
                 );
                 Ok(())
             }
@@ -449,9 +451,9 @@ impl Examiner {
                 error,
                 round,
                 mismatches = ?examination.mismatches,
-                "the master differs from what it was given, and is given it once more; please report this line"
+                "the master does not hold what was restored to it; restoring again; please report this line"
             );
-            // What the master holds wins over what was expected; the rest is tried again.
+            // What the master holds wins over what was expected; the rest is retried.
             let first = self.first_look(connection).await?;
             let found = inspect::second(first, connection, plan.expected());
             let found = self.while_alive(found).await?;
@@ -519,8 +521,7 @@ fn say_difference(difference: &[String]) {
         rarely!(
             warn,
             ?difference,
-            "the master was changed past rosrescue, and the mirror follows it; let everybody use \
-             rosrescue's address"
+            "the master was changed directly, bypassing rosrescue, and the mirror now follows it; set ROS_MASTER_URI to rosrescue's address everywhere"
         );
     }
 }
@@ -531,8 +532,7 @@ fn say_older(difference: &[String]) {
         rarely!(
             warn,
             ?difference,
-            "the master holds a newer state than the checkpoint, and goes on with it: the disk was full, the \
-             checkpoint came from a copy, or the master was changed past rosrescue"
+            "the master's state is newer than the checkpoint, so it is kept: the disk was full, the checkpoint is an old copy, or the master was changed directly"
         );
     }
 }

@@ -1,44 +1,46 @@
-//! The supervised rosmaster: our child, or one that an earlier rosrescue left running.
+//! The supervised rosmaster: a child of this process, or one that an earlier rosrescue left
+//! running.
 
 use tokio::sync::mpsc;
 
 use crate::{
     ledger::Ledger,
     limit::{Pair, alarm, all_clear, rarely},
-    process::{self, Left, ProcessError, Rosmaster},
+    process::{self, Orphan, ProcessError, Rosmaster},
     ros_env::MasterUri,
     upstream::Upstream,
 };
 
-/// That the master has ended or is killed, and that one is started.
+/// Limits the log lines that the master has ended or is killed, and that a new one is started.
 static ENDED: Pair = Pair::new();
 
-/// A child's process id, and how it ended.
+/// Process id of a child, and how it ended.
 type End = (u32, String);
 
 /// The master that rosrescue starts and ends.
 #[derive(Debug)]
 pub(crate) struct MasterProcess {
     rosmaster: Rosmaster,
-    /// Port of the last master. Tried first, so that the address stays the same.
+    /// Port of the last master. It is tried first, so that the address stays the same.
     port: Option<u16>,
-    /// Our child, or the master that was left running, until its end is reported.
+    /// Process id of our child, or of the master that was left running, until its end is reported.
     current: Option<u32>,
-    /// A master that an earlier rosrescue had just started. It is empty, and used in place of a new one.
+    /// A master that an earlier rosrescue had just started. It is empty, and used in place of a new
+    /// one.
     starting: Option<u32>,
-    /// Our child, until it is called for the first time.
+    /// Process id of our child until it is called for the first time.
     new: Option<i32>,
     ends: (mpsc::Sender<End>, mpsc::Receiver<End>),
     /// How the last master ended, until it is reported.
     end: Option<String>,
-    /// Whether the present one was killed by us.
+    /// Whether rosrescue killed the present master.
     killed: bool,
 }
 
 impl MasterProcess {
-    /// Starts masters with `rosmaster`. The last one was at `port`; `left` is what still runs of an earlier
-    /// rosrescue.
-    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Left>) -> Self {
+    /// Starts masters with `rosmaster`. The last one was at `port`; `left` is what still runs of an
+    /// earlier rosrescue.
+    pub(crate) fn new(rosmaster: Rosmaster, port: Option<u16>, left: Option<Orphan>) -> Self {
         let mut this = Self {
             rosmaster,
             port,
@@ -51,16 +53,16 @@ impl MasterProcess {
         };
         let pid = match left {
             None => return this,
-            Some(Left::Serving(pid)) => {
+            Some(Orphan::Serving(pid)) => {
                 tracing::info!(pid, port, "an earlier rosrescue left its rosmaster running");
                 this.current = Some(pid);
                 pid
             }
-            Some(Left::Starting(pid)) => {
+            Some(Orphan::Starting(pid)) => {
                 tracing::info!(
                     pid,
                     port,
-                    "an earlier rosrescue had just started this rosmaster"
+                    "using a rosmaster that an earlier rosrescue had just started"
                 );
                 this.starting = Some(pid);
                 pid
@@ -68,22 +70,22 @@ impl MasterProcess {
         };
         this.watch(pid, async move {
             process::ended(pid).await;
-            "it was no child of this rosrescue".to_owned()
+            "it was not started by this rosrescue".to_owned()
         });
         this
     }
 
-    /// The process id of the present one.
+    /// Process id of the present master.
     pub(crate) fn pid(&self) -> Option<u32> {
         self.current
     }
 
     /// Whether a master of an earlier rosrescue is running that may hold a state.
-    pub(crate) fn is_left(&self) -> bool {
+    pub(crate) fn is_orphan(&self) -> bool {
         self.current.is_some()
     }
 
-    /// Reports the end of `pid`, for which `end` waits.
+    /// Waits for `end` in a task and reports how `pid` ended.
     fn watch(&self, pid: u32, end: impl Future<Output = String> + Send + 'static) {
         let ends = self.ends.0.clone();
         tokio::spawn(async move {
@@ -92,7 +94,7 @@ impl MasterProcess {
         });
     }
 
-    /// Starts a master, or takes one that is starting already.
+    /// Starts a master, or takes one that is already starting.
     pub(crate) async fn spawn(
         &mut self,
         ledger: &Ledger,
@@ -117,7 +119,8 @@ impl MasterProcess {
         let uri = address.to_string();
         upstream.relocate(address);
         if ledger.session().master_uri.as_ref() != Some(&uri) {
-            // Recorded before it runs: if rosrescue dies now, the next one can find the master.
+            // This is recorded before the master runs, so that the next rosrescue can find it if
+            // this one dies now.
             ledger.update_session(|session| session.master_uri = Some(uri));
         }
         let mut child = self.rosmaster.start(port).await?;
@@ -134,14 +137,14 @@ impl MasterProcess {
         Ok(pid)
     }
 
-    /// A master that was started since the last call of [`Self::take_new`]: its process id and port, and whether it
-    /// is ROS's own program.
+    /// The master that was started since the last call of [`Self::take_new`]: its process id and
+    /// port, and whether it is ROS's own program.
     pub(crate) fn new_one(&self) -> Option<(u32, u16, bool)> {
         let pid = u32::try_from(self.new?).ok()?;
         Some((pid, self.port?, self.rosmaster.is_own()))
     }
 
-    /// Gives up the master's port, which another program has.
+    /// Gives up the master's port, which another program has taken.
     pub(crate) fn port_taken(&mut self, by: Option<u32>) {
         rarely!(
             warn,
@@ -152,12 +155,12 @@ impl MasterProcess {
         self.port = None;
     }
 
-    /// The process id of a master that was started since the last call.
+    /// Takes the process id of a master that was started since the last call.
     pub(crate) fn take_new(&mut self) -> Option<i32> {
         self.new.take()
     }
 
-    /// How the last master ended, once.
+    /// Takes how the last master ended.
     pub(crate) fn take_end(&mut self) -> Option<String> {
         self.end.take()
     }
@@ -176,15 +179,15 @@ impl MasterProcess {
     }
 
     pub(crate) fn kill(&mut self) {
-        // A child's process id cannot be reused before its end is reported. For a master that was left
-        // running this holds except for a moment between its end and the report.
+        // A child's process id cannot be reused before its end is reported. For a master that was
+        // left running this also holds, except for a moment between its end and the report.
         if let Some(pid) = self.current {
             if self.port.is_some() {
                 alarm!(
                     warn,
                     ENDED,
                     pid,
-                    "the master does not answer, and is killed; a new one is started"
+                    "the master does not answer; killing it and starting a new one"
                 );
             }
             process::signal_process(pid, rustix::process::Signal::KILL);
@@ -200,7 +203,7 @@ impl MasterProcess {
         }
     }
 
-    /// Ends the master at once, so that it notifies no node any more. Returns when it is gone.
+    /// Kills the master at once, so that it notifies no more nodes. Returns when it is gone.
     pub(crate) fn end(mut self) -> impl Future<Output = ()> + Send + 'static {
         self.current = self.current.or(self.starting);
         if let Some(pid) = self.current {
@@ -219,13 +222,13 @@ impl MasterProcess {
     }
 }
 
-/// Returns how the master `current` ended, when it has ended. Cancel safe.
+/// Waits until the master `current` has ended, and returns how. Cancel safe.
 async fn gone(ends: &mut mpsc::Receiver<End>, current: Option<u32>) -> String {
     loop {
         match ends.recv().await {
             Some((pid, how)) if Some(pid) == current => return how,
             Some(_) => {}
-            // Never: the caller holds a sender.
+            // This does not happen, because the caller holds a sender.
             None => std::future::pending().await,
         }
     }

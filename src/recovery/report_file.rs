@@ -58,7 +58,7 @@ pub(super) fn keep(checkpoint: PathBuf, kept: Kept) {
     }
     tokio::task::spawn_blocking(move || {
         if let Err(error) = write(&checkpoint, &kept) {
-            tracing::debug!(%error, "the report of this rescue is not kept");
+            tracing::debug!(%error, "could not keep the report of this rescue");
         }
     });
 }

@@ -126,7 +126,11 @@ impl Driver {
         if report.outcome == Outcome::Resumed && quiet.contains(&cause) {
             // This is usual: a master with `-t` closes each idle connection, and the threads of a
             // master that is being stopped end before it does.
-            all_clear!(info, AWAY, "calls pass to the master: the same one goes on");
+            all_clear!(
+                info,
+                AWAY,
+                "calls pass to the master: the same master continues"
+            );
             return;
         }
         let report = self.board.update(|facts| facts.add(report));
@@ -175,7 +179,7 @@ impl Driver {
             match self.process {
                 Some(_) => self.log_once(format!("waiting for the master: {what}")),
                 None => self.log_once(format!(
-                    "waiting for the master, which somebody has to start: {what}"
+                    "waiting for the master, which you must start: {what}"
                 )),
             }
         }

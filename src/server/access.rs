@@ -80,8 +80,12 @@ impl Grant {
 /// XML-RPC fault would end a node that is starting.
 fn refusal(peer: IpAddr, what: &str, option: &str) -> Refusal {
     let reason = match what {
-        "call" => format!("{peer} may not call this master: rosrescue's {option} does not name it"),
-        _ => format!("{peer} may only read here: rosrescue's {option} does not name it"),
+        "call" => {
+            format!("{peer} may not call this master: its address is not in rosrescue's {option}")
+        }
+        _ => format!(
+            "{peer} may only read from this master: its address is not in rosrescue's {option}"
+        ),
     };
     Refusal {
         status: StatusCode::FORBIDDEN,
@@ -100,15 +104,19 @@ impl fmt::Display for Access {
         let may_call: Vec<_> = [&self.allow[..], &self.allow_write].concat();
         match (self.allow.is_empty(), self.allow_write.is_empty()) {
             (true, true) => f.write_str("everybody may call and change"),
-            (false, true) => write!(f, "only these may call and change: {}", list(&self.allow)),
+            (false, true) => write!(
+                f,
+                "only these networks may call and change: {}",
+                list(&self.allow)
+            ),
             (true, false) => write!(
                 f,
-                "everybody may read, only these may change: {}",
+                "everybody may read, only these networks may change: {}",
                 list(&self.allow_write)
             ),
             (false, false) => write!(
                 f,
-                "only these may call: {}; only these may change: {}",
+                "only these networks may call: {}; only these may change: {}",
                 list(&may_call),
                 list(&self.allow_write)
             ),
@@ -209,12 +217,12 @@ mod tests {
             |allow: &[&str], write: &[&str]| Access::new(nets(allow), nets(write)).to_string();
         assert_eq!(
             says(&["10.0.0.7/24"], &["fd00::/64"]),
-            "only these may call: this computer, 10.0.0.0/24, fd00::/64; only these may change: \
+            "only these networks may call: this computer, 10.0.0.0/24, fd00::/64; only these may change: \
              this computer, fd00::/64"
         );
         assert_eq!(
             says(&[], &["10.0.0.8/32"]),
-            "everybody may read, only these may change: this computer, 10.0.0.8/32"
+            "everybody may read, only these networks may change: this computer, 10.0.0.8/32"
         );
     }
 

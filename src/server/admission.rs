@@ -50,7 +50,7 @@ pub(crate) fn check_post(headers: &HeaderMap, names: &[String]) -> Result<(), Re
     if BROWSER_TYPES.contains(&essence.as_str()) {
         return Err(Refusal {
             status: StatusCode::UNSUPPORTED_MEDIA_TYPE,
-            reason: format!("content type `{essence:.100}` is not taken; XML-RPC is text/xml"),
+            reason: format!("content type `{essence:.100}` is not accepted; XML-RPC is text/xml"),
         });
     }
     Ok(())

@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn the_slowest_gives_way_when_there_is_no_room() {
+    async fn the_slowest_is_closed_when_there_is_no_room() {
         let answers = Answers::within(2 * LARGE);
         let readers = [(); 2].map(|()| Arc::<Reader>::default());
         let mut held = Vec::new();

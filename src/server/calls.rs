@@ -51,11 +51,11 @@ const LARGE: usize = 64 << 10;
 /// Largest answer that is kept, in bytes.
 const KEPT_MOST: usize = 16 << 20;
 /// Why a write is not answered.
-const UNANSWERED: &str = "the master gave no answer";
+const UNANSWERED: &str = "the master did not answer";
 /// Why a call that only a master can answer is not answered.
 pub(super) const NOT_IN_TIME: &str = "the master did not come back in time, see --hold";
 /// Why a multicall of reads is not answered while the master is away.
-const UNANSWERABLE: &str = "so many answers at once are left to the master";
+const UNANSWERABLE: &str = "only a master can answer so many reads at once";
 
 /// Why a call is not answered here.
 #[derive(Debug)]
@@ -114,14 +114,14 @@ pub struct LargeAnswer {
 fn refuse_shutdown(peer: SocketAddr, call: Option<&Request>) -> Option<HttpReply> {
     let call = call.filter(|call| call.kind() == Kind::Shutdown)?;
     if !admission::may_shut_down(peer.ip()) {
-        rarely!(warn, %peer, "refused to shut the master down for another computer");
+        rarely!(warn, %peer, "refused a shutdown of the master from another computer");
         return Some(no_shutdown(
-            "shutdown is taken from the master's own computer only",
+            "shutdown is accepted only from the master's own computer",
         ));
     }
     if admission::is_for_a_node(call) {
-        rarely!(warn, %peer, "refused to shut down for a node that is registered at our address");
-        return Some(no_shutdown("this is the master, and no node"));
+        rarely!(warn, %peer, "refused a shutdown that was meant for a node: a node is registered at rosrescue's address");
+        return Some(no_shutdown("this is the master, not a node"));
     }
     None
 }

@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_one_that_has_been_idle_for_longest_gives_way() {
+    fn the_one_that_has_been_idle_for_longest_is_closed() {
         let idle = Idle::among(4);
         let [first, second, third, fourth] = [(); 4].map(|()| Arc::new(Notify::new()));
         let was_idle = idle.enter(&first);

@@ -167,7 +167,7 @@ pub async fn run(
             }
             Err(error) => {
                 if !std::mem::replace(&mut failed, true) {
-                    rarely!(warn, %error, "cannot accept connections, and tries again; raise the limit on open files, if that is the reason");
+                    rarely!(warn, %error, "cannot accept connections; retrying; raise the limit on open files if that is the reason");
                 }
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
@@ -211,13 +211,13 @@ async fn serve(stream: TcpStream, peer: SocketAddr, server: Arc<Server>, stop: C
             ended = &mut connection => break ended,
             () = close.notified() => {
                 if deadlines.is_idle() {
-                    tracing::debug!(%peer, "closed, having been idle for longest");
+                    tracing::debug!(%peer, "closed the connection that was idle for longest");
                     return;
                 }
             }
             () = deadlines.reader.is_to_close() => {
                 if deadlines.is_replying() && deadlines.reader.is_slow() {
-                    tracing::debug!(%peer, "closed: it reads too slowly, and others need the room");
+                    tracing::debug!(%peer, "closed a connection that reads too slowly: others need its memory");
                     // A reset, so that the kernel keeps nothing of the answer and the client calls
                     // again.
                     let stream = connection.into_parts().io.into_inner();

@@ -138,7 +138,7 @@ impl Drop for PassOn {
         let body = Bytes::from(xmlrpc::encode_call(&call.into()));
         runtime.spawn(async move {
             if let Err(error) = leader.forward(term, &Head::default(), &body).await {
-                tracing::debug!(%error, "telling the leader that an answer was passed on");
+                tracing::debug!(%error, "could not tell the leader that an answer was passed on");
             }
         });
     }
@@ -297,7 +297,7 @@ impl Others {
             tokio::select! {
                 biased;
                 Some(reply) = call.by_mirror_when_fresh(), if by_mirror => return Ok(reply),
-                changed = way.changed() => changed.map_err(|_| Closed("rosrescue stops"))?,
+                changed = way.changed() => changed.map_err(|_| Closed("rosrescue is stopping"))?,
                 () = retry => {}
                 () = &mut hold => {
                     call.calls.stats.calls_unanswered.count();
@@ -328,7 +328,7 @@ impl Others {
         let _ = self.handovers.send((to.to_owned(), tell)).await;
         handed_over(
             told.await
-                .unwrap_or_else(|_| Err("rosrescue stops".to_owned())),
+                .unwrap_or_else(|_| Err("rosrescue is stopping".to_owned())),
         )
     }
 }
@@ -394,7 +394,7 @@ impl Call<'_> {
             return match leader.forward(term, &self.head, &self.body).await {
                 Ok(raw) => Some(self.pass_on(leader, term, raw)),
                 Err(error) => {
-                    tracing::debug!(%error, "a call to the leader");
+                    tracing::debug!(%error, "a call to the leader failed");
                     None
                 }
             };
@@ -425,7 +425,7 @@ impl Call<'_> {
         match reply {
             Ok(raw) => Some(self.pass_on(leader, term, raw)),
             Err(error) => {
-                tracing::debug!(%error, "a read from the leader");
+                tracing::debug!(%error, "a read from the leader failed");
                 self.by_mirror().await
             }
         }
@@ -484,7 +484,7 @@ fn passed_on() -> HttpReply {
 fn not_leading(term: u64) -> HttpReply {
     text(
         peer::NOT_LEADING,
-        format!("this rosrescue does not lead in term {term}\n"),
+        format!("this rosrescue is not the leader in term {term}\n"),
     )
 }
 
@@ -492,8 +492,7 @@ fn too_large(bytes: usize) -> HttpReply {
     xml(&Reply::Fault {
         code: 1,
         text: format!(
-            "the call has {bytes} bytes, and with --cluster it may have {RECORD_BYTES_MAX} at most; set a \
-             large parameter in parts, or give nodes a file"
+            "the call has {bytes} bytes, but with --cluster at most {RECORD_BYTES_MAX} are allowed; set a large parameter in parts, or store it in a file"
         ),
     })
 }

@@ -33,8 +33,7 @@ use crate::{
 
 /// Sent to another computer whose body rosrescue cannot decode. The master may be able to, and the
 /// call may be a `shutdown`.
-const UNDECODED: &str = "rosrescue cannot decode this request, and takes such from the master's own \
-                         computer only; send XML-RPC in UTF-8, without a document type";
+const UNDECODED: &str = "rosrescue cannot decode this request, and accepts such requests only from the master's own computer; send XML-RPC in UTF-8, without a document type";
 
 /// Other large answers are waiting, and this one cannot be made again.
 const NO_ROOM: Closed = Closed("too many large answers at the same time");
@@ -133,11 +132,11 @@ async fn post(
         Ok(read) => read,
         Err(BodyError::TooLarge { limit }) => {
             server.stats.requests_refused.count();
-            rarely!(warn, %peer, limit, "refused a request body beyond the limit (--max-body)");
+            rarely!(warn, %peer, limit, "refused a request body larger than the limit (--max-body)");
             let reason = format!("the body is larger than {limit} bytes, see --max-body\n");
             return Ok(text(StatusCode::PAYLOAD_TOO_LARGE, reason));
         }
-        Err(BodyError::Broken) => return Err(Closed("the request broke off")),
+        Err(BodyError::Broken) => return Err(Closed("the request ended early")),
         Err(BodyError::TooSlow) => return Err(Closed("the request came too slowly")),
         Err(BodyError::NoRoom) => return Err(Closed("too many large requests at the same time")),
     };
@@ -154,7 +153,7 @@ async fn post(
         tracing::debug!(%peer, bytes = body.len(), "a request that cannot be decoded");
         if !admission::may_shut_down(peer.ip()) {
             server.stats.requests_refused.count();
-            rarely!(warn, %peer, "refused a request of another computer that cannot be decoded");
+            rarely!(warn, %peer, "refused a request from another computer that cannot be decoded");
             return Ok(xml(&Reply::Fault {
                 code: 1,
                 text: UNDECODED.to_owned(),

@@ -1,4 +1,4 @@
-//! The computers of the robot, as `/status.json` has them.
+//! The computers of the robot in `/status.json` and in `rosrescue status`.
 
 use std::fmt;
 
@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::cluster::{ClusterFacts, LeaderFacts, MemberFacts, Takeover};
 use crate::{clock, cluster::machine::Role, ros_env::MasterUri};
 
-/// What is known of the computers of the robot, this one included. All times of day are seconds since 1970.
+/// What is known about the robot's computers, this one included. Times of day are seconds since
+/// 1970.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Computers {
     /// This computer's name.
@@ -15,37 +16,37 @@ pub(crate) struct Computers {
     pub(crate) role: Role,
     /// Since when it has this role.
     pub(crate) since: f64,
-    /// Who leads, or led last.
+    /// The current leader, or the last one while there is none.
     pub(crate) leader: Option<Leader>,
-    /// Since when nobody leads; none while somebody does.
+    /// Since when there is no leader; none while there is one.
     pub(crate) leaderless_since: Option<f64>,
-    /// The journal's last record that is known.
+    /// The last journal record that this computer knows of.
     pub(crate) seq: u64,
-    /// Records that this computer's mirror lacks.
+    /// Number of journal records that this computer's mirror lacks.
     pub(crate) behind: u64,
-    /// Writes that were made here and that etcd does not have yet.
+    /// Number of writes made here that etcd does not have yet.
     pub(crate) uncommitted: u64,
-    /// Why etcd does not answer; none if it does.
+    /// Why etcd does not answer; none while it answers.
     pub(crate) etcd_trouble: Option<Trouble>,
-    /// Sorted by name.
+    /// All computers, sorted by name.
     pub(crate) computers: Vec<Computer>,
-    /// Times that this computer has taken over.
+    /// Number of takeovers by this computer.
     pub(crate) takeovers: u64,
-    /// The last of them.
+    /// The last takeover by this computer.
     pub(crate) last_takeover: Option<Taken>,
-    /// Writes that were answered alone and did not hold.
+    /// Number of writes answered while cut off that were lost.
     pub(crate) lost_writes: u64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Leader {
     pub(crate) name: String,
-    /// Where nodes and other computers reach it.
+    /// Address at which nodes and other computers reach the leader.
     pub(crate) uri: String,
     pub(crate) version: String,
-    /// Grows with each leader.
+    /// The leader's term: a number that grows with each leader.
     pub(crate) term: u64,
-    /// Since when this computer knows of it.
+    /// When this computer learned of this leader.
     pub(crate) since: f64,
 }
 
@@ -55,31 +56,32 @@ pub(crate) struct Trouble {
     pub(crate) why: String,
 }
 
-/// A computer, as it said last.
+/// A computer of the robot, as it last described itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Computer {
     pub(crate) name: String,
     pub(crate) uri: String,
     pub(crate) version: String,
     pub(crate) role: Role,
-    /// Records that its mirror lacks.
+    /// Number of journal records that its mirror lacks.
     pub(crate) behind: u64,
-    /// When it was heard of last; none if not since this rosrescue started, or if it is this computer.
+    /// When this computer last heard from it; none for this computer itself, or if not since this
+    /// rosrescue started.
     pub(crate) heard: Option<f64>,
-    /// It is not heard of any more.
+    /// Whether it has not been heard from for 15 s.
     pub(crate) away: bool,
 }
 
 /// A takeover by this computer.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Taken {
-    /// When writes were answered here for the first time.
+    /// When this computer answered its first write as the leader.
     pub(crate) at: f64,
-    /// From the last sign of the previous leader until then.
+    /// Seconds from the last sign of the previous leader to the first answered write.
     pub(crate) seconds: f64,
-    /// Who led before; none if nobody did.
+    /// Name of the previous leader; none if there was none.
     pub(crate) from: Option<String>,
-    /// Whether the previous leader gave up leading by itself.
+    /// Whether the previous leader gave up in order, as in a handover.
     pub(crate) in_order: bool,
 }
 
@@ -91,7 +93,7 @@ impl From<&ClusterFacts> for Computers {
             .map(|of| Computer::new(of, facts))
             .collect();
         computers.sort_by(|a, b| a.name.cmp(&b.name));
-        // The first leader took over from nobody.
+        // A takeover has no previous leader when this computer was the first one.
         let last = facts.last_takeover.as_ref();
         let last = last.filter(|takeover| takeover.from.is_some());
         Self {
@@ -160,15 +162,15 @@ impl From<&Takeover> for Taken {
 }
 
 impl Computers {
-    /// Who leads now.
+    /// The current leader; none while there is no leader.
     pub(crate) fn leads(&self) -> Option<&Leader> {
         self.leader
             .as_ref()
             .filter(|_| self.leaderless_since.is_none())
     }
 
-    /// The name of the computer that a person means by `given`: its name, the beginning of one name, or its
-    /// address.
+    /// Finds the computer that `given` means: its whole name, the beginning of exactly one name, or
+    /// its address.
     pub(crate) fn find(&self, given: &str) -> Option<&str> {
         let names = || self.computers.iter().map(|of| of.name.as_str());
         if let Some(name) = names().find(|name| *name == given) {
@@ -187,7 +189,7 @@ impl Computers {
         meant.next().is_none().then_some(&first.name)
     }
 
-    /// The lines of `rosrescue status`, at `now` in seconds since 1970.
+    /// Writes the lines of `rosrescue status`. `now` is in seconds since 1970.
     pub(crate) fn lines(&self, now: f64, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let ago = |at: f64| format!("{} ({} ago)", clock::wall_text(at), clock::span(now - at));
         match (&self.leader, self.leaderless_since) {
@@ -206,7 +208,7 @@ impl Computers {
                 leader.name,
                 leader.term
             )?,
-            (None, _) => writeln!(f, "leader      NONE is known")?,
+            (None, _) => writeln!(f, "leader      NONE known yet")?,
         }
         for (number, computer) in self.computers.iter().enumerate() {
             let head = if number == 0 { "computers" } else { "" };
@@ -224,11 +226,7 @@ impl Computers {
             writeln!(f, "etcd        NO ANSWER since {}: {why}", ago(*since))?;
         }
         if self.uncommitted > 0 {
-            writeln!(
-                f,
-                "not in etcd {} changes of this computer",
-                self.uncommitted
-            )?;
+            writeln!(f, "not in etcd {} changes made here", self.uncommitted)?;
         }
         if let Some(Taken {
             at,
@@ -238,10 +236,10 @@ impl Computers {
         }) = &self.last_takeover
         {
             let from = from.as_ref().map(|from| format!(" from {from}"));
-            let order = if *in_order { ", in order" } else { "" };
+            let order = if *in_order { " (handover)" } else { "" };
             writeln!(
                 f,
-                "takeover    {}{}{order}: in {}; {} by this computer so far",
+                "takeover    {}{}{order}, took {}; {} by this computer so far",
                 ago(*at),
                 from.unwrap_or_default(),
                 match *seconds < 1.0 {
@@ -254,7 +252,7 @@ impl Computers {
         if self.lost_writes > 0 {
             writeln!(
                 f,
-                "lost        {} of the changes made alone: others had changed the same. The log lists them",
+                "lost        {} of the changes made while cut off: others had changed the same. The log lists them",
                 self.lost_writes
             )?;
         }
@@ -349,9 +347,9 @@ mod tests {
                 "            pc-2 (this one) is following, 2 records behind",
                 "            pc-3 is AWAY, no contact since the start",
                 "etcd        NO ANSWER since THEN: no majority",
-                "not in etcd 3 changes of this computer",
-                "takeover    THEN from pc-3: in 2.04 s; 2 by this computer so far",
-                "lost        1 of the changes made alone: others had changed the same. The log lists them",
+                "not in etcd 3 changes made here",
+                "takeover    THEN from pc-3, took 2.04 s; 2 by this computer so far",
+                "lost        1 of the changes made while cut off: others had changed the same. The log lists them",
             ]
         );
     }

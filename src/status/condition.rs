@@ -1,4 +1,4 @@
-//! How the robot is, in words for a tired person: one name, what nodes notice now, and what to do.
+//! The condition of the robot in words: one name, what nodes notice now, and what to do.
 
 mod computers;
 
@@ -9,25 +9,25 @@ use serde::{Deserialize, Serialize};
 use super::{Facts, Guarded, Mode, summary::some};
 use crate::{clock, gate::State};
 
-/// The conditions, from the best to the worst.
+/// The conditions, from best to worst.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Name {
     /// Calls pass to the master and every change is recorded.
     Protected,
-    /// Another computer leads, and calls are forwarded to it.
+    /// Another computer leads, and this one forwards calls to it.
     Following,
     /// The master is away, and the mirror answers in its place.
     StandingIn,
-    /// Of several computers none leads, as far as this one knows: the mirror answers reads, writes wait.
+    /// This computer knows of no leader: the mirror answers reads, and writes wait.
     NoLeader,
-    /// The master dies again and again. Between two deaths calls may pass.
+    /// The master keeps dying. Calls may pass between two deaths.
     CrashLoop,
     /// Calls are answered, but changes are not recorded.
     Unprotected,
     /// This computer is cut off from the others.
     Alone,
-    /// Nobody knows the state: no master was ever seen, and calls wait for one.
+    /// The state is unknown: no master has been seen yet, and calls wait for one.
     Waiting,
 }
 
@@ -43,7 +43,7 @@ impl Name {
         Self::Waiting,
     ];
 
-    /// As in JSON and in metrics.
+    /// The name used in JSON and metrics.
     pub(crate) fn as_str(self) -> &'static str {
         match self {
             Self::Protected => "protected",
@@ -63,39 +63,39 @@ impl Name {
             Self::Following => "following the leader",
             Self::StandingIn => "standing in for the master",
             Self::NoLeader => "no computer leads",
-            Self::CrashLoop => "crash loop of the master",
+            Self::CrashLoop => "master crash loop",
             Self::Unprotected => "UNPROTECTED",
             Self::Alone => "ALONE",
-            Self::Waiting => "waiting for a first master",
+            Self::Waiting => "waiting for the first master",
         }
     }
 }
 
-/// How the robot is.
+/// The condition of the robot at one moment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Condition {
-    /// The worst that is so.
+    /// The worst condition that applies.
     pub(crate) name: Name,
-    /// Since when, in seconds since 1970 by the wall clock.
+    /// When the condition began, in seconds since 1970 by the wall clock.
     pub(crate) since: f64,
-    /// What nodes notice now.
+    /// What nodes notice now, in one or more sentences.
     pub(crate) text: String,
-    /// What to do; none if nothing is.
+    /// What to do; none if there is nothing to do.
     pub(crate) action: Option<String>,
 }
 
 impl Condition {
-    /// Whether nobody needs to look.
+    /// Whether nobody has to look at the robot.
     pub(crate) fn is_good(&self) -> bool {
         self.is_protected() && self.action.is_none()
     }
 
-    /// Whether calls pass to a master, here or on the leading computer, and changes are recorded.
+    /// Whether changes are recorded and calls pass to a master, here or on the leader.
     pub(crate) fn is_protected(&self) -> bool {
         matches!(self.name, Name::Protected | Name::Following)
     }
 
-    /// In a line, as systemd shows it.
+    /// The condition in one line, as systemd shows it.
     pub(crate) fn line(&self) -> String {
         let action = self.action.iter().map(|action| format!(" To do: {action}"));
         let text = format!(
@@ -104,7 +104,7 @@ impl Condition {
             self.text,
             action.collect::<String>()
         );
-        // A newline would start another assignment.
+        // systemd would read a newline as the start of another assignment.
         text.replace('\n', " ")
     }
 
@@ -113,18 +113,18 @@ impl Condition {
     }
 }
 
-/// What the condition follows from, besides the [`Facts`].
+/// The facts that decide the condition, in addition to [`Facts`].
 #[derive(Debug)]
 pub(crate) struct Situation {
     pub(crate) gate: State,
-    /// Since when calls pass, or do not.
+    /// When the gate last opened or shut.
     pub(crate) gate_since: Instant,
-    /// Why changes are not recorded.
+    /// Why changes are not recorded; none if they are.
     pub(crate) unprotected: Option<String>,
     pub(crate) master: String,
 }
 
-/// The condition of `now`.
+/// Derives the condition from the situation and the facts.
 pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
     let (mut text, mut action) = nodes_notice(now, facts);
     let (mut name, mut since) = match now.gate {
@@ -175,7 +175,7 @@ pub(crate) fn condition(now: &Situation, facts: &Facts) -> Condition {
                  continues."
             );
             action.get_or_insert_with(|| {
-                format!("continue the guardian: `fg`, `bg` or `kill -CONT {pid}`.")
+                format!("resume the guardian with `fg`, `bg` or `kill -CONT {pid}`.")
             });
         }
         Guarded::Nobody | Guarded::Systemd | Guarded::Guardian { .. } => {}
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_past_rosrescue_is_not_protected() {
+    fn changes_that_bypass_rosrescue_are_not_protected() {
         let mut facts = Facts::new(Mode::Proxy);
         facts.bypassing = vec!["rosout (process 7)".to_owned()];
         let condition = of(OPEN, None, &facts);

@@ -22,29 +22,29 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         ("standing_in", "whether the mirror answers, because the master is away", Some(flag(status.standing_in_since.is_some()).into())),
         ("protected", "whether the state is recorded", Some(flag(status.unprotected.is_none()).into())),
         ("crash_loop", "whether the master dies again and again", Some(flag(status.crash_loop).into())),
-        ("guarded", "whether another process keeps the port when rosrescue dies", Some(flag(status.guarded).into())),
-        ("action_needed", "whether somebody should look: the status says what to do", Some(flag(status.condition.action.is_some()).into())),
+        ("guarded", "whether a guardian or systemd restarts rosrescue if it dies", Some(flag(status.guarded).into())),
+        ("action_needed", "whether somebody has to act: /status.json says what to do", Some(flag(status.condition.action.is_some()).into())),
         ("master_deaths_total", "masters that have died", Some(status.deaths as f64)),
-        ("worker_restarts_total", "times that rosrescue itself has died and was started again, in this session", Some(status.worker_restarts as f64)),
+        ("worker_restarts_total", "restarts of rosrescue itself after it died, in this session", Some(status.worker_restarts as f64)),
         ("recoveries_total", "masters examined, the first one included", Some(status.recoveries as f64)),
-        ("rescues_total", "rescues: recoveries but for an ordinary start", Some(status.rescues as f64)),
+        ("rescues_total", "recoveries other than an ordinary start", Some(status.rescues as f64)),
         ("pending_writes", "writes answered by the mirror that the master has not run yet", Some(status.pending_writes as f64)),
         ("nodes", "nodes registered", Some(status.state.nodes as f64)),
-        ("publishers", "publishers of topics, each topic counted", Some(status.state.publishers as f64)),
-        ("subscribers", "subscribers of topics, each topic counted", Some(status.state.subscribers as f64)),
+        ("publishers", "publishers, counted once for each topic", Some(status.state.publishers as f64)),
+        ("subscribers", "subscribers, counted once for each topic", Some(status.state.subscribers as f64)),
         ("services", "services registered", Some(status.state.services as f64)),
         ("params", "parameters set", Some(status.state.params as f64)),
         ("unreachable_nodes", "nodes that do not answer and are not known to be dead", Some(status.unreachable.len() as f64)),
-        ("alive_nodes", "registered nodes whose port a process listens at, or that have answered lately", Some(status.alive_nodes as f64)),
+        ("alive_nodes", "registered nodes that have a listening process or answered lately", Some(status.alive_nodes as f64)),
         ("dead_nodes", "registered nodes whose port refuses connections", Some(status.dead_nodes.len() as f64)),
-        ("unchecked_nodes", "registered nodes that were not asked yet, or not lately", Some(status.unchecked_nodes.len() as f64)),
-        ("bypassing", "processes and computers that talk to the master past rosrescue", Some(status.bypassing.len() as f64)),
+        ("unchecked_nodes", "registered nodes without a check in the last two minutes", Some(status.unchecked_nodes.len() as f64)),
+        ("bypassing", "processes and computers that bypass rosrescue and talk to the master directly", Some(status.bypassing.len() as f64)),
         ("clients", "connections of clients, a thousand at most", Some(status.clients.len() as f64)),
         ("start_time_seconds", "when this process was started, in seconds since 1970", Some(status.started)),
         ("journal_bytes", "size of the checkpoint's journal", Some(journal.bytes as f64)),
         ("snapshot_bytes", "size of the checkpoint before its journal", Some(journal.snapshot_bytes as f64)),
         ("disk_free_bytes", "bytes free on the checkpoint's disk", journal.disk_free_bytes.map(|bytes| bytes as f64)),
-        ("last_recovery_seconds", "how long calls did not pass to the master the last time", status.last_recovery.as_ref().map(|report| report.phases.total_ms / 1e3)),
+        ("last_recovery_seconds", "how long calls did not pass to the master in the last recovery", status.last_recovery.as_ref().map(|report| report.phases.total_ms / 1e3)),
     ];
     for (name, help, value) in values {
         if let Some(value) = value {
@@ -52,7 +52,7 @@ pub(crate) fn metrics(stats: &Stats, status: &Status) -> String {
         }
     }
     let names = Name::ALL.map(|name| (name.as_str(), status.condition.name == name));
-    let help = "1 for what is so, as in /status.json";
+    let help = "1 for the present condition, as in /status.json, and 0 for the others";
     add_one_of(&mut text, "condition", help, "name", &names);
     if let Some(cluster) = &status.cluster {
         add_cluster(&mut text, cluster);
@@ -67,15 +67,15 @@ fn add_cluster(text: &mut String, of: &Computers) {
     #[rustfmt::skip]
     let values: [(&str, &str, Option<f64>); 10] = [
         ("cluster_leader", "whether any computer leads, as far as this one knows", Some(u8::from(of.leads().is_some()).into())),
-        ("cluster_term", "grows with each leader", Some(term as f64)),
+        ("cluster_term", "number of the leader's term, which grows with each leader", Some(term as f64)),
         ("cluster_behind_records", "records of the journal that this computer's mirror lacks", Some(of.behind as f64)),
         ("cluster_uncommitted_records", "writes made here that etcd does not have yet", Some(of.uncommitted as f64)),
         ("cluster_etcd_up", "whether etcd answers", Some(u8::from(of.etcd_trouble.is_none()).into())),
         ("cluster_computers", "computers that have ever taken part, this one included", Some(of.computers.len() as f64)),
-        ("cluster_computers_away", "those of them that are not heard of", Some(away as f64)),
-        ("cluster_takeovers_total", "times that this computer has taken over", Some(of.takeovers as f64)),
-        ("cluster_last_takeover_seconds", "from the last sign of the previous leader to the first answered write here, the last time", last.map(|last| last.seconds)),
-        ("cluster_lost_writes_total", "changes made alone that did not hold, because others had changed the same", Some(of.lost_writes as f64)),
+        ("cluster_computers_away", "computers that have not been heard from for 15 s", Some(away as f64)),
+        ("cluster_takeovers_total", "takeovers by this computer", Some(of.takeovers as f64)),
+        ("cluster_last_takeover_seconds", "duration of the last takeover, from the last sign of the previous leader to the first write answered here", last.map(|last| last.seconds)),
+        ("cluster_lost_writes_total", "changes made while cut off that were lost, because others had changed the same", Some(of.lost_writes as f64)),
     ];
     for (name, help, value) in values {
         if let Some(value) = value {
@@ -93,7 +93,7 @@ fn add_cluster(text: &mut String, of: &Computers) {
     add_one_of(
         text,
         "cluster_role",
-        "1 for what this computer does",
+        "1 for the role of this computer, 0 for the others",
         "role",
         &roles,
     );

@@ -1,4 +1,4 @@
-//! What a rescue did, and how long each part of it took.
+//! The report of a rescue: what was done, and how long each part took.
 
 use std::{fmt, time::Duration};
 
@@ -7,31 +7,31 @@ use serde::{Deserialize, Serialize};
 use crate::limit::{Pair, all_clear, rarely};
 use crate::{clock, master::Counts};
 
-/// That the master is away, and that calls pass again.
+/// Limits the log lines that the master is away and that calls pass again.
 pub(crate) static AWAY: Pair = Pair::new();
 
-/// The cause of a report when rosrescue itself was started.
+/// Cause of a recovery at an ordinary start of rosrescue.
 pub(crate) const STARTED: &str = "rosrescue started";
-/// The same, if the one before had died.
+/// Cause of a recovery after the previous rosrescue process died.
 pub(crate) const DIED: &str = "rosrescue itself died and restarted";
-/// The cause of the first one after another computer has led.
+/// Cause of the first recovery after this computer took over from another one.
 pub(crate) const TAKEN_OVER: &str = "this computer took over";
-/// The cause of the first one of a computer that was cut off from the leader.
+/// Cause of the first recovery of a computer that was cut off from the leader.
 pub(crate) const CUT_OFF: &str = "this computer was cut off from the others";
 
 /// How the present master got its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// An empty master and an empty mirror: a new session.
+    /// A new session: master and mirror were both empty.
     Begun,
-    /// A new incarnation was brought to the mirror's state.
+    /// A new master was given the mirror's state.
     Injected,
-    /// The mirror took over what a running master holds.
+    /// The mirror was set to the state of a running master.
     Adopted,
-    /// The same incarnation as before was brought to the mirror's state again.
+    /// The same master as before was given the changes that it had missed.
     Reconciled,
-    /// The same incarnation as before, unchanged.
+    /// The same master as before already held the right state.
     Resumed,
 }
 
@@ -57,61 +57,63 @@ impl fmt::Display for Outcome {
 /// Durations in milliseconds.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Phases {
-    /// From the moment when calls stopped passing to the master's open port.
+    /// From the moment calls stopped passing until the master's port was open.
     pub absence_ms: f64,
-    /// Reading what the master holds.
+    /// Time to read the master's state.
     pub inspection_ms: f64,
-    /// Giving it the state and reading that back.
+    /// Time to give the master the state and to read it back.
     pub injection_ms: f64,
-    /// From the moment when calls stopped passing to the one when they passed again.
+    /// From the moment calls stopped passing until they passed again.
     pub total_ms: f64,
 }
 
-/// What was done for one master. One that comes after an outage, or after a restart of rosrescue, is a
+/// The report of one recovery. A recovery after an outage or after a restart of rosrescue is a
 /// rescue.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
     /// The rescue's number, as in the names of its files; 0 for an ordinary start.
     pub number: u64,
-    /// Why calls no longer passed.
+    /// Why calls stopped passing.
     pub cause: String,
-    /// How the process of the master before ended, if rosrescue has seen it.
+    /// How the previous master's process ended; none if rosrescue did not see it end.
     pub ended: Option<String>,
-    /// When calls stopped passing: seconds since 1970 by the wall clock, to compare with logs.
+    /// When calls stopped passing, in seconds since 1970 by the wall clock, for comparison with
+    /// logs.
     pub detected_at: f64,
     /// How the master got its state.
     pub outcome: Outcome,
     /// The process id that the master reports.
     pub master_pid: i32,
-    /// What the master speaks: HTTP and Python.
+    /// HTTP version and Python version of the master, as text.
     #[serde(default)]
     pub master_speaks: String,
     pub phases: Phases,
-    /// Calls that the mirror answered meanwhile.
+    /// Number of calls that the mirror answered during the outage.
     pub answered: u64,
-    /// Calls that waited in vain meanwhile, because only a master could answer them.
+    /// Number of calls that timed out during the outage, because only a master could answer them.
     pub unanswered: u64,
-    /// From then to the end of the health check, in milliseconds; none until then.
+    /// Time from the open gate to the end of the health check, in milliseconds; none until it ends.
     pub health_check_ms: Option<f64>,
-    /// What the master holds now.
+    /// Number of items of each kind that the master holds now.
     pub restored: Counts,
     /// What could not be given to the master, and why.
     pub not_restored: Vec<String>,
-    /// Differences between the master, read back, and what it was given. Should be empty.
+    /// Differences between what the master was given and what was read back. This list should be
+    /// empty.
     pub mismatches: Vec<String>,
-    /// Nodes that were found dead and unregistered.
+    /// Dead nodes that were unregistered.
     pub removed: Vec<String>,
-    /// Registrations that were added (`+`) or removed (`-`), because the node itself reports so.
+    /// Registrations that were added (`+`) or removed (`-`) because the node itself reports so.
     pub reconciled: Vec<String>,
-    /// Nodes that did not answer and were kept.
+    /// Nodes that did not answer and stay registered.
     pub unreachable: Vec<String>,
-    /// Topics whose subscribers were sent the list of publishers once more, in case the master died before it
-    /// could. Nothing is wrong with them.
+    /// Topics whose subscribers were sent the publishers again, in case the previous master died
+    /// before it could. Nothing is wrong with them.
     pub told_again: Vec<String>,
 }
 
 impl Report {
-    /// Whether it was worth a report to a person: not the ordinary start.
+    /// Whether a person should see the report: it is not an ordinary start.
     pub(crate) fn is_rescue(&self) -> bool {
         !(self.cause == STARTED && matches!(self.outcome, Outcome::Begun | Outcome::Adopted))
     }
@@ -125,7 +127,7 @@ impl Report {
         self.told_again = check.notified;
     }
 
-    /// The lists that are not empty, each with what it means.
+    /// The lists that are not empty, each with its title.
     fn lists(&self) -> impl Iterator<Item = (&'static str, &[String])> {
         let lists: [(_, &[String]); 6] = [
             ("could not be restored", &self.not_restored),
@@ -138,7 +140,7 @@ impl Report {
         lists.into_iter().filter(|(_, list)| !list.is_empty())
     }
 
-    /// What nodes noticed.
+    /// What nodes noticed of the outage.
     fn felt(&self) -> String {
         match (self.answered, self.unanswered) {
             (0, 0) => "no calls meanwhile".to_owned(),
@@ -171,12 +173,12 @@ impl Report {
             rarely!(
                 warn,
                 ?list,
-                "the new master cannot hold these, or could not return them; set them anew"
+                "the new master cannot hold these parameters, or could not return them; set them again"
             );
         }
     }
 
-    /// Logs what the health check has found.
+    /// Logs what the health check found.
     pub(crate) fn log_check(&self) {
         if !self.is_rescue() && self.lists().next().is_none() {
             return;
@@ -191,13 +193,13 @@ impl Report {
             reconciled = some(&self.reconciled),
             told_again = some(&self.told_again),
             unreachable = some(&self.unreachable),
-            "all nodes were asked whether they live: the rescue is complete"
+            "every node was checked: the rescue is complete"
         );
     }
 }
 
 impl Report {
-    /// One line for people.
+    /// The report in one line.
     pub(crate) fn line(&self) -> String {
         let at = clock::wall_text(self.detected_at);
         let Self {
@@ -211,7 +213,7 @@ impl Report {
     }
 }
 
-/// A few lines for people.
+/// The report in a few lines.
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Phases {
@@ -242,7 +244,7 @@ impl fmt::Display for Report {
     }
 }
 
-/// A duration in milliseconds, to a hundredth.
+/// Converts a duration to milliseconds, rounded to hundredths.
 pub(crate) fn ms(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1e5).round() / 1e2
 }
@@ -250,14 +252,14 @@ pub(crate) fn ms(duration: Duration) -> f64 {
 /// Results of the health check after a recovery.
 #[derive(Debug, Default)]
 pub(crate) struct HealthCheck {
-    /// From the open gate to its end.
+    /// Time from the open gate to the end of the health check.
     pub duration: Duration,
-    /// Dead nodes that were unregistered at the master, so that others are notified.
+    /// Dead nodes that were unregistered with the master, so that it notifies other nodes.
     pub removed: Vec<String>,
-    /// Registrations that were added or removed, because the node itself reports so.
+    /// Registrations that were added or removed because the node itself reports so.
     pub reconciled: Vec<String>,
-    /// Nodes that did not answer and were kept.
+    /// Nodes that did not answer and stay registered.
     pub unreachable: Vec<String>,
-    /// Topics whose subscribers were sent the full list of publishers.
+    /// Topics whose subscribers were sent the complete list of publishers.
     pub notified: Vec<String>,
 }

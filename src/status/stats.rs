@@ -40,14 +40,14 @@ macro_rules! counters {
 
 counters! {
     calls = "calls that clients made",
-    calls_from_mirror = "reads that the mirror answered while there was a master, see --reads",
+    calls_from_mirror = "reads that the mirror answered while a master was running, see --reads",
     calls_without_master = "calls that the mirror answered because the master was away or late",
-    calls_unanswered = "calls that only a master could answer and that waited for one in vain, see --hold",
-    writes_recorded = "writes that were answered with success and journaled",
-    write_batches = "round trips to the master with writes",
+    calls_unanswered = "calls that only a master could answer and that timed out, see --hold",
+    writes_recorded = "successful writes that were journaled",
+    write_batches = "batches of writes sent to the master",
     notifications_sent = "notifications that rosrescue sent to nodes in the master's place",
     requests_not_understood = "requests that rosrescue could not decode and forwarded unchanged",
     requests_refused = "requests that were refused, see security.md",
     divergences = "replies in which the mirror and the master differed",
-    masters_restored = "masters that were brought to the mirror's state",
+    masters_restored = "masters to which the state was restored",
 }

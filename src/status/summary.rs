@@ -1,4 +1,4 @@
-//! The status at one moment, as `/status.json` has it and `rosrescue status` reads it.
+//! The complete status at one moment, as `/status.json` has it and `rosrescue status` shows it.
 
 use std::fmt;
 
@@ -7,92 +7,94 @@ use serde::{Deserialize, Serialize};
 use super::{Mode, computers::Computers, condition::Condition, report::Report};
 use crate::{clock, master::Counts};
 
-/// The version of the format. It changes when a field goes away or gets another meaning; new fields do not
-/// change it.
+/// Version of the format. It changes when a field is removed or changes its meaning, not when a
+/// field is added.
 pub(crate) const SCHEMA: u32 = 1;
 
-/// A connection of a client.
+/// A client's connection.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Client {
     pub(crate) peer: String,
-    /// The caller id of its last call, cut if it is long.
+    /// Caller id of the last call, shortened if it is long.
     pub(crate) caller_id: String,
-    /// Calls on this connection.
+    /// Number of calls on this connection.
     pub(crate) calls: u64,
 }
 
-/// All calls of one caller since the start.
+/// Statistics of all calls by one caller since this process started.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Caller {
-    /// Its caller id, or the address of a client that says none.
+    /// The caller id, or the client's address if it sends none.
     pub(crate) caller: String,
     pub(crate) calls: u64,
-    /// Until the answer was ready, in milliseconds.
+    /// Mean time until the answer was ready, in milliseconds.
     pub(crate) mean_ms: f64,
     pub(crate) longest_ms: f64,
-    /// When the longest call ended: seconds since 1970.
+    /// When the longest call ended, in seconds since 1970.
     pub(crate) longest_at: f64,
 }
 
-/// The checkpoint's journal.
+/// Sizes and times of the checkpoint's journal.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Journal {
-    /// Since the checkpoint was last written as a whole.
+    /// Number of records since the checkpoint was last rewritten as a whole.
     pub(crate) records: u64,
     pub(crate) bytes: u64,
-    /// The part of the file before the journal.
+    /// Size of the checkpoint file before the journal begins.
     pub(crate) snapshot_bytes: u64,
-    /// When the checkpoint was last written as a whole: seconds since 1970.
+    /// When the checkpoint was last rewritten as a whole, in seconds since 1970.
     pub(crate) last_compaction: Option<f64>,
-    /// What is free on its disk.
+    /// Free bytes on the checkpoint's disk.
     pub(crate) disk_free_bytes: Option<u64>,
 }
 
-/// The status at one moment. All times of day are seconds since 1970 by the wall clock.
+/// The status at one moment. Times of day are seconds since 1970 by the wall clock.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Status {
-    /// [`SCHEMA`].
+    /// Version of the format: [`SCHEMA`].
     pub(crate) schema: u32,
     pub(crate) version: String,
     pub(crate) mode: Mode,
-    /// The process that serves nodes.
+    /// Id of the process that serves nodes.
     pub(crate) pid: u32,
-    /// When it was started.
+    /// When this process started.
     pub(crate) started: f64,
-    /// The same, in seconds until now.
+    /// Seconds since this process started.
     pub(crate) uptime: f64,
-    /// What nodes use as `ROS_MASTER_URI`.
+    /// Address that nodes use as `ROS_MASTER_URI`.
     pub(crate) uri: String,
     pub(crate) condition: Condition,
-    /// The real master's address.
+    /// Address of the real master.
     pub(crate) master: String,
-    /// Its process id, or the last one's; none if there was none.
+    /// Process id of the master, or of the last one; none if there was none.
     pub(crate) master_pid: Option<i32>,
-    /// What the last one spoke: HTTP and Python.
+    /// HTTP and Python of the present or last master.
     #[serde(default)]
     pub(crate) master_speaks: Option<String>,
-    /// What talks to the master of `proxy` past rosrescue: processes, users and other computers.
+    /// Processes, users and computers that bypass rosrescue and talk directly to the master of
+    /// `proxy`.
     #[serde(default)]
     pub(crate) bypassing: Vec<String>,
-    /// Whether the master of `proxy` is on this computer and takes connections from others.
+    /// Whether the master of `proxy` runs on this computer and accepts connections from other
+    /// computers.
     #[serde(default)]
     pub(crate) master_is_open: bool,
     /// Whether calls pass to the master.
     pub(crate) open: bool,
-    /// Whether calls are answered, by the master or the mirror.
+    /// Whether calls are answered by the master or the mirror.
     pub(crate) ready: bool,
     /// Whether calls go to another computer, which has the master.
     #[serde(default)]
     pub(crate) elsewhere: bool,
     /// Since when the mirror stands in; none while calls pass.
     pub(crate) standing_in_since: Option<f64>,
-    /// Writes that the mirror has answered and the master has not run yet.
+    /// Number of writes that the mirror answered and the master has not run yet.
     pub(crate) pending_writes: usize,
     /// Whether the master keeps dying.
     pub(crate) crash_loop: bool,
-    /// Masters that have died in this session.
+    /// Number of masters that have died in this session.
     pub(crate) deaths: u64,
-    /// Times that rosrescue itself has died and was started again, in this session.
+    /// Number of times rosrescue itself died and was restarted in this session.
     #[serde(default)]
     pub(crate) worker_restarts: u64,
     pub(crate) checkpoint: String,
@@ -102,41 +104,42 @@ pub(crate) struct Status {
     /// Whether the guardian or systemd keeps the port and restarts rosrescue when it dies.
     pub(crate) guarded: bool,
     pub(crate) guarded_by: String,
-    /// Contents of the mirror.
+    /// Number of items of each kind in the mirror.
     pub(crate) state: Counts,
-    /// Nodes that do not answer and are not known to be dead.
+    /// Nodes that do not answer but are not known to be dead.
     pub(crate) unreachable: Vec<String>,
     /// Registered nodes whose port refuses connections.
     #[serde(default)]
     pub(crate) dead_nodes: Vec<String>,
-    /// Registered nodes that were not asked yet, or not lately.
+    /// Registered nodes that have not been checked yet, or not lately.
     #[serde(default)]
     pub(crate) unchecked_nodes: Vec<String>,
-    /// How many registered nodes live, by the kernel's table of sockets or an answer.
+    /// Number of registered nodes that are alive, by the kernel's socket table or an answer.
     #[serde(default)]
     pub(crate) alive_nodes: usize,
-    /// Masters examined since the start, the first one included.
+    /// Number of masters examined since this process started, including the first.
     pub(crate) recoveries: u64,
-    /// The report of the last one.
+    /// Report of the last recovery.
     pub(crate) last_recovery: Option<Report>,
-    /// Rescues in this session, and the reports of the last 20, the oldest first.
+    /// Number of rescues in this session. The reports of the last 20 follow, oldest first.
     pub(crate) rescues: u64,
     pub(crate) last_rescues: Vec<Report>,
-    /// Between the last two times when somebody asked, at least a second apart.
+    /// Calls per second between the last two requests for the status that were at least a second
+    /// apart.
     pub(crate) calls_per_second: f64,
-    /// The callers whose longest call took longest, at most 20.
+    /// The callers with the longest calls, at most 20.
     pub(crate) slowest_callers: Vec<Caller>,
-    /// Connections of clients, at most a thousand.
+    /// Connections of clients, at most 1,000.
     pub(crate) clients: Vec<Client>,
-    /// Counters since the start.
+    /// Counters since this process started.
     pub(crate) counters: serde_json::Map<String, serde_json::Value>,
-    /// The computers of the robot; none if it is this one alone.
+    /// The robot's computers; none without `--cluster`.
     #[serde(default)]
     pub(crate) cluster: Option<Computers>,
 }
 
 impl Status {
-    /// A counter's value; 0 if an older rosrescue does not know it.
+    /// A counter's value; 0 if an older rosrescue does not report it.
     pub(crate) fn counter(&self, name: &str) -> u64 {
         let value = self.counters.get(name);
         value.and_then(serde_json::Value::as_u64).unwrap_or(0)
@@ -170,7 +173,7 @@ impl Status {
     }
 }
 
-/// Ten lines for a tired person, and what is wrong in more.
+/// Writes the status in ten lines, plus one for each problem.
 impl fmt::Display for Status {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Condition {
@@ -247,7 +250,7 @@ impl fmt::Display for Status {
     }
 }
 
-/// How often something has died.
+/// How often something has died, as a phrase.
 fn died(times: u64) -> String {
     match times {
         0 => String::new(),
@@ -256,7 +259,7 @@ fn died(times: u64) -> String {
     }
 }
 
-/// Names for people, not all of very many.
+/// Lists names for people, and shortens long lists.
 pub(crate) fn some(names: &[String]) -> String {
     const MOST: usize = 10;
     let shown = names
@@ -271,7 +274,7 @@ pub(crate) fn some(names: &[String]) -> String {
     }
 }
 
-/// Bytes for people.
+/// Formats a number of bytes for people.
 pub(crate) fn size(bytes: u64) -> String {
     let mut value = bytes as f64;
     for unit in ["B", "kB", "MB", "GB"] {

@@ -62,9 +62,7 @@ pub(crate) async fn second(
     if !first.has_params() {
         rarely!(
             warn,
-            "the master holds a parameter that it can never return, so getParam of it and of each \
-             namespace around it fails for everybody; delete it, or set it to numbers of 32 bits and \
-             dates without markup"
+            "the master holds a parameter that it can never return, so getParam of it and of every namespace that contains it fails for all nodes; delete it, or set it to 32-bit integers and dates without markup"
         );
     }
     let second = match first.second_call(previous) {

@@ -44,7 +44,7 @@ pub(crate) enum PeerError {
     Connect(#[from] ConnectError),
     #[error(transparent)]
     Call(#[from] CallError),
-    #[error("it does not lead in term {term}")]
+    #[error("it is not the leader in term {term}")]
     NotLeading { term: u64 },
 }
 

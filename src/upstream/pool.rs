@@ -24,7 +24,7 @@ pub enum ReadError {
     #[error(transparent)]
     Call(#[from] CallError),
     /// The gate was shut meanwhile.
-    #[error("the gate was shut")]
+    #[error("the master went away meanwhile")]
     Shut,
 }
 

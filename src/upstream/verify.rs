@@ -17,7 +17,7 @@ pub enum VerifyError {
     #[error(transparent)]
     Call(#[from] CallError),
     /// It is another incarnation, which does not hold the state yet.
-    #[error("the master behind a new connection does not bear the present incarnation's token")]
+    #[error("the master behind a new connection does not have the present incarnation's token")]
     OtherIncarnation,
     /// The master that was served is gone.
     #[error("the master's sentinel has ended")]

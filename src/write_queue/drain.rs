@@ -28,7 +28,7 @@ use crate::{
     xmlrpc::{self, Reply},
 };
 
-/// Pause before an unsent batch is tried again while the gate stays open.
+/// Pause before an unsent batch is retried while the gate stays open.
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
 /// How long a batch may continue after the gate has shut, before the mirror answers it. A killed
 /// master closes its connections within milliseconds; a master that only closed an idle connection
@@ -326,8 +326,7 @@ impl Drain {
             rarely!(
                 warn,
                 ?difference,
-                "the master held something else than the mirror, which follows it now; if it was \
-                 changed past rosrescue, let everybody use rosrescue's address"
+                "the master's state differed from the mirror, which now follows it; if a client changed the master directly, set its ROS_MASTER_URI to rosrescue's address"
             );
         }
         self.answer_opaque();
@@ -443,8 +442,7 @@ impl Drain {
         rarely!(
             warn,
             calls = items.len(),
-            "the master did not answer each call of a multicall; callers try again, and its state \
-             is read anew"
+            "the master did not answer each call of a multicall; callers retry, and the master's state is read again"
         );
         self.link.ledger.doubt();
         for item in items {

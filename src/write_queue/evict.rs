@@ -91,6 +91,6 @@ fn say(nodes: &[String], by: &str) {
     tracing::info!(
         ?nodes,
         by,
-        "taken out: dead, for another node has registered with their port"
+        "unregistered dead nodes: another node now uses their port"
     );
 }

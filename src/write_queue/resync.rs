@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_failed_is_tried_again_though_calls_pass_in_between() {
+    fn a_failed_inspection_is_retried_although_calls_pass_in_between() {
         let start = Instant::now();
         let mut schedule = ResyncSchedule::default();
         schedule.request();

@@ -98,7 +98,7 @@ fn nodes() -> Vec<Node> {
 /// Plays `script`, and if that fails a shorter one and panics.
 fn hold(what: &str, script: &Script, mut run: impl FnMut(&Script) -> Result<(), Failure>) {
     let Err(first) = run(script) else { return };
-    // At once, and not with the test's output: whoever waits has to know what for.
+    // At once, and not with the test's output: a person who waits must know what for.
     let say = |text: String| drop(writeln!(std::io::stderr(), "{text}"));
     say(format!(
         "{what} fails: {first}\n\n{}\nIt is made shorter now, for at most {SHRINKING:?}.",

@@ -1,6 +1,6 @@
 //! What a node may hear.
 //!
-//! Without a crash it is exactly what the model says, in order; through rosrescue, with what is so told once more here
+//! Without a crash it is exactly what the model says, in order; through rosrescue, with the present state told once more here
 //! and there (`docs/decisions/0031`). A crash of the master may do this, and nothing else:
 //!
 //! * The callbacks of the one call that was under way may be lost, or come once more: the master
@@ -8,7 +8,7 @@
 //! * So may those of unregistrations that are answered while no master is there. Several of them
 //!   are told with the one list that is true in the end.
 //! * While the mirror stands in, what is out of date when it would be sent may be left out.
-//! * Whoever misses a list by that is sent one that is true after it.
+//! * A node that misses a list because of that is sent one that is true after it.
 //! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
 //!   crash before the last one (the letter may cross a change). So may a subscriber of a parameter be
 //!   sent its value. Never a partial list, never a value that is not true, never a `shutdown`, nothing
@@ -98,7 +98,7 @@ impl TrueLists {
         list.is_some_and(|list| self.before.contains(&list) || self.since.contains(&list))
     }
 
-    /// Whether the node at `api` still has to be told of what the crash has swallowed: it subscribes,
+    /// Whether the node at `api` still must hear what the crash has swallowed: it subscribes,
     /// and has not heard a list that was true after the call that was under way.
     pub(crate) fn owes(&self, api: &str, swallowed: &Call, heard: &[Call]) -> bool {
         let Some((api, topic, _)) = as_list(api, swallowed) else {

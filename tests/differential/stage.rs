@@ -58,7 +58,7 @@ impl<'n> Stage<'n> {
         with_real_apis(call, &self.apis)
     }
 
-    /// Through rosrescue a node may be told once more what is so: `docs/decisions/0031`.
+    /// Through rosrescue a node may be told the present state once more: `docs/decisions/0031`.
     pub(crate) fn allow_repeats(&mut self) {
         self.repeats.get_or_insert_default().add(&self.model);
     }

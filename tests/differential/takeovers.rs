@@ -40,7 +40,7 @@ pub(crate) fn script(seed: u64, calls: usize, takeovers: usize, nodes: usize) ->
     script
 }
 
-/// How a computer ceases to lead.
+/// How a computer stops leading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum End {
     /// It dies, and is switched on again at once.
@@ -423,7 +423,7 @@ fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
                 "divergences and lost writes of computer {index}: {counters:?}"
             ));
         }
-        let mut wire = computer.wire().ok_or("it does not listen")?;
+        let mut wire = computer.wire().ok_or("it is not listening")?;
         stage
             .same_reads(&mut wire)
             .map_err(|why| format!("computer {index}: {why}"))?;
@@ -439,7 +439,7 @@ fn finish(rig: &mut Rig, stage: &mut Stage<'_>) -> Result<(), Failure> {
     rig.end(End::Death)?;
     rig.attach(stage)?;
     let (index, _) = rig.at[0];
-    let mut wire = rig.computers[index].wire().ok_or("it does not listen")?;
+    let mut wire = rig.computers[index].wire().ok_or("it is not listening")?;
     stage
         .same_reads(&mut wire)
         .map_err(|why| format!("after the last leader's death: {why}"))

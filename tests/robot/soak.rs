@@ -250,7 +250,7 @@ impl Writer {
         })
     }
 
-    fn begin_anew(&self, state: Own) {
+    fn restart_from(&self, state: Own) {
         *lock(&self.past) = Past {
             states: vec![state],
             ..Past::default()
@@ -360,7 +360,7 @@ impl Stage<'_> {
         }
         for writer in self.writers {
             let state = writer.state();
-            writer.begin_anew(state);
+            writer.restart_from(state);
         }
         self.count("silences");
         self.note_what_is_owed();
@@ -383,7 +383,7 @@ impl Stage<'_> {
             if found != writer.state() {
                 self.count("states that went back");
             }
-            writer.begin_anew(found);
+            writer.restart_from(found);
         }
         self.note_what_is_owed();
         self.go_on();

@@ -60,7 +60,7 @@ fn messages() -> Vec<String> {
 
 /// A message up to what differs from time to time, or to where it goes on explaining.
 fn beginning(message: &str) -> &str {
-    let ends = ["{", "; ", ". ", ": nodes go", "…"];
+    let ends = ["{", "; ", ". ", ": nodes keep", "…"];
     let end = ends.iter().filter_map(|end| message.find(end)).min();
     &message[..end.unwrap_or(message.len())]
 }

@@ -40,7 +40,7 @@ pub fn open_or_create(path: &Path) -> io::Result<File> {
     };
     match check(&file)? {
         0 | 1 => Ok(file),
-        _ => Err(io::Error::other("the file has another name elsewhere")),
+        _ => Err(io::Error::other("the file has another hard link")),
     }
 }
 

@@ -94,7 +94,7 @@ pub(in crate::app) async fn join(given: Given) -> Result<(Others, Member), EtcdE
     let post = &given.post;
     post.ledger.leave();
     // One that an earlier process left may hold what others have changed since.
-    block_in_place(|| given.rosmaster.left_behind(None));
+    block_in_place(|| given.rosmaster.claim_orphan(None));
     let known = given.restored;
     let (way, way_rx) = watch::channel(Way::Nobody { known });
     let (handovers_tx, handovers) = mpsc::channel(1);

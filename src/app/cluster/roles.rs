@@ -354,7 +354,7 @@ impl Member {
         self.prepare();
     }
 
-    /// Begins to find out whether the session in etcd goes on, if the machine waits for that.
+    /// Begins to find out whether the session in etcd continues, if the machine waits for that.
     pub(super) fn decide(&mut self) {
         let waits = self.machine.role() == Role::CatchingUp
             && self.machine.session() == Session::Unknown
@@ -382,7 +382,7 @@ impl Member {
             };
             let goes_on = match session::decide(restore, evidence) {
                 Decision::Restore(why) => {
-                    tracing::info!(why, "the session in etcd goes on: {}", state.counts());
+                    tracing::info!(why, "the session in etcd continues: {}", state.counts());
                     true
                 }
                 Decision::Fresh(why) => {

@@ -1,4 +1,4 @@
-//! What is so on this computer. Gathers and judges nothing.
+//! Gathers facts about this computer, and judges nothing.
 
 use std::{
     collections::BTreeSet,

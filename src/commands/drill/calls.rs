@@ -33,7 +33,7 @@ pub(super) struct Api {
 struct Answer {
     value: Result<Value, String>,
     took: Duration,
-    /// The connection broke, and the call was made again, as rospy and roscpp do.
+    /// The connection broke, and the call was repeated, as rospy and roscpp do.
     again: bool,
 }
 

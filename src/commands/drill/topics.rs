@@ -44,7 +44,7 @@ impl Seen {
         self.last = Some(now);
         self.is_numbered |= number.is_some() && self.number.is_none();
         if let (Some(before), Some(number)) = (self.number, number) {
-            // A publisher that begins anew has lost its link, which is told otherwise.
+            // A publisher that restarts has lost its link, which is reported separately.
             let missing = number.wrapping_sub(before).wrapping_sub(1);
             self.lost += u64::from(missing).min(1 << 20) * u64::from(missing < 1 << 31);
         }

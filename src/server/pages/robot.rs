@@ -22,7 +22,7 @@ pub(super) struct Node {
     pub(super) publishes: Vec<String>,
     pub(super) subscribes: Vec<String>,
     pub(super) serves: Vec<String>,
-    /// When it was taken out: seconds since 1970.
+    /// When it was unregistered, in seconds since 1970.
     pub(super) removed_at: Option<u64>,
 }
 

@@ -1,4 +1,4 @@
-//! How a robot of several computers is, as one of them sees it.
+//! The condition of one computer in a robot that has several.
 
 use std::time::{Duration, Instant};
 
@@ -9,10 +9,11 @@ use crate::{
     status::cluster::{ClusterFacts, LeaderFacts, MemberFacts},
 };
 
-/// The next leader is there after the time to live and 300 ms; a starting computer knows in a second.
+/// Time after which a missing leader is worth a look. A new leader normally takes over within
+/// etcd's time to live plus 300 ms, and a starting computer finds the leader within a second.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// What is so because of the other computers.
+/// A condition caused by the other computers.
 pub(super) struct Notice {
     pub(super) name: Name,
     pub(super) since: Instant,
@@ -20,7 +21,8 @@ pub(super) struct Notice {
     pub(super) action: Option<String>,
 }
 
-/// None while this computer leads: then it is as with a single one.
+/// The condition caused by the other computers; none on the leader, whose condition is that of a
+/// single computer.
 pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
     let leader = of.leader.as_ref();
     let notice = match (of.role, leader, of.leaderless) {
@@ -52,7 +54,7 @@ pub(super) fn notice(gate: State, of: &ClusterFacts) -> Option<Notice> {
 fn following(of: &ClusterFacts, leader: &LeaderFacts) -> Notice {
     let LeaderFacts { name, uri, .. } = leader;
     let trouble = match of.etcd {
-        Some(_) => format!(" This computer could not take over now{}.", etcd(of)),
+        Some(_) => format!(" This computer cannot take over now{}.", etcd(of)),
         None => String::new(),
     };
     Notice {
@@ -106,7 +108,7 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
         text: format!("{notice}. This computer is cut off from the others{why}."),
         action: Some(
             match (&of.etcd, &of.leader) {
-                // Nothing has come from etcd since the start.
+                // Nothing has come from etcd since this process started.
                 (Some(_), None) => {
                     "make sure that a majority of etcd runs, and that --cluster has its addresses and client port. \
                      `rosrescue check --cluster URLS` tries each."
@@ -120,7 +122,7 @@ fn alone(gate: State, of: &ClusterFacts) -> Notice {
     }
 }
 
-/// What the leader says besides, and what is to be done.
+/// The leader's extra sentences about the other computers, and what to do.
 pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
     let others = of.members.iter().filter(|member| member.name != of.name);
     let (away, here): (Vec<_>, Vec<_>) = others.partition(|member| member.is_away());
@@ -143,12 +145,12 @@ pub(super) fn leads(of: &ClusterFacts) -> (String, Option<String>) {
         text.push('.');
     }
     if of.etcd.is_some() {
-        text += &format!(" Writes may have to wait{}.", etcd(of));
+        text += &format!(" Writes may be delayed{}.", etcd(of));
     }
     (text, action)
 }
 
-/// Why etcd does not answer, for the end of a sentence; empty if it does.
+/// Why etcd does not answer, in parentheses for the end of a sentence; empty if it answers.
 fn etcd(of: &ClusterFacts) -> String {
     let why = of.etcd.as_ref().map(|(_, why)| format!(" ({why})"));
     why.unwrap_or_default()
@@ -198,7 +200,7 @@ mod tests {
         cluster.etcd = trouble();
         let line = of(State::Elsewhere, &cluster).line();
         assert!(
-            line.contains("could not take over now (etcd has no majority)"),
+            line.contains("cannot take over now (etcd has no majority)"),
             "{line}"
         );
     }
@@ -251,7 +253,7 @@ mod tests {
         );
         let action = |of: Condition| of.action.unwrap();
         assert!(action(refusing).contains("restore the network"));
-        // The options may be wrong, not the network.
+        // The `--cluster` option may be wrong, instead of the network.
         cluster.leader = None;
         let never = action(of(OPEN, &cluster));
         assert!(never.contains("rosrescue check --cluster"), "{never}");

@@ -43,7 +43,7 @@ pub(super) struct Node {
     subscribing: Option<String>,
     /// Notifications that wait for the mutex.
     blocked: Vec<Call>,
-    /// When the last value of each parameter to arrive was set, whoever sent it.
+    /// When the last value of each parameter to arrive was set, from any sender.
     arrived: BTreeMap<String, u64>,
     gone_back: Vec<String>,
 }

@@ -114,7 +114,7 @@ fn a_hung_disk_delays_neither_calls_nor_the_next_master() {
         assert_rescued(&mut rescue);
     }
     rescue.wait_line("the log says which file is missing", |line| {
-        line.contains("cannot create the file for a process's output")
+        line.contains("cannot create the output file of a child process")
     });
     disk.heal();
     assert_rescued(&mut rescue);

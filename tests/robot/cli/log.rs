@@ -87,7 +87,7 @@ fn after_many_deaths_the_last_lines_say_that_the_master_is_back(mode: Mode) {
     let is_waiting = [
         "the master is away",
         "waiting for the master",
-        "could not be read or restored",
+        "could not read or restore",
     ];
     for (all_clear, alarms) in [
         ("calls pass to the master", &is_waiting[..]),

@@ -117,7 +117,7 @@ fn a_new_session_is_said_to_be_one() {
     let mut rescue = Setup::core(&scratch, free_port()).start();
     rescue.wait_line("what it did", |line| line.contains("a new session started"));
     let said = rescue.output().join("\n");
-    assert!(!said.contains("got the whole state"), "{said}");
+    assert!(!said.contains("whole state was restored"), "{said}");
 }
 
 /// The gate stays open although rosmaster closes what is idle for four seconds.

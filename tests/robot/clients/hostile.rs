@@ -394,7 +394,7 @@ fn no_other_computer_can_shut_the_master_down() {
     eventually("the master has tried to shut rosrescue down", || {
         let log = rescue.output();
         log.iter()
-            .any(|line| line.contains("registered at our address"))
+            .any(|line| line.contains("registered at rosrescue's address"))
     });
     // All other calls pass.
     let body = encode_call("setParam", params!["/far", "/far", 1]);

@@ -284,7 +284,7 @@ fn no_rosmaster_no_descriptors_and_no_permission() {
     let scratch = Scratch::new();
     let port = free_port();
     let found = Found::by(check(&scratch, port).env("PATH", "/nowhere"));
-    found.assert_problem("rosmaster", "no rosmaster is on the PATH");
+    found.assert_problem("rosmaster", "there is no rosmaster on the PATH");
     // A python without ROS before the system's.
     let tools = scratch.path("tools");
     fs::create_dir(&tools).unwrap();

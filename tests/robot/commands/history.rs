@@ -60,10 +60,10 @@ fn the_last_five_sessions_and_each_rescue_are_kept() {
     eventually("the rescue is kept", || {
         names(&robot).contains(&"rescue-1".to_owned())
     });
-    // As the master died: before the dead node was taken out.
+    // As the master died: before the dead node was unregistered.
     let rescue = run(&robot, &["inspect", "rescue-1"]);
     assert!(rescue.contains("  /dead at http"), "{rescue}");
-    eventually("the dead node is taken out", || {
+    eventually("the dead node is unregistered", || {
         !robot.state().knows("/dead")
     });
     robot.client().set_param("/before", 2);

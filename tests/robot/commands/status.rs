@@ -75,7 +75,7 @@ fn it_says_what_nodes_notice_and_what_to_do() {
     );
 }
 
-/// Names come from whoever calls; one must not write to the terminal of whoever asks.
+/// Callers choose their names, which must not write to the terminal of a person who asks.
 #[test]
 fn it_prints_no_commands_for_a_terminal() {
     let robot = Robot::start(Mode::Core);
@@ -129,7 +129,7 @@ fn a_newer_rosrescue_is_said_to_be_one() {
     );
 }
 
-/// A master that was never seen: nodes wait, and whoever asks is told what for.
+/// A master that was never seen: nodes wait, and the status says what for.
 #[test]
 fn it_says_that_nodes_wait_for_a_first_master() {
     let scratch = Scratch::new();

@@ -55,7 +55,7 @@ fn a_node_that_bypasses_rosrescue_is_named_until_it_ends() {
             ))
     };
     assert!(found.iter().any(by_environment), "{found:?}");
-    assert!(rescue.log().contains("goes past rosrescue"));
+    assert!(rescue.log().contains("bypasses rosrescue"));
 
     signal(node.pid(), rustix::process::Signal::KILL);
     eventually("the status no longer names the node", || {

@@ -165,7 +165,7 @@ fn a_starved_master_is_not_killed() {
     assert_eq!(status(&client)["deaths"], 0);
     assert_eq!(robot.bare().param("/number"), Some(Value::Int(last)));
     assert!(
-        robot.rescue.log().contains("and is not killed"),
+        robot.rescue.log().contains("but is not killed"),
         "no probe was missed: {}",
         robot.rescue.log()
     );

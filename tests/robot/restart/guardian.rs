@@ -248,8 +248,8 @@ fn workers_that_have_served_are_always_restarted_at_once() {
     worker_after(&scratch, dead);
     assert!(client.master_pid().is_some());
     let said = rescue.stderr().join("\n");
-    assert_eq!(said.matches("started at once").count(), 5, "{said}");
-    assert_eq!(said.matches("again and again").count(), 3, "{said}");
+    assert_eq!(said.matches("restarting it at once").count(), 5, "{said}");
+    assert_eq!(said.matches("the worker keeps dying").count(), 3, "{said}");
     assert_eq!(said.matches("pause=0ns").count(), 3, "{said}");
 }
 
@@ -271,7 +271,7 @@ fn a_guardian_stopped_by_ctrl_z_does_not_count_as_one() {
     let mut rescue = setup.guarded().start();
     let client = rescue.client();
     let by = || status(&client)["guarded_by"].as_str().unwrap().to_owned();
-    assert!(by().contains("which nothing starts again"), "{}", by());
+    assert!(by().contains("which nothing restarts"), "{}", by());
     crate::support::stop(rescue.pid());
     rescue.wait_line("the log says that the guardian is stopped", |line| {
         line.contains("unguarded")
@@ -321,7 +321,7 @@ fn a_clean_stop_ends_everything() {
         assert_eq!(rescue.wait().code(), Some(0), "{signals:?}");
         assert_eq!(scratch.survivors(), vec![], "{signals:?}");
         let said = rescue.stderr().join("\n");
-        assert!(said.contains("closed in order"), "{said}");
+        assert!(said.contains("stopped cleanly"), "{said}");
         assert!(!said.contains("unguarded"), "{said}");
     }
 }
@@ -399,7 +399,7 @@ fn an_error_at_the_start_is_reported_once_and_ends_rosrescue() {
         (
             &["core", "-p", &free, "--rosmaster", "/nonexistent"],
             1,
-            "is not a program that can be run",
+            "is not an executable program",
         ),
         (
             &["proxy", "--master", "m:1"],
@@ -436,7 +436,7 @@ fn a_worker_survives_its_guardian_and_reports_it() {
     signal(worker, Signal::TERM);
     eventually("the worker ends", || !alive(worker));
     eventually("rosrescue was stopped cleanly", || {
-        rescue.stderr().join("\n").contains("closed in order")
+        rescue.stderr().join("\n").contains("stopped cleanly")
     });
 }
 

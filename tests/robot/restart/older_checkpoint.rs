@@ -99,7 +99,7 @@ fn a_full_disk(mut rescue: Rescue, bare: &Client, disk: &SmallDisk, end: impl Fn
     rescue.wait_serving();
     assert_goes_on(&rescue, bare, pid, &wanted, &nodes);
     rescue.wait_line("the log says that the master is newer", |line| {
-        line.contains("the master holds a newer state than the checkpoint")
+        line.contains("the master's state is newer than the checkpoint")
     });
     assert!(is_unprotected(&rescue));
     client.set_param("/changed", 3);

@@ -81,7 +81,7 @@ fn with_a_socket_unit_systemd_replaces_the_guardian() {
         .wrapped(|own| activated(own, socket.into()))
         .at_port(port)
         .spawn();
-    manager.wait("STATUS=waiting for a first master: Calls wait");
+    manager.wait("STATUS=waiting for the first master: Calls wait");
     manager.wait("WATCHDOG=1");
     assert!(!manager.has_heard("READY=1"));
     let mut master = Rosmaster::start_at(&scratch, master_port);

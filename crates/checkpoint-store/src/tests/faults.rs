@@ -209,7 +209,7 @@ fn a_file_that_would_become_too_large_is_rewritten() {
     assert_eq!(state(&open(&fs).unwrap().1.unwrap()), [1, 2]);
 }
 
-/// The previous generation gives way, the present one does not.
+/// The previous generation is dropped, the present one is not.
 #[test]
 fn on_a_full_disk_the_previous_generation_makes_room_for_the_next() {
     let fs = SimFs::default();

@@ -162,16 +162,16 @@ impl Evidence {
         let turns = now.turns.saturating_sub(before.turns);
         let each = waited / u32::try_from(turns).unwrap_or(u32::MAX).max(1);
         if self.runnable && turns < TURNS_LEAST || each > STARVED_WAIT {
-            return Verdict::Unproved("it gets too little of the processor");
+            return Verdict::Unproved("it gets too little CPU time");
         }
         if self.on_disk {
             return Verdict::Unproved("it waits for a disk");
         }
         if self.was_stopped {
-            return Verdict::Unproved("it was stopped for a part of the time only");
+            return Verdict::Unproved("it was stopped only part of the time");
         }
         if last.own_wait.saturating_sub(first.own_wait) > watched / UNFAIR_PART {
-            return Verdict::Unproved("rosrescue gets too little of the processor to ask it");
+            return Verdict::Unproved("rosrescue gets too little CPU time to probe it");
         }
         Verdict::Hung
     }
@@ -244,7 +244,7 @@ mod tests {
                 effort.runnable = at == moment;
                 effort.turns = 0;
             };
-            is_unproved(verdict(waits), "too little of the processor");
+            is_unproved(verdict(waits), "too little CPU time");
             // Threads that look for work are runnable at times.
             let found = verdict(|at, effort, _| effort.runnable = at == moment);
             assert_eq!(found, Verdict::Hung);
@@ -253,7 +253,7 @@ mod tests {
             effort.turns /= 10;
             effort.waited += ms(at) / 5;
         });
-        is_unproved(found, "too little of the processor");
+        is_unproved(found, "too little CPU time");
         let found = verdict(|at, effort, _| effort.ran += ms(at) / 5);
         is_unproved(found, "busy");
         is_unproved(verdict(|_, effort, _| effort.on_disk = true), "disk");
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(evidence.judge(BUSY_LIMIT), Verdict::Hung);
     }
 
-    /// A start that is busy for five seconds and then waits for ever.
+    /// A start that is busy for five seconds and then waits forever.
     #[test]
     fn progress_of_long_ago_does_not_count() {
         let start = Instant::now();

@@ -386,7 +386,7 @@ fn nothing_happens_after_a_stop() {
 }
 
 /// A dying process accepts connections until its listening socket is closed, which comes last. A
-/// relay in front of a dead master accepts and closes them for ever.
+/// relay in front of a dead master accepts and closes them forever.
 #[test]
 fn a_master_that_is_still_dying_dies_once() {
     let mut script = Script::serving(Supervision::Theirs);

@@ -115,7 +115,7 @@ impl Cause {
             Self::Exited => "the master's process ended",
             Self::Hung => "the master stopped answering",
             Self::Late => "the master answered late",
-            Self::Stopping => "rosrescue stops",
+            Self::Stopping => "rosrescue is stopping",
         }
     }
 }
@@ -148,7 +148,7 @@ pub enum Action {
     /// Report why a master that does not answer is not killed.
     Spare(&'static str),
     /// Stop rosrescue: no master can be started, and there is no state to give to a later one.
-    /// Reporting the error is better than retrying for ever.
+    /// Reporting the error is better than retrying forever.
     GiveUp,
     /// Report a crash loop, with the number of deaths within a minute.
     ReportCrashLoop(usize),

@@ -163,7 +163,7 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
             let topic_type = self.topic_type(topic);
             let mut put_back = Vec::new();
             if missing.len() > 1 {
-                put_back = self.take_out_subscribers(topic);
+                put_back = self.remove_subscribers(topic);
             }
             let last = missing.pop();
             for (caller_id, name, api) in missing {
@@ -184,9 +184,9 @@ impl<'a, W: FnMut(Request, Reply)> Restore<'a, W> {
         }
     }
 
-    /// Unregisters the subscribers that the new master already has for a topic, so that they are not notified
-    /// of each publisher separately.
-    fn take_out_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
+    /// Unregisters the new master's own subscribers of a topic, so that they are not notified of each
+    /// publisher separately.
+    fn remove_subscribers(&mut self, topic: &str) -> Vec<(&'a str, String, &'a str)> {
         let found = self.found;
         let subscribers = found
             .registry()

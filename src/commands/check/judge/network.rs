@@ -11,7 +11,7 @@ use crate::ros_env;
 
 /// A name that takes longer to look up delays every call to its node.
 const SLOW: u128 = 1000;
-/// Of what goes past rosrescue.
+/// Of what bypasses rosrescue.
 const BYPASS: &str = "unprotected";
 const AGAIN: &str = "restart it with the ROS_MASTER_URI of rosrescue: its changes are not recorded";
 
@@ -309,7 +309,7 @@ impl Findings {
             self.warn(
                 BYPASS,
                 format!(
-                    "the master at {uri} accepts connections from other computers, past rosrescue"
+                    "the master at {uri} accepts connections from other computers, which can bypass rosrescue"
                 ),
                 "start it with ROS_IP=127.0.0.1 and without ROS_HOSTNAME",
             );

@@ -16,10 +16,10 @@ const CONDITIONS = {
   following: ["good", "Following the leader"],
   standing_in: ["warn", "Standing in for the master"],
   no_leader: ["warn", "No computer leads"],
-  crash_loop: ["bad", "Crash loop of the master"],
+  crash_loop: ["bad", "Master crash loop"],
   unprotected: ["bad", "UNPROTECTED"],
   alone: ["bad", "ALONE: cut off from the other computers"],
-  waiting: ["warn", "Waiting for a first master"],
+  waiting: ["warn", "Waiting for the first master"],
 };
 const ROLES = { joining: "joining", following: "following", catching_up: "taking over", leading: "leads", alone: "ALONE" };
 const OUTCOMES = {

@@ -42,7 +42,7 @@ fn a_crash_loop_is_slowed_down_and_reported_but_never_given_up() {
 }
 
 #[test]
-fn a_master_that_cannot_be_spawned_is_tried_again_with_growing_pauses() {
+fn a_master_that_cannot_be_spawned_is_retried_with_growing_pauses() {
     let mut script = Script::serving(Supervision::Ours);
     script
         .lose()

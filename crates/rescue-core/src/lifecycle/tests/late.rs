@@ -45,7 +45,7 @@ impl Script {
     }
 }
 
-const STARVED: Action = Action::Spare("it gets too little of the processor");
+const STARVED: Action = Action::Spare("it gets too little CPU time");
 const BUSY: Action = Action::Spare("it is busy");
 
 #[test]
@@ -199,7 +199,7 @@ fn a_master_that_starts_slowly_is_not_ended_while_it_works() {
         actions
     };
     assert_eq!(refuse(&mut script, Does::Work, 120), []);
-    // Then it waits for ever.
+    // Then it waits forever.
     let actions = refuse(&mut script, Does::Nothing, 2);
     assert_eq!(actions.first(), Some(&Action::Kill));
     script.feed(Input::Exited, &[Action::Spawn]);

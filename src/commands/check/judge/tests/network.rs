@@ -220,7 +220,7 @@ fn another_computer_of_the_robot() {
         facts.master_host = Some(host("base", "10.0.0.9", false));
         facts.elsewhere = Some(rosrescue(None));
         facts.elsewhere_host = Some(host("base", "10.0.0.9", false));
-        facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+        facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
         facts.disk.refused = Some("denied".to_owned());
         facts.units.clear();
     };
@@ -306,7 +306,7 @@ fn addresses_that_may_change_and_nodes_of_another_master() {
 }
 
 #[test]
-fn what_goes_past_rosrescue_is_warned_of() {
+fn clients_that_bypass_rosrescue_are_reported() {
     let behind = |bypassing: &[&str], is_open| {
         Some(Behind {
             uri: MasterUri::parse("http://robot:11312").unwrap(),

@@ -99,9 +99,9 @@ fn the_ros_that_is_installed() {
     one(
         Problem,
         "rosmaster",
-        "no rosmaster is on the PATH",
+        "there is no rosmaster on the PATH",
         |facts| {
-            facts.rosmaster = Some(Err("no rosmaster is on the PATH".to_owned()));
+            facts.rosmaster = Some(Err("there is no rosmaster on the PATH".to_owned()));
         },
     );
     one(
@@ -168,7 +168,7 @@ fn units_of_systemd() {
         with(Kind::Roslaunch, true),
     );
     assert_eq!(said(with(Kind::Roscore, false)), []);
-    one(Note, "systemd", "no rosrescue service", |facts| facts.units.clear());
+    one(Note, "systemd", "no unit", |facts| facts.units.clear());
     one(Note, "systemd", "does not start at boot", |facts| {
         facts.units[0].is_enabled = false;
     });
