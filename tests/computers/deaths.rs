@@ -1,17 +1,19 @@
 use std::thread::{scope, sleep};
 use std::time::{Duration, Instant};
 
+use crate::chance::Chance;
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
 use crate::support::{Library, eventually};
 use crate::traffic::{Named, TYPE, Traffic};
-use crate::{alone, rounds, some_time};
+use crate::{alone, rounds};
 use rustix::process::Signal;
 
 /// By its power, of which nobody hears anything, or by SIGKILL to all that runs there, of which the kernel tells.
 #[test]
 fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
     let _alone = alone();
+    let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     for round in 0..rounds() {
@@ -19,7 +21,7 @@ fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
         let dies = victim(round, leader);
         let rest = fleet.others(dies);
         traffic.await_writes(&[0, 1, 2]);
-        sleep(some_time(Duration::from_secs(1)));
+        sleep(chance.time(Duration::from_secs(1)));
         let (mark, begin) = (fleet.mark(), Instant::now());
         let power = round % 2 == 0;
         if power {
