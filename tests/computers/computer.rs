@@ -93,6 +93,8 @@ pub(crate) struct Computer {
     scratch: Arc<Scratch>,
     /// More options of rosrescue.
     pub(crate) options: Vec<String>,
+    /// More options of etcd.
+    pub(crate) etcd_options: Vec<String>,
     /// Its `--cluster-name`.
     pub(crate) called: String,
     /// Its `--cluster`, if it is not as it must be.
@@ -119,6 +121,7 @@ impl Computer {
             boots: 0,
             scratch: Arc::clone(scratch),
             options: Vec::new(),
+            etcd_options: Vec::new(),
             called: name.to_owned(),
             cluster: None,
         }
@@ -221,6 +224,7 @@ impl Computer {
             &peer,
         ]);
         command.args(["--initial-cluster", &cluster.join(",")]);
+        command.args(&self.etcd_options);
         self.scratch.prepare(&mut command);
         let etcd = Process::start(format!("etcd of {}", self.name), &mut self.inside(&command));
         self.etcd = Some(etcd);

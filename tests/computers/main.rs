@@ -26,6 +26,8 @@ mod cables;
 mod deaths;
 /// A computer's disk is older than what was acknowledged.
 mod disks;
+/// Loops of drivers, while another computer takes over.
+mod drivers;
 /// etcd is away altogether.
 mod etcd;
 /// Another computer leads because somebody says so.
