@@ -4,11 +4,12 @@ use std::time::{Duration, Instant};
 use rosrescue::xmlrpc::Value;
 use rustix::process::Signal;
 
+use crate::chance::Chance;
 use crate::computer::{NAMES, send};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
 use crate::support::{Library, PATIENCE, eventually, holds, params};
 use crate::traffic::{Named, TYPE, Traffic};
-use crate::{alone, rounds, some_time};
+use crate::{alone, rounds};
 
 /// Waits until `value` is there, on each computer.
 #[track_caller]
@@ -27,6 +28,7 @@ fn await_param(fleet: &Fleet, key: &str, value: i32) {
 #[test]
 fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
     let _alone = alone();
+    let mut chance = Chance::new();
     let mut fleet = Fleet::start(&["--alone", "serve"]);
     let traffic = Traffic::start(&fleet);
     for round in 0..rounds() {
@@ -37,7 +39,7 @@ fn a_computer_that_is_cut_off_serves_its_nodes_and_has_its_writes_kept() {
         fleet.computers[leader].set_param(&contested, 1);
         await_param(&fleet, &contested, 1);
         traffic.await_writes(&[0, 1, 2]);
-        sleep(some_time(Duration::from_secs(1)));
+        sleep(chance.time(Duration::from_secs(1)));
         let (mark, begin) = (fleet.mark(), Instant::now());
         fleet.network.cut_cable(cut);
         let next = fleet.await_leader_of(&rest);

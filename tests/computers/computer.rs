@@ -84,6 +84,8 @@ pub(crate) struct Computer {
     pub(crate) talker: Option<Node>,
     pub(crate) listener: Option<Node>,
     rescue: Option<Process>,
+    /// What its rosrescues have logged that have ended.
+    earlier: Vec<String>,
     etcd: Option<Process>,
     /// Its first process. With it all end.
     power: Option<Process>,
@@ -91,6 +93,8 @@ pub(crate) struct Computer {
     scratch: Arc<Scratch>,
     /// More options of rosrescue.
     pub(crate) options: Vec<String>,
+    /// More options of etcd.
+    pub(crate) etcd_options: Vec<String>,
     /// Its `--cluster-name`.
     pub(crate) called: String,
     /// Its `--cluster`, if it is not as it must be.
@@ -111,11 +115,13 @@ impl Computer {
             talker: None,
             listener: None,
             rescue: None,
+            earlier: Vec::new(),
             etcd: None,
             power: None,
             boots: 0,
             scratch: Arc::clone(scratch),
             options: Vec::new(),
+            etcd_options: Vec::new(),
             called: name.to_owned(),
             cluster: None,
         }
@@ -163,8 +169,7 @@ impl Computer {
         // It ends when the kernel has seen the last one of them off.
         power.wait();
         self.etcd = None;
-        self.assert_no_panic();
-        self.rescue = None;
+        self.bury_rescue();
         self.talker = None;
         self.listener = None;
     }
@@ -219,6 +224,7 @@ impl Computer {
             &peer,
         ]);
         command.args(["--initial-cluster", &cluster.join(",")]);
+        command.args(&self.etcd_options);
         self.scratch.prepare(&mut command);
         let etcd = Process::start(format!("etcd of {}", self.name), &mut self.inside(&command));
         self.etcd = Some(etcd);
@@ -234,6 +240,30 @@ impl Computer {
                 name.is_ok_and(|name| name.trim_end() == "rosrescue")
             })
         })
+    }
+
+    /// The process id, seen from outside, of the process that starts the worker.
+    #[track_caller]
+    pub(crate) fn guardian(&self) -> u32 {
+        let rescue = self.rescue.as_ref().expect("a rosrescue");
+        eventually_some("there is a guardian", || child_of(rescue))
+    }
+
+    /// Removes the data of its etcd, which does not run.
+    pub(crate) fn wipe_etcd(&self) {
+        assert!(self.etcd.is_none(), "it runs");
+        fs::remove_dir_all(self.path("etcd")).unwrap();
+    }
+
+    /// The process ids, seen from outside, of all that runs there but for its first process.
+    pub(crate) fn processes(&self) -> Vec<u32> {
+        let power = self.power.as_ref().expect("the computer is off");
+        let init = child_of(power).expect("the first process of a computer");
+        let space = |pid: u32| fs::read_link(format!("/proc/{pid}/ns/pid")).ok();
+        let own = space(init);
+        let all = self.scratch.survivors().into_iter().map(|(pid, _)| pid);
+        all.filter(|&pid| pid != init && space(pid) == own)
+            .collect()
     }
 
     /// SIGKILL.
@@ -311,8 +341,24 @@ impl Computer {
         let rescue = self.rescue.as_mut().expect("a rosrescue");
         send(rescue, Signal::TERM);
         rescue.wait();
+        self.bury_rescue();
+    }
+
+    /// Starts rosrescue again, which has ended or is about to.
+    #[track_caller]
+    pub(crate) fn restart_rescue(&mut self) {
+        let rescue = self.rescue.as_mut().expect("a rosrescue");
+        rescue.wait();
+        self.bury_rescue();
+        self.start_rescue();
+    }
+
+    /// Keeps what it has logged.
+    fn bury_rescue(&mut self) {
         self.assert_no_panic();
-        self.rescue = None;
+        let rescue = self.rescue.take();
+        self.earlier
+            .extend(rescue.iter().flat_map(|it| it.output()));
     }
 
     /// Runs `rosrescue ARGUMENTS` to its end: exit status and output.
@@ -394,6 +440,12 @@ impl Computer {
     pub(crate) fn logged(&self, text: &str) -> Vec<String> {
         let lines = self.rescue.iter().flat_map(|rescue| rescue.output());
         lines.filter(|line| line.contains(text)).collect()
+    }
+
+    /// As [`Self::logged`], since the computer was made.
+    pub(crate) fn ever_logged(&self, text: &str) -> Vec<String> {
+        let earlier = self.earlier.iter().filter(|line| line.contains(text));
+        earlier.cloned().chain(self.logged(text)).collect()
     }
 
     #[track_caller]

@@ -1,17 +1,19 @@
 use std::thread::{scope, sleep};
 use std::time::{Duration, Instant};
 
-use crate::computer::{NAMES, send};
+use crate::chance::Chance;
+use crate::computer::{Computer, NAMES, send};
 use crate::fleet::{Fleet, READ, TAKEOVER, TTL, victim};
-use crate::support::{Library, eventually};
+use crate::support::{Library, eventually, params, signal};
 use crate::traffic::{Named, TYPE, Traffic};
-use crate::{alone, rounds, some_time};
+use crate::{alone, rounds};
 use rustix::process::Signal;
 
 /// By its power, of which nobody hears anything, or by SIGKILL to all that runs there, of which the kernel tells.
 #[test]
 fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
     let _alone = alone();
+    let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     for round in 0..rounds() {
@@ -19,7 +21,7 @@ fn a_computer_dies_and_comes_back_and_no_node_of_another_notices() {
         let dies = victim(round, leader);
         let rest = fleet.others(dies);
         traffic.await_writes(&[0, 1, 2]);
-        sleep(some_time(Duration::from_secs(1)));
+        sleep(chance.time(Duration::from_secs(1)));
         let (mark, begin) = (fleet.mark(), Instant::now());
         let power = round % 2 == 0;
         if power {
@@ -94,4 +96,69 @@ fn a_node_whose_name_was_taken_is_told_to_shut_down_by_the_next_leader() {
     fleet.bring_back(leader);
     fleet.await_same_state();
     fleet.assert_nodes_live();
+}
+
+/// Its guardian starts it again, and the computer goes on leading. Idle: nothing else takes the processor's time.
+#[test]
+fn writes_go_on_soon_after_the_death_of_the_leaders_worker_or_computer() {
+    let _alone = alone();
+    let mut chance = Chance::new();
+    let mut fleet = Fleet::quick(&[]);
+    let (mut workers, mut computers) = (Vec::new(), Vec::new());
+    for round in 0..rounds() {
+        let leader = fleet.await_whole();
+        let rest = fleet.others(leader);
+        let caller = [leader, rest[round / 2 % 2]][round % 2];
+        sleep(chance.time(Duration::from_secs(1)));
+        let worker = fleet.computers[leader].worker();
+        let begin = Instant::now();
+        signal(worker, Signal::KILL);
+        workers.push(first_write(&fleet.computers[caller], begin));
+        let leads = fleet.await_whole();
+        println!(
+            "the worker of {} dies: first write on {} after {:.2?}; {} leads",
+            NAMES[leader], NAMES[caller], workers[round], NAMES[leads]
+        );
+
+        let leader = leads;
+        let rest = fleet.others(leader);
+        let caller = rest[round % 2];
+        sleep(chance.time(Duration::from_secs(1)));
+        fleet.network.cut_cable(leader);
+        let begin = Instant::now();
+        fleet.computers[leader].power_off();
+        computers.push(first_write(&fleet.computers[caller], begin));
+        let leads = fleet.await_leader_of(&rest);
+        println!(
+            "{} dies: first write on {} after {:.2?}; {} leads",
+            NAMES[leader], NAMES[caller], computers[round], NAMES[leads]
+        );
+        fleet.network.mend_cable(leader);
+        fleet.bring_back(leader);
+    }
+    for (what, mut took, most) in [
+        ("a worker", workers, TAKEOVER),
+        ("a computer", computers, TTL + TAKEOVER),
+    ] {
+        took.sort();
+        let (median, longest) = (took[took.len() / 2], took[took.len() - 1]);
+        println!(
+            "the death of {what}, {} times: first write after {median:.2?} in the median, {longest:.2?} at most",
+            took.len()
+        );
+        assert!(longest < most, "{took:?}");
+    }
+    fleet.await_flow(&[0, 1, 2]);
+    fleet.assert_nodes_live();
+}
+
+/// How long after `begin` the first write is answered there.
+fn first_write(computer: &Computer, begin: Instant) -> Duration {
+    let write = || {
+        computer
+            .client()
+            .ask("setParam", params!["/test", "/first", 1])
+    };
+    computer.within(|| eventually("a write is answered", || write().is_some()));
+    begin.elapsed()
 }

@@ -8,10 +8,10 @@ use crate::computer::Computer;
 use crate::fleet::Fleet;
 
 /// The checkpoint and what is beside it, at one moment.
-struct Disk(Vec<(PathBuf, Vec<u8>)>);
+pub(crate) struct Disk(Vec<(PathBuf, Vec<u8>)>);
 
 impl Disk {
-    fn of(computer: &Computer) -> Self {
+    pub(crate) fn of(computer: &Computer) -> Self {
         let files = fs::read_dir(computer.path("")).unwrap();
         let paths = files.map(|file| file.unwrap().path());
         let paths = paths.filter(|path| {
@@ -26,7 +26,7 @@ impl Disk {
     }
 
     /// The computer has what was on the disk then.
-    fn put_back(&self, computer: &Computer) {
+    pub(crate) fn put_back(&self, computer: &Computer) {
         for (path, _) in Self::of(computer).0 {
             fs::remove_file(path).unwrap();
         }

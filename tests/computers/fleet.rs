@@ -31,6 +31,11 @@ impl Fleet {
     /// Three computers, each with an etcd, and nothing else. `options` are rosrescue's.
     #[track_caller]
     pub(crate) fn empty(options: &[&str]) -> Self {
+        Self::with(options, &[])
+    }
+
+    #[track_caller]
+    fn with(options: &[&str], etcd_options: &[&str]) -> Self {
         let (network, scratch) = (Network::new(), Arc::new(Scratch::new()));
         let computers = (0..COUNT).map(|index| Computer::new(index, &network, &scratch));
         let mut fleet = Self {
@@ -40,6 +45,8 @@ impl Fleet {
         };
         for computer in &mut fleet.computers {
             computer.options = options.iter().map(|&option| option.to_owned()).collect();
+            let etcd_options = etcd_options.iter();
+            computer.etcd_options = etcd_options.map(|&option| option.to_owned()).collect();
             computer.boot();
             computer.start_etcd();
         }
@@ -50,16 +57,31 @@ impl Fleet {
     /// A whole robot: rosrescue and nodes on each.
     #[track_caller]
     pub(crate) fn start(options: &[&str]) -> Self {
-        let mut fleet = Self::empty(options);
+        Self::empty(options).whole()
+    }
+
+    /// As [`Self::start`], with the settings of etcd that docs/several-computers.md recommends.
+    #[track_caller]
+    pub(crate) fn quick(options: &[&str]) -> Self {
+        let etcd = [
+            "--heartbeat-interval=50",
+            "--election-timeout=500",
+            "--pre-vote",
+        ];
+        Self::with(options, &etcd).whole()
+    }
+
+    #[track_caller]
+    fn whole(mut self) -> Self {
         for index in 0..COUNT {
-            fleet.computers[index].start_rescue();
+            self.computers[index].start_rescue();
         }
         for index in 0..COUNT {
-            fleet.computers[index].await_answers();
+            self.computers[index].await_answers();
         }
-        fleet.await_whole();
-        fleet.start_all_nodes();
-        fleet
+        self.await_whole();
+        self.start_all_nodes();
+        self
     }
 
     #[track_caller]

@@ -1,11 +1,12 @@
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use crate::chance::Chance;
 use crate::computer::NAMES;
 use crate::fleet::{Fleet, READ};
 use crate::support::eventually;
 use crate::traffic::Traffic;
-use crate::{alone, rounds, some_time};
+use crate::{alone, rounds};
 
 /// 200 ms are promised; others use the machine as well.
 const HANDOVER: Duration = Duration::from_secs(2);
@@ -13,6 +14,7 @@ const HANDOVER: Duration = Duration::from_secs(2);
 #[test]
 fn the_leader_hands_over_when_it_is_told_to_and_when_it_is_stopped() {
     let _alone = alone();
+    let mut chance = Chance::new();
     let mut fleet = Fleet::start(&[]);
     let traffic = Traffic::start(&fleet);
     let mark = fleet.mark();
@@ -20,7 +22,7 @@ fn the_leader_hands_over_when_it_is_told_to_and_when_it_is_stopped() {
         let leader = fleet.await_whole();
         let rest = fleet.others(leader);
         traffic.await_writes(&[0, 1, 2]);
-        sleep(some_time(Duration::from_millis(500)));
+        sleep(chance.time(Duration::from_millis(500)));
         let begin = Instant::now();
         let to = rest[round % 2];
         // Told by whom is the same.

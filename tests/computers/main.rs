@@ -13,6 +13,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 #[path = "../support/mod.rs"]
 mod support;
 
+mod chance;
 mod computer;
 mod fleet;
 mod network;
@@ -25,10 +26,14 @@ mod cables;
 mod deaths;
 /// A computer's disk is older than what was acknowledged.
 mod disks;
+/// Loops of drivers, while another computer takes over.
+mod drivers;
 /// etcd is away altogether.
 mod etcd;
 /// Another computer leads because somebody says so.
 mod handover;
+/// Calls of all computers under random failures, and whether all that was promised was kept.
+mod history;
 /// What a computer that was cut off has written meets what others have.
 mod lonely;
 /// Two computers do not see each other, or not all of each other.
@@ -53,10 +58,4 @@ fn rounds() -> usize {
     rounds.map_or(3, |rounds| {
         rounds.parse().expect("ROSRESCUE_ROUNDS is a number")
     })
-}
-
-/// Some time below `most`.
-fn some_time(most: std::time::Duration) -> std::time::Duration {
-    use std::hash::{BuildHasher, RandomState};
-    most.mul_f64(f64::from(RandomState::new().hash_one(0) as u32) / f64::from(u32::MAX))
 }

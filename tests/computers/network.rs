@@ -2,14 +2,31 @@
 
 use std::fs::File;
 use std::os::fd::AsFd;
+use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::support::ip;
+use crate::support::{Process, ip};
 
 pub(crate) const COUNT: usize = 3;
+
+const BAD_NETWORK: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/tests/computers/bad_network.py"
+);
+
+/// What is wrong with a cable that is not cut.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Quality {
+    /// Each way, in milliseconds.
+    pub(crate) delay: u32,
+    /// Up to so many milliseconds more.
+    pub(crate) jitter: u32,
+    /// Of a hundred packets each way.
+    pub(crate) loss: u32,
+}
 
 /// The address of a computer. No other test sees it: the switch has a namespace of its own, too.
 pub(crate) fn address(computer: usize) -> String {
@@ -65,24 +82,68 @@ impl Network {
 
     /// Packets between these two vanish.
     pub(crate) fn cut_pair(&self, one: usize, other: usize) {
-        for (from, to) in [(one, other), (other, one)] {
-            // A permanent entry for an Ethernet address that nobody has.
-            ip(&format!(
-                "-n {} neigh replace {} lladdr 02:00:00:00:00:99 dev eth0 nud permanent",
-                self.namespace(from),
-                address(to)
-            ));
-        }
+        self.cut_way(one, other);
+        self.cut_way(other, one);
     }
 
     pub(crate) fn mend_pair(&self, one: usize, other: usize) {
-        for (from, to) in [(one, other), (other, one)] {
-            ip(&format!(
-                "-n {} neigh del {} dev eth0",
-                self.namespace(from),
-                address(to)
-            ));
-        }
+        self.mend_way(one, other);
+        self.mend_way(other, one);
+    }
+
+    /// Packets of the first one to the other one vanish.
+    pub(crate) fn cut_way(&self, from: usize, to: usize) {
+        // A permanent entry for an Ethernet address that nobody has.
+        ip(&format!(
+            "-n {} neigh replace {} lladdr 02:00:00:00:00:99 dev eth0 nud permanent",
+            self.namespace(from),
+            address(to)
+        ));
+    }
+
+    pub(crate) fn mend_way(&self, from: usize, to: usize) {
+        ip(&format!(
+            "-n {} neigh del {} dev eth0",
+            self.namespace(from),
+            address(to)
+        ));
+    }
+
+    /// The computer's cable delays packets, and loses some, until the answer is handed to [`Self::mend_quality`].
+    #[track_caller]
+    pub(crate) fn worsen(&self, computer: usize, quality: &Quality, seed: u64) -> Process {
+        let switch = &self.prefix;
+        let (inner, outer) = (format!("inner{computer}"), format!("outer{computer}"));
+        ip(&format!(
+            "-n {switch} link add {inner} type veth peer name {outer}"
+        ));
+        ip(&format!("-n {switch} link set {outer} up"));
+        ip(&format!("-n {switch} link set port{computer} nomaster"));
+        ip(&format!("-n {switch} link set {inner} master switch up"));
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", switch, "/usr/bin/python3", BAD_NETWORK]);
+        command.args([format!("port{computer}"), outer]);
+        let Quality {
+            delay,
+            jitter,
+            loss,
+        } = quality;
+        command.args([delay, jitter, loss].map(u32::to_string));
+        command.arg(seed.to_string());
+        let mut bad = Process::start(format!("the cable of {computer}"), &mut command);
+        bad.wait_line("`ready`", |line| line == "ready");
+        bad
+    }
+
+    #[track_caller]
+    pub(crate) fn mend_quality(&self, computer: usize, mut bad: Process) {
+        assert!(bad.exited().is_none(), "it has ended:\n{}", bad.log());
+        bad.kill();
+        let switch = &self.prefix;
+        ip(&format!("-n {switch} link del inner{computer}"));
+        ip(&format!(
+            "-n {switch} link set port{computer} master switch"
+        ));
     }
 
     /// What the server answers to this client vanishes; other ports and the other direction work.
@@ -109,9 +170,7 @@ impl Drop for Network {
             .map(|computer| self.namespace(computer))
             .chain([self.prefix.clone()])
         {
-            let _ = std::process::Command::new("ip")
-                .args(["netns", "del", &name])
-                .output();
+            let _ = Command::new("ip").args(["netns", "del", &name]).output();
         }
     }
 }

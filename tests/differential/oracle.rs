@@ -8,13 +8,15 @@
 //! * So may those of unregistrations that are answered while no master is there. Several of them
 //!   are told with the one list that is true in the end.
 //! * While the mirror stands in, what is out of date when it would be sent may be left out.
-//! * A node that misses a list because of that is sent one that is true after it.
-//! * A subscriber may be sent the full list of a topic's publishers, true at some moment since the
-//!   crash before the last one (the letter may cross a change). So may a subscriber of a parameter be
-//!   sent its value. Never a partial list, never a value that is not true, never a `shutdown`, nothing
-//!   to a node that does not subscribe.
+//! * Whoever misses a list by that is sent one that is true after it.
+//! * A subscriber may be told once more what it was told: the full list of a topic's publishers, or the value of a
+//!   parameter. Never a partial list, never a value that was not true since the crash before the last one, never a
+//!   `shutdown`, nothing to a node that does not subscribe.
+//!
+//! What one node is told about one topic or one parameter **never goes back**, whatever is told twice: nothing that was
+//! over before what the node has been told already. It is the order in which the model reached its states.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use rosrescue::master::Master;
 use rosrescue::xmlrpc::{Call, Value};
@@ -31,6 +33,28 @@ pub(crate) struct Expected {
 
 type List = (String, String, Vec<String>);
 
+/// A moment in the life of the model.
+#[derive(Debug)]
+enum Moment {
+    /// It sends that to the node at this address. A multicall passes through states that nobody sees.
+    Notice(String, Call),
+    State(Master),
+}
+
+impl Moment {
+    /// Whether the node at `api` may be told that now.
+    fn says(&self, api: &str, call: &Call) -> bool {
+        match self {
+            Self::Notice(to, notice) => to == api && notice == call,
+            Self::State(state) if call.method == "paramUpdate" => is_true_param(state, api, call),
+            Self::State(state) => as_list(api, call).is_some_and(|(api, topic, list)| {
+                let subscribers = state.subscribers_of(&topic);
+                subscribers.contains(&api) && state.publishers_of(&topic) == list
+            }),
+        }
+    }
+}
+
 /// Full lists of publishers, by subscriber and topic, as they have been true lately.
 #[derive(Debug, Default)]
 pub(crate) struct TrueLists {
@@ -43,6 +67,8 @@ pub(crate) struct TrueLists {
     after: HashSet<List>,
     /// Those who have subscribed all the time since then.
     faithful: Option<HashSet<(String, String)>>,
+    /// What was true, and told, since all that was heard was judged.
+    course: Vec<Moment>,
 }
 
 impl TrueLists {
@@ -69,9 +95,38 @@ impl TrueLists {
         self.add(model);
     }
 
+    /// The model sends that to the node at `api`.
+    pub(crate) fn send(&mut self, api: &str, call: &Call) {
+        let notice = Moment::Notice(api.to_owned(), call.clone());
+        self.course.push(notice);
+    }
+
+    /// All that was heard up to this state has been judged.
+    pub(crate) fn settled(&mut self, model: &Master) {
+        self.course = vec![Moment::State(model.clone())];
+    }
+
+    /// The first call that tells the node at `api` what was over before another one, which it has heard earlier.
+    pub(crate) fn goes_back<'c>(&self, api: &str, heard: &'c [Call]) -> Option<&'c Call> {
+        let mut reached = BTreeMap::new();
+        heard.iter().find(|call| {
+            let subject = (&call.method, call.params.get(1).and_then(Value::as_str));
+            let from = reached.get(&subject).copied().unwrap_or_default();
+            let says = |moment: &Moment| moment.says(api, call);
+            match self.course[from..].iter().position(says) {
+                Some(steps) => {
+                    reached.insert(subject, from + steps);
+                    false
+                }
+                None => self.course[..from].iter().any(says),
+            }
+        })
+    }
+
     /// What is true in that state.
     pub(crate) fn add(&mut self, model: &Master) {
         self.states_since.push(model.clone());
+        self.course.push(Moment::State(model.clone()));
         let mut subscribers = HashSet::new();
         for topic in model.subscribed_topics() {
             let publishers = model.publishers_of(topic);
@@ -247,6 +302,46 @@ mod tests {
         ] {
             assert!(!verdict(&expected, heard), "{heard:?}");
         }
+    }
+
+    #[test]
+    fn what_is_told_twice_never_goes_back() {
+        let update = |value: i32| {
+            let params = vec!["/master".into(), "/k/".into(), value.into()];
+            Call::new("paramUpdate", params)
+        };
+        let mut model = Master::default();
+        let mut lists = TrueLists::default();
+        let subscribe = vec!["/s".into(), "http://s".into(), "/k".into()];
+        model.apply(&Call::new("subscribeParam", subscribe).into());
+        for value in [1, 2, 3, 1] {
+            let params = vec!["/n".into(), "/k".into(), value.into()];
+            model.apply(&Call::new("setParam", params).into());
+            lists.send("http://s", &update(value));
+            lists.add(&model);
+        }
+        let told = |values: &[i32]| {
+            let heard: Vec<_> = values.iter().copied().map(update).collect();
+            lists.goes_back("http://s", &heard).cloned()
+        };
+        for good in [
+            &[1, 2, 3, 1][..],
+            &[1, 1, 2, 2, 3, 3, 1, 1],
+            &[2, 3],
+            &[1, 3, 1],
+            &[1],
+        ] {
+            assert_eq!(told(good), None, "{good:?}");
+        }
+        assert_eq!(told(&[1, 3, 2]), Some(update(2)));
+        assert_eq!(told(&[2, 1, 3]), Some(update(3)));
+        assert_eq!(
+            lists.goes_back("http://other", &[update(3), update(2)]),
+            None
+        );
+        lists.settled(&model);
+        lists.add(&model);
+        assert_eq!(lists.goes_back("http://s", &[update(1)]), None);
     }
 
     #[test]

@@ -108,6 +108,9 @@ impl<'n> Stage<'n> {
             // The mirror leaves out what is out of date when it is sent. rosrescue tells nobody to shut down without
             // evidence that it is the one who is meant, and these nodes give none.
             let risky = risky || self.away;
+            if let Some(repeats) = &mut self.repeats {
+                repeats.send(to, &call);
+            }
             if let Some(index) = self.apis.iter().position(|api| api == to) {
                 self.told[index].push(Expected { call, risky });
             }
@@ -165,6 +168,9 @@ impl<'n> Stage<'n> {
                     .map_err(|why| format!("callbacks to node{index}: {why}"))?;
             }
         }
+        if let Some(repeats) = &mut self.repeats {
+            repeats.settled(&self.model);
+        }
         Ok(())
     }
 
@@ -193,7 +199,12 @@ impl<'n> Stage<'n> {
             judge(&[], &late, |call| lists.has(&node.api, call))?;
             news.extend(late);
         }
-        Ok(())
+        match lists.goes_back(&node.api, &news) {
+            Some(call) if !unordered() => {
+                Err(format!("it goes back to\n  {call:?}\nin\n  {news:?}"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Every read that a client may send, of everything that was ever named.

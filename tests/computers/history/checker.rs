@@ -1,0 +1,558 @@
+//! What was promised, and whether a recorded history keeps it. No clock, no network: times are microseconds from the start.
+//!
+//! * An acknowledged write is in the final state, or a later one is. The exception is a write that a computer
+//!   acknowledged while it was alone: it may lose against others, and then a warning names both values.
+//! * On one computer no read goes back, and none misses a write that was acknowledged there before, except while it is alone.
+//!   The value of a write that nobody acknowledged may disappear again.
+//! * Nobody reads what nobody wrote.
+//! * What a subscriber was told last is what the final state says.
+//! * No two computers lead at the same moment, and no two in the same term.
+//!
+//! A write is later than another one if it began after that one was acknowledged. Of writes that overlap either one may be
+//! the last. One that failed may still take effect at any time.
+
+use std::collections::BTreeMap;
+
+/// Microseconds from the start of a history.
+pub(crate) type Time = u64;
+
+/// What a parameter is; each value is written once. None: it is not set.
+pub(crate) type Value = Option<i32>;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum What {
+    Write(i32),
+    Read(Value),
+}
+
+/// A call of a client. Reads that failed are not recorded.
+#[derive(Clone, Debug)]
+pub(crate) struct Op {
+    pub(crate) computer: usize,
+    pub(crate) key: String,
+    pub(crate) what: What,
+    pub(crate) start: Time,
+    /// When it was answered. None: it failed.
+    pub(crate) end: Option<Time>,
+}
+
+/// A warning: what this computer acknowledged while it was alone does not hold.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Loss {
+    pub(crate) computer: usize,
+    pub(crate) key: String,
+    pub(crate) value: i32,
+}
+
+/// What a computer said of itself, some time between the two moments.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Sample {
+    pub(crate) computer: usize,
+    pub(crate) from: Time,
+    pub(crate) to: Time,
+    pub(crate) says: Says,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Says {
+    Alone,
+    /// It leads in this term, and calls pass to its master.
+    Leads(u64),
+    /// Anything else.
+    Other,
+}
+
+/// The last notification of a parameter that a subscriber got. None: there was none.
+#[derive(Clone, Debug)]
+pub(crate) struct Told {
+    pub(crate) subscriber: String,
+    pub(crate) key: String,
+    pub(crate) value: Value,
+}
+
+#[derive(Clone, Debug, Default)]
+pub(crate) struct History {
+    pub(crate) ops: Vec<Op>,
+    pub(crate) losses: Vec<Loss>,
+    pub(crate) samples: Vec<Sample>,
+}
+
+/// The state after all failures, which all computers agree on.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct End {
+    pub(crate) values: BTreeMap<String, i32>,
+    pub(crate) told: Vec<Told>,
+}
+
+/// Whoever says that it is alone may have been so for this long without a sample, and until this long after the last one.
+const ALONE_SLACK: Time = 500_000;
+
+/// Two samples that are this close together leave no room for a leader that stood still in between.
+const CLOSE: Time = 400_000;
+
+/// All that is wrong, as sentences.
+pub(crate) fn violations(history: &History, end: &End) -> Vec<String> {
+    let judge = Judge::new(history);
+    let keys = judge.writes_by_key();
+    let mut wrong = Vec::new();
+    for (key, writes) in &keys {
+        wrong.extend(judge.lost(key, writes, end));
+        wrong.extend(judge.reads(key, writes));
+    }
+    wrong.extend(told(end));
+    wrong.extend(leaders(&history.samples));
+    wrong
+}
+
+/// A write, and what is known of it.
+#[derive(Clone, Copy, Debug)]
+struct Write<'a> {
+    op: &'a Op,
+    value: i32,
+    /// A computer that was alone may have acknowledged it.
+    alone: bool,
+    /// Nobody has to find it in the end.
+    excused: bool,
+}
+
+impl Write<'_> {
+    /// Whether every order of the two has this one first.
+    fn is_before(&self, other: &Write<'_>) -> bool {
+        self.op.end.is_some_and(|end| end < other.op.start)
+    }
+}
+
+struct Judge<'a> {
+    history: &'a History,
+}
+
+impl<'a> Judge<'a> {
+    fn new(history: &'a History) -> Self {
+        Self { history }
+    }
+
+    fn is_alone(&self, op: &Op) -> bool {
+        let to = op.end.unwrap_or(op.start) + ALONE_SLACK;
+        let from = op.start.saturating_sub(ALONE_SLACK);
+        let mut samples = self.history.samples.iter();
+        samples.any(|it| {
+            it.computer == op.computer && it.says == Says::Alone && it.from <= to && it.to >= from
+        })
+    }
+
+    fn writes_by_key(&self) -> BTreeMap<&'a str, Vec<Write<'a>>> {
+        let mut keys: BTreeMap<&str, Vec<Write<'_>>> = BTreeMap::new();
+        for op in &self.history.ops {
+            let writes = keys.entry(op.key.as_str()).or_default();
+            if let What::Write(value) = op.what {
+                let alone = op.end.is_some() && self.is_alone(op);
+                let excused = alone && self.is_reported(op, value);
+                writes.push(Write {
+                    op,
+                    value,
+                    alone,
+                    excused,
+                });
+            }
+        }
+        for writes in keys.values_mut() {
+            excuse_replaced(writes);
+        }
+        keys
+    }
+
+    fn is_reported(&self, op: &Op, value: i32) -> bool {
+        let mut losses = self.history.losses.iter();
+        losses.any(|it| it.computer == op.computer && it.key == op.key && it.value == value)
+    }
+
+    /// Acknowledged writes that are neither in the final state nor before a write that is there.
+    fn lost(&self, key: &str, writes: &[Write<'_>], end: &End) -> Vec<String> {
+        let last = match end.values.get(key) {
+            None => None,
+            Some(value) => match writes.iter().find(|it| it.value == *value) {
+                None => return vec![format!("{key} is {value} in the end, which nobody wrote")],
+                last => last,
+            },
+        };
+        let is_lost = |it: &&Write<'_>| {
+            it.op.end.is_some() && !it.excused && last.is_none_or(|last| last.is_before(it))
+        };
+        let lost: Vec<_> = writes.iter().filter(is_lost).collect();
+        let Some(first) = lost.first() else {
+            return Vec::new();
+        };
+        let alone = if first.alone { ", alone" } else { "" };
+        vec![format!(
+            "{} acknowledged writes of {key} are lost; the first{alone}: {:?}; in the end there is {:?}",
+            lost.len(),
+            first.op,
+            last.map(|it| it.op)
+        )]
+    }
+
+    /// Reads that are older than what their computer has shown or acknowledged before.
+    fn reads(&self, key: &str, writes: &[Write<'_>]) -> Vec<String> {
+        let mut wrong = Vec::new();
+        let by_value: BTreeMap<i32, &Write<'_>> = writes.iter().map(|it| (it.value, it)).collect();
+        // From when on a computer may show nothing that is older than the start of which write.
+        let mut floors: BTreeMap<usize, Vec<(Time, &Op)>> = BTreeMap::new();
+        let mut reads = Vec::new();
+        for op in self.history.ops.iter().filter(|op| op.key == key) {
+            let (Some(end), false) = (op.end, self.is_alone(op)) else {
+                continue;
+            };
+            if let What::Read(value) = op.what {
+                let write = value.map(|value| by_value.get(&value).copied());
+                match write {
+                    Some(None) => {
+                        wrong.push(format!("{key}: nobody wrote what {op:?} has found"));
+                        continue;
+                    }
+                    Some(Some(write)) if write.op.start > end => {
+                        wrong.push(format!("{op:?} has found what was written later"));
+                        continue;
+                    }
+                    _ => {}
+                }
+                let write = write.flatten();
+                reads.push((op, write));
+                if let Some(write) = write.filter(|it| !it.excused)
+                    && let Some(acknowledged) = write.op.end
+                {
+                    let floor = (end.max(acknowledged), write.op);
+                    floors.entry(op.computer).or_default().push(floor);
+                }
+            }
+        }
+        for write in writes.iter().filter(|it| !it.excused) {
+            if let Some(end) = write.op.end {
+                let floor = (end, write.op);
+                floors.entry(write.op.computer).or_default().push(floor);
+            }
+        }
+        floors.values_mut().for_each(|of| of.sort_by_key(|it| it.0));
+        reads.sort_by_key(|(op, _)| op.start);
+        let mut at: BTreeMap<usize, (usize, Option<&Op>)> = BTreeMap::new();
+        for (op, write) in reads {
+            let Some(floors) = floors.get(&op.computer) else {
+                continue;
+            };
+            let (next, floor) = at.entry(op.computer).or_default();
+            while let Some((from, of)) = floors.get(*next).filter(|it| it.0 < op.start) {
+                debug_assert!(*from < op.start);
+                if floor.is_none_or(|floor| floor.start < of.start) {
+                    *floor = Some(of);
+                }
+                *next += 1;
+            }
+            let is_older = |floor: &&Op| match write {
+                None => true,
+                Some(write) => write.op.end.is_some_and(|end| end < floor.start),
+            };
+            if let Some(floor) = floor.filter(is_older) {
+                wrong.push(format!("{op:?} goes back behind {floor:?}"));
+            }
+        }
+        wrong
+    }
+}
+
+/// Only the last one of the writes that a computer acknowledges alone has to last, or to be reported.
+fn excuse_replaced(writes: &mut [Write<'_>]) {
+    let alone: Vec<Write<'_>> = writes.iter().filter(|it| it.alone).copied().collect();
+    for write in writes.iter_mut().filter(|it| it.alone) {
+        let mut later = alone.iter();
+        write.excused |= later
+            .any(|it| it.op.computer == write.op.computer && write.is_before(it) && it.excused);
+    }
+}
+
+fn told(end: &End) -> Vec<String> {
+    let wrong = end.told.iter().filter_map(|told| {
+        let last = end.values.get(&told.key).copied();
+        let Told {
+            subscriber,
+            key,
+            value,
+        } = told;
+        (*value != last).then(|| {
+            format!("{subscriber} was told that {key} is {value:?}, and in the end it is {last:?}")
+        })
+    });
+    wrong.collect()
+}
+
+/// Two that lead at the same moment, or one after the other in the same term.
+fn leaders(samples: &[Sample]) -> Vec<String> {
+    let mut spans: Vec<(usize, u64, Time, Time)> = Vec::new();
+    let mut before: BTreeMap<usize, &Sample> = BTreeMap::new();
+    let mut terms: BTreeMap<u64, usize> = BTreeMap::new();
+    let mut wrong = Vec::new();
+    for sample in samples {
+        let last = before.insert(sample.computer, sample);
+        let Says::Leads(term) = sample.says else {
+            continue;
+        };
+        let first = *terms.entry(term).or_insert(sample.computer);
+        if first != sample.computer {
+            wrong.push(format!("{sample:?} leads in the term of {first}"));
+        }
+        if let Some(last) = last
+            && last.says == sample.says
+            && sample.to - last.from < CLOSE
+        {
+            spans.push((sample.computer, term, last.to, sample.from));
+        }
+    }
+    spans.sort_by_key(|span| span.2);
+    let mut latest: Option<(usize, u64, Time, Time)> = None;
+    for span in spans {
+        if let Some(latest) = latest
+            && latest.0 != span.0
+            && span.2 < latest.3
+        {
+            wrong.push(format!(
+                "two lead at once: {} in term {} from {} to {}, {} in term {} from {} to {}",
+                latest.0, latest.1, latest.2, latest.3, span.0, span.1, span.2, span.3
+            ));
+        }
+        if latest.is_none_or(|latest| latest.3 < span.3) {
+            latest = Some(span);
+        }
+    }
+    wrong
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KEY: &str = "/k";
+
+    fn write(computer: usize, value: i32, start: Time, end: impl Into<Option<Time>>) -> Op {
+        op(computer, What::Write(value), start, end.into())
+    }
+
+    fn read(computer: usize, value: impl Into<Value>, start: Time, end: Time) -> Op {
+        op(computer, What::Read(value.into()), start, Some(end))
+    }
+
+    fn op(computer: usize, what: What, start: Time, end: Option<Time>) -> Op {
+        let key = KEY.to_owned();
+        Op {
+            computer,
+            key,
+            what,
+            start,
+            end,
+        }
+    }
+
+    fn says(computer: usize, from: Time, to: Time, says: Says) -> Sample {
+        Sample {
+            computer,
+            from,
+            to,
+            says,
+        }
+    }
+
+    /// What is wrong with these calls, if the parameter is that in the end. Computer 2 is alone from second 10 to 20.
+    fn judge(ops: &[Op], losses: &[(usize, i32)], end: Value) -> Vec<String> {
+        let losses = losses.iter().map(|(computer, value)| Loss {
+            computer: *computer,
+            key: KEY.to_owned(),
+            value: *value,
+        });
+        let history = History {
+            ops: ops.to_vec(),
+            losses: losses.collect(),
+            samples: vec![says(2, 10 * S, 20 * S, Says::Alone)],
+        };
+        let values = end.map(|value| (KEY.to_owned(), value)).into_iter();
+        let end = End {
+            values: values.collect(),
+            told: Vec::new(),
+        };
+        violations(&history, &end)
+    }
+
+    #[track_caller]
+    fn good(ops: &[Op], losses: &[(usize, i32)], end: Value) {
+        assert_eq!(judge(ops, losses, end), <[String; 0]>::default());
+    }
+
+    #[track_caller]
+    fn bad(ops: &[Op], losses: &[(usize, i32)], end: Value, word: &str) {
+        let wrong = judge(ops, losses, end);
+        assert!(wrong.len() == 1 && wrong[0].contains(word), "{wrong:?}");
+    }
+
+    /// A second.
+    const S: Time = 1_000_000;
+
+    #[test]
+    fn the_last_acknowledged_write_is_there_or_one_that_overlaps_it() {
+        let one_by_one = [write(0, 1, 1, 2), write(1, 2, 3, 4)];
+        good(&one_by_one, &[], Some(2));
+        bad(&one_by_one, &[], Some(1), "lost");
+        bad(&one_by_one, &[], None, "lost");
+        let overlapping = [write(0, 1, 1, 4), write(1, 2, 2, 3)];
+        good(&overlapping, &[], Some(1));
+        good(&overlapping, &[], Some(2));
+        bad(&overlapping, &[], None, "2 acknowledged writes");
+        bad(&overlapping, &[], Some(3), "nobody wrote");
+        good(&[], &[], None);
+    }
+
+    #[test]
+    fn a_write_that_failed_may_be_there_or_not_and_at_any_time() {
+        let ops = [write(0, 1, 1, 2), write(1, 2, 3, None), write(0, 3, 5, 6)];
+        good(&ops, &[], Some(2));
+        good(&ops, &[], Some(3));
+        bad(&ops, &[], Some(1), "lost");
+    }
+
+    #[test]
+    fn only_a_write_that_was_made_alone_may_be_lost_and_only_if_it_is_reported() {
+        let others = write(0, 1, 12 * S, 13 * S);
+        let alone =
+            [14, 15, 16].map(|second| write(2, second, second as Time * S, second as Time * S + 1));
+        let ops = [&[others.clone()][..], &alone].concat();
+        bad(&ops, &[], Some(1), "3 acknowledged writes");
+        good(&ops, &[(2, 16)], Some(1));
+        bad(&ops, &[(2, 15)], Some(1), "the first, alone");
+        bad(&ops, &[(0, 16)], Some(1), "lost");
+        good(&ops, &[], Some(16));
+        let ops = [write(1, 1, S, 2 * S), write(0, 2, 3 * S, 4 * S)];
+        bad(&ops, &[(0, 2)], Some(1), "lost");
+    }
+
+    #[test]
+    fn no_read_of_a_computer_goes_back() {
+        let writes = [write(0, 1, 1, 2), write(0, 2, 3, 4)];
+        let with = |reads: &[Op]| [&writes[..], reads].concat();
+        good(&with(&[read(1, 1, 5, 6), read(1, 2, 7, 8)]), &[], Some(2));
+        bad(
+            &with(&[read(1, 2, 5, 6), read(1, 1, 7, 8)]),
+            &[],
+            Some(2),
+            "goes back",
+        );
+        bad(
+            &with(&[read(1, 1, 5, 6), read(1, None, 7, 8)]),
+            &[],
+            Some(2),
+            "goes back",
+        );
+        // Two at the same time, and two computers.
+        good(&with(&[read(1, 2, 5, 7), read(1, 1, 6, 8)]), &[], Some(2));
+        good(&with(&[read(1, 2, 5, 6), read(2, 1, 7, 8)]), &[], Some(2));
+        bad(&with(&[read(1, 9, 5, 6)]), &[], Some(2), "nobody wrote");
+        let early = [write(0, 1, 7, 8), read(1, 1, 5, 6)];
+        bad(&early, &[], Some(1), "written later");
+        // Nobody is promised that what was not acknowledged stays.
+        let failed = [
+            write(0, 1, 1, 2),
+            write(0, 2, 3, None),
+            read(1, 2, 4, 5),
+            read(1, 1, 6, 7),
+        ];
+        good(&failed, &[], Some(1));
+        let late = [
+            write(0, 1, 1, 2),
+            write(0, 2, 3, 9),
+            read(1, 2, 4, 5),
+            read(1, 1, 6, 7),
+        ];
+        good(&late, &[], Some(2));
+    }
+
+    #[test]
+    fn a_caller_sees_what_was_acknowledged_to_it() {
+        let ops = |reader| [write(0, 1, 1, 2), write(0, 2, 3, 4), read(reader, 1, 5, 6)];
+        bad(&ops(0), &[], Some(2), "goes back");
+        good(&ops(1), &[], Some(2));
+    }
+
+    #[test]
+    fn a_computer_that_is_alone_has_a_history_of_its_own() {
+        let others = [write(0, 1, S, 2 * S), write(0, 2, 11 * S, 12 * S)];
+        let alone = [
+            read(2, 1, 13 * S, 13 * S + 1),
+            write(2, 3, 14 * S, 14 * S + 1),
+        ];
+        let with = |reads: &[Op]| [&others[..], &alone, reads].concat();
+        good(&with(&[read(2, 3, 15 * S, 15 * S + 1)]), &[], Some(3));
+        good(&with(&[read(2, 2, 25 * S, 25 * S + 1)]), &[(2, 3)], Some(2));
+        // It holds: nobody may miss it.
+        bad(
+            &with(&[read(2, 2, 25 * S, 25 * S + 1)]),
+            &[],
+            Some(3),
+            "goes back",
+        );
+        // What it had shown before binds it afterwards.
+        let before = [
+            write(0, 1, 1, 2),
+            write(0, 2, 3, 4),
+            read(2, 2, 5, 6),
+            read(2, 1, 25 * S, 25 * S + 1),
+        ];
+        bad(&before, &[], Some(2), "goes back");
+    }
+
+    #[test]
+    fn the_last_notification_is_what_the_end_is() {
+        let told = |value: Value| Told {
+            subscriber: "/s".to_owned(),
+            key: KEY.to_owned(),
+            value,
+        };
+        let end = |value| End {
+            values: BTreeMap::from([(KEY.to_owned(), 2)]),
+            told: vec![told(value)],
+        };
+        let history = History {
+            ops: vec![write(0, 2, 1, 2)],
+            ..History::default()
+        };
+        assert!(violations(&history, &end(Some(2))).is_empty());
+        assert_eq!(violations(&history, &end(Some(1))).len(), 1);
+        assert_eq!(violations(&history, &end(None)).len(), 1);
+    }
+
+    #[test]
+    fn no_two_computers_lead_at_once() {
+        let ms = 1000;
+        let leads =
+            |computer, term, at: Time| says(computer, at * ms, (at + 10) * ms, Says::Leads(term));
+        let one_by_one = [
+            leads(0, 1, 0),
+            leads(0, 1, 50),
+            says(0, 100 * ms, 110 * ms, Says::Other),
+            leads(1, 2, 100),
+            leads(1, 2, 150),
+        ];
+        assert_eq!(leaders(&one_by_one), <[String; 0]>::default());
+        let both = [
+            leads(0, 1, 0),
+            leads(1, 2, 20),
+            leads(0, 1, 50),
+            leads(1, 2, 60),
+            leads(0, 1, 100),
+        ];
+        assert!(leaders(&both)[0].contains("at once"));
+        // It stood still between the two, and another one led.
+        let stopped = [
+            leads(0, 1, 0),
+            leads(1, 2, 2500),
+            leads(1, 2, 2550),
+            leads(0, 1, 3000),
+        ];
+        assert_eq!(leaders(&stopped), <[String; 0]>::default());
+        let same_term = [leads(0, 1, 0), leads(1, 1, 500)];
+        assert!(leaders(&same_term)[0].contains("the term of 0"));
+    }
+}

@@ -1,0 +1,265 @@
+//! What goes wrong.
+
+use std::time::Duration;
+
+use rustix::process::Signal;
+
+use super::clients::Clients;
+use crate::chance::Chance;
+use crate::disks::Disk;
+use crate::fleet::Fleet;
+use crate::network::{COUNT, Quality};
+use crate::support::{Process, alive, eventually, signal, stop};
+
+/// Who is called by the number of a computer.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Fault {
+    /// SIGKILL for the process that answers.
+    Worker(usize),
+    /// SIGKILL for the process that starts it; somebody starts rosrescue again.
+    Guardian(usize),
+    /// SIGKILL for everything, of which the kernel tells the others.
+    Killed(usize),
+    /// The power fails.
+    Power(usize),
+    /// The power fails, and the disk lacks what the checkpoint was given last.
+    OlderDisk(usize),
+    /// The process that answers stands still.
+    Paused(usize),
+    /// Everything stands still, etcd too.
+    Frozen(usize),
+    OneWay(usize, usize),
+    Pair(usize, usize),
+    Cable(usize),
+    Bad(usize, Quality),
+    /// It reaches the others, but no etcd.
+    NoEtcd(usize),
+    Etcd(usize),
+    AllEtcds,
+    /// All etcds lose their data, and a person does what the documentation says.
+    Wiped,
+    Handover(usize),
+}
+
+impl Fault {
+    pub(super) fn roll(chance: &mut Chance) -> Self {
+        let one = chance.below(COUNT);
+        let other = (one + 1 + chance.below(COUNT - 1)) % COUNT;
+        match chance.below(32) {
+            0..3 => Self::Worker(one),
+            3..5 => Self::Guardian(one),
+            5..7 => Self::Killed(one),
+            7..9 => Self::Power(one),
+            9..12 => Self::OlderDisk(one),
+            12..15 => Self::Paused(one),
+            15..17 => Self::Frozen(one),
+            17..20 => Self::OneWay(one, other),
+            20..22 => Self::Pair(one, other),
+            22..24 => Self::Cable(one),
+            24..26 => Self::Bad(
+                one,
+                Quality {
+                    delay: chance.of(&[2, 20, 100]),
+                    jitter: chance.of(&[0, 20]),
+                    loss: chance.of(&[0, 3, 15]),
+                },
+            ),
+            26 => Self::NoEtcd(one),
+            27 => Self::Etcd(one),
+            28 => Self::AllEtcds,
+            29 => Self::Wiped,
+            _ => Self::Handover(one),
+        }
+    }
+
+    /// The computers that it concerns.
+    fn computers(&self) -> Vec<usize> {
+        match *self {
+            Self::AllEtcds | Self::Wiped => vec![0, 1, 2],
+            // Its commands and those of other faults must not meet: they change the same cables.
+            Self::OneWay(one, other) | Self::Pair(one, other) => vec![one, other],
+            Self::NoEtcd(_) => vec![0, 1, 2],
+            Self::Worker(one)
+            | Self::Guardian(one)
+            | Self::Killed(one)
+            | Self::Power(one)
+            | Self::OlderDisk(one)
+            | Self::Paused(one)
+            | Self::Frozen(one)
+            | Self::Cable(one)
+            | Self::Bad(one, _)
+            | Self::Etcd(one)
+            | Self::Handover(one) => vec![one],
+        }
+    }
+
+    /// Lets it happen. It lasts, or is over.
+    #[track_caller]
+    pub(super) fn begin(
+        self,
+        fleet: &mut Fleet,
+        clients: &Clients,
+        chance: &mut Chance,
+    ) -> Option<Lasting> {
+        let mut lasting = Lasting {
+            fault: self,
+            pids: Vec::new(),
+            cable: None,
+        };
+        match self {
+            Self::Worker(one) => {
+                signal(fleet.computers[one].worker(), Signal::KILL);
+                return None;
+            }
+            Self::Guardian(one) => {
+                let computer = &mut fleet.computers[one];
+                let worker = computer.worker();
+                signal(computer.guardian(), Signal::KILL);
+                eventually("the worker ends with its guardian", || !alive(worker));
+                computer.restart_rescue();
+                return None;
+            }
+            Self::Killed(one) => fleet.computers[one].power_off(),
+            Self::Power(one) => power_off(fleet, one),
+            Self::OlderDisk(one) => {
+                let worker = fleet.computers[one].worker();
+                stop(worker);
+                let disk = Disk::of(&fleet.computers[one]);
+                signal(worker, Signal::CONT);
+                std::thread::sleep(chance.time(Duration::from_secs(1)));
+                // Nobody else has what it answers alone.
+                let alone = fleet.computers[one].role_is("alone");
+                power_off(fleet, one);
+                if !alone {
+                    disk.put_back(&fleet.computers[one]);
+                }
+            }
+            Self::Paused(one) => lasting.pids = vec![fleet.computers[one].worker()],
+            Self::Frozen(one) => lasting.pids = fleet.computers[one].processes(),
+            Self::OneWay(from, to) => fleet.network.cut_way(from, to),
+            Self::Pair(one, other) => fleet.network.cut_pair(one, other),
+            Self::Cable(one) => fleet.network.cut_cable(one),
+            Self::Bad(one, quality) => {
+                let seed = chance.below(1 << 30) as u64;
+                lasting.cable = Some(fleet.network.worsen(one, &quality, seed));
+            }
+            Self::NoEtcd(one) => {
+                for other in (0..COUNT).filter(|other| *other != one) {
+                    fleet.network.cut_port(one, other, 2379);
+                }
+                fleet.computers[one].kill_etcd();
+            }
+            Self::Etcd(one) => fleet.computers[one].kill_etcd(),
+            Self::AllEtcds => fleet.computers.iter_mut().for_each(|it| it.kill_etcd()),
+            Self::Wiped => {
+                wipe(fleet, clients);
+                return None;
+            }
+            Self::Handover(one) => {
+                // There may be nobody to hand over to.
+                let (status, said) = fleet.computers[one].rosrescue(&["handover"]);
+                println!("handover: {status:?}, {said}");
+                return None;
+            }
+        }
+        for pid in &lasting.pids {
+            signal(*pid, Signal::STOP);
+        }
+        Some(lasting)
+    }
+}
+
+/// A fault that goes on.
+#[derive(Debug)]
+pub(super) struct Lasting {
+    pub(super) fault: Fault,
+    /// What stands still.
+    pids: Vec<u32>,
+    /// What copies the packets of a bad cable.
+    cable: Option<Process>,
+}
+
+impl Lasting {
+    /// Whether it has to end before `fault` can begin.
+    pub(super) fn meets(&self, fault: &Fault) -> bool {
+        let concerned = fault.computers();
+        self.fault
+            .computers()
+            .iter()
+            .any(|it| concerned.contains(it))
+    }
+
+    #[track_caller]
+    pub(super) fn end(self, fleet: &mut Fleet) {
+        for pid in &self.pids {
+            signal(*pid, Signal::CONT);
+        }
+        match self.fault {
+            Fault::Killed(one) => switch_on(fleet, one),
+            Fault::Power(one) | Fault::OlderDisk(one) => {
+                fleet.network.mend_cable(one);
+                switch_on(fleet, one);
+            }
+            Fault::OneWay(from, to) => fleet.network.mend_way(from, to),
+            Fault::Pair(one, other) => fleet.network.mend_pair(one, other),
+            Fault::Cable(one) => fleet.network.mend_cable(one),
+            Fault::Bad(one, _) => {
+                let cable = self.cable.expect("a bad cable");
+                fleet.network.mend_quality(one, cable);
+            }
+            Fault::NoEtcd(one) => {
+                for other in (0..COUNT).filter(|other| *other != one) {
+                    fleet.network.mend_port(one, other, 2379);
+                }
+                fleet.computers[one].start_etcd();
+            }
+            Fault::Etcd(one) => fleet.computers[one].start_etcd(),
+            Fault::AllEtcds => fleet.computers.iter_mut().for_each(|it| it.start_etcd()),
+            _ => {}
+        }
+    }
+}
+
+fn power_off(fleet: &mut Fleet, one: usize) {
+    fleet.network.cut_cable(one);
+    fleet.computers[one].power_off();
+}
+
+/// Without waiting for anything: another fault may go on.
+fn switch_on(fleet: &mut Fleet, one: usize) {
+    let computer = &mut fleet.computers[one];
+    computer.boot();
+    computer.start_etcd();
+    computer.start_rescue();
+}
+
+/// As docs/several-computers.md says under "Backup".
+#[track_caller]
+fn wipe(fleet: &mut Fleet, clients: &Clients) {
+    for computer in &mut fleet.computers {
+        computer.await_answers();
+    }
+    let leader = fleet.await_whole();
+    for other in fleet.others(leader) {
+        fleet.computers[other].stop_rescue();
+    }
+    fleet.computers[leader].stop_rescue();
+    clients.forget_terms();
+    for computer in &mut fleet.computers {
+        computer.kill_etcd();
+        computer.wipe_etcd();
+    }
+    for computer in &mut fleet.computers {
+        computer.start_etcd();
+    }
+    fleet.await_etcd();
+    let options = fleet.computers[leader].options.clone();
+    let always = ["--restore", "always"].map(str::to_owned);
+    fleet.computers[leader].options.extend(always);
+    fleet.computers[leader].start_rescue();
+    fleet.computers[leader].await_answers();
+    fleet.computers[leader].options = options;
+    for other in fleet.others(leader) {
+        fleet.computers[other].start_rescue();
+    }
+}
