@@ -2,6 +2,7 @@
 
 mod connection;
 pub(crate) mod inspect;
+pub(crate) mod next;
 pub(crate) mod peer;
 pub(crate) mod pool;
 pub(crate) mod sentinel;

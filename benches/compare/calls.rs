@@ -50,6 +50,14 @@ pub(crate) const WHOLE: &[(Call, &[usize])] = &[
     (Call::Launch, &[1, 8]),
 ];
 
+/// The calls to measure with this version and an earlier one.
+pub(crate) const VERSIONS: &[(Call, &[usize])] = &[
+    (Call::GetParam, &[1, 64]),
+    (Call::SetParam, &[1, 64]),
+    (Call::Register, &[1, 64]),
+    (Call::Launch, &[1]),
+];
+
 /// The calls to measure on a small computer.
 pub(crate) const SMALLER: &[(Call, &[usize])] = &[
     (Call::GetPid, &[1, 8]),

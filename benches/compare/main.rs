@@ -1,9 +1,8 @@
 //! Compares rosrescue with a bare rosmaster, HAProxy and nginx in one run: `cargo bench --bench compare`.
 //!
-//! There are five parts: single kinds of calls over few and many connections; real clients (many nodes that
-//! start at once, and `roslaunch`); writes that notify nodes; how times grow with the state; and the first
-//! part again on a simulated small computer. It prints tables as Markdown, draws a picture, and writes all
-//! numbers as JSON. The text below each table explains its numbers.
+//! Five parts: single kinds of calls by few and many connections; real clients (a storm of nodes and `roslaunch`);
+//! writes that notify nodes; what grows with the state; and the first again on a stand-in for a small computer. A sixth one, `--parts versions --before FILE`, compares with an
+//! earlier rosrescue. Prints tables as Markdown, draws a picture, and writes every number as JSON. What a number means is said below each table.
 
 #![allow(
     clippy::unwrap_used,
@@ -58,6 +57,8 @@ enum Part {
     Scale,
     /// The calls on one core at a quarter of its speed
     Small,
+    /// Some of the calls by this version and the one of `--before`; not one of the default.
+    Versions,
 }
 
 /// Compares rosrescue with a bare rosmaster, HAProxy and nginx.
@@ -87,8 +88,11 @@ struct Options {
     /// Number of turns of the writes that notify, and of starts of rospy nodes, for each party
     #[arg(long, value_name = "COUNT", default_value_t = 5)]
     notifies: usize,
-    /// File for all numbers as JSON; the picture is written beside it as SVG [default: compare.json in
-    /// Cargo's target folder]
+    /// An earlier rosrescue, for `--parts versions`
+    #[arg(long, value_name = "FILE", required_if_eq("parts", "versions"))]
+    before: Option<PathBuf>,
+    /// Where all numbers go as JSON, and the picture beside it as SVG [default: compare.json in Cargo's target
+    /// folder]
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Also write the tables of all parts into benches/results.md, and the picture into docs/
@@ -103,6 +107,7 @@ struct Measured {
     seconds: f64,
     turns: usize,
     calls: Option<Vec<calls::Cell>>,
+    versions: Option<Vec<calls::Cell>>,
     robots: Option<Vec<robots::Times>>,
     notify: Option<notify::Notify>,
     scale: Option<Vec<scale::Row>>,
@@ -130,6 +135,10 @@ fn main() -> ExitCode {
         );
         return ExitCode::FAILURE;
     }
+    if let Some(before) = &options.before {
+        let before = before.canonicalize().expect("--before: no such file");
+        party::BEFORE.set(before).expect("set once");
+    }
     let measured = measure(&options);
     let text = report::markdown(&measured);
     println!("{text}");
@@ -154,13 +163,15 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options) -> Measured {
     let (seconds, turns) = (options.seconds, options.turns.max(1));
-    let calls = |plan| calls::measure(&party::start(&Kind::ALL), plan, seconds, turns);
+    let of = |kinds: &[Kind], plan| calls::measure(&party::start(kinds), plan, seconds, turns);
+    let calls = |plan| of(&Kind::ALL, plan);
     let needs = |part| options.parts.contains(&part);
     Measured {
         machine: machine::describe(),
         seconds,
         turns,
         calls: needs(Part::Calls).then(|| calls(calls::WHOLE)),
+        versions: needs(Part::Versions).then(|| of(&Kind::VERSIONS, calls::VERSIONS)),
         robots: needs(Part::Robots).then(|| robots::measure(options.storms, options.launches)),
         notify: needs(Part::Notify).then(|| notify::measure(NOTIFY_SECONDS, options.notifies)),
         scale: needs(Part::Scale).then(|| scale::measure(seconds)),

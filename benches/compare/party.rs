@@ -1,6 +1,6 @@
 //! The parties to compare, each with its own rosmaster, all started in the same way.
 
-use std::fmt;
+use std::{fmt, path::PathBuf, process::Command, sync::OnceLock};
 
 use serde::{Serialize, Serializer};
 
@@ -13,6 +13,9 @@ use crate::{
     },
 };
 
+/// The earlier rosrescue of [`Kind::CoreBefore`] and [`Kind::ProxyBefore`].
+pub(crate) static BEFORE: OnceLock<PathBuf> = OnceLock::new();
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// A rosmaster without anything in front of it.
@@ -23,6 +26,10 @@ pub(crate) enum Kind {
     Proxy,
     Haproxy,
     Nginx,
+    /// `rosrescue core` of an earlier version.
+    CoreBefore,
+    /// `rosrescue proxy` of an earlier version.
+    ProxyBefore,
 }
 
 impl Kind {
@@ -35,6 +42,31 @@ impl Kind {
     ];
     /// The parties that are compared by real clients.
     pub(crate) const OURS: [Self; 3] = [Self::Bare, Self::Core, Self::Proxy];
+    /// This version beside an earlier one.
+    pub(crate) const VERSIONS: [Self; 5] = [
+        Self::Bare,
+        Self::CoreBefore,
+        Self::Core,
+        Self::ProxyBefore,
+        Self::Proxy,
+    ];
+}
+
+impl Kind {
+    /// `setup` of the rosrescue that this kind is about.
+    fn program(self, setup: Setup) -> Setup {
+        if !matches!(self, Self::CoreBefore | Self::ProxyBefore) {
+            return setup;
+        }
+        setup.wrapped(|own| {
+            let mut command = Command::new(BEFORE.get().expect("--before"));
+            command.args(own.get_args());
+            for (key, value) in own.get_envs() {
+                command.env(key, value.unwrap_or_default());
+            }
+            command
+        })
+    }
 }
 
 impl fmt::Display for Kind {
@@ -45,6 +77,8 @@ impl fmt::Display for Kind {
             Self::Proxy => "rosrescue proxy",
             Self::Haproxy => "HAProxy",
             Self::Nginx => "nginx",
+            Self::CoreBefore => "core before",
+            Self::ProxyBefore => "proxy before",
         })
     }
 }
@@ -76,19 +110,18 @@ pub(crate) struct Party {
 }
 
 impl Party {
-    fn core() -> Self {
+    /// One that starts its own master.
+    fn core(kind: Kind) -> Self {
         let scratch = Scratch::new();
         let setup = Setup::core(&scratch, free_port()).arg("--no-rosout");
-        let rescue = setup.guarded().start();
+        let rescue = kind.program(setup).guarded().start();
         let client = rescue.client();
         eventually("roscore's parameters are set", || {
             client.param("/rosdistro").is_some()
         });
         Self {
-            kind: Kind::Core,
-            master_pid: client
-                .master_pid()
-                .expect("the master does not report its process id"),
+            kind,
+            master_pid: client.master_pid().expect("the master's process id"),
             client,
             before: Before::Rescue(Box::new(rescue)),
             _master: None,
@@ -108,10 +141,11 @@ impl Party {
             .master_pid()
             .expect("the master does not report its process id");
         let (client, before) = match kind {
-            Kind::Core => panic!("`core` starts its own master"),
+            Kind::Core | Kind::CoreBefore => panic!("`core` starts its own master"),
             Kind::Bare => (client, Before::Nothing),
-            Kind::Proxy => {
-                let rescue = Setup::proxy(&scratch, master_port).guarded().start();
+            Kind::Proxy | Kind::ProxyBefore => {
+                let setup = Setup::proxy(&scratch, master_port);
+                let rescue = kind.program(setup).guarded().start();
                 (rescue.client(), Before::Rescue(Box::new(rescue)))
             }
             Kind::Haproxy | Kind::Nginx => {
@@ -145,11 +179,12 @@ impl Party {
 
 /// Starts one party of each of `kinds`, in that order. `core` must be one of them.
 pub(crate) fn start(kinds: &[Kind]) -> Vec<Party> {
-    let core = Party::core();
+    let core = Party::core(Kind::Core);
     let like = core.master_pid;
     let mut core = Some(core);
     let of = |kind: &Kind| match kind {
         Kind::Core => core.take().expect("one `core`"),
+        Kind::CoreBefore => Party::core(*kind),
         kind => Party::start(*kind, like),
     };
     kinds.iter().map(of).collect()

@@ -16,7 +16,7 @@ fn program(kind: Kind) -> Option<(&'static str, &'static str)> {
     match kind {
         Kind::Haproxy => Some(("haproxy", "haproxy")),
         Kind::Nginx => Some(("nginx", "nginx-light")),
-        Kind::Bare | Kind::Core | Kind::Proxy => None,
+        Kind::Bare | Kind::Core | Kind::Proxy | Kind::CoreBefore | Kind::ProxyBefore => None,
     }
 }
 

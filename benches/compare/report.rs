@@ -19,6 +19,10 @@ pub(crate) fn markdown(measured: &Measured) -> String {
     if let Some(cells) = &measured.calls {
         parts.push(calls(cells) + CALLS.trim_end());
     }
+    if let Some(cells) = &measured.versions {
+        let text = calls(cells).replacen("### Calls", "### This version and an earlier one", 1);
+        parts.push(text.trim_end().to_owned());
+    }
     if let Some(times) = &measured.robots {
         parts.push(robots(times) + ROBOTS.trim_end());
     }
@@ -96,15 +100,19 @@ fn calls(cells: &[Cell]) -> String {
             |seen, _| format!("{:.0} + {:.0}", seen.own_cpu_us, seen.master_cpu_us),
         ),
     ];
-    let names = Kind::ALL.map(|kind| kind.to_string()).join(" | ");
+    let parties = cells.first().map_or([].as_slice(), |cell| &cell.parties);
+    let names: Vec<_> = parties.iter().map(|seen| seen.party.to_string()).collect();
+    let (names, rule) = (names.join(" | "), "--:|".repeat(names.len()));
     let mut text = "### Calls\n".to_owned();
     for (title, cell_text) in tables {
-        text += &format!(
-            "\n{title}\n\n| call | connections | {names} |\n|---|--:|--:|--:|--:|--:|--:|\n"
-        );
+        text += &format!("\n{title}\n\n| call | connections | {names} |\n|---|--:|{rule}\n");
         for cell in cells {
             let bare = cell.of(Kind::Bare);
-            let texts = Kind::ALL.map(|kind| cell_text(cell.of(kind), bare));
+            let texts: Vec<_> = cell
+                .parties
+                .iter()
+                .map(|seen| cell_text(seen, bare))
+                .collect();
             let texts = texts.join(" | ");
             text += &format!("| {} | {} | {texts} |\n", cell.call, cell.connections);
         }

@@ -12,6 +12,7 @@
     reason = "a bench ends at the first thing that goes wrong"
 )]
 
+mod deaths;
 #[path = "../shared/mod.rs"]
 mod shared;
 mod subject;
@@ -21,6 +22,7 @@ use std::time::Duration;
 use clap::Args;
 
 use crate::{
+    deaths::{Death, Victims},
     shared::{caller::Seen, machine},
     subject::{Kind, Subject, Window},
 };
@@ -55,12 +57,22 @@ struct Options {
     #[arg(long, value_name = "KIND,…", value_delimiter = ',', value_enum)]
     #[arg(default_values_t = [Kind::Core, Kind::Proxy, Kind::Bare])]
     kinds: Vec<Kind>,
+    /// Only deaths of rosrescue: of the worker alone, or of worker and master at once, KILLS of each
+    #[arg(long, value_name = "WHO,…", value_delimiter = ',', value_enum)]
+    deaths: Vec<Victims>,
+    /// Busy processes beside those deaths
+    #[arg(long, value_name = "COUNT", default_value_t = 0)]
+    load: usize,
 }
 
 fn main() {
     let Some(options) = shared::options::<Options>("pauses") else {
         return;
     };
+    if !options.deaths.is_empty() {
+        println!("{}", rosrescue_dies(&options));
+        return;
+    }
     let lines: Vec<_> = options
         .kinds
         .iter()
@@ -82,17 +94,10 @@ fn main() {
         println!("Without a master for {} s:\n", options.away);
         println!("| | read | write | write that changes nothing | a subscriber is notified |");
         println!("|---|--:|--:|--:|--:|");
-        for kind in guarded.clone() {
+        for kind in guarded {
             println!("{}", outage(*kind, &options));
         }
         println!();
-    }
-    let deaths: Vec<_> = guarded.filter_map(|kind| deaths(*kind, &options)).collect();
-    if !deaths.is_empty() {
-        println!("rosrescue itself is killed:\n");
-        println!("| | read | write | write that changes nothing | calls without an answer |");
-        println!("|---|--:|--:|--:|--:|");
-        println!("{}\n", deaths.join("\n"));
     }
     println!("{}", EXPLANATION.trim());
 }
@@ -187,19 +192,31 @@ fn outage(kind: Kind, options: &Options) -> String {
     )
 }
 
-/// Measures a line of the third table. `None` if nothing restarts rosrescue.
-fn deaths(kind: Kind, options: &Options) -> Option<String> {
-    let mut subject = Subject::start(kind, options.nodes);
-    let windows: Vec<_> = (0..KILLS_A_LIFE)
-        .map_while(|_| subject.kill_rosrescue())
-        .collect();
-    (!windows.is_empty()).then(|| {
-        let failed: usize = windows.iter().flat_map(all).map(|seen| seen.failed).sum();
-        format!(
-            "| {kind} | {} | {} | {} | {failed} |",
-            cell(windows.iter().map(|window| window.read.pause)),
-            cell(windows.iter().map(|window| window.write.pause)),
-            cell(windows.iter().map(|window| window.idle.pause)),
-        )
-    })
+/// The table of the deaths of rosrescue.
+fn rosrescue_dies(options: &Options) -> String {
+    let mut text = format!(
+        "{}, {} nodes, {} deaths each, {} busy processes beside them.\n\n\
+         | killed | longest wait for a read | for a write | waits over 150 ms | calls without an answer |\n\
+         |---|--:|--:|--:|--:|\n",
+        machine::describe(),
+        options.nodes,
+        options.kills,
+        options.load
+    );
+    for victims in &options.deaths {
+        let deaths = deaths::measure(*victims, options.kills, options.nodes, options.load);
+        let both = |death: &Death| [death.read, death.write];
+        let long = deaths
+            .iter()
+            .flat_map(both)
+            .filter(|seen| seen.pause > 150.0);
+        let failed: usize = deaths.iter().flat_map(both).map(|seen| seen.failed).sum();
+        text += &format!(
+            "| {victims:?} | {} | {} | {} | {failed} |\n",
+            cell(deaths.iter().map(|death| death.read.pause)),
+            cell(deaths.iter().map(|death| death.write.pause)),
+            long.count(),
+        );
+    }
+    text
 }

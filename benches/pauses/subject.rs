@@ -1,13 +1,12 @@
 //! A master with nodes and clients, and what the clients notice of its death.
 
 use std::{
-    fmt, fs,
+    fmt,
     thread::sleep,
     time::{Duration, Instant},
 };
 
 use clap::ValueEnum;
-use rustix::process::Signal;
 
 use crate::shared::{
     caller::{Caller, Seen},
@@ -16,7 +15,7 @@ use crate::shared::{
     second::SecondMaster,
     support::{
         Client, FakeNode, Mode, Robot, Rosmaster, Scratch, State, encode_call, eventually,
-        free_port, http_request, params, signal,
+        free_port, http_request, params,
     },
 };
 
@@ -243,24 +242,6 @@ impl Subject {
         counted.assert_same(&held, "after the outage");
         (window, notified)
     }
-
-    /// Kills the process of rosrescue that answers calls with SIGKILL, if another one keeps its sockets open.
-    /// `None` if there is no such process.
-    pub(crate) fn kill_rosrescue(&mut self) -> Option<Window> {
-        let guardian = self.master.robot().rescue.pid();
-        let worker = worker_of(guardian)?;
-        Some(self.window(|_| signal(worker, Signal::KILL)))
-    }
-}
-
-/// The child of `guardian` that runs the same program.
-fn worker_of(guardian: u32) -> Option<u32> {
-    let program = |pid: u32| fs::read_link(format!("/proc/{pid}/exe")).ok();
-    let children = fs::read_to_string(format!("/proc/{guardian}/task/{guardian}/children")).ok()?;
-    let mut children = children
-        .split_whitespace()
-        .filter_map(|pid| pid.parse().ok());
-    children.find(|pid| program(*pid).is_some() && program(*pid) == program(guardian))
 }
 
 fn ms(duration: Duration) -> f64 {

@@ -7,6 +7,8 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
+const LOG_CONFIG: &str = "ROS_PYTHON_LOG_CONFIG_FILE";
+
 /// A rosmaster without rosrescue, killed when it is dropped.
 #[derive(Debug)]
 pub(crate) struct SecondMaster(Child);
@@ -28,14 +30,26 @@ impl SecondMaster {
         }
         arguments.extend(["-p".to_owned(), port.to_string()]);
         let mut command = Command::new(&arguments[0]);
+        let pairs = environment.iter().filter_map(|pair| pair.split_once('='));
+        let pairs: Vec<_> = pairs.collect();
         command
             .args(&arguments[1..])
             .env_clear()
-            .envs(environment.iter().filter_map(|pair| pair.split_once('=')))
+            .envs(pairs.iter().copied())
             .env("ROS_LOG_DIR", log)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::null());
+        // One that cannot read its logging configuration logs nothing, and is faster than any robot's: rosrescue's
+        // is a file that only its own child inherits.
+        let own = pairs.iter().find(|(name, _)| *name == LOG_CONFIG);
+        if let Some(file) = own.and_then(|(_, path)| path.strip_prefix("/proc/self/fd/")) {
+            let text = fs::read(format!("/proc/{of}/fd/{file}")).expect("a logging configuration");
+            let copy = log.join("second-logging.conf");
+            fs::create_dir_all(log).expect("the folder of the log");
+            fs::write(&copy, text).expect("a copy of it");
+            command.env(LOG_CONFIG, copy);
+        }
         command
     }
 

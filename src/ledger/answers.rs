@@ -141,8 +141,13 @@ impl Ledger {
             }
             Reply::Value(_) => {
                 let accepted = replay::accepted(&inner.mirror, call, &reply).calls;
-                let executed = accepted.into_iter().filter(|of| of.executed);
-                executed.map(|of| of.call).collect()
+                // A master that is newer than the mirror may have what the mirror cannot delete.
+                let may_be_set =
+                    |call: &Request| inner.unconfirmed && *call.method() == Method::DeleteParam;
+                let counts = accepted
+                    .into_iter()
+                    .filter(|of| of.executed || may_be_set(of.call));
+                counts.map(|of| of.call).collect()
             }
         };
         if !changes {

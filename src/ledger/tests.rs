@@ -122,6 +122,22 @@ fn what_is_answered_by_the_mirror_is_pending_until_delivered_or_succeeded() {
 }
 
 #[test]
+fn what_an_older_mirror_cannot_delete_is_pending_until_a_master_was_read() {
+    let ledger = ledger();
+    let delete = || call("deleteParam", &["/n", "/newer"]);
+    let answer = |call: &Request| ledger.stand_in(Instant::now(), call).unwrap().0;
+    ledger.set_unconfirmed();
+    let refused = answered(&delete(), &mut Master::default());
+    assert_eq!(answer(&delete()), refused);
+    answer(&delete());
+    assert_eq!(pending(&ledger), [delete()]);
+    ledger.delivered();
+    ledger.serve();
+    answer(&delete());
+    assert_eq!(pending(&ledger), []);
+}
+
+#[test]
 fn too_many_pending_writes_make_another_incarnation_of_their_master() {
     let ledger = ledger();
     let before = ledger.token();

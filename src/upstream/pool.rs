@@ -9,10 +9,15 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::sync::Semaphore;
 
-use super::{CallError, Connection, Head, RawReply, Upstream, VerifyError, verify};
+use super::{
+    CallError, Head, RawReply, Upstream, VerifyError,
+    next::Next,
+    verify::{self, Verified},
+};
 use crate::{
     gate::{self, State},
     ledger::Ledger,
+    replay::Token,
 };
 
 /// Why a read got no reply from the master.
@@ -35,7 +40,7 @@ pub struct Pool {
     gate: gate::Rx,
     permits: Semaphore,
     /// Idle connections, each with its incarnation.
-    idle: Mutex<Vec<(u64, Connection)>>,
+    idle: Mutex<Vec<(u64, Next)>>,
     /// Number of reads that have waited too long.
     stalled: AtomicUsize,
 }
@@ -74,16 +79,17 @@ impl Pool {
         Stalled(self)
     }
 
-    fn take_idle(&self, incarnation: u64) -> Option<Connection> {
+    fn take_idle(&self, incarnation: u64) -> Option<Next> {
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        idle.retain_mut(|(of, connection)| *of == incarnation && !connection.is_closed());
-        idle.pop().map(|(_, connection)| connection)
+        idle.retain_mut(|(of, next)| *of == incarnation && !next.is_stale());
+        idle.pop().map(|(_, next)| next)
     }
 
-    fn put_idle(&self, incarnation: u64, connection: Connection, reply: &RawReply) {
-        if reply.leaves_connection_usable() {
+    fn put_idle(&self, incarnation: u64, token: Token, verified: Verified, reply: &RawReply) {
+        let connect = connect(self.upstream.clone(), token);
+        if let Some(next) = Next::after(verified, reply, connect) {
             let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-            idle.push((incarnation, connection));
+            idle.push((incarnation, next));
         }
     }
 
@@ -98,19 +104,19 @@ impl Pool {
         let attempt = async {
             // The semaphore is never closed.
             let _permit = self.permits.acquire().await;
-            if let Some(mut connection) = self.take_idle(incarnation)
-                && let Ok(reply) = connection.forward(head, body.clone()).await
+            let (upstream, token) = (&self.upstream, self.ledger.token());
+            if let Some(next) = self.take_idle(incarnation)
+                && let Some(mut verified) = next.ready().await
+                && let Ok(reply) = verified.forward(upstream, &token, head, body.clone()).await
             {
-                self.put_idle(incarnation, connection, &reply);
+                self.put_idle(incarnation, token, verified, &reply);
                 return Ok(reply);
             }
-            let connection = self.upstream.connect().await.map_err(VerifyError::from)?;
-            let (upstream, token) = (&self.upstream, self.ledger.token());
-            let mut verified = verify::connection(connection, upstream, &token).await?;
+            let mut verified = connect(upstream.clone(), token.clone()).await?;
             let reply = verified
                 .forward(upstream, &token, head, body.clone())
                 .await?;
-            self.put_idle(incarnation, verified.connection, &reply);
+            self.put_idle(incarnation, token, verified, &reply);
             Ok(reply)
         };
         let mut gate = self.gate.clone();
@@ -119,4 +125,9 @@ impl Pool {
             _ = gate.wait_for(|state| state != (State::Open { incarnation })) => Err(ReadError::Shut),
         }
     }
+}
+
+async fn connect(upstream: Arc<Upstream>, token: Token) -> Result<Verified, VerifyError> {
+    let connection = upstream.connect().await?;
+    verify::connection(connection, &upstream, &token).await
 }

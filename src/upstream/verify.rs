@@ -60,10 +60,10 @@ pub(crate) struct Verified {
 }
 
 impl Verified {
-    /// Wraps a connection on which the token was found before.
-    pub(crate) fn before(connection: Connection) -> Self {
-        let by = Verification::TokenFirst;
-        Self { connection, by }
+    /// Returns whether the connection leads to that incarnation for as long as it is open. Behind a tunnel
+    /// it may not: the tunnel can lead a connection that carries nothing yet elsewhere.
+    pub(crate) fn stays_verified(&self) -> bool {
+        !matches!(self.by, Verification::TokenAfterwards)
     }
 
     /// Sends `body` unchanged. Returns the reply unchanged, if it comes from the incarnation that

@@ -23,7 +23,7 @@ use crate::{
     limit::rarely,
     master::{Master, Method, Request},
     status::stats::Stats,
-    upstream::{Connection, RawReply, inspect::InspectError},
+    upstream::{RawReply, inspect::InspectError, next::Next},
     wait,
     xmlrpc::{self, Reply},
 };
@@ -58,7 +58,7 @@ pub(crate) struct Drain {
     resync_interval: Option<Duration>,
     items: mpsc::Receiver<Item>,
     pub(super) queue: VecDeque<Item>,
-    connection: Option<(u64, Connection)>,
+    connection: Option<(u64, Next)>,
     in_flight: Option<InFlight>,
     /// Until when the batch in flight may continue behind a shut gate.
     grace: Option<tokio::time::Instant>,
@@ -246,7 +246,8 @@ impl Drain {
             return;
         }
         let mut connection = self.connection.take();
-        connection.take_if(|(of, connection)| *of != incarnation || connection.is_closed());
+        connection.take_if(|(of, next)| *of != incarnation || next.is_stale());
+        let connection = connection.map(|(_, next)| next);
         self.stats.write_batches.count();
         let request = (!items.is_empty()).then(|| batch::outbound(&items));
         self.link.ledger.with_order(|order, _| {

@@ -8,16 +8,17 @@ use crate::{
     master::Master,
     replay::Token,
     upstream::{
-        CallError, Connection, Head, RawReply, VerifyError,
+        CallError, Head, RawReply, VerifyError,
         inspect::{self, InspectError},
+        next::Next,
         verify::{self, Verified},
     },
 };
 
 /// The result of a round trip.
 pub(super) struct Done {
-    /// The connection, if it is reusable, and its incarnation.
-    pub(super) connection: Option<(u64, Connection)>,
+    /// The next connection, if there is one already, and its incarnation.
+    pub(super) connection: Option<(u64, Next)>,
     pub(super) result: Result<Received, RoundTripError>,
 }
 
@@ -54,13 +55,17 @@ impl RoundTripError {
 pub(super) async fn round_trip(
     link: Link,
     incarnation: u64,
-    connection: Option<(u64, Connection)>,
+    connection: Option<Next>,
     request: Option<(Head, Bytes)>,
 ) -> Done {
     let token = link.ledger.token();
-    let connected = match connection {
-        Some((_, connection)) => Ok(Verified::before(connection)),
-        None => connect(&link, &token).await,
+    let ready = match connection {
+        Some(next) => next.ready().await,
+        None => None,
+    };
+    let connected = match ready {
+        Some(verified) => Ok(verified),
+        None => connect(link.clone(), token.clone()).await,
     };
     let mut verified = match connected {
         Ok(verified) => verified,
@@ -82,20 +87,20 @@ pub(super) async fn round_trip(
                 .map_err(Into::into)
         }
     };
-    let usable = match &result {
-        Ok(Received::Reply(reply)) => reply.leaves_connection_usable(),
-        Ok(Received::Held(_)) => true,
-        Err(_) => false,
+    let connection = match &result {
+        Ok(Received::Reply(reply)) => Next::after(verified, reply, connect(link, token)),
+        Ok(Received::Held(_)) => Some(Next::Kept(verified)),
+        Err(_) => None,
     };
     Done {
-        connection: usable.then_some((incarnation, verified.connection)),
+        connection: connection.map(|next| (incarnation, next)),
         result,
     }
 }
 
-async fn connect(link: &Link, token: &Token) -> Result<Verified, VerifyError> {
+async fn connect(link: Link, token: Token) -> Result<Verified, VerifyError> {
     let connection = link.upstream.connect_for_writes().await?;
-    verify::connection(connection, &link.upstream, token).await
+    verify::connection(connection, &link.upstream, &token).await
 }
 
 /// Reads the state of the master behind a connection.

@@ -1,12 +1,13 @@
 #!/usr/bin/python3
 """A typical robot driver. It publishes at 50 Hz, reads a parameter and logs at 10 Hz, and runs `diagnostic_updater`,
 which reads its period at 4 Hz. Five times a second it prints the time of its longest pass since the last such line, in
-milliseconds.
+milliseconds. With `writes` it also sets a parameter in each pass, and advertises and unregisters a topic once a second.
 
 As on most robots, neither `~diagnostic_period` nor `/rosout_disable_topics_generation` is set, so rospy's
 `get_param_cached` calls `subscribeParam` each time.
 """
 
+import sys
 import time
 
 import diagnostic_updater
@@ -32,6 +33,10 @@ def main():
         if number % (HZ // 10) == 0:
             rospy.get_param("/gain", 0)
             rospy.loginfo("pass %d", number)
+            if "writes" in sys.argv:
+                rospy.set_param("~pass", number)
+        if number % HZ == 0 and "writes" in sys.argv:
+            rospy.Publisher("~now_and_then", String, queue_size=1).unregister()
         updater.update()
         longest = max(longest, time.monotonic() - begin)
         if number % (HZ // 5) == 0:

@@ -235,6 +235,17 @@ impl Writer {
         true
     }
 
+    /// From now on the node says of itself what `state` says of it: what it says and is not so, is mended.
+    fn claim(&self, state: &Own) {
+        const TYPE: &str = "std_msgs/String";
+        for number in 0..NAMES {
+            let topic = format!("{}n{number}", space(self.index));
+            let of = |topics: &BTreeSet<String>| topics.contains(&topic).then_some(TYPE);
+            self.node.claim_publication(&topic, of(&state.published));
+            self.node.claim_subscription(&topic, of(&state.subscribed));
+        }
+    }
+
     fn state(&self) -> Own {
         lock(&self.past).states.last().unwrap().clone()
     }
@@ -250,11 +261,14 @@ impl Writer {
         })
     }
 
-    fn restart_from(&self, state: Own) {
-        *lock(&self.past) = Past {
-            states: vec![state],
-            ..Past::default()
-        };
+    /// In a silence, in which it is in `state`. What was not recorded may still be lost, so what came before counts.
+    fn is_in(&self, state: Own, is_recorded: bool) {
+        let mut past = lock(&self.past);
+        if is_recorded {
+            *past = Past::default();
+        }
+        past.states.push(state);
+        past.last = None;
     }
 }
 
@@ -358,12 +372,11 @@ impl Stage<'_> {
                 }
             }
         }
+        let is_recorded = self.note_what_is_owed();
         for writer in self.writers {
-            let state = writer.state();
-            writer.restart_from(state);
+            writer.is_in(writer.state(), is_recorded);
         }
         self.count("silences");
-        self.note_what_is_owed();
         self.go_on();
     }
 
@@ -372,6 +385,15 @@ impl Stage<'_> {
     fn assert_what_is_owed(&mut self) {
         self.pause();
         self.await_service(None);
+        // A state that went back is no longer what the nodes say of themselves.
+        eventually("all nodes have been asked", || {
+            for writer in self.writers {
+                writer.claim(&Own::read(&self.client(), writer.index));
+            }
+            let last = self.status("last_recovery").unwrap_or_default();
+            last["health_check_ms"].is_number()
+        });
+        let is_recorded = self.status("unprotected") == Some(serde_json::Value::Null);
         for writer in self.writers {
             let found = Own::read(&self.client(), writer.index);
             assert!(
@@ -383,9 +405,8 @@ impl Stage<'_> {
             if found != writer.state() {
                 self.count("states that went back");
             }
-            writer.restart_from(found);
+            writer.is_in(found, is_recorded);
         }
-        self.note_what_is_owed();
         self.go_on();
     }
 
@@ -413,6 +434,10 @@ impl Stage<'_> {
                 self.count("masters killed");
                 if let Some(pid) = self.bare.master_pid() {
                     signal(pid, Signal::KILL);
+                    // Before the worker has noticed, both would die together.
+                    let is_other = || self.bare.master_pid().is_some_and(|it| it != pid);
+                    let never = holds(3 * PATIENCE, || !is_other());
+                    assert!(!never, "no other master: {}", self.rescue.log());
                 }
                 self.await_service(None);
             }

@@ -255,11 +255,16 @@ fn writes_answered_before_the_master_is_examined_are_kept() {
     node.unpublish(&client, "/topic");
     client.set_param("/back", 2);
     client.set_param("/new", 2);
+    client.set_param("/going", 2);
     rescue.kill();
     put_back(&copy, &rescue.checkpoint());
     crate::support::stop(master.pid());
     rescue.start_again();
     eventually("rosrescue answers", || client.param("/back").is_some());
+    // The mirror of the older checkpoint does not know it.
+    client
+        .call("deleteParam", params!["/node", "/going"])
+        .unwrap();
     client.set_param("/back", 1);
     node.publish(&client, "/topic", "std_msgs/String");
     crate::support::signal(master.pid(), rustix::process::Signal::CONT);
@@ -270,5 +275,6 @@ fn writes_answered_before_the_master_is_examined_are_kept() {
     });
     assert_eq!(bare.param("/back"), Some(1.into()));
     assert_eq!(bare.param("/new"), Some(2.into()));
+    assert_eq!(bare.param("/going"), None);
     assert_eq!(State::read(&bare).publishers_of("/topic"), ["/node"]);
 }

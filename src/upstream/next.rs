@@ -1,0 +1,139 @@
+//! This module holds the connection for the next call.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::{RawReply, VerifyError, verify::Verified};
+
+/// A connection that was made ahead is not used after this time: the master may close an idle one.
+/// `core` starts rosmaster with `-t 5`, and a timeout of less than a second makes no sense.
+const AGE_MAX: Duration = Duration::from_millis(500);
+
+/// A connection for the next call.
+#[derive(Debug)]
+pub(crate) enum Next {
+    /// The master has left the connection of the last call open.
+    Kept(Verified),
+    /// The master closes each connection after one answer, so the next one is made ahead. The next call
+    /// then does not wait until the master has accepted it. The moment is that of its beginning.
+    Ahead(AbortOnDropHandle<Result<Verified, VerifyError>>, Instant),
+}
+
+impl Next {
+    /// Returns what follows `verified`, on which `reply` has come: the connection itself, or a new one
+    /// that `connect` makes. Returns none if the next call has to connect.
+    pub(crate) fn after(
+        verified: Verified,
+        reply: &RawReply,
+        connect: impl Future<Output = Result<Verified, VerifyError>> + Send + 'static,
+    ) -> Option<Self> {
+        if reply.leaves_connection_usable() {
+            return Some(Self::Kept(verified));
+        }
+        let useful = reply.status.is_success() && verified.stays_verified();
+        let connect = async {
+            // The answer goes to its client first.
+            tokio::task::yield_now().await;
+            connect.await
+        };
+        let ahead = || AbortOnDropHandle::new(tokio::spawn(connect));
+        useful.then(|| Self::Ahead(ahead(), Instant::now()))
+    }
+
+    /// Returns whether the connection has ended, or may end soon.
+    pub(crate) fn is_stale(&mut self) -> bool {
+        match self {
+            Self::Kept(verified) => verified.connection.is_closed(),
+            Self::Ahead(_, since) => since.elapsed() > AGE_MAX,
+        }
+    }
+
+    /// Waits for the connection. Returns none if it has ended, or could not be made.
+    pub(crate) async fn ready(self) -> Option<Verified> {
+        match self {
+            Self::Kept(verified) => Some(verified),
+            Self::Ahead(made, _) => {
+                let mut verified = made.await.ok()?.ok()?;
+                (!verified.connection.is_closed()).then_some(verified)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use hyper::{HeaderMap, StatusCode, header::HeaderValue};
+    use tokio::net::TcpListener;
+
+    use super::*;
+    use crate::{
+        replay::Token,
+        ros_env::MasterUri,
+        upstream::{
+            Upstream,
+            verify::{self, Verification},
+        },
+    };
+
+    fn reply(keeps_alive: bool) -> RawReply {
+        RawReply {
+            keeps_alive,
+            status: StatusCode::OK,
+            reason: None,
+            headers: HeaderMap::new(),
+            body: bytes::Bytes::new(),
+        }
+    }
+
+    async fn connect(upstream: Arc<Upstream>) -> Result<Verified, VerifyError> {
+        let connection = upstream.connect().await?;
+        verify::connection(connection, &upstream, &Token::new("session", 1)).await
+    }
+
+    #[tokio::test]
+    async fn a_master_that_closes_each_connection_has_accepted_the_next_before_it_is_needed() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let uri = format!("http://{}", listener.local_addr().unwrap());
+        let uri = MasterUri::parse(&uri).unwrap();
+        let name = HeaderValue::from_static("test");
+        let upstream = Arc::new(Upstream::new(uri, name, Duration::from_secs(1), 3));
+        let sentinel = Arc::new(upstream.connect_sentinel().await.unwrap());
+        let (_sentinel, _) = listener.accept().await.unwrap();
+        let after = async |reply, by| {
+            upstream.set_verification(Some(by));
+            let last = connect(upstream.clone()).await.unwrap();
+            let (last_end, _) = listener.accept().await.unwrap();
+            (
+                Next::after(last, &reply, connect(upstream.clone())),
+                last_end,
+            )
+        };
+        let by_sentinel = || Verification::Sentinel(sentinel.clone());
+
+        let (next, _open) = after(reply(true), by_sentinel()).await;
+        assert!(matches!(next, Some(Next::Kept(_))));
+
+        let (next, _) = after(reply(false), by_sentinel()).await;
+        let (accepted, _) = listener.accept().await.unwrap();
+        let mut next = next.unwrap();
+        assert!(!next.is_stale());
+        let verified = next.ready().await.unwrap();
+        drop(accepted);
+
+        // One that the master may close by itself soon is not used.
+        let (next, _) = after(reply(false), by_sentinel()).await;
+        let Some(Next::Ahead(made, since)) = next else {
+            panic!("{next:?}")
+        };
+        assert!(Next::Ahead(made, since - 2 * AGE_MAX).is_stale());
+
+        // A tunnel may lead it elsewhere before it is used.
+        let (next, _) = after(reply(false), Verification::TokenAfterwards).await;
+        assert!(next.is_none());
+        drop(verified);
+    }
+}
