@@ -1,8 +1,5 @@
-//! The checkpoint: its file format, its store on disk, and whether its session continues.
+//! The checkpoint: its text and its session are in [`rescue_core::checkpoint`], its file in [`checkpoint_store`].
 
-pub mod compare;
-pub(crate) mod folder;
-pub mod format;
-pub mod putback;
-pub mod session;
-pub mod store;
+pub use checkpoint_store as store;
+pub(crate) use checkpoint_store::folder;
+pub use rescue_core::checkpoint::{compare, format, putback, session};

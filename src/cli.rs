@@ -17,7 +17,7 @@ pub use self::{
         RestoreArgs, VerifyArgs,
     },
     live::{For, HandoverArgs, TopArgs, WaitArgs},
-    serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, SyncPolicy},
+    serve::{CommonArgs, CoreArgs, LogFormat, ProxyArgs, Reads, RestoreChoice, SyncPolicy},
     service::{CompletionsArgs, InstallArgs, ManArgs, ScopeArgs, UninstallArgs},
     tools::{CheckArgs, DrillArgs, HideArgs, OutputArgs, StatusArgs, TargetArgs, Tool, Victim},
 };

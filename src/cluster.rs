@@ -1,30 +1,14 @@
-//! Several computers: one leads, the others follow, and one of them takes over.
+//! Several computers: one leads, the others follow, and one of them takes over. The decisions are in
+//! [`rescue_core::cluster`].
 //!
-//! Two keys in etcd, below the robot's prefix, decide who leads. `leader` says who, and its revision is the
-//! *term*. `alive` is written by every transaction of the leader, at least four times in the time to live.
-//! Whoever has seen no change of both for the time to live, by its own clock, may claim. Every transaction of
-//! the leader succeeds only if `leader` has its term and `alive` is as the previous one left it. So one that
-//! was cut off can commit nothing, and one that is sent twice has its effect once. The records of calls are
-//! in `journal/`, and travel in the same transaction. See decision 29.
-//!
-//! * [`displaced`]: who is to be told to shut down by the next leader; pure.
-//! * [`machine`]: who leads, and what may be acknowledged; pure.
-//! * [`journal`]: records and snapshots to and from keys and values; pure.
-//! * [`merge`]: what of the writes of a computer that was alone still holds; pure.
-//! * [`namesake`]: another computer with this one's name; pure.
 //! * [`etcd`]: etcd's JSON gateway.
 //! * [`survey`]: what is wrong with `--cluster`.
 //! * [`replica`]: the robot's state in etcd.
 //! * [`way`]: where calls go.
 
-pub mod displaced;
 pub mod etcd;
-pub mod journal;
-pub mod machine;
-pub mod merge;
-pub mod namesake;
 pub mod replica;
 pub mod survey;
-#[cfg(test)]
-mod tests;
 pub mod way;
+
+pub use rescue_core::cluster::{displaced, journal, machine, merge, namesake};

@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use crate::{
     checkpoint::session::Restore,
-    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, SyncPolicy},
+    cli::{CommonArgs, CoreArgs, ProxyArgs, Reads, RestoreChoice, SyncPolicy},
     hide::Hide,
     lifecycle::Probing,
     ros_env::{self, Lookup, MasterUri, UriError},
@@ -281,7 +281,11 @@ impl Config {
             advertised,
             master,
             reads,
-            restore: args.restore,
+            restore: match args.restore {
+                RestoreChoice::Auto => Restore::Auto,
+                RestoreChoice::Always => Restore::Always,
+                RestoreChoice::Never => Restore::Never,
+            },
             history: args.history << 20,
             sync: args.sync,
             sync_interval: Duration::from_millis(args.sync_interval),

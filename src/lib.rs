@@ -49,21 +49,16 @@ pub mod cluster;
 pub mod commands;
 pub mod config;
 #[cfg(test)]
+#[path = "../crates/rescue-core/src/dice.rs"]
 pub(crate) mod dice;
 pub(crate) mod gate;
 pub mod guardian;
-pub(crate) mod health;
-pub mod hide;
 pub(crate) mod ledger;
-pub mod lifecycle;
 pub(crate) mod limit;
 pub mod log;
 pub(crate) mod nodes;
-pub(crate) mod order;
 pub(crate) mod process;
 pub(crate) mod recovery;
-pub(crate) mod regular_file;
-pub mod replay;
 pub(crate) mod resolver;
 pub mod ros_env;
 pub(crate) mod roscore;
@@ -73,5 +68,8 @@ pub(crate) mod upstream;
 pub(crate) mod wait;
 pub(crate) mod write_queue;
 
+pub(crate) use checkpoint_store::regular_file;
+pub(crate) use rescue_core::{health, order};
+pub use rescue_core::{hide, lifecycle, replay};
 pub use ros1_master::{master, xmlrpc};
 pub use server::listener;

@@ -2,15 +2,10 @@
 
 use std::{net::IpAddr, path::PathBuf};
 
-use clap::{
-    Args, ValueEnum,
-    builder::{FalseyValueParser, PossibleValue},
-};
-
+use clap::{Args, ValueEnum, builder::FalseyValueParser};
 use ipnet::IpNet;
 
 use super::{cluster::ClusterArgs, tools::HideArgs};
-use crate::checkpoint::session::Restore;
 
 /// Options of `rosrescue core`. The short ones are roscore's.
 #[derive(Args, Clone, Debug)]
@@ -92,8 +87,8 @@ pub struct CommonArgs {
     #[arg(long, env = "ROSRESCUE_CHECKPOINT", value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
     /// When to restore the state of the checkpoint at the start of rosrescue
-    #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = Restore::Auto)]
-    pub restore: Restore,
+    #[arg(long, env = "ROSRESCUE_RESTORE", value_enum, default_value_t = RestoreChoice::Auto)]
+    pub restore: RestoreChoice,
     /// Most space for the checkpoints that are kept: of the last five sessions, and of the last twenty rescues,
     /// in MiB; 0 for the last session alone. `rosrescue history` lists them
     #[arg(
@@ -285,22 +280,15 @@ fn network(text: &str) -> Result<IpNet, &'static str> {
     Ok(mapped.unwrap_or(net))
 }
 
-impl ValueEnum for Restore {
-    fn value_variants<'a>() -> &'a [Self] {
-        &[Self::Auto, Self::Always, Self::Never]
-    }
-
-    fn to_possible_value(&self) -> Option<PossibleValue> {
-        let (name, help) = match self {
-            Self::Auto => (
-                "auto",
-                "If the session goes on: same boot and no orderly stop, or a registered node still lives",
-            ),
-            Self::Always => ("always", "Always"),
-            Self::Never => ("never", "Never: the old file is kept under another name"),
-        };
-        Some(PossibleValue::new(name).help(help))
-    }
+/// Whether a checkpoint is restored at start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum RestoreChoice {
+    /// If the session goes on: same boot and no orderly stop, or a registered node still lives
+    Auto,
+    /// Always
+    Always,
+    /// Never: the old file is kept under another name
+    Never,
 }
 
 /// When the journal is forced to the disk.

@@ -1,91 +1,36 @@
-//! etcd's JSON gateway: transactions, ranges, leases and watches over plain HTTP/1.
-//!
-//! A request goes to the endpoint that has answered last. If it does not answer soon, the next one gets it as
-//! well: everything that is sent here may be done twice with the same effect.
-
-mod connection;
-mod error;
-mod tls;
-mod watch;
-mod wire;
+//! The robot's keys in etcd: the requests of the machine, as transactions on `leader` and `alive`.
 
 use std::{
-    ops::Range,
-    sync::{
-        Arc,
-        atomic::{AtomicUsize, Ordering},
-    },
+    ops::{Deref, Range},
     time::Duration,
 };
 
-use bytes::Bytes;
-use serde_json::json;
-use tokio::task::JoinSet;
-
-use self::connection::Endpoint;
-pub use self::{
-    connection::Access,
-    error::EtcdError,
-    tls::Tls,
-    watch::{Change, Watch, WatchEnd},
-    wire::Kv,
+pub use etcd_kv::{
+    Access, Change, EtcdError, Found, Kv, Options, Status, Tls, Tried, Watch, WatchEnd,
 };
+use etcd_kv::{Client, Txn, TxnOp};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
 use super::{
     journal::{Keys, Put},
-    machine::{Answer, Op, Settings, View},
+    machine::{Alive, Answer, Guard, Leader, Op, Settings, View},
 };
 
-/// After this time without an answer the next endpoint is asked as well. A transaction takes 1 to 20 ms.
-const NEXT_AFTER: Duration = Duration::from_millis(250);
-/// Pause after all endpoints have failed, within the time of a request.
-const ROUND_PAUSE: Duration = Duration::from_millis(100);
-/// Most keys of one page of a range. The values of so many are 16 MiB at most.
-const PAGE: usize = 32;
 /// Most robots that are looked for.
 const ROBOTS_MOST: usize = 16;
 /// The keys of all robots are before it.
 const ROBOTS_END: &str = "0";
 
-/// All that is to be known about a cluster of etcd.
+/// A client of etcd that knows the robot's keys.
 #[derive(Clone, Debug)]
-pub struct Options {
-    /// `http://HOST:PORT` or `https://HOST:PORT` each.
-    pub endpoints: Vec<String>,
-    pub access: Access,
-}
+pub struct Etcd(Client);
 
-/// A client of a cluster of etcd.
-#[derive(Clone, Debug)]
-pub struct Etcd {
-    endpoints: Arc<[Endpoint]>,
-    /// The endpoint that has answered last.
-    preferred: Arc<AtomicUsize>,
-}
+impl Deref for Etcd {
+    type Target = Client;
 
-/// Keys of one moment.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Found {
-    pub revision: u64,
-    pub kvs: Vec<Kv>,
-}
-
-/// An endpoint that was tried on its own.
-#[derive(Debug)]
-pub struct Tried {
-    pub endpoint: String,
-    /// The id of its cluster, or why it does not serve clients.
-    pub cluster: Result<u64, EtcdError>,
-}
-
-/// What a member of etcd says of itself.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Status {
-    pub endpoint: String,
-    pub version: String,
-    pub db_bytes: u64,
-    pub is_leader: bool,
-    /// What is wrong with it, in its own words.
-    pub errors: Vec<String>,
+    fn deref(&self) -> &Client {
+        &self.0
+    }
 }
 
 impl Etcd {
@@ -93,22 +38,9 @@ impl Etcd {
     ///
     /// # Errors
     ///
-    /// If an endpoint is no URL, or certificates cannot be read.
+    /// As [`Client::new`].
     pub fn new(options: &Options) -> Result<Self, EtcdError> {
-        let access = Arc::new(options.access.clone());
-        let tls = access.tls.settings()?;
-        let endpoints = options.endpoints.iter();
-        let endpoints = endpoints.map(|url| Endpoint::new(url, &access, tls.as_ref()));
-        let endpoints: Vec<_> = endpoints.collect::<Result<_, _>>()?;
-        if endpoints.is_empty() {
-            return Err(EtcdError::Options(
-                "no endpoint of etcd is given".to_owned(),
-            ));
-        }
-        Ok(Self {
-            endpoints: endpoints.into(),
-            preferred: Arc::default(),
-        })
+        Client::new(options).map(Self)
     }
 
     /// Carries out a request of the machine. `entry`: what a beat adds to the journal.
@@ -124,9 +56,13 @@ impl Etcd {
         entry: Option<&Put>,
         limit: Duration,
     ) -> Result<Answer, EtcdError> {
-        let (request, seq) = wire::request(keys, settings, op, entry);
-        let answer: wire::TxnAnswer = self.ask("kv/txn", &request, limit).await?;
-        answer.read(keys, seq)
+        let (txn, seq) = transaction(keys, settings, op, entry);
+        let done = self.txn(&txn, limit).await?;
+        if done.succeeded && done.gets.is_empty() {
+            let revision = done.revision;
+            return Ok(Answer::Applied { revision, seq });
+        }
+        view(keys, done.revision, done.gets.iter().flatten()).map(Answer::Is)
     }
 
     /// Writes `puts`, one after the other, if `leader` has this term. Returns whether it has.
@@ -142,9 +78,8 @@ impl Etcd {
         limit: Duration,
     ) -> Result<bool, EtcdError> {
         for put in puts {
-            let request = wire::guarded(keys, term, &[wire::put(put)]);
-            let answer: wire::TxnAnswer = self.ask("kv/txn", &request, limit).await?;
-            if !answer.succeeded {
+            let txn = guarded(keys, term, vec![write(put)]);
+            if !self.txn(&txn, limit).await?.succeeded {
                 return Ok(false);
             }
         }
@@ -163,10 +98,9 @@ impl Etcd {
         ranges: &[Range<String>],
         limit: Duration,
     ) -> Result<bool, EtcdError> {
-        let deletes: Vec<_> = ranges.iter().map(wire::delete).collect();
-        let request = wire::guarded(keys, term, &deletes);
-        let answer: wire::TxnAnswer = self.ask("kv/txn", &request, limit).await?;
-        Ok(answer.succeeded)
+        let deletes = ranges.iter().cloned().map(TxnOp::Delete).collect();
+        let done = self.txn(&guarded(keys, term, deletes), limit).await?;
+        Ok(done.succeeded)
     }
 
     /// Both keys of the machine.
@@ -175,58 +109,8 @@ impl Etcd {
     ///
     /// Why they are not known.
     pub async fn view(&self, keys: &Keys, limit: Duration) -> Result<View, EtcdError> {
-        let answer: wire::TxnAnswer = self.ask("kv/txn", &wire::read(keys), limit).await?;
-        answer.view(keys)
-    }
-
-    /// All keys in `range` and their values, in order, as of one moment.
-    ///
-    /// # Errors
-    ///
-    /// [`EtcdError::Compacted`] if that moment is gone before all were read; other reasons.
-    pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
-        let mut found: Option<Found> = None;
-        let mut from = range.start.clone();
-        loop {
-            let revision = found.as_ref().map_or(0, |found| found.revision);
-            let request = wire::range(&(from..range.end.clone()), revision, PAGE);
-            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
-            let (revision, more, kvs) = page.read()?;
-            let found = found.get_or_insert(Found {
-                revision,
-                kvs: Vec::new(),
-            });
-            found.kvs.extend(kvs);
-            let Some(last) = found.kvs.last().filter(|_| more) else {
-                return Ok(found.clone());
-            };
-            // The first key after it.
-            from = format!("{}\0", last.key);
-        }
-    }
-
-    /// A lease that goes by itself after about `ttl`, and is 2 s long at least. What is written with it goes
-    /// with it.
-    ///
-    /// # Errors
-    ///
-    /// Why there is none.
-    pub async fn grant(&self, ttl: Duration, limit: Duration) -> Result<i64, EtcdError> {
-        let request = json!({ "TTL": ttl.as_secs().max(1) });
-        let lease: wire::LeaseAnswer = self.ask("lease/grant", &request, limit).await?;
-        Ok(lease.id)
-    }
-
-    /// Prolongs a lease. Returns whether there is such a lease.
-    ///
-    /// # Errors
-    ///
-    /// Why that is not known.
-    pub async fn keep_alive(&self, lease: i64, limit: Duration) -> Result<bool, EtcdError> {
-        let request = json!({ "ID": lease.to_string() });
-        let answer: wire::Streamed<wire::LeaseAnswer> =
-            self.ask("lease/keepalive", &request, limit).await?;
-        Ok(answer.result.ttl > 0)
+        let done = self.txn(&look(keys), limit).await?;
+        view(keys, done.revision, done.gets.iter().flatten())
     }
 
     /// Writes a key that goes with `lease`.
@@ -240,81 +124,14 @@ impl Etcd {
         lease: i64,
         limit: Duration,
     ) -> Result<(), EtcdError> {
-        let _: serde_json::Value = self.ask("kv/put", &wire::leased(put, lease), limit).await?;
-        Ok(())
-    }
-
-    /// Lets etcd forget what was before `revision`. It does not do so by itself, and grows.
-    ///
-    /// # Errors
-    ///
-    /// Why it did not.
-    pub async fn compact(&self, revision: u64, limit: Duration) -> Result<(), EtcdError> {
-        let request = json!({ "revision": revision.to_string() });
-        match self
-            .ask::<serde_json::Value>("kv/compaction", &request, limit)
+        self.0
+            .put_with_lease(&put.key, &put.value, lease, limit)
             .await
-        {
-            Err(EtcdError::Compacted { .. }) | Ok(_) => Ok(()),
-            Err(error) => Err(error),
-        }
     }
 
-    /// What each endpoint says of itself.
-    pub async fn status(&self, limit: Duration) -> Vec<Result<Status, EtcdError>> {
-        let mut asked = JoinSet::new();
-        for index in 0..self.endpoints.len() {
-            let client = self.clone();
-            asked.spawn(async move { (index, client.status_of(index, limit).await) });
-        }
-        let mut found = asked.join_all().await;
-        found.sort_by_key(|(index, _)| *index);
-        found.into_iter().map(|(_, status)| status).collect()
-    }
-
-    async fn status_of(&self, index: usize, limit: Duration) -> Result<Status, EtcdError> {
-        let Some(endpoint) = self.endpoints.get(index) else {
-            return Err(EtcdError::Options("there is no such endpoint".to_owned()));
-        };
-        let bytes = endpoint
-            .call("maintenance/status", "{}".into(), limit)
-            .await?;
-        wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
-    }
-
-    /// Tries each endpoint on its own, with a look at a key of `keys`. Needs no majority.
+    /// Tries each endpoint on its own. Needs no majority.
     pub async fn try_each(&self, keys: &Keys, limit: Duration) -> Vec<Tried> {
-        let mut asked = JoinSet::new();
-        for index in 0..self.endpoints.len() {
-            let (client, key) = (self.clone(), keys.leader());
-            asked.spawn(async move { (index, client.try_one(index, &key, limit).await) });
-        }
-        let mut tried = asked.join_all().await;
-        tried.sort_by_key(|(index, _)| *index);
-        tried.into_iter().filter_map(|(_, tried)| tried).collect()
-    }
-
-    async fn try_one(&self, index: usize, key: &str, limit: Duration) -> Option<Tried> {
-        let endpoint = self.endpoints.get(index)?;
-        let request = wire::local_count(key);
-        let answer = endpoint
-            .call("kv/range", request.to_string().into(), limit)
-            .await;
-        let cluster = answer.and_then(|bytes| {
-            let cluster =
-                wire::parse(&bytes).and_then(|answer: wire::RangeAnswer| answer.cluster());
-            cluster.map_err(|error| match error {
-                EtcdError::NotEtcd { why, .. } => EtcdError::NotEtcd {
-                    endpoint: endpoint.url().to_owned(),
-                    why,
-                },
-                other => other,
-            })
-        });
-        Some(Tried {
-            endpoint: endpoint.url().to_owned(),
-            cluster,
-        })
+        self.0.try_each(&keys.leader(), limit).await
     }
 
     /// The names of the robots that have a leader in this etcd, or had one; some of them, if there are many.
@@ -327,10 +144,10 @@ impl Etcd {
         let mut from = "/".to_owned();
         // Not key by key: a robot may have a thousand.
         for _ in 0..ROBOTS_MOST {
-            let request = wire::first_key(&(from..ROBOTS_END.to_owned()));
-            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
-            let (_, _, kvs) = page.read()?;
-            let key = kvs.first().and_then(|kv| kv.key.strip_prefix('/'));
+            let key = self
+                .first_key(&(from..ROBOTS_END.to_owned()), limit)
+                .await?;
+            let key = key.as_deref().and_then(|key| key.strip_prefix('/'));
             let Some(name) = key.and_then(|key| key.split('/').next()) else {
                 break;
             };
@@ -344,68 +161,204 @@ impl Etcd {
         robots.sort();
         Ok(robots)
     }
+}
 
-    /// What changes in `range`, after revision `after`. Nothing for `quiet` means that the endpoint is cut off,
-    /// and another one is asked.
-    pub fn watch(&self, range: Range<String>, after: u64, quiet: Duration) -> Watch {
-        Watch::new(self.clone(), range, after + 1, quiet)
+/// Both keys of the machine, of all keys below its prefix.
+///
+/// # Errors
+///
+/// If they are not what rosrescue writes there.
+pub fn view_of(found: &Found, keys: &Keys) -> Result<View, EtcdError> {
+    view(keys, found.revision, found.kvs.iter())
+}
+
+/// Brings a view up to date with a change of a key.
+///
+/// # Errors
+///
+/// If the key is not what rosrescue writes there.
+pub fn absorb(change: &Change, view: &mut View, keys: &Keys) -> Result<(), EtcdError> {
+    view.revision = view.revision.max(change.revision);
+    absorb_key(view, keys, &change.key, change.kv.as_ref())
+}
+
+/// The value of `leader`.
+#[derive(Debug, Serialize, Deserialize)]
+struct LeaderValue {
+    name: String,
+    id: String,
+    claim: u64,
+    uri: String,
+    #[serde(default)]
+    boot: String,
+    version: String,
+}
+
+/// The value of `alive`.
+#[derive(Debug, Serialize, Deserialize)]
+struct AliveValue {
+    beat: u64,
+    seq: u64,
+    released: Option<String>,
+    /// A version that does not write it settles the session when it leads.
+    #[serde(default = "settled_before")]
+    settled: bool,
+}
+
+fn settled_before() -> bool {
+    true
+}
+
+fn write(put: &Put) -> TxnOp {
+    TxnOp::Put {
+        key: put.key.clone(),
+        value: put.value.clone(),
     }
+}
 
-    fn preferred(&self) -> usize {
-        self.preferred.load(Ordering::Relaxed) % self.endpoints.len()
+fn write_json(key: String, value: &impl Serialize) -> TxnOp {
+    // Cannot fail: texts and numbers.
+    let value = serde_json::to_vec(value).unwrap_or_default();
+    TxnOp::Put { key, value }
+}
+
+fn both(keys: &Keys) -> Vec<TxnOp> {
+    vec![TxnOp::Get(keys.leader()), TxnOp::Get(keys.alive())]
+}
+
+/// Both keys, read.
+fn look(keys: &Keys) -> Txn {
+    Txn {
+        success: both(keys),
+        ..Txn::default()
     }
+}
 
-    /// Sends a request, to one endpoint after the other, until one has answered.
-    async fn ask<T: serde::de::DeserializeOwned>(
-        &self,
-        path: &'static str,
-        request: &serde_json::Value,
-        limit: Duration,
-    ) -> Result<T, EtcdError> {
-        let body = Bytes::from(request.to_string());
-        let end = tokio::time::Instant::now() + limit;
-        let mut asked: JoinSet<(usize, Result<Bytes, EtcdError>)> = JoinSet::new();
-        let mut next = self.preferred();
-        let mut failure = None;
-        let mut ask_at = tokio::time::Instant::now();
-        loop {
-            tokio::select! {
-                biased;
-                () = tokio::time::sleep_until(end) => {
-                    asked.abort_all();
-                    return Err(failure.unwrap_or(EtcdError::Silent { limit }));
-                }
-                Some(done) = asked.join_next() => match done {
-                    Ok((index, Ok(bytes))) => {
-                        self.preferred.store(index, Ordering::Relaxed);
-                        return wire::parse(&bytes);
-                    }
-                    Ok((_, Err(error))) if error.is_final() => return Err(error),
-                    Ok((_, Err(error))) => {
-                        let round = next % self.endpoints.len() == self.preferred();
-                        let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
-                        ask_at = ask_at.min(tokio::time::Instant::now() + pause);
-                        // One that answers knows more than one that does not.
-                        if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
-                            failure = Some(error);
-                        }
-                    }
-                    Err(_) => {}
-                },
-                () = tokio::time::sleep_until(ask_at) => {
-                    let (client, body, index) = (self.clone(), body.clone(), next % self.endpoints.len());
-                    let rest = end.saturating_duration_since(tokio::time::Instant::now());
-                    asked.spawn(async move {
-                        match client.endpoints.get(index) {
-                            Some(endpoint) => (index, endpoint.call(path, body, rest).await),
-                            None => (index, Err(EtcdError::Silent { limit: rest })),
-                        }
-                    });
-                    next = next.wrapping_add(1);
-                    let again = if self.endpoints.len() > 1 { NEXT_AFTER } else { limit };
-                    ask_at = tokio::time::Instant::now() + again;
-                }
-            }
+/// `changes`, if `leader` has this term.
+fn guarded(keys: &Keys, term: u64, changes: Vec<TxnOp>) -> Txn {
+    Txn {
+        compare: vec![(keys.leader(), term)],
+        success: changes,
+        failure: Vec::new(),
+    }
+}
+
+/// The transaction of `op`, and the journal's last record after it.
+fn transaction(keys: &Keys, settings: &Settings, op: &Op, entry: Option<&Put>) -> (Txn, u64) {
+    let alive = |beat, seq, released: &Option<String>, settled| {
+        let released = released.clone();
+        let value = AliveValue {
+            beat,
+            seq,
+            released,
+            settled,
+        };
+        write_json(keys.alive(), &value)
+    };
+    let txn = |guard: &Guard, changes: Vec<TxnOp>| Txn {
+        compare: vec![(keys.leader(), guard.leader), (keys.alive(), guard.alive)],
+        success: changes,
+        failure: both(keys),
+    };
+    match op {
+        Op::Read => (look(keys), 0),
+        Op::Claim {
+            guard,
+            claim,
+            seq,
+            settled,
+        } => {
+            let Settings {
+                name,
+                id,
+                uri,
+                boot,
+                version,
+                ..
+            } = settings.clone();
+            let claim = *claim;
+            let leader = LeaderValue {
+                name,
+                id,
+                claim,
+                uri,
+                boot,
+                version,
+            };
+            let alive = alive(0, *seq, &None, *settled);
+            let changes = vec![write_json(keys.leader(), &leader), alive];
+            (txn(guard, changes), *seq)
+        }
+        Op::Beat {
+            guard,
+            beat,
+            seq,
+            released,
+            settled,
+        } => {
+            let last = entry.and_then(|entry| keys.seq_of(&entry.key));
+            let seq = last.unwrap_or(*seq);
+            let alive = alive(*beat, seq, released, *settled);
+            let changes = entry.map(write).into_iter().chain([alive]);
+            (txn(guard, changes.collect()), seq)
         }
     }
+}
+
+fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EtcdError> {
+    serde_json::from_slice(bytes).map_err(|error| EtcdError::NotEtcd {
+        endpoint: "an endpoint".to_owned(),
+        why: error.to_string(),
+    })
+}
+
+fn view<'a>(
+    keys: &Keys,
+    revision: u64,
+    kvs: impl Iterator<Item = &'a Kv>,
+) -> Result<View, EtcdError> {
+    let mut view = View {
+        revision,
+        ..View::default()
+    };
+    for kv in kvs {
+        absorb_key(&mut view, keys, &kv.key, Some(kv))?;
+    }
+    Ok(view)
+}
+
+/// Takes a key into a view, if it belongs there; none if it was deleted.
+fn absorb_key(view: &mut View, keys: &Keys, key: &str, kv: Option<&Kv>) -> Result<(), EtcdError> {
+    if key == keys.leader() {
+        view.leader = match kv {
+            None => None,
+            Some(kv) => {
+                let value: LeaderValue = parse(&kv.value)?;
+                Some(Leader {
+                    term: kv.revision,
+                    name: value.name,
+                    id: value.id,
+                    claim: value.claim,
+                    uri: value.uri,
+                    boot: value.boot,
+                    version: value.version,
+                })
+            }
+        };
+    } else if key == keys.alive() {
+        view.alive = match kv {
+            None => None,
+            Some(kv) => {
+                let value: AliveValue = parse(&kv.value)?;
+                Some(Alive {
+                    revision: kv.revision,
+                    beat: value.beat,
+                    seq: value.seq,
+                    released: value.released,
+                    settled: value.settled,
+                })
+            }
+        };
+    }
+    Ok(())
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use thiserror::Error;
 
 use super::{
-    etcd::{Etcd, EtcdError, Kv},
+    etcd::{self, Etcd, EtcdError, Kv},
     journal::{self, JournalError, Keys, Manifest, Progress, Put},
     machine::{Answer, Op, Settings, View},
 };
@@ -76,7 +76,7 @@ impl Replica {
     async fn try_load(&self, known: Progress) -> Result<Loaded, ReplicaError> {
         let found = self.client.range(&self.keys.small(), self.limit).await?;
         let mut loaded = Loaded {
-            view: found.view(&self.keys)?,
+            view: etcd::view_of(&found, &self.keys)?,
             checkpoint: None,
             records: Vec::new(),
             members: Vec::new(),

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use rosrescue::cluster::{
-    etcd::{Access, Etcd},
+    etcd::{self, Access, Etcd},
     machine::{ANSWER_LIMIT, Action, Answer, Input, Machine, Role, View},
 };
 use tokio::{
@@ -71,7 +71,7 @@ fn run(
                 input = next.recv() => input.unwrap(),
                 changes = watch.next() => {
                     for change in changes.unwrap() {
-                        change.absorb(&mut view, &keys).unwrap();
+                        etcd::absorb(&change, &mut view, &keys).unwrap();
                     }
                     Input::View(View::clone(&view))
                 }

@@ -6,7 +6,7 @@ use super::{AGAIN, Member, apply, cut_off::note};
 use crate::{
     checkpoint::format::Record,
     cluster::{
-        etcd::{Change, WatchEnd},
+        etcd::{self, Change, WatchEnd},
         journal::{self, Manifest, Progress},
         machine::{Input, Leader},
         merge::Changes,
@@ -106,7 +106,7 @@ impl Member {
         self.trouble.clear();
         let keys = self.replica.keys.clone();
         for change in &changes {
-            if let Err(error) = change.absorb(&mut self.view, &keys) {
+            if let Err(error) = etcd::absorb(change, &mut self.view, &keys) {
                 self.trouble.set(&error.into());
             }
             self.known.member(&keys, &change.key, change.kv.as_ref());

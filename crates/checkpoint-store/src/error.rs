@@ -1,0 +1,107 @@
+//! Errors of the store.
+
+use std::io;
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use super::Change;
+use rescue_core::checkpoint::format::EncodeError;
+
+/// Why a checkpoint cannot be opened. Nothing has been changed.
+#[derive(Debug, Error)]
+pub enum OpenError {
+    #[error(
+        "the checkpoint `{}` is in use by another rosrescue{}; stop that one or choose another file with --checkpoint",
+        path.display(),
+        holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
+    )]
+    Locked {
+        path: PathBuf,
+        /// The process that holds the lock, if known.
+        holder: Option<u32>,
+    },
+    /// The file is something else.
+    #[error("`{}` is not a rosrescue checkpoint; move it away or choose another with --checkpoint", path.display())]
+    NotACheckpoint { path: PathBuf },
+    /// A later rosrescue wrote it.
+    #[error(
+        "`{}` was written in checkpoint format {version} by a newer rosrescue; use that one, or move the file away",
+        path.display()
+    )]
+    NewerVersion { path: PathBuf, version: u32 },
+    /// The operating system refused.
+    #[error(
+        "cannot {doing} `{}`: {source}; make it readable and writable for this user or choose another file with --checkpoint",
+        path.display()
+    )]
+    Io {
+        doing: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        source: io::Error,
+    },
+}
+
+impl OpenError {
+    /// The operating system's error, without advice.
+    pub fn without_advice(&self) -> String {
+        match self {
+            Self::Io {
+                doing,
+                path,
+                source,
+            } => format!("cannot {doing} `{}`: {source}", path.display()),
+            other => other.to_string(),
+        }
+    }
+}
+
+/// Why something was not recorded. Calls are still forwarded.
+#[derive(Debug, Error)]
+pub enum StoreError {
+    /// An earlier failure, or no [`begin`](super::Store::begin) yet.
+    #[error("`{}` records nothing: {reason}", path.display())]
+    Unprotected { path: PathBuf, reason: String },
+    /// The operating system refused.
+    #[error("cannot {doing} `{}`: {source}", path.display())]
+    Io {
+        doing: &'static str,
+        path: PathBuf,
+        source: io::Error,
+    },
+    /// Another process changed the file.
+    #[error("`{}` was changed by somebody else: {change}", path.display())]
+    Changed { path: PathBuf, change: Change },
+    /// Another rosrescue took the lock after ours had been removed.
+    #[error(
+        "`{}` is in use by another rosrescue{} now; stop one of the two",
+        path.display(),
+        holder.map(|pid| format!(" (process {pid})")).unwrap_or_default()
+    )]
+    Taken {
+        path: PathBuf,
+        /// The process that holds the lock, if known.
+        holder: Option<u32>,
+    },
+    /// The snapshot is older than the journal.
+    #[error(
+        "a snapshot as of record {snapshot} cannot replace a journal that has reached {journal}; take a new one"
+    )]
+    Stale {
+        /// The last record in the snapshot.
+        snapshot: u64,
+        /// The journal's last record.
+        journal: u64,
+    },
+    /// A new generation is already being written.
+    #[error("another generation of the checkpoint is being written; finish that one first")]
+    Busy,
+    /// The new generation is obsolete: a later one was begun, the file was set aside, or too much was
+    /// recorded meanwhile.
+    #[error("the new generation of `{}` was superseded and has been dropped; begin another", path.display())]
+    Overtaken { path: PathBuf },
+    /// The content cannot be encoded.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+}

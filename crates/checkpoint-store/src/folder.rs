@@ -1,0 +1,102 @@
+//! Whether other users may change the files in a checkpoint's folder.
+
+use std::{
+    fs, io,
+    os::unix::fs::MetadataExt,
+    path::{Path, PathBuf},
+};
+
+/// The bit that lets only a file's owner rename or remove it.
+const STICKY: u32 = 0o1000;
+
+/// Owner and mode of a folder.
+#[derive(Clone, Copy, Debug)]
+struct Access {
+    mode: u32,
+    user: u32,
+    group: u32,
+}
+
+impl Access {
+    fn at(folder: &Path) -> io::Result<Self> {
+        let metadata = fs::metadata(folder)?;
+        Ok(Self {
+            mode: metadata.mode(),
+            user: metadata.uid(),
+            group: metadata.gid(),
+        })
+    }
+
+    /// Which others than the user `own` may create files here.
+    fn others(self, own: u32) -> Option<&'static str> {
+        // Many distributions give each user a group of the same number, without other members.
+        let is_private = self.group == self.user || self.group == 0;
+        if self.mode & 0o002 != 0 {
+            Some("every user may write to it")
+        } else if self.mode & 0o020 != 0 && !is_private {
+            Some("its group may write to it")
+        } else if self.user != own && self.user != 0 {
+            Some("it belongs to another user")
+        } else {
+            None
+        }
+    }
+}
+
+/// The first of the folders that hold the checkpoint at `path` in which other users may plant or swap files, and why;
+/// none if all are safe or cannot be looked at.
+pub fn open_to_others(path: &Path) -> Option<(PathBuf, &'static str)> {
+    let own = rustix::process::geteuid().as_raw();
+    let path = std::path::absolute(path).ok()?;
+    let existing = path
+        .ancestors()
+        .skip(1)
+        .find_map(|it| fs::canonicalize(it).ok());
+    let existing = existing?;
+    let folders = existing
+        .ancestors()
+        .map(|it| Some((it, Access::at(it).ok()?)));
+    folders
+        .flatten()
+        .enumerate()
+        // In a sticky folder others may plant a file beside the checkpoint, but not swap what is below it.
+        .filter(|(level, (_, access))| *level == 0 || access.mode & STICKY == 0)
+        .find_map(|(_, (folder, access))| Some((folder.to_owned(), access.others(own)?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn others_are_those_who_may_write_beside_the_owner_and_root() {
+        let others = |mode, user, group| Access { mode, user, group }.others(1000);
+        assert_eq!(others(0o755, 1000, 1000), None);
+        assert_eq!(others(0o755, 0, 0), None);
+        assert_eq!(others(0o775, 1000, 1000), None, "a group of the user's own");
+        assert!(others(0o775, 1000, 100).is_some());
+        assert!(others(0o1777, 0, 0).is_some());
+        assert!(others(0o755, 1001, 1001).is_some());
+    }
+
+    #[test]
+    fn a_folder_below_a_sticky_one_is_safe_and_one_below_an_open_one_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let set = |path: &Path, mode| {
+            fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+        };
+        let above = fs::canonicalize(folder.path()).unwrap();
+        let own = above.join("own");
+        fs::create_dir(&own).unwrap();
+        let found = |name| open_to_others(&own.join(name)).map(|(folder, _)| folder);
+        assert_eq!(found("chkpt.yaml"), None);
+        set(&above, 0o1777);
+        assert_eq!(found("chkpt.yaml"), None);
+        set(&above, 0o777);
+        assert_eq!(found("chkpt.yaml"), Some(above.clone()));
+        set(&own, 0o1777);
+        assert_eq!(found("missing/chkpt.yaml"), Some(own.clone()));
+    }
+}

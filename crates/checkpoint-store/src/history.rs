@@ -1,0 +1,283 @@
+//! The checkpoints that are kept beside the present one: the last sessions, and the states of rescues.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use super::generation::append_all;
+use super::names::{previous, with};
+use super::{Disk, Names, Storage};
+use rescue_core::checkpoint::format::{self, Checkpoint};
+use ros1_master::xmlrpc::Value;
+
+/// Earlier sessions that are kept.
+const SESSIONS_MOST: usize = 5;
+/// Rescues that are kept.
+const RESCUES_MOST: usize = 20;
+
+/// Names of the nodes and parameters of `rosrescue drill` begin with this. The process id follows.
+pub const DRILLS: &str = "/rosrescue_drill_";
+
+/// Why a checkpoint is kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// It was the last of a session when another one began.
+    Session,
+    /// The state that was given to a new master.
+    Rescue,
+}
+
+impl Kind {
+    /// As in the file's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Session => "session",
+            Self::Rescue => "rescue",
+        }
+    }
+}
+
+/// A file of the history.
+#[derive(Clone, Debug)]
+pub struct Kept {
+    pub kind: Kind,
+    /// Grows with each file of its kind.
+    pub number: u64,
+    pub path: PathBuf,
+    pub bytes: u64,
+    /// Wall clock time of its last record, in seconds since 1970.
+    pub written: i64,
+}
+
+/// What is kept beside the checkpoint at `path`, whose links are resolved: sessions first, the last ones first.
+///
+/// # Errors
+///
+/// If the folder cannot be read.
+pub fn kept(path: &Path) -> io::Result<Vec<Kept>> {
+    let names = names_of(path);
+    let mut kept = Vec::new();
+    for kind in [Kind::Session, Kind::Rescue] {
+        for number in names.numbers(&Disk, kind.name())?.into_iter().rev() {
+            let path = names.numbered(kind.name(), number);
+            // Another process may have removed it.
+            let Ok(metadata) = fs::metadata(&path) else {
+                continue;
+            };
+            kept.push(Kept {
+                kind,
+                number,
+                path,
+                bytes: metadata.len(),
+                written: metadata.mtime(),
+            });
+        }
+    }
+    Ok(kept)
+}
+
+/// The last number of a rescue's state beside the checkpoint at `path`; 0 if there is none.
+pub fn last_rescue(path: &Path) -> u64 {
+    let numbers = names_of(path).numbers(&Disk, Kind::Rescue.name());
+    numbers
+        .ok()
+        .and_then(|mut numbers| numbers.pop())
+        .unwrap_or(0)
+}
+
+/// Keeps `checkpoint`, the state of rescue `number`, beside the checkpoint at `path`. It is not synced: it is a copy, and
+/// a memory card wears out. Drills are left out: `rosrescue restore` must not set what they had set.
+///
+/// # Errors
+///
+/// If it cannot be written; nothing is left of it then.
+pub fn keep_rescue(path: &Path, number: u64, mut checkpoint: Checkpoint) -> io::Result<PathBuf> {
+    checkpoint.snapshot.remove_named(DRILLS);
+    checkpoint.pending.retain(|call| {
+        let caller = call.params.first().and_then(Value::as_str);
+        caller.is_none_or(|caller| !caller.starts_with(DRILLS))
+    });
+    let names = names_of(path);
+    let kept = names.numbered(Kind::Rescue.name(), number);
+    let encoded = format::encode_checkpoint(&checkpoint, 1).map_err(io::Error::other)?;
+    // The next start removes what a crash leaves of it.
+    let fresh = with(&kept, ".new");
+    let written = Disk
+        .create(&fresh)
+        .and_then(|file| append_all(&Disk, &file, &encoded.bytes))
+        .and_then(|()| fs::rename(&fresh, &kept));
+    if written.is_err() {
+        let _ = fs::remove_file(&fresh);
+    }
+    written.map(|()| kept)
+}
+
+/// Removes what is too much: all but the last sessions and rescues, and of these the oldest, until they take no
+/// more than `bytes_most`. The last session stays in any case.
+///
+/// # Errors
+///
+/// If the folder cannot be read.
+pub fn trim(path: &Path, bytes_most: u64) -> io::Result<()> {
+    let all = kept(path)?;
+    let (mut sessions, mut rescues): (Vec<_>, Vec<_>) =
+        all.into_iter().partition(|kept| kept.kind == Kind::Session);
+    let mut surplus = sessions.split_off(SESSIONS_MOST.min(sessions.len()));
+    surplus.extend(rescues.split_off(RESCUES_MOST.min(rescues.len())));
+    // By age: the last of each kind, the last but one, …
+    let mut ranked: Vec<_> = sessions.into_iter().enumerate().collect();
+    ranked.extend(rescues.into_iter().enumerate());
+    ranked.sort_by_key(|(rank, _)| *rank);
+    let mut total: u64 = 0;
+    for (rank, kept) in ranked {
+        total = total.saturating_add(kept.bytes);
+        let last_session = kept.kind == Kind::Session && rank == 0;
+        if total > bytes_most && !last_session {
+            surplus.push(kept);
+        }
+    }
+    for kept in surplus {
+        // A failed removal must not prevent anything.
+        let _ = fs::remove_file(&kept.path);
+        let _ = fs::remove_file(previous(&kept.path));
+    }
+    Ok(())
+}
+
+fn names_of(path: &Path) -> Names {
+    Names {
+        path: path.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ros1_master::{master::SnapshotNode, xmlrpc::Call};
+
+    fn place() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("c.yaml");
+        (folder, path)
+    }
+
+    fn file(path: &Path, name: &str, bytes: usize) {
+        fs::write(with(path, &format!(".{name}")), vec![b'x'; bytes]).unwrap();
+    }
+
+    fn listed(path: &Path) -> Vec<String> {
+        let kept = kept(path).unwrap().into_iter();
+        kept.map(|kept| format!("{}-{}", kept.kind.name(), kept.number))
+            .collect()
+    }
+
+    #[test]
+    fn the_last_sessions_and_rescues_stay() {
+        let (_folder, path) = place();
+        for number in 1..=7 {
+            file(&path, &format!("session-{number}"), 1);
+        }
+        for number in 5..=30 {
+            file(&path, &format!("rescue-{number}"), 1);
+        }
+        file(&path, "session-1.previous", 1);
+        file(&path, "rescue-31.new", 1);
+        file(&path, "broken-1", 1);
+        trim(&path, 100).unwrap();
+        let sessions = (3..=7).rev().map(|number| format!("session-{number}"));
+        let rescues = (11..=30).rev().map(|number| format!("rescue-{number}"));
+        assert_eq!(listed(&path), sessions.chain(rescues).collect::<Vec<_>>());
+        assert!(!with(&path, ".session-1.previous").exists());
+        assert!(with(&path, ".broken-1").exists());
+    }
+
+    #[test]
+    fn the_oldest_give_way_to_the_limit_but_the_last_session_stays() {
+        let (_folder, path) = place();
+        for number in 1..=3 {
+            file(&path, &format!("session-{number}"), 10);
+            file(&path, &format!("rescue-{number}"), 10);
+        }
+        trim(&path, 40).unwrap();
+        let left = ["session-3", "session-2", "rescue-3", "rescue-2"];
+        assert_eq!(listed(&path), left);
+        trim(&path, 5).unwrap();
+        assert_eq!(listed(&path), ["session-3"]);
+        trim(&path, 0).unwrap();
+        assert_eq!(listed(&path), ["session-3"]);
+    }
+
+    #[test]
+    fn a_rescue_is_a_whole_checkpoint_with_its_number() {
+        let (_folder, path) = place();
+        let checkpoint = Checkpoint {
+            seq: 7,
+            ..Checkpoint::default()
+        };
+        for number in 1..=2 {
+            let kept = keep_rescue(&path, number, checkpoint.clone()).unwrap();
+            assert_eq!(kept, with(&path, &format!(".rescue-{number}")));
+            let loaded = super::super::read(&kept).unwrap().unwrap();
+            assert!(loaded.exact && loaded.damage.is_empty());
+            assert_eq!(loaded.checkpoint, Some(checkpoint.clone()));
+        }
+        assert_eq!(listed(&path), ["rescue-2", "rescue-1"]);
+        let nowhere = path.join("nowhere/c.yaml");
+        assert!(keep_rescue(&nowhere, 1, checkpoint).is_err());
+    }
+
+    #[test]
+    fn a_rescue_is_kept_without_the_drill_that_caused_it() {
+        let (_folder, path) = place();
+        let list = |nodes: &[&str]| nodes.iter().map(|node| (*node).to_owned()).collect();
+        let robot = || {
+            let mut checkpoint = Checkpoint::default();
+            let snapshot = &mut checkpoint.snapshot;
+            snapshot
+                .nodes
+                .insert("/n".to_owned(), SnapshotNode::default());
+            snapshot
+                .subscribers
+                .insert("/scan".to_owned(), list(&["/n"]));
+            snapshot.params.insert("speed".to_owned(), 3.into());
+            checkpoint.pending = vec![Call::new(
+                "setParam",
+                vec!["/n".into(), "/speed".into(), 3.into()],
+            )];
+            checkpoint
+        };
+        let mut with_drill = robot();
+        let drill = format!("{DRILLS}7");
+        let snapshot = &mut with_drill.snapshot;
+        snapshot
+            .nodes
+            .insert(drill.clone(), SnapshotNode::default());
+        snapshot
+            .subscribers
+            .insert("/scan".to_owned(), list(&["/n", &drill]));
+        snapshot
+            .subscribers
+            .insert("/odom".to_owned(), list(&[&drill]));
+        snapshot
+            .publishers
+            .insert(format!("{drill}/topic"), list(&[&drill]));
+        snapshot
+            .topic_types
+            .insert(format!("{drill}/topic"), "x/Y".to_owned());
+        snapshot
+            .param_subscribers
+            .insert("/".to_owned(), list(&[&drill]));
+        snapshot
+            .params
+            .insert("rosrescue_drill_7".to_owned(), 1.into());
+        let write = Call::new(
+            "setParam",
+            vec![drill.as_str().into(), drill.as_str().into(), 1.into()],
+        );
+        with_drill.pending.push(write);
+        let kept = keep_rescue(&path, 1, with_drill).unwrap();
+        let loaded = super::super::read(&kept).unwrap().unwrap();
+        assert_eq!(loaded.checkpoint, Some(robot()));
+    }
+}

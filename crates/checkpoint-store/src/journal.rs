@@ -1,0 +1,216 @@
+//! Appends records to the present file and syncs them.
+
+use std::io;
+use std::sync::Arc;
+
+use super::generation::failed;
+use super::storage::FileId;
+use super::{Names, Storage, Store, StoreError};
+use rescue_core::checkpoint::format::{self, Entry, Stamp};
+
+/// Most encoding buffer that is kept between appends.
+const BUFFER_BYTES_MAX: usize = 1024 * 1024;
+
+/// The file that receives the records.
+pub(super) struct Active<S: Storage> {
+    pub(super) file: Arc<S::File>,
+    pub(super) stamp: Stamp,
+    pub(super) generation: u64,
+    pub(super) snapshot_bytes: u64,
+    pub(super) journal_bytes: u64,
+    pub(super) id: FileId,
+    /// Check sum of everything written.
+    pub(super) crc: u32,
+    /// Modification time after our last write.
+    pub(super) modified: i128,
+    /// Whether another process may have written to it, so that its content must be read.
+    pub(super) suspect: bool,
+    /// Whether everything appended has been synced.
+    pub(super) clean: bool,
+    /// Whether the file's name has been synced.
+    pub(super) named: bool,
+}
+
+impl<S: Storage> Store<S> {
+    /// Records `entries` with one write. Each gets a number, whether it could be recorded or not; returns the
+    /// last one. After that they survive the death of every process; a [`sync_job`](Self::sync_job) makes
+    /// them survive a loss of power.
+    ///
+    /// # Errors
+    ///
+    /// If they were not recorded. The store is then unprotected, unless the reason is an
+    /// [`EncodeError`](rescue_core::checkpoint::format::EncodeError).
+    pub fn append(&mut self, entries: &[Entry]) -> Result<u64, StoreError> {
+        let first = self.seq.saturating_add(1);
+        self.seq = self.seq.saturating_add(entries.len() as u64);
+        let mut encoded = Ok(());
+        self.buffer.clear();
+        self.buffer.shrink_to(BUFFER_BYTES_MAX);
+        for (seq, entry) in (first..).zip(entries) {
+            let start = self.buffer.len();
+            if let Err(error) = format::push_body(&mut self.buffer, seq, entry) {
+                encoded = Err(error);
+            }
+            let body = self.buffer.get(start..).unwrap_or_default();
+            if let Some(pending) = &mut self.pending {
+                pending.keep(body);
+            }
+            if let Some(active) = &self.active
+                && !body.is_empty()
+            {
+                format::seal(&mut self.buffer, start, active.stamp);
+            }
+        }
+        let active = match (&mut self.active, &self.unprotected) {
+            (Some(active), None) => active,
+            (_, reason) => {
+                let reason = reason.clone().unwrap_or_default();
+                return Err(StoreError::Unprotected {
+                    path: self.names.path.clone(),
+                    reason,
+                });
+            }
+        };
+        // Nothing may be acknowledged that was appended after foreign bytes, or to a truncated file.
+        if let Ok(status) = self.storage.status(&active.file)
+            && let Err(change) = active.compare(&status)
+        {
+            return Err(self.changed(change));
+        }
+        active.clean &= self.buffer.is_empty();
+        let length = active.length() + self.buffer.len() as u64;
+        let appended = match length > self.file_bytes_max {
+            // A larger file could not be read again.
+            true => Err(io::ErrorKind::FileTooLarge.into()),
+            false => self.storage.append(&active.file, &self.buffer),
+        };
+        let written = match appended {
+            Ok(taken) if taken == self.buffer.len() => Ok(()),
+            // Not retried: the rest would fail too, only with a clearer error.
+            Ok(taken) => Err(io::Error::new(
+                io::ErrorKind::StorageFull,
+                format!("only {taken} of {} bytes were taken", self.buffer.len()),
+            )),
+            Err(error) => Err(error),
+        };
+        match written {
+            Ok(()) => {
+                active.journal_bytes += self.buffer.len() as u64;
+                active.crc = crc32c::crc32c_append(active.crc, &self.buffer);
+                if let Ok(status) = self.storage.status(&active.file) {
+                    active.modified = status.modified;
+                    if let Err(change) = active.compare(&status) {
+                        return Err(self.changed(change));
+                    }
+                }
+                encoded?;
+                Ok(self.seq)
+            }
+            Err(source) => Err(self.latch(failed("write", &self.names.path)(source))),
+        }
+    }
+
+    /// Stops recording to the present file for good: records are missing in it, because the disk was silent.
+    /// `reason`: in words.
+    pub fn give_up(&mut self, reason: &str) {
+        self.latch(failed("write", &self.names.path)(io::Error::new(
+            io::ErrorKind::TimedOut,
+            reason,
+        )));
+    }
+
+    /// Stops recording to the present file for good.
+    pub(super) fn latch(&mut self, error: StoreError) -> StoreError {
+        self.unprotected = Some(error.to_string());
+        if self.active.take().is_some_and(|active| !active.named)
+            && let Some(present) = &mut self.present
+        {
+            // It is unknown how much of it is on the medium. The previous generation has everything that was.
+            present.usable = false;
+        }
+        error
+    }
+
+    /// The sync that is due; `None` if none is.
+    pub fn sync_job(&self) -> Option<SyncJob<S>> {
+        let active = self
+            .active
+            .as_ref()
+            .filter(|active| !active.clean || !active.named)?;
+        Some(SyncJob {
+            storage: self.storage.clone(),
+            file: Arc::clone(&active.file),
+            names: (!active.named).then(|| self.names.clone()),
+            generation: active.generation,
+            seq: self.seq,
+        })
+    }
+
+    /// Notes the result of a sync.
+    ///
+    /// # Errors
+    ///
+    /// If it failed: the store is now unprotected.
+    pub fn synced(&mut self, done: Synced) -> Result<(), StoreError> {
+        let active = self
+            .active
+            .as_mut()
+            .filter(|active| active.generation == done.generation);
+        match (done.result, active) {
+            (Ok(()), active) => {
+                self.synced_seq = self.synced_seq.max(done.seq);
+                if let Some(active) = active {
+                    active.named |= done.named;
+                    active.clean |= done.seq == self.seq;
+                }
+                Ok(())
+            }
+            (Err(source), Some(_)) => Err(self.latch(failed("sync", &self.names.path)(source))),
+            // Of a file that has been replaced since. Its successor holds the same records and is not synced
+            // yet.
+            (Err(_), None) => Ok(()),
+        }
+    }
+}
+
+/// Syncs everything appended so far; see [`Store::sync_job`](super::Store::sync_job).
+#[must_use = "nothing is synced until it has run"]
+pub struct SyncJob<S: Storage> {
+    pub(super) storage: S,
+    pub(super) file: Arc<S::File>,
+    /// Present if the folder must be synced too.
+    pub(super) names: Option<Names>,
+    generation: u64,
+    seq: u64,
+}
+
+/// The result of a sync.
+#[must_use = "give it to `Store::synced`"]
+pub struct Synced {
+    generation: u64,
+    seq: u64,
+    pub(super) named: bool,
+    pub(super) result: io::Result<()>,
+}
+
+impl<S: Storage> SyncJob<S> {
+    /// Syncs. Blocks as long as the disk does.
+    pub fn run(self) -> Synced {
+        let mut result = self.storage.sync(&self.file);
+        if let (Ok(()), Some(names)) = (&result, &self.names) {
+            result = self.storage.sync_dir(names.folder());
+        }
+        let Self {
+            generation,
+            seq,
+            names,
+            ..
+        } = self;
+        Synced {
+            generation,
+            seq,
+            named: names.is_some(),
+            result,
+        }
+    }
+}

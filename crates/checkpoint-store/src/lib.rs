@@ -1,0 +1,277 @@
+//! The checkpoint on disk.
+//!
+//! A [`Store`] owns one file and its companions: it takes the lock, loads the file ([`Loaded`]), appends
+//! records, and replaces the file by a new generation when the journal is too large or the disk has failed.
+//! It is synchronous and never decides when to do so. Slow work ([`SyncJob`], [`CompactionJob`]) is returned
+//! as a job for a blocking thread; meanwhile records can be appended. `docs/checkpoint.md` has the commit
+//! procedure and the assumptions about the disk.
+//!
+//! A failed write or sync *latches*: the file is never written again, because the data that a failed `fsync`
+//! has dropped is reported only once. The store is then [unprotected](Store::unprotected) until
+//! [`Store::rearm`] has written a new file. A change by another process to the file, its folder or its lock
+//! makes no write fail; a [`CheckJob`] finds it, and it latches too.
+
+mod aside;
+mod error;
+pub mod folder;
+mod generation;
+pub mod history;
+mod journal;
+mod load;
+mod lock;
+mod names;
+pub mod regular_file;
+#[cfg(test)]
+mod sim;
+mod storage;
+#[cfg(test)]
+mod tests;
+mod watch;
+
+use std::path::{Path, PathBuf};
+
+use aside::{keep_aside, set_aside_previous};
+pub use error::{OpenError, StoreError};
+use generation::{COMPACTION_BYTES_MIN, Pending};
+pub use generation::{Compacted, CompactionJob};
+use journal::Active;
+pub use journal::{SyncJob, Synced};
+pub use load::Loaded;
+pub use lock::DiskLock;
+pub use lock::holder_of;
+use names::Names;
+pub use storage::{Disk, FileId, FileStatus, Storage};
+pub use watch::{Change, CheckJob, Checked};
+
+/// Kinds of names for files that are kept: damaged ones,
+const BROKEN: &str = "broken";
+/// and unreadable ones.
+const UNREADABLE: &str = "unreadable";
+
+/// The file that is known to be at the path.
+#[derive(Clone, Copy, Debug)]
+struct Present {
+    id: FileId,
+    /// Whether it can become the previous generation.
+    usable: bool,
+}
+
+/// A checkpoint, locked and open.
+pub struct Store<S: Storage = Disk> {
+    storage: S,
+    names: Names,
+    /// The file that receives the records.
+    active: Option<Active<S>>,
+    /// Why nothing is recorded. `None` only if `active` is set.
+    unprotected: Option<String>,
+    pending: Option<Pending>,
+    /// Number of the last record, recorded or not: a number is never used twice.
+    seq: u64,
+    synced_seq: u64,
+    /// The highest generation that was begun.
+    generation: u64,
+    /// The known file. Any other file at the path is kept before it is replaced,
+    present: Option<Present>,
+    /// under this kind of name;
+    aside_kind: &'static str,
+    /// this is where the last one went.
+    kept: Option<PathBuf>,
+    compact_above: u64,
+    file_bytes_max: u64,
+    buffer: Vec<u8>,
+    lock: S::Lock,
+    lock_id: FileId,
+}
+
+/// Reads the checkpoint at `path` and changes nothing: no lock, no folder, no copies. For a disk on which
+/// [`Store::open`] fails because it is read-only.
+///
+/// # Errors
+///
+/// If the file cannot be read, is not a checkpoint or is too new.
+pub fn read(path: &Path) -> Result<Option<Loaded>, OpenError> {
+    let names = Names {
+        path: path.to_owned(),
+    };
+    Ok(load::load(&Disk, &names)?.map(|found| found.loaded))
+}
+
+impl Store<Disk> {
+    /// Opens the checkpoint at `path` on this machine's disk; see [`Store::open_on`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Store::open_on`].
+    pub fn open(path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
+        Self::open_on(Disk, path)
+    }
+
+    /// Opens the checkpoint at `path` for a state from elsewhere; see [`Store::open_over_on`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Store::open_over_on`].
+    pub fn open_over(path: &Path) -> Result<Self, OpenError> {
+        Self::open_over_on(Disk, path)
+    }
+}
+
+/// The name of the generation before the file at `path`.
+pub fn previous_of(path: &Path) -> PathBuf {
+    names::previous(path)
+}
+
+fn open_failed(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> OpenError {
+    let path = path.to_owned();
+    move |source| OpenError::Io {
+        doing,
+        path,
+        source,
+    }
+}
+
+impl<S: Storage> Store<S> {
+    /// Takes the lock of the checkpoint at `path` and loads it. Creates its folder if needed. A damaged file
+    /// is also copied to another name, and so is a torn append. An unreadable file is kept when it is
+    /// replaced. Nothing can be recorded before [`begin`](Self::begin).
+    ///
+    /// # Errors
+    ///
+    /// If the folder or the file cannot be used, another rosrescue has it, or the file is not a checkpoint or
+    /// too new. The file is then untouched.
+    pub fn open_on(storage: S, path: &Path) -> Result<(Self, Option<Loaded>), OpenError> {
+        let mut store = Self::lock_on(storage, path)?;
+        let (storage, names) = (&store.storage, &store.names);
+        let Some(found) = load::load(storage, names)? else {
+            // The operator removed the file to start afresh; the previous generation must not be restored
+            // later.
+            names
+                .remove_unfinished(storage)
+                .and_then(|()| set_aside_previous(storage, names, "old"))
+                .map_err(open_failed("clear the folder of", &names.path))?;
+            return Ok((store, None));
+        };
+        let mut loaded = found.loaded;
+        store.present = found.present;
+        if store.present.is_none() {
+            store.aside_kind = UNREADABLE;
+        }
+        // Best effort: a read-only disk can still be read.
+        let _ = names.remove_unfinished(storage);
+        let kept = match store.present {
+            Some(_) => keep_aside(storage, names, &mut loaded, found.torn),
+            None => Ok(()),
+        };
+        let bad_previous = found.bad_previous;
+        let cleared = bad_previous.map_or(Ok(()), |kind| set_aside_previous(storage, names, kind));
+        if let Err(error) = kept.and(cleared) {
+            let path = names.path.display();
+            loaded.damage.push(format!(
+                "what is damaged of `{path}` could not be kept: {error}"
+            ));
+            // Kept when it is replaced, then.
+            store.present = store.present.filter(|present| present.usable);
+        }
+        store.set_counts(found.seq, found.generation);
+        Ok((store, Some(loaded)))
+    }
+
+    /// Takes the lock of the checkpoint at `path` for a state from elsewhere. The present file and its
+    /// previous generation are kept under other names before they are replaced.
+    ///
+    /// # Errors
+    ///
+    /// As [`open_on`](Self::open_on). Other files and folders are not renamed.
+    pub fn open_over_on(storage: S, path: &Path) -> Result<Self, OpenError> {
+        let mut store = Self::lock_on(storage, path)?;
+        let (storage, names) = (&store.storage, &store.names);
+        // Its numbers must not be used again.
+        let found = load::load(storage, names)?.unwrap_or_default();
+        let _ = names.remove_unfinished(storage);
+        set_aside_previous(storage, names, UNREADABLE)
+            .map_err(open_failed("clear the folder of", &names.path))?;
+        store.aside_kind = UNREADABLE;
+        store.set_counts(found.seq, found.generation);
+        Ok(store)
+    }
+
+    /// Locks `path`, without reading what is there.
+    fn lock_on(storage: S, path: &Path) -> Result<Self, OpenError> {
+        let path = storage
+            .locate(path)
+            .map_err(open_failed("make the folder of", path))?;
+        let names = Names { path };
+        let lock_path = names.lock();
+        let lock = storage
+            .lock(&names.path, &lock_path)
+            .map_err(open_failed("lock", &lock_path))?
+            .map_err(|holder| OpenError::Locked {
+                path: names.path.clone(),
+                holder,
+            })?;
+        let lock_id = storage
+            .lock_id(&lock)
+            .map_err(open_failed("lock", &lock_path))?;
+        Ok(Self {
+            storage,
+            names,
+            active: None,
+            unprotected: Some("it has not been begun yet".to_owned()),
+            pending: None,
+            seq: 0,
+            synced_seq: 0,
+            generation: 0,
+            present: None,
+            aside_kind: BROKEN,
+            kept: None,
+            compact_above: COMPACTION_BYTES_MIN,
+            file_bytes_max: load::FILE_BYTES_MAX,
+            buffer: Vec::new(),
+            lock,
+            lock_id,
+        })
+    }
+
+    fn set_counts(&mut self, seq: u64, generation: u64) {
+        (self.seq, self.synced_seq, self.generation) = (seq, seq, generation);
+    }
+
+    /// The file's path, links resolved.
+    pub fn path(&self) -> &Path {
+        &self.names.path
+    }
+
+    /// Number of the last record, recorded or not.
+    pub fn seq(&self) -> u64 {
+        self.seq
+    }
+
+    /// Number of the last record known to survive a loss of power.
+    pub fn synced_seq(&self) -> u64 {
+        self.synced_seq
+    }
+
+    /// Number of times the file has been rewritten.
+    pub fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Size of the journal in bytes.
+    pub fn journal_bytes(&self) -> u64 {
+        self.active
+            .as_ref()
+            .map_or(0, |active| active.journal_bytes)
+    }
+
+    /// Size of the part before the journal, in bytes.
+    pub fn snapshot_bytes(&self) -> u64 {
+        self.active
+            .as_ref()
+            .map_or(0, |active| active.snapshot_bytes)
+    }
+
+    /// Why nothing is recorded; `None` if records are written.
+    pub fn unprotected(&self) -> Option<&str> {
+        self.unprotected.as_deref()
+    }
+}

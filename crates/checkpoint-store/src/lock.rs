@@ -1,0 +1,144 @@
+//! The lock on this machine's disk, which no other process can remove.
+//!
+//! A lock file alone is not enough: it can be deleted, or renamed with its folder, and the next rosrescue
+//! would create a new one. So there are three locks. The lock file works for every process that sees the
+//! folder, in other containers too. A socket in the abstract namespace, named after the checkpoint, cannot be
+//! removed while rosrescue lives. The checkpoint itself is locked too, see [`claim`].
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::os::fd::AsFd;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use rustix::fs::FlockOperation;
+
+use super::storage::FileId;
+use crate::regular_file;
+
+/// Locks of a process that is killed while it starts another one last until that one has closed its inherited
+/// descriptors. A rosrescue that starts at that moment must not be refused.
+const LINGER: Duration = Duration::from_millis(500);
+
+#[derive(Debug)]
+pub struct DiskLock {
+    file: File,
+    /// `None` if the kernel lacks such sockets.
+    _name: Option<UnixDatagram>,
+}
+
+/// Refused; with the process that holds the lock, if known.
+type Refused = Option<u32>;
+
+impl DiskLock {
+    /// Takes the lock of `checkpoint` with the lock file `path`.
+    pub(super) fn take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
+        let start = Instant::now();
+        loop {
+            match Self::try_take(checkpoint, path)? {
+                Err(_) if start.elapsed() < LINGER => std::thread::sleep(LINGER / 20),
+                taken => return Ok(taken),
+            }
+        }
+    }
+
+    fn try_take(checkpoint: &Path, path: &Path) -> io::Result<Result<Self, Refused>> {
+        let name = match bind(checkpoint) {
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => {
+                return Ok(Err(holder_in(path)));
+            }
+            other => other.ok(),
+        };
+        if is_claimed(checkpoint) {
+            return Ok(Err(holder_in(path)));
+        }
+        Ok(lock_file(path)?.map(|file| Self { file, _name: name }))
+    }
+
+    /// Makes a new lock file, and its folder if needed, when the one at `path` is no longer ours.
+    pub(super) fn renew(&mut self, path: &Path) -> io::Result<Result<(), Refused>> {
+        if FileId::at(path)? == Some(self.id()?) {
+            return Ok(Ok(()));
+        }
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        Ok(lock_file(path)?.map(|file| self.file = file))
+    }
+
+    pub(super) fn id(&self) -> io::Result<FileId> {
+        Ok(FileId::of(&self.file.metadata()?))
+    }
+}
+
+/// Locks a checkpoint's own file while it is open, where the file system can.
+pub(super) fn claim(file: &File) {
+    let _ = rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive);
+}
+
+/// Whether another rosrescue has this file open.
+fn is_claimed(checkpoint: &Path) -> bool {
+    let Ok(file) = regular_file::open(checkpoint) else {
+        return false;
+    };
+    let tried = rustix::fs::flock(file, FlockOperation::NonBlockingLockShared);
+    tried == Err(rustix::io::Errno::WOULDBLOCK)
+}
+
+/// Whether a rosrescue uses this checkpoint; with its process id, if known.
+pub fn holder_of(checkpoint: &Path) -> Option<Option<u32>> {
+    let mut path = checkpoint.as_os_str().to_owned();
+    path.push(".lock");
+    is_claimed(checkpoint).then(|| holder_in(Path::new(&path)))
+}
+
+fn lock_file(path: &Path) -> io::Result<Result<File, Refused>> {
+    let mut file = regular_file::open_or_create(path)?;
+    match rustix::fs::flock(file.as_fd(), FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {
+            // For people and for error messages; the lock holds without it.
+            let _ = file
+                .set_len(0)
+                .and_then(|()| writeln!(file, "{}", std::process::id()));
+            Ok(Ok(file))
+        }
+        Err(rustix::io::Errno::WOULDBLOCK) => Ok(Err(holder(file))),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// The process id in the lock file at `path`.
+fn holder_in(path: &Path) -> Refused {
+    regular_file::open(path).ok().and_then(holder)
+}
+
+/// The process id in a lock file.
+fn holder(file: File) -> Option<u32> {
+    let mut text = String::new();
+    file.take(32).read_to_string(&mut text).ok()?;
+    text.trim().parse().ok()
+}
+
+/// Binds the socket named after the checkpoint. A datagram socket has no queue of connections that another
+/// process could fill.
+fn bind(checkpoint: &Path) -> io::Result<UnixDatagram> {
+    let root = FileId::of(&fs::metadata("/")?);
+    // Within one tree of mounts a path means one file. Containers that share a network have a tree each.
+    let mounts = fs::read_link("/proc/self/ns/mnt").unwrap_or_default();
+    let folder = checkpoint.parent().unwrap_or_else(|| Path::new("/"));
+    let path = fs::canonicalize(folder)?.join(checkpoint.file_name().unwrap_or_default());
+    let tree = format!("{}:{}:{}:", mounts.display(), root.device, root.inode);
+    let hash = fnv1a(&[tree.as_bytes(), path.as_os_str().as_bytes()].concat());
+    let name = format!("rosrescue-checkpoint-{hash:016x}");
+    UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(name)?)
+}
+
+/// 64-bit FNV-1a. A path can be longer than a socket's name, and every version must compute the same name.
+fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}

@@ -1,0 +1,322 @@
+//! A client of etcd's JSON gateway: transactions, ranges, leases and watches over HTTP/1, with TLS.
+//!
+//! A request goes to the endpoint that has answered last. If it does not answer soon, the next one gets it as
+//! well: everything that is sent here may be done twice with the same effect.
+
+mod connection;
+mod error;
+mod tls;
+mod watch;
+mod wire;
+
+use std::{
+    ops::Range,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
+
+use bytes::Bytes;
+use serde_json::json;
+use tokio::task::JoinSet;
+
+pub use connection::Access;
+use connection::Endpoint;
+pub use error::EtcdError;
+pub use tls::Tls;
+pub use watch::{Change, Watch, WatchEnd};
+pub use wire::{Kv, Txn, TxnOp, TxnResult};
+
+/// After this time without an answer the next endpoint is asked as well. A transaction takes 1 to 20 ms.
+const NEXT_AFTER: Duration = Duration::from_millis(250);
+/// Pause after all endpoints have failed, within the time of a request.
+const ROUND_PAUSE: Duration = Duration::from_millis(100);
+/// Most keys of one page of a range. The values of so many are 16 MiB at most.
+const PAGE: usize = 32;
+
+/// What a client has to know about a cluster of etcd.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// `http://HOST:PORT` or `https://HOST:PORT` each.
+    pub endpoints: Vec<String>,
+    pub access: Access,
+}
+
+/// A client of a cluster of etcd.
+#[derive(Clone, Debug)]
+pub struct Client {
+    endpoints: Arc<[Endpoint]>,
+    /// The endpoint that has answered last.
+    preferred: Arc<AtomicUsize>,
+}
+
+/// Keys of one moment.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Found {
+    pub revision: u64,
+    pub kvs: Vec<Kv>,
+}
+
+/// An endpoint that was tried on its own.
+#[derive(Debug)]
+pub struct Tried {
+    pub endpoint: String,
+    /// The id of its cluster, or why it does not serve clients.
+    pub cluster: Result<u64, EtcdError>,
+}
+
+/// What a member of etcd says of itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Status {
+    pub endpoint: String,
+    pub version: String,
+    pub db_bytes: u64,
+    pub is_leader: bool,
+    /// What is wrong with it, in its own words.
+    pub errors: Vec<String>,
+}
+
+impl Client {
+    /// A client; connects when something is asked.
+    ///
+    /// # Errors
+    ///
+    /// If an endpoint is no URL, or certificates cannot be read.
+    pub fn new(options: &Options) -> Result<Self, EtcdError> {
+        let access = Arc::new(options.access.clone());
+        let tls = access.tls.settings()?;
+        let endpoints = options.endpoints.iter();
+        let endpoints = endpoints.map(|url| Endpoint::new(url, &access, tls.as_ref()));
+        let endpoints: Vec<_> = endpoints.collect::<Result<_, _>>()?;
+        if endpoints.is_empty() {
+            return Err(EtcdError::Options(
+                "no endpoint of etcd is given".to_owned(),
+            ));
+        }
+        Ok(Self {
+            endpoints: endpoints.into(),
+            preferred: Arc::default(),
+        })
+    }
+
+    /// Carries out a transaction, once or several times.
+    ///
+    /// # Errors
+    ///
+    /// Why it is not known whether it was carried out.
+    pub async fn txn(&self, txn: &Txn, limit: Duration) -> Result<TxnResult, EtcdError> {
+        let answer: wire::TxnAnswer = self.ask("kv/txn", &txn.request(), limit).await?;
+        answer.read()
+    }
+
+    /// The first key in `range`, without its value.
+    ///
+    /// # Errors
+    ///
+    /// Why it is not known.
+    pub async fn first_key(
+        &self,
+        range: &Range<String>,
+        limit: Duration,
+    ) -> Result<Option<String>, EtcdError> {
+        let request = wire::first_key(range);
+        let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
+        let (_, _, kvs) = page.read()?;
+        Ok(kvs.into_iter().next().map(|kv| kv.key))
+    }
+
+    /// All keys in `range` and their values, in order, as of one moment.
+    ///
+    /// # Errors
+    ///
+    /// [`EtcdError::Compacted`] if that moment is gone before all were read; other reasons.
+    pub async fn range(&self, range: &Range<String>, limit: Duration) -> Result<Found, EtcdError> {
+        let mut found: Option<Found> = None;
+        let mut from = range.start.clone();
+        loop {
+            let revision = found.as_ref().map_or(0, |found| found.revision);
+            let request = wire::range(&(from..range.end.clone()), revision, PAGE);
+            let page: wire::RangeAnswer = self.ask("kv/range", &request, limit).await?;
+            let (revision, more, kvs) = page.read()?;
+            let found = found.get_or_insert(Found {
+                revision,
+                kvs: Vec::new(),
+            });
+            found.kvs.extend(kvs);
+            let Some(last) = found.kvs.last().filter(|_| more) else {
+                return Ok(found.clone());
+            };
+            // The first key after it.
+            from = format!("{}\0", last.key);
+        }
+    }
+
+    /// A lease that goes by itself after about `ttl`, and is 2 s long at least. What is written with it goes
+    /// with it.
+    ///
+    /// # Errors
+    ///
+    /// Why there is none.
+    pub async fn grant(&self, ttl: Duration, limit: Duration) -> Result<i64, EtcdError> {
+        let request = json!({ "TTL": ttl.as_secs().max(1) });
+        let lease: wire::LeaseAnswer = self.ask("lease/grant", &request, limit).await?;
+        Ok(lease.id)
+    }
+
+    /// Writes a key that goes with `lease`.
+    ///
+    /// # Errors
+    ///
+    /// Why it is not known whether it was written.
+    pub async fn put_with_lease(
+        &self,
+        key: &str,
+        value: &[u8],
+        lease: i64,
+        limit: Duration,
+    ) -> Result<(), EtcdError> {
+        let _: serde_json::Value = self
+            .ask("kv/put", &wire::leased(key, value, lease), limit)
+            .await?;
+        Ok(())
+    }
+
+    /// Lets etcd forget what was before `revision`. It does not do so by itself, and grows.
+    ///
+    /// # Errors
+    ///
+    /// Why it did not.
+    pub async fn compact(&self, revision: u64, limit: Duration) -> Result<(), EtcdError> {
+        let request = json!({ "revision": revision.to_string() });
+        match self
+            .ask::<serde_json::Value>("kv/compaction", &request, limit)
+            .await
+        {
+            Err(EtcdError::Compacted { .. }) | Ok(_) => Ok(()),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// What each endpoint says of itself.
+    pub async fn status(&self, limit: Duration) -> Vec<Result<Status, EtcdError>> {
+        let mut asked = JoinSet::new();
+        for index in 0..self.endpoints.len() {
+            let client = self.clone();
+            asked.spawn(async move { (index, client.status_of(index, limit).await) });
+        }
+        let mut found = asked.join_all().await;
+        found.sort_by_key(|(index, _)| *index);
+        found.into_iter().map(|(_, status)| status).collect()
+    }
+
+    async fn status_of(&self, index: usize, limit: Duration) -> Result<Status, EtcdError> {
+        let Some(endpoint) = self.endpoints.get(index) else {
+            return Err(EtcdError::Options("there is no such endpoint".to_owned()));
+        };
+        let bytes = endpoint
+            .call("maintenance/status", "{}".into(), limit)
+            .await?;
+        wire::parse::<wire::StatusAnswer>(&bytes)?.read(endpoint.url())
+    }
+
+    /// Tries each endpoint on its own, with a look at `key`. Needs no majority.
+    pub async fn try_each(&self, key: &str, limit: Duration) -> Vec<Tried> {
+        let mut asked = JoinSet::new();
+        for index in 0..self.endpoints.len() {
+            let (client, key) = (self.clone(), key.to_owned());
+            asked.spawn(async move { (index, client.try_one(index, &key, limit).await) });
+        }
+        let mut tried = asked.join_all().await;
+        tried.sort_by_key(|(index, _)| *index);
+        tried.into_iter().filter_map(|(_, tried)| tried).collect()
+    }
+
+    async fn try_one(&self, index: usize, key: &str, limit: Duration) -> Option<Tried> {
+        let endpoint = self.endpoints.get(index)?;
+        let request = wire::local_count(key);
+        let answer = endpoint
+            .call("kv/range", request.to_string().into(), limit)
+            .await;
+        let cluster = answer.and_then(|bytes| {
+            let cluster =
+                wire::parse(&bytes).and_then(|answer: wire::RangeAnswer| answer.cluster());
+            cluster.map_err(|error| match error {
+                EtcdError::NotEtcd { why, .. } => EtcdError::NotEtcd {
+                    endpoint: endpoint.url().to_owned(),
+                    why,
+                },
+                other => other,
+            })
+        });
+        Some(Tried {
+            endpoint: endpoint.url().to_owned(),
+            cluster,
+        })
+    }
+
+    /// What changes in `range`, after revision `after`. Nothing for `quiet` means that the endpoint is cut off,
+    /// and another one is asked.
+    pub fn watch(&self, range: Range<String>, after: u64, quiet: Duration) -> Watch {
+        Watch::new(self.clone(), range, after + 1, quiet)
+    }
+
+    fn preferred(&self) -> usize {
+        self.preferred.load(Ordering::Relaxed) % self.endpoints.len()
+    }
+
+    /// Sends a request, to one endpoint after the other, until one has answered.
+    async fn ask<T: serde::de::DeserializeOwned>(
+        &self,
+        path: &'static str,
+        request: &serde_json::Value,
+        limit: Duration,
+    ) -> Result<T, EtcdError> {
+        let body = Bytes::from(request.to_string());
+        let end = tokio::time::Instant::now() + limit;
+        let mut asked: JoinSet<(usize, Result<Bytes, EtcdError>)> = JoinSet::new();
+        let mut next = self.preferred();
+        let mut failure = None;
+        let mut ask_at = tokio::time::Instant::now();
+        loop {
+            tokio::select! {
+                biased;
+                () = tokio::time::sleep_until(end) => {
+                    asked.abort_all();
+                    return Err(failure.unwrap_or(EtcdError::Silent { limit }));
+                }
+                Some(done) = asked.join_next() => match done {
+                    Ok((index, Ok(bytes))) => {
+                        self.preferred.store(index, Ordering::Relaxed);
+                        return wire::parse(&bytes);
+                    }
+                    Ok((_, Err(error))) if error.is_final() => return Err(error),
+                    Ok((_, Err(error))) => {
+                        let round = next % self.endpoints.len() == self.preferred();
+                        let pause = if round { ROUND_PAUSE } else { Duration::ZERO };
+                        ask_at = ask_at.min(tokio::time::Instant::now() + pause);
+                        // One that answers knows more than one that does not.
+                        if failure.as_ref().is_none_or(EtcdError::is_unreachable) {
+                            failure = Some(error);
+                        }
+                    }
+                    Err(_) => {}
+                },
+                () = tokio::time::sleep_until(ask_at) => {
+                    let (client, body, index) = (self.clone(), body.clone(), next % self.endpoints.len());
+                    let rest = end.saturating_duration_since(tokio::time::Instant::now());
+                    asked.spawn(async move {
+                        match client.endpoints.get(index) {
+                            Some(endpoint) => (index, endpoint.call(path, body, rest).await),
+                            None => (index, Err(EtcdError::Silent { limit: rest })),
+                        }
+                    });
+                    next = next.wrapping_add(1);
+                    let again = if self.endpoints.len() > 1 { NEXT_AFTER } else { limit };
+                    ask_at = tokio::time::Instant::now() + again;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! What changes in etcd, as it changes; across lost connections, members and restarts.
+
+use std::{ops::Range, pin::Pin, time::Duration};
+
+use base64::{Engine, engine::general_purpose::STANDARD};
+use bytes::{Bytes, BytesMut};
+use http_body_util::BodyExt;
+use hyper::body::Incoming;
+use serde_json::json;
+use tokio::time::Instant;
+
+use super::{
+    Client, EtcdError, Kv,
+    wire::{self, Streamed, WatchAnswer},
+};
+
+/// The longest message: etcd parts them at 2 MiB, which is 2.7 MiB in base64.
+const MESSAGE_BYTES_MAX: usize = 8 << 20;
+/// Pause before a watch is opened again.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// A key that has changed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Change {
+    pub key: String,
+    pub revision: u64,
+    /// None if it was deleted.
+    pub kv: Option<Kv>,
+}
+
+/// Why a watch has ended.
+#[derive(Debug)]
+pub enum WatchEnd {
+    /// What was to come next is forgotten: the state must be read anew.
+    Compacted,
+    /// It would not help to ask again.
+    Failed(EtcdError),
+}
+
+struct Open {
+    endpoint: usize,
+    body: Incoming,
+    buffer: BytesMut,
+    /// When it is given up if nothing is heard.
+    until: Instant,
+}
+
+type Opening = Pin<Box<dyn Future<Output = Result<Incoming, EtcdError>> + Send>>;
+
+/// A watch. Changes come in their order; after a lost connection some may come twice.
+pub struct Watch {
+    client: Client,
+    range: Range<String>,
+    /// The next revision.
+    next: u64,
+    quiet: Duration,
+    open: Option<Open>,
+    /// Which endpoint is being opened. Kept here, as [`Open::until`] is: whoever waits for changes may give up at
+    /// any time and wait anew, and a member that is silent must be noticed all the same.
+    opening: Option<(usize, Opening)>,
+    failures: usize,
+}
+
+impl Watch {
+    pub(super) fn new(client: Client, range: Range<String>, next: u64, quiet: Duration) -> Self {
+        Self {
+            client,
+            range,
+            next,
+            quiet,
+            open: None,
+            opening: None,
+            failures: 0,
+        }
+    }
+
+    /// The next changes. May be cancelled.
+    ///
+    /// # Errors
+    ///
+    /// Why there will be none.
+    pub async fn next(&mut self) -> Result<Vec<Change>, WatchEnd> {
+        loop {
+            let read = match &mut self.open {
+                Some(open) => tokio::time::timeout_at(open.until, open.message()).await,
+                None => {
+                    self.open().await?;
+                    continue;
+                }
+            };
+            if let (Ok(Ok(Some(_))), Some(open)) = (&read, &mut self.open) {
+                open.until = Instant::now() + self.quiet;
+            }
+            let answer = match read {
+                Ok(Ok(Some(line))) => wire::parse::<Streamed<WatchAnswer>>(&line),
+                Ok(Ok(None)) => {
+                    self.close("its stream has ended");
+                    continue;
+                }
+                Ok(Err(why)) => {
+                    self.close(&why);
+                    continue;
+                }
+                Err(_) => {
+                    self.close("nothing was heard");
+                    continue;
+                }
+            };
+            match answer {
+                Ok(Streamed { result }) if result.canceled => self.canceled(&result)?,
+                Ok(Streamed { result }) => {
+                    self.failures = 0;
+                    let changes = self.changes(&result).map_err(WatchEnd::Failed)?;
+                    if !changes.is_empty() {
+                        return Ok(changes);
+                    }
+                }
+                // An error in the stream: the member stops.
+                Err(error) => self.close(&error.to_string()),
+            }
+        }
+    }
+
+    fn close(&mut self, why: &str) {
+        tracing::debug!(why, from = self.range.start, "a watch of etcd has ended");
+        self.open = None;
+        self.failures += 1;
+    }
+
+    fn canceled(&mut self, answer: &WatchAnswer) -> Result<(), WatchEnd> {
+        if answer.compact_revision > 0 {
+            return Err(WatchEnd::Compacted);
+        }
+        let reason = &answer.cancel_reason;
+        let refused = ["user name is empty", "permission denied"];
+        if refused.iter().any(|text| reason.contains(text)) {
+            let code = if reason.contains("permission") { 7 } else { 3 };
+            return Err(WatchEnd::Failed(EtcdError::answered(
+                "the watch",
+                code,
+                reason,
+            )));
+        }
+        if let Some(endpoint) = self
+            .open
+            .as_ref()
+            .and_then(|open| self.client.endpoints.get(open.endpoint))
+        {
+            // Perhaps it is too old.
+            endpoint.forget_token();
+        }
+        self.close(reason);
+        Ok(())
+    }
+
+    async fn open(&mut self) -> Result<(), WatchEnd> {
+        let next = (self.client.preferred() + self.failures) % self.client.endpoints.len();
+        if self.opening.is_none() {
+            self.opening = Some((next, self.opening_of(next)));
+        }
+        let Some((index, opening)) = &mut self.opening else {
+            return Ok(());
+        };
+        let (index, opened) = (*index, opening.await);
+        self.opening = None;
+        match opened {
+            Ok(body) => {
+                self.open = Some(Open {
+                    endpoint: index,
+                    body,
+                    buffer: BytesMut::new(),
+                    until: Instant::now() + self.quiet,
+                });
+            }
+            Err(error) if error.is_final() => return Err(WatchEnd::Failed(error)),
+            Err(error) => self.close(&error.to_string()),
+        }
+        Ok(())
+    }
+
+    fn opening_of(&self, index: usize) -> Opening {
+        let request = json!({ "create_request": {
+            "key": STANDARD.encode(&self.range.start), "range_end": STANDARD.encode(&self.range.end),
+            "start_revision": self.next.to_string(), "fragment": true,
+        }});
+        let (client, quiet) = (self.client.clone(), self.quiet);
+        let pause = PAUSE.saturating_mul(u32::from(self.failures > 0));
+        Box::pin(async move {
+            tokio::time::sleep(pause).await;
+            match client.endpoints.get(index) {
+                Some(endpoint) => {
+                    endpoint
+                        .stream("watch", request.to_string().into(), quiet)
+                        .await
+                }
+                None => std::future::pending().await,
+            }
+        })
+    }
+
+    fn changes(&mut self, answer: &WatchAnswer) -> Result<Vec<Change>, EtcdError> {
+        let mut changes = Vec::with_capacity(answer.events.len());
+        for event in &answer.events {
+            let kv = event.kv.read()?;
+            // The rest of this revision may be in the next message.
+            self.next = self.next.max(kv.revision + u64::from(!answer.fragment));
+            changes.push(Change {
+                key: kv.key.clone(),
+                revision: kv.revision,
+                kv: (event.kind != "DELETE").then_some(kv),
+            });
+        }
+        Ok(changes)
+    }
+}
+
+impl Open {
+    /// The next line.
+    async fn message(&mut self) -> Result<Option<Bytes>, String> {
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
+                let line = self.buffer.split_to(end + 1);
+                return Ok(Some(line.freeze()));
+            }
+            if self.buffer.len() > MESSAGE_BYTES_MAX {
+                return Err("a message is too long".to_owned());
+            }
+            match self.body.frame().await {
+                None => return Ok(None),
+                Some(Err(error)) => return Err(error.to_string()),
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data() {
+                        self.buffer.extend_from_slice(&data);
+                    }
+                }
+            }
+        }
+    }
+}

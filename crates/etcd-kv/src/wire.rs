@@ -1,0 +1,296 @@
+//! Requests and answers as the gateway has them: bytes in base64, and most integers as text.
+
+use std::ops::Range;
+
+use base64::{Engine, engine::general_purpose::STANDARD};
+use serde::{Deserialize, Deserializer, de::DeserializeOwned};
+use serde_json::{Value, json};
+
+use super::{EtcdError, Status};
+
+/// A key with its value.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Kv {
+    pub key: String,
+    pub value: Vec<u8>,
+    /// The revision of its last change.
+    pub revision: u64,
+}
+
+/// Changes and reads of one moment, on a condition.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Txn {
+    /// Keys, each with the revision of its last change; 0 for a key that does not exist. All must hold.
+    pub compare: Vec<(String, u64)>,
+    /// What is done then,
+    pub success: Vec<TxnOp>,
+    /// and what otherwise.
+    pub failure: Vec<TxnOp>,
+}
+
+/// A part of a transaction.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TxnOp {
+    /// Reads a key.
+    Get(String),
+    /// Writes a key.
+    Put { key: String, value: Vec<u8> },
+    /// Deletes all keys in a range.
+    Delete(Range<String>),
+}
+
+/// What a transaction has done.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TxnResult {
+    /// Whether the condition held.
+    pub succeeded: bool,
+    /// etcd's revision after it.
+    pub revision: u64,
+    /// What each [`TxnOp::Get`] found: a key, or nothing.
+    pub gets: Vec<Option<Kv>>,
+}
+
+impl Txn {
+    pub(super) fn request(&self) -> Value {
+        let ops = |ops: &[TxnOp]| ops.iter().map(TxnOp::request).collect::<Vec<_>>();
+        let compare = self
+            .compare
+            .iter()
+            .map(|(key, revision)| is_at(key, *revision));
+        json!({
+            "compare": compare.collect::<Vec<_>>(),
+            "success": ops(&self.success),
+            "failure": ops(&self.failure),
+        })
+    }
+}
+
+impl TxnOp {
+    fn request(&self) -> Value {
+        match self {
+            Self::Get(key) => json!({ "request_range": { "key": base64(key) } }),
+            Self::Put { key, value } => {
+                json!({ "request_put": { "key": base64(key), "value": base64(value) } })
+            }
+            Self::Delete(range) => {
+                let (key, end) = (base64(&range.start), base64(&range.end));
+                json!({ "request_delete_range": { "key": key, "range_end": end } })
+            }
+        }
+    }
+}
+
+fn base64(bytes: impl AsRef<[u8]>) -> String {
+    STANDARD.encode(bytes)
+}
+
+pub(super) fn leased(key: &str, value: &[u8], lease: i64) -> Value {
+    json!({ "key": base64(key), "value": base64(value), "lease": lease.to_string() })
+}
+
+/// `revision` 0: the present one.
+pub(super) fn range(range: &Range<String>, revision: u64, limit: usize) -> Value {
+    json!({
+        "key": base64(&range.start), "range_end": base64(&range.end),
+        "revision": revision.to_string(), "limit": limit.to_string(),
+    })
+}
+
+/// The first key in `range`, without its value.
+pub(super) fn first_key(range: &Range<String>) -> Value {
+    json!({
+        "key": base64(&range.start), "range_end": base64(&range.end), "limit": "1", "keys_only": true,
+    })
+}
+
+/// Whether `key` exists, as the asked member alone knows: it needs no majority.
+pub(super) fn local_count(key: &str) -> Value {
+    json!({ "key": base64(key), "serializable": true, "count_only": true })
+}
+
+fn is_at(key: &str, revision: u64) -> Value {
+    json!({
+        "key": base64(key), "target": "MOD", "result": "EQUAL", "mod_revision": revision.to_string(),
+    })
+}
+
+pub(super) fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EtcdError> {
+    serde_json::from_slice(bytes).map_err(|error| not_etcd(&error.to_string()))
+}
+
+fn not_etcd(why: &str) -> EtcdError {
+    EtcdError::NotEtcd {
+        endpoint: "an endpoint".to_owned(),
+        why: why.to_owned(),
+    }
+}
+
+/// An integer, as a number or as a text.
+fn number<'de, T, D>(from: D) -> Result<T, D::Error>
+where
+    T: std::str::FromStr + Default,
+    D: Deserializer<'de>,
+{
+    let text = match Value::deserialize(from)? {
+        Value::String(text) => text,
+        Value::Number(number) => number.to_string(),
+        _ => return Ok(T::default()),
+    };
+    text.parse()
+        .map_err(|_| serde::de::Error::custom("no integer"))
+}
+
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Header {
+    #[serde(default, deserialize_with = "number")]
+    revision: u64,
+    #[serde(default, deserialize_with = "number")]
+    member_id: u64,
+    #[serde(default, deserialize_with = "number")]
+    cluster_id: u64,
+}
+
+#[derive(Debug, Deserialize)]
+pub(super) struct RawKv {
+    key: String,
+    /// An empty value is left out.
+    #[serde(default)]
+    value: String,
+    #[serde(default, deserialize_with = "number")]
+    mod_revision: u64,
+}
+
+impl RawKv {
+    pub(super) fn read(&self) -> Result<Kv, EtcdError> {
+        let key = STANDARD.decode(&self.key).ok();
+        let key = key.and_then(|key| String::from_utf8(key).ok());
+        let value = STANDARD.decode(&self.value).ok();
+        let (Some(key), Some(value)) = (key, value) else {
+            return Err(not_etcd("a key or value is not in base64"));
+        };
+        let revision = self.mod_revision;
+        Ok(Kv {
+            key,
+            value,
+            revision,
+        })
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct RangeAnswer {
+    header: Header,
+    kvs: Vec<RawKv>,
+    more: bool,
+}
+
+impl RangeAnswer {
+    /// The id of the cluster that the asked member belongs to.
+    pub(super) fn cluster(&self) -> Result<u64, EtcdError> {
+        match self.header.cluster_id {
+            0 => Err(not_etcd("its answer names no cluster")),
+            id => Ok(id),
+        }
+    }
+
+    pub(super) fn read(&self) -> Result<(u64, bool, Vec<Kv>), EtcdError> {
+        let kvs = self.kvs.iter().map(RawKv::read).collect::<Result<_, _>>()?;
+        Ok((self.header.revision, self.more, kvs))
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct TxnAnswer {
+    header: Header,
+    succeeded: bool,
+    responses: Vec<OpAnswer>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct OpAnswer {
+    response_range: Option<RangeAnswer>,
+}
+
+impl TxnAnswer {
+    pub(super) fn read(&self) -> Result<TxnResult, EtcdError> {
+        let ranges = self
+            .responses
+            .iter()
+            .filter_map(|answer| answer.response_range.as_ref());
+        let gets = ranges.map(|range| range.kvs.first().map(RawKv::read).transpose());
+        Ok(TxnResult {
+            succeeded: self.succeeded,
+            revision: self.header.revision,
+            gets: gets.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+/// A member of etcd, as the port for its peers lists them.
+#[derive(Debug, Deserialize)]
+pub(super) struct Peer {
+    #[serde(rename = "peerURLs")]
+    _urls: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+pub(super) struct LeaseAnswer {
+    #[serde(rename = "ID", default, deserialize_with = "number")]
+    pub(super) id: i64,
+}
+
+/// An answer of a stream.
+#[derive(Debug, Deserialize)]
+pub(super) struct Streamed<T> {
+    pub(super) result: T,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct StatusAnswer {
+    header: Header,
+    version: String,
+    #[serde(rename = "dbSize", deserialize_with = "number")]
+    db_size: u64,
+    #[serde(deserialize_with = "number")]
+    leader: u64,
+    errors: Vec<String>,
+}
+
+impl StatusAnswer {
+    pub(super) fn read(self, endpoint: &str) -> Result<Status, EtcdError> {
+        if self.version.is_empty() {
+            return Err(not_etcd("its status has no version"));
+        }
+        Ok(Status {
+            endpoint: endpoint.to_owned(),
+            is_leader: self.leader != 0 && self.leader == self.header.member_id,
+            version: self.version,
+            db_bytes: self.db_size,
+            errors: self.errors,
+        })
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct WatchAnswer {
+    pub(super) canceled: bool,
+    /// The next message goes on with the same revision.
+    pub(super) fragment: bool,
+    pub(super) cancel_reason: String,
+    #[serde(deserialize_with = "number")]
+    pub(super) compact_revision: u64,
+    pub(super) events: Vec<WatchEvent>,
+}
+
+#[derive(Debug, Deserialize)]
+pub(super) struct WatchEvent {
+    /// `DELETE`, or nothing.
+    #[serde(rename = "type", default)]
+    pub(super) kind: String,
+    pub(super) kv: RawKv,
+}

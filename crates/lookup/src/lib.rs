@@ -1,0 +1,117 @@
+//! Resolves host names. Concurrent lookups of one name share a lookup, each in a thread of its own,
+//! so neither the runtime nor the end of the process waits for a name server that does not answer.
+
+use std::{
+    collections::BTreeMap,
+    io,
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs, UdpSocket},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use tokio::sync::{Semaphore, watch};
+
+/// Most lookups at a time. A name server that does not answer blocks a thread for some ten seconds.
+const LOOKUPS: usize = 64;
+
+/// The addresses of a name without a port, or why there are none.
+type Found = Result<Arc<[SocketAddr]>, Arc<io::Error>>;
+
+static PERMITS: Semaphore = Semaphore::const_new(LOOKUPS);
+static UNDER_WAY: Mutex<BTreeMap<String, watch::Receiver<Option<Found>>>> =
+    Mutex::new(BTreeMap::new());
+
+fn under_way() -> MutexGuard<'static, BTreeMap<String, watch::Receiver<Option<Found>>>> {
+    UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Looks up the addresses of `host` and adds `port`. IPv4 addresses come first, as in roscpp.
+///
+/// # Errors
+///
+/// If the host has no address, or the lookup fails.
+pub async fn addresses(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return Ok(vec![SocketAddr::new(address, port)]);
+    }
+    let mut answer = {
+        let mut under_way = under_way();
+        match under_way.get(host) {
+            Some(answer) => answer.clone(),
+            None => {
+                let (tell, answer) = watch::channel(None);
+                under_way.insert(host.to_owned(), answer.clone());
+                tokio::spawn(look_up(host.to_owned(), tell));
+                answer
+            }
+        }
+    };
+    let found = answer.wait_for(Option::is_some).await;
+    let found = found.map_err(io::Error::other)?.clone();
+    match found {
+        Some(Ok(addresses)) => Ok(addresses.iter().map(|at| with_port(*at, port)).collect()),
+        Some(Err(error)) => Err(io::Error::new(error.kind(), error)),
+        None => Err(io::ErrorKind::NotFound.into()),
+    }
+}
+
+/// Whether an address belongs to this computer: then the kernel uses it as the source address of a
+/// route to itself. Nothing is sent.
+pub fn is_own(address: IpAddr) -> bool {
+    let any = match address {
+        IpAddr::V4(_) => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
+        IpAddr::V6(_) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+    };
+    let source = || {
+        let socket = UdpSocket::bind((any, 0))?;
+        socket.connect((address, 9))?;
+        Ok::<_, io::Error>(socket.local_addr()?.ip())
+    };
+    address.is_loopback() || address.is_unspecified() || source().is_ok_and(|own| own == address)
+}
+
+/// Sets the port and keeps the scope of an IPv6 address.
+fn with_port(mut address: SocketAddr, port: u16) -> SocketAddr {
+    address.set_port(port);
+    address
+}
+
+async fn look_up(host: String, tell: watch::Sender<Option<Found>>) {
+    // The semaphore is never closed.
+    let permit = PERMITS.acquire().await;
+    let name = host.clone();
+    let search = move || {
+        let _permit = permit;
+        let found = (name.as_str(), 0).to_socket_addrs();
+        let found = found.map_err(Arc::new).map(|addresses| {
+            let mut addresses: Vec<_> = addresses.collect();
+            addresses.sort_by_key(SocketAddr::is_ipv6);
+            addresses.dedup();
+            addresses.into()
+        });
+        // The entry is removed before the result is sent, so that later callers look the name up
+        // afresh.
+        under_way().remove(&name);
+        tell.send_replace(Some(found));
+    };
+    // If no thread can be started, the sender is dropped, and the waiters notice.
+    let named = std::thread::Builder::new().name("lookup".to_owned());
+    if named.spawn(search).is_err() {
+        under_way().remove(&host);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_name_is_looked_up_and_an_address_is_not() {
+        let local = addresses("localhost", 4711).await.unwrap();
+        assert!(local.iter().all(|at| at.ip().is_loopback()), "{local:?}");
+        assert!(local.iter().all(|at| at.port() == 4711), "{local:?}");
+        assert_eq!(addresses("::1", 4711).await.unwrap().len(), 1);
+        assert!(under_way().get("::1").is_none());
+        let nobody = addresses("nobody.invalid", 4711).await;
+        assert!(nobody.is_err(), "{nobody:?}");
+    }
+}

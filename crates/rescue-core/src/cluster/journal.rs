@@ -1,0 +1,393 @@
+//! Records and snapshots to and from keys and values of etcd, within its limits.
+//!
+//! ```text
+//! ROBOT/leader, ROBOT/alive           see `machine`
+//! ROBOT/journal/N                     the records up to number N; or the name of a blob, if they are large; or
+//!                                     that of a snapshot, if the state was replaced by record N
+//! ROBOT/values/blob/N/PART            such records, in parts, written before the journal names them
+//! ROBOT/snapshot                      the name of the snapshot that is whole, and what it stands for
+//! ROBOT/values/snapshot/N/PART        a snapshot of the state after record N, in the checkpoint's form
+//! ```
+
+use std::ops::Range;
+
+use thiserror::Error;
+
+use crate::checkpoint::format::{self, EncodeError, Record};
+
+/// Most bytes of the records of one transaction. etcd refuses requests of 1.5 MiB, takes 60 ms for one of
+/// 1 MB, and nothing else is committed meanwhile.
+pub const BATCH_BYTES: usize = 256 << 10;
+/// Most records of one transaction: more are no quicker.
+pub const BATCH_RECORDS: usize = 2_000;
+/// Bytes of a part of something larger.
+const PART_BYTES: usize = 512 << 10;
+/// The largest record. etcd keeps 2 GiB at most unless it is told otherwise, and a record is in the journal
+/// and in two snapshots before it goes.
+pub const RECORD_BYTES_MAX: usize = 64 << 20;
+/// A snapshot is due when the journal has outgrown the last one and this,
+const SNAPSHOT_BYTES: usize = 1 << 20;
+/// or has so many entries: who joins reads them all.
+const SNAPSHOT_ENTRIES: usize = 1_000;
+
+#[derive(Debug, Error, PartialEq)]
+pub enum JournalError {
+    #[error(
+        "the call takes {bytes} bytes in the journal, and etcd is given {RECORD_BYTES_MAX} at most; \
+         set a large parameter in parts, or give nodes a file"
+    )]
+    TooLarge { bytes: usize },
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+    #[error(
+        "`{key}` is not what rosrescue writes there: {why}; is another program using this prefix?"
+    )]
+    Damaged { key: String, why: String },
+    #[error("the journal goes on with record {found} where {expected} was expected")]
+    Gap { expected: u64, found: u64 },
+}
+
+/// A key and its value.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Put {
+    pub key: String,
+    pub value: Vec<u8>,
+}
+
+/// The names of all keys of a robot.
+#[derive(Clone, Debug)]
+pub struct Keys(String);
+
+impl Keys {
+    /// The keys of `robot`, which may have slashes.
+    pub fn new(robot: &str) -> Self {
+        Self(format!("/{}/", robot.trim_matches('/')))
+    }
+
+    pub fn prefix(&self) -> &str {
+        &self.0
+    }
+
+    pub fn leader(&self) -> String {
+        format!("{}leader", self.0)
+    }
+
+    pub fn alive(&self) -> String {
+        format!("{}alive", self.0)
+    }
+
+    pub fn member(&self, name: &str) -> String {
+        format!("{}members/{name}", self.0)
+    }
+
+    pub fn journal(&self, seq: u64) -> String {
+        format!("{}journal/{seq:020}", self.0)
+    }
+
+    /// All keys but parts of values.
+    pub fn small(&self) -> Range<String> {
+        self.0.clone()..format!("{}v", self.0)
+    }
+
+    /// The keys of the journal after record `seq`.
+    pub fn journal_after(&self, seq: u64) -> Range<String> {
+        self.journal(seq.saturating_add(1))..format!("{}journal0", self.0)
+    }
+
+    /// What goes when there is a snapshot of record `seq`: the journal up to it, and its blobs.
+    pub fn behind(&self, seq: u64) -> [Range<String>; 2] {
+        let next = seq.saturating_add(1);
+        [
+            self.journal(0)..self.journal(next),
+            self.blob(0)..self.blob(next),
+        ]
+    }
+
+    /// The number of the last record in a key of the journal.
+    pub fn seq_of(&self, key: &str) -> Option<u64> {
+        key.strip_prefix(&self.0)?
+            .strip_prefix("journal/")?
+            .parse()
+            .ok()
+    }
+
+    fn blob(&self, seq: u64) -> String {
+        format!("{}values/blob/{seq:020}/", self.0)
+    }
+
+    pub fn snapshot(&self) -> String {
+        format!("{}snapshot", self.0)
+    }
+
+    fn snapshots(&self, seq: u64) -> String {
+        format!("{}values/snapshot/{seq:020}/", self.0)
+    }
+
+    /// The parts of snapshots before that of record `seq`.
+    pub fn snapshots_before(&self, seq: u64) -> Range<String> {
+        self.snapshots(0)..self.snapshots(seq)
+    }
+
+    /// The keys of the parts of what a manifest names.
+    pub fn parts(&self, manifest: &Manifest) -> Range<String> {
+        let folder = match manifest.kind {
+            Kind::Blob => self.blob(manifest.seq),
+            Kind::Snapshot => self.snapshots(manifest.seq),
+        };
+        format!("{folder}0")..format!("{folder}:")
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Blob,
+    Snapshot,
+}
+
+impl Kind {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Blob => "blob",
+            Self::Snapshot => "snapshot",
+        }
+    }
+}
+
+/// What is in parts elsewhere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Manifest {
+    kind: Kind,
+    /// The last record in it.
+    pub seq: u64,
+    bytes: usize,
+    crc: u32,
+}
+
+impl Manifest {
+    /// Whether it names a whole state, and not records.
+    pub fn is_state(&self) -> bool {
+        self.kind == Kind::Snapshot
+    }
+
+    /// The parts of `bytes`, and the manifest that is to be written after them.
+    fn split(keys: &Keys, kind: Kind, seq: u64, bytes: &[u8]) -> (Self, Vec<Put>) {
+        let manifest = Self {
+            kind,
+            seq,
+            bytes: bytes.len(),
+            crc: crc32c::crc32c(bytes),
+        };
+        let folder = match kind {
+            Kind::Blob => keys.blob(seq),
+            Kind::Snapshot => keys.snapshots(seq),
+        };
+        let parts = bytes
+            .chunks(PART_BYTES)
+            .enumerate()
+            .map(|(number, part)| Put {
+                key: format!("{folder}{number:06}"),
+                value: part.to_vec(),
+            });
+        (manifest, parts.collect())
+    }
+
+    fn text(&self) -> Vec<u8> {
+        let Self {
+            kind,
+            seq,
+            bytes,
+            crc,
+        } = self;
+        format!("{} seq={seq} bytes={bytes} crc32c={crc:08x}\n", kind.word()).into_bytes()
+    }
+
+    /// Reads a value that may be a manifest.
+    pub fn read(value: &[u8]) -> Option<Self> {
+        let line = std::str::from_utf8(value).ok()?.strip_suffix('\n')?;
+        let mut words = line.split(' ');
+        let kind = words.next()?;
+        let kind = [Kind::Blob, Kind::Snapshot]
+            .into_iter()
+            .find(|of| of.word() == kind)?;
+        Some(Self {
+            kind,
+            seq: words.next()?.strip_prefix("seq=")?.parse().ok()?,
+            bytes: words.next()?.strip_prefix("bytes=")?.parse().ok()?,
+            crc: u32::from_str_radix(words.next()?.strip_prefix("crc32c=")?, 16).ok()?,
+        })
+    }
+
+    /// Puts the parts together, which are in the order of their keys.
+    pub fn assemble(&self, keys: &Keys, parts: &[Vec<u8>]) -> Result<Vec<u8>, JournalError> {
+        let whole = parts.concat();
+        if whole.len() == self.bytes && crc32c::crc32c(&whole) == self.crc {
+            return Ok(whole);
+        }
+        let found = whole.len();
+        Err(JournalError::Damaged {
+            key: keys.parts(self).start,
+            why: format!(
+                "{found} bytes were read of {}, or not those that were written",
+                self.bytes
+            ),
+        })
+    }
+}
+
+/// What one transaction adds to the journal.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Batch {
+    /// How many of the records are in it.
+    pub count: usize,
+    pub entry: Option<Put>,
+}
+
+/// The first of `records`, as many as go into one transaction.
+///
+/// # Errors
+///
+/// [`JournalError::TooLarge`] if the first one is too large at all. It must not have been run: see
+/// [`check_size`].
+pub fn pack(keys: &Keys, records: &[Record]) -> Result<Batch, JournalError> {
+    let (mut value, mut seq, mut count) = (Vec::new(), 0, 0);
+    for record in records.iter().take(BATCH_RECORDS) {
+        let before = value.len();
+        format::push_record(&mut value, record)?;
+        if count > 0 && value.len() > BATCH_BYTES {
+            value.truncate(before);
+            break;
+        }
+        (seq, count) = (record.seq, count + 1);
+    }
+    if count == 0 {
+        return Ok(Batch::default());
+    }
+    check_size(value.len())?;
+    if value.len() > BATCH_BYTES {
+        // It is alone.
+        value = Manifest::split(keys, Kind::Blob, seq, &value).0.text();
+    }
+    let key = keys.journal(seq);
+    let entry = Some(Put { key, value });
+    Ok(Batch { count, entry })
+}
+
+/// What has to be written before the transaction with this record, each on its own. Without the entry it means
+/// nothing.
+///
+/// # Errors
+///
+/// [`JournalError::TooLarge`].
+pub fn parts(keys: &Keys, record: &Record) -> Result<Vec<Put>, JournalError> {
+    let mut value = Vec::new();
+    format::push_record(&mut value, record)?;
+    check_size(value.len())?;
+    match value.len() > BATCH_BYTES {
+        true => Ok(Manifest::split(keys, Kind::Blob, record.seq, &value).1),
+        false => Ok(Vec::new()),
+    }
+}
+
+/// Whether a call whose record has so many bytes can be in the journal. To be asked before it is run.
+pub fn check_size(bytes: usize) -> Result<(), JournalError> {
+    match bytes > RECORD_BYTES_MAX {
+        true => Err(JournalError::TooLarge { bytes }),
+        false => Ok(()),
+    }
+}
+
+/// The records of an entry of the journal, or of a blob.
+pub fn records(key: &str, value: &[u8]) -> Result<Vec<Record>, JournalError> {
+    format::read_records(value).map_err(|why| JournalError::Damaged {
+        key: key.to_owned(),
+        why,
+    })
+}
+
+/// The parts of a snapshot, `bytes` of the state after record `seq`, and what is to be written at
+/// [`Keys::snapshot`] when they are there.
+pub fn snapshot(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
+    let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
+    let (key, value) = (keys.snapshot(), manifest.text());
+    (parts, Put { key, value })
+}
+
+/// The parts of a state that replaces the present one as record `seq`, and the journal's entry that names them.
+pub fn state(keys: &Keys, seq: u64, bytes: &[u8]) -> (Vec<Put>, Put) {
+    let (manifest, parts) = Manifest::split(keys, Kind::Snapshot, seq, bytes);
+    let (key, value) = (keys.journal(seq), manifest.text());
+    (parts, Put { key, value })
+}
+
+/// How far a mirror has followed the journal, and how large that is.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Progress {
+    /// The last record.
+    pub seq: u64,
+    entries: usize,
+    bytes: usize,
+    snapshot_bytes: usize,
+}
+
+impl Progress {
+    /// A snapshot of the state after record `seq` was read or written.
+    pub fn after_snapshot(seq: u64, snapshot_bytes: usize) -> Self {
+        Self {
+            seq,
+            snapshot_bytes,
+            ..Self::default()
+        }
+    }
+
+    /// Takes an entry of the journal. Returns those of its records that are new.
+    ///
+    /// # Errors
+    ///
+    /// [`JournalError::Gap`] if one is missing in between: a snapshot must be read.
+    pub fn take(
+        &mut self,
+        records: Vec<Record>,
+        bytes: usize,
+    ) -> Result<Vec<Record>, JournalError> {
+        let mut expected = self.seq + 1;
+        let new: Vec<_> = records
+            .into_iter()
+            .filter(|record| record.seq > self.seq)
+            .collect();
+        for record in &new {
+            let found = record.seq;
+            if found != expected {
+                return Err(JournalError::Gap { expected, found });
+            }
+            expected += 1;
+        }
+        if !new.is_empty() {
+            self.entries += 1;
+            self.bytes += bytes;
+            self.seq = expected - 1;
+        }
+        Ok(new)
+    }
+
+    /// Takes a state that replaces the present one as record `seq`.
+    pub fn take_state(&mut self, seq: u64, bytes: usize) {
+        self.entries += 1;
+        self.bytes += bytes;
+        self.seq = seq;
+    }
+
+    /// A snapshot of `bytes` has been written, of the state when the progress was `then`.
+    pub fn snapshot_written(&mut self, then: Self, bytes: usize) {
+        self.entries = self.entries.saturating_sub(then.entries);
+        self.bytes = self.bytes.saturating_sub(then.bytes);
+        self.snapshot_bytes = bytes;
+    }
+
+    /// Whether the leader is to write a snapshot.
+    pub fn wants_snapshot(&self) -> bool {
+        self.entries >= SNAPSHOT_ENTRIES || self.bytes > self.snapshot_bytes.max(SNAPSHOT_BYTES)
+    }
+}
+
+#[cfg(test)]
+mod tests;

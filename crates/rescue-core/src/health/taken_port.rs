@@ -1,0 +1,207 @@
+//! Ports that pass from one node to another. A port has one process behind it: when a node registers with a
+//! port, any node registered with it before is gone.
+//!
+//! A master does not know that. When the old node is started again, at another port, it sends a `shutdown` to
+//! the former one, where by now an innocent node listens (ros_comm issue 2241).
+
+use std::collections::HashMap;
+
+use super::port_of;
+use crate::{
+    master::{Master, Request},
+    replay::Token,
+};
+
+/// Nodes by their ports.
+struct Holders<'a>(HashMap<&'a str, Vec<&'a str>>);
+
+impl<'a> Holders<'a> {
+    fn new(mirror: &'a Master) -> Self {
+        let mut holders = Self(HashMap::new());
+        for (node, api) in mirror.nodes().filter(|(node, _)| !Token::is_ours(node)) {
+            holders.0.entry(port_of(api)).or_default().push(node);
+        }
+        holders
+    }
+
+    /// Those that lose their ports to `registrants`. One call may register several names at one port: it
+    /// says itself that they are one process.
+    fn displaced(&self, registrants: &[(&str, &str)]) -> Vec<&'a str> {
+        let ports = registrants.iter();
+        let holders = ports.flat_map(|(_, port)| self.0.get(port).map_or(&[][..], Vec::as_slice));
+        let mut displaced: Vec<_> = holders
+            .filter(|holder| !registrants.iter().any(|(node, _)| node == *holder))
+            .copied()
+            .collect();
+        displaced.sort_unstable();
+        displaced.dedup();
+        displaced
+    }
+}
+
+/// The nodes for which `call`, or an entry of it, registers something, with their ports.
+fn registrants(call: &Request) -> Vec<(&str, &str)> {
+    let registrants = call.calls().into_iter().filter_map(Request::registrant);
+    registrants
+        .map(|(node, api)| (node, port_of(api)))
+        .collect()
+}
+
+/// The first of `calls` that takes a port from a node of `mirror`, or from one of an earlier call.
+pub fn first_taking<'a>(
+    mirror: &'a Master,
+    calls: impl Iterator<Item = &'a Request>,
+) -> Option<usize> {
+    let mut holders = None;
+    let mut calls = calls.map(registrants);
+    calls.position(|registrants| {
+        if registrants.is_empty() {
+            return false;
+        }
+        let holders = holders.get_or_insert_with(|| Holders::new(mirror));
+        let takes = !holders.displaced(&registrants).is_empty();
+        for (node, port) in registrants {
+            holders.0.entry(port).or_default().push(node);
+        }
+        takes
+    })
+}
+
+/// Nodes that are gone, and the call that takes them out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Eviction {
+    pub nodes: Vec<String>,
+    pub call: Request,
+}
+
+impl Eviction {
+    /// What has to go before `call`, if it takes ports from nodes of `mirror`. A registration that is refused
+    /// takes none.
+    pub fn before(mirror: &Master, call: &Request) -> Option<Self> {
+        first_taking(mirror, std::iter::once(call))?;
+        let mut after = mirror.clone();
+        after.apply_telling(call, &mut ());
+        let mut registrants = registrants(call);
+        registrants.retain(|(node, port)| after.api_of(node).map(port_of) == Some(port));
+        let nodes = Holders::new(mirror).displaced(&registrants);
+        let calls: Vec<_> = nodes
+            .iter()
+            .flat_map(|node| mirror.forget_calls(node))
+            .collect();
+        (!calls.is_empty()).then(|| Self {
+            nodes: nodes.into_iter().map(str::to_owned).collect(),
+            call: Request::multicall(calls),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::master::Method;
+
+    fn publish(node: &str, topic: &str, api: &str) -> Request {
+        Request::new(
+            Method::RegisterPublisher,
+            [node, topic, "std_msgs/String", api],
+        )
+    }
+
+    fn offer(node: &str, service: &str, port: u16) -> Request {
+        let (service_api, api) = (
+            format!("rosrpc://h:{port}"),
+            format!("http://h:{}/", port - 1),
+        );
+        Request::new(Method::RegisterService, [node, service, &service_api, &api])
+    }
+
+    fn master(calls: impl IntoIterator<Item = Request>) -> Master {
+        let mut master = Master::default();
+        for call in calls {
+            assert!(crate::master::is_success(&master.apply(&call).reply));
+        }
+        master
+    }
+
+    #[test]
+    fn a_port_changes_hands_by_any_registration_alone_or_in_a_multicall() {
+        let mirror = master([publish("/old", "/t", "http://h:1/")]);
+        let subscribe = Request::new(
+            Method::SubscribeParam,
+            ["/new", "http://h:1", "/gain"].map(str::to_owned),
+        );
+        let inner = Request::multicall([publish("/new", "/t", "http://h:1/path")]);
+        for call in [
+            publish("/new", "/t", "http://h:1/"),
+            subscribe,
+            Request::multicall([inner]),
+        ] {
+            let eviction = Eviction::before(&mirror, &call).unwrap();
+            assert_eq!(eviction.nodes, ["/old"]);
+            let mut mirror = mirror.clone();
+            mirror.apply(&eviction.call);
+            assert_eq!(mirror.api_of("/old"), None);
+            assert_eq!(Eviction::before(&mirror, &call), None);
+        }
+    }
+
+    #[test]
+    fn others_keep_what_they_have() {
+        let [_, token] = Token::new("mark", 1).leave();
+        let mirror = master([publish("/old", "/t", "http://h:1/"), token]);
+        let token_api = mirror.nodes().find(|(node, _)| Token::is_ours(node));
+        let (_, token_api) = token_api.unwrap();
+        for call in [
+            // The node itself; another port; another host; a refused call; the token; no registration.
+            publish("/old", "/u", "http://h:1/"),
+            publish("/new", "/t", "http://h:10/"),
+            publish("/new", "/t", "http://i:1/"),
+            publish("/new", "", "http://h:1/"),
+            publish("/new", "/t", token_api),
+            Request::new(Method::GetParam, ["/new", "/t"]),
+            // One process that has several names says so.
+            Request::multicall([
+                publish("/old", "/t", "http://h:1/"),
+                publish("/new", "/t", "http://h:1/"),
+            ]),
+        ] {
+            assert_eq!(Eviction::before(&mirror, &call), None, "{call:?}");
+        }
+    }
+
+    /// A node that has lost its service keeps a reference, and a master never forgets it.
+    #[test]
+    fn a_reference_by_a_lost_service_goes_and_its_provider_keeps_it() {
+        let mut mirror = master([
+            offer("/old", "/s", 11),
+            offer("/old", "/lost", 11),
+            offer("/heir", "/s", 21),
+            offer("/heir", "/lost", 21),
+            Request::new(
+                Method::UnregisterService,
+                ["/heir", "/lost", "rosrpc://h:21"],
+            ),
+            publish("/old", "/t", "http://h:10/"),
+        ]);
+        let before = master([offer("/heir", "/s", 21)]).snapshot().services;
+        let call = publish("/new", "/t", "http://h:10/");
+        let eviction = Eviction::before(&mirror, &call).unwrap();
+        let applied = mirror.apply(&eviction.call);
+        assert_eq!(mirror.api_of("/old"), None);
+        assert_eq!(mirror.snapshot().services, before);
+        // Nobody is told to shut down.
+        let told = |notice| matches!(notice, crate::master::Notice::Shutdown { .. });
+        assert!(!applied.notices.into_iter().any(told));
+    }
+
+    #[test]
+    fn a_batch_ends_before_the_call_that_takes_a_port() {
+        let mirror = master([publish("/old", "/t", "http://h:1/")]);
+        let first = |calls: &[Request]| first_taking(&mirror, calls.iter());
+        let [one, two] = ["/one", "/two"].map(|node| publish(node, "/t", "http://h:2/"));
+        let old = publish("/new", "/t", "http://h:1/");
+        assert_eq!(first(&[one.clone(), one.clone(), old]), Some(2));
+        assert_eq!(first(&[one.clone(), two]), Some(1));
+        assert_eq!(first(&[one.clone(), one]), None);
+    }
+}

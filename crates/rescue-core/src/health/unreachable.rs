@@ -1,0 +1,126 @@
+//! Nodes that do not answer and are not known to be dead.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use super::backoff::Backoff;
+
+/// Pause before an unreachable node is asked again for the first time.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// Pauses double up to this one.
+const LONGEST_PAUSE: Duration = Duration::from_secs(60);
+
+/// The unreachable ports, and when each is asked next.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Unreachable {
+    of: BTreeMap<String, Wait>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Wait {
+    backoff: Backoff,
+    /// It is due, and has not answered yet.
+    asked: bool,
+}
+
+impl Unreachable {
+    /// Adds a port that has not answered, or notes that it has not answered again. Returns whether that is
+    /// new.
+    pub fn add(&mut self, port: &str, now: Instant) -> bool {
+        if let Some(wait) = self.of.get_mut(port) {
+            if std::mem::take(&mut wait.asked) {
+                wait.backoff.done(now, LONGEST_PAUSE);
+            }
+            return false;
+        }
+        let wait = Wait {
+            backoff: Backoff::new(now + FIRST_PAUSE, FIRST_PAUSE * 2),
+            asked: false,
+        };
+        self.of.insert(port.to_owned(), wait);
+        true
+    }
+
+    /// Removes a port that has answered or has nobody. Returns whether it was unreachable.
+    pub fn remove(&mut self, port: &str) -> bool {
+        self.of.remove(port).is_some()
+    }
+
+    /// Drops those that are not registered any more.
+    pub fn retain(&mut self, registered: impl Fn(&str) -> bool) {
+        self.of.retain(|port, _| registered(port));
+    }
+
+    pub fn contains(&self, port: &str) -> bool {
+        self.of.contains_key(port)
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.of.is_empty()
+    }
+
+    /// Ports to ask now. None is returned again before it has been added again: however long it has to wait
+    /// for its visit, there is one at a time. Each following pause is longer.
+    pub fn due(&mut self, now: Instant) -> Vec<String> {
+        let waiting = self.of.iter_mut().filter(|(_, wait)| !wait.asked);
+        let due = waiting.filter(|(_, wait)| wait.backoff.next() <= now);
+        due.map(|(port, wait)| {
+            wait.asked = true;
+            port.clone()
+        })
+        .collect()
+    }
+
+    /// When the next one is due.
+    pub fn next(&self) -> Option<Instant> {
+        let waiting = self.of.values().filter(|wait| !wait.asked);
+        waiting.map(|wait| wait.backoff.next()).min()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unreachable_nodes_are_asked_with_growing_pauses() {
+        let start = Instant::now();
+        let mut unreachable = Unreachable::default();
+        assert!(unreachable.add("a", start) && !unreachable.add("a", start));
+        let mut asked = Vec::new();
+        while asked.len() < 9 {
+            let next = unreachable.next().unwrap();
+            assert_eq!(unreachable.due(next), ["a"]);
+            assert!(!unreachable.add("a", next));
+            asked.push((next - start).as_secs());
+        }
+        assert_eq!(asked, [1, 3, 7, 15, 31, 63, 123, 183, 243]);
+        assert_eq!(unreachable.due(start), Vec::<String>::new());
+        assert!(unreachable.remove("a") && unreachable.is_empty());
+        assert_eq!(unreachable.next(), None);
+    }
+
+    #[test]
+    fn who_is_being_asked_is_not_asked_again() {
+        let start = Instant::now();
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", start);
+        let late = start + Duration::from_secs(100);
+        assert_eq!(unreachable.due(late), ["a"]);
+        assert_eq!(unreachable.next(), None);
+        assert_eq!(unreachable.due(late), Vec::<String>::new());
+        unreachable.add("a", late);
+        assert_eq!(unreachable.next(), Some(late + FIRST_PAUSE * 2));
+    }
+
+    #[test]
+    fn who_is_not_registered_any_more_is_not_unreachable() {
+        let mut unreachable = Unreachable::default();
+        unreachable.add("a", Instant::now());
+        unreachable.add("b", Instant::now());
+        unreachable.retain(|port| port == "b");
+        assert!(!unreachable.contains("a") && unreachable.contains("b"));
+    }
+}

@@ -1,0 +1,31 @@
+//! What rosrescue decides, without a runtime, sockets, files or a clock: time is an argument, and work is
+//! returned as values.
+//!
+//! * [`hide`]: which values of parameters are not shown.
+//! * [`replay`]: recognising a master, reading its state, and the one call that brings it to a state.
+//! * [`lifecycle`]: phases, deadlines, backoff, when the gate opens and shuts.
+//! * [`health`]: judging what a node reports; which nodes are unreachable.
+//! * [`order`]: the order in which a node hears of a topic, a parameter or its own name.
+//! * [`checkpoint`]: the checkpoint's text, whether its session continues, and how two states differ.
+//! * [`cluster`]: several computers: who leads, and whose writes hold.
+
+#![cfg_attr(
+    test,
+    allow(
+        clippy::disallowed_macros,
+        clippy::disallowed_methods,
+        reason = "tests start at some time, and print what they counted"
+    )
+)]
+
+pub mod checkpoint;
+pub mod cluster;
+#[cfg(test)]
+mod dice;
+pub mod health;
+pub mod hide;
+pub mod lifecycle;
+pub mod order;
+pub mod replay;
+
+use ros1_master::{master, xmlrpc};

@@ -1,0 +1,564 @@
+//! Decides when to connect to, examine, probe, spawn and kill a master, and when calls may pass to
+//! it. In between, `recovery::examine` shuts the gate to writes during an injection.
+//!
+//! This is a state machine without IO: the shell passes in what happened and when, and carries out
+//! the returned actions. The machine owns every deadline, so that each can be tested without
+//! waiting.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+use self::evidence::{BUSY_LIMIT, Evidence, Sample, Verdict};
+
+pub mod evidence;
+mod patience;
+mod types;
+
+pub use patience::Patience;
+pub use types::{Action, Cause, Input, Probing, Supervision};
+
+/// Older deaths do not count towards a crash loop.
+const DEATH_MEMORY: Duration = Duration::from_secs(60);
+/// Number of deaths within [`DEATH_MEMORY`] after each of which a new master is started at once.
+const DEATHS_AT_ONCE: usize = 5;
+/// The first pause in a crash loop. It doubles with each further death.
+const FIRST_PAUSE: Duration = Duration::from_millis(500);
+/// The longest pause in a crash loop.
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// A master that has served for this time ends the crash loop. The pauses continue as long as more
+/// than [`DEATHS_AT_ONCE`] deaths lie within [`DEATH_MEMORY`].
+const CALM: Duration = Duration::from_secs(10);
+/// A spawned master that has used this many times [`Probing::start_limit`] of processor time will
+/// never listen.
+const STARTS_AT_MOST: u32 = 10;
+/// Pause between two samples of a master that starts slowly.
+const SAMPLE_PAUSE: Duration = Duration::from_millis(500);
+/// Pause before the next attempt after a server that is not a master.
+const NOT_A_MASTER_PAUSE: Duration = Duration::from_secs(1);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// No master is connected.
+    Seeking,
+    /// A master is connected, but not known to hold the state yet.
+    Examining,
+    /// The gate is open.
+    Serving,
+    /// The mirror answers until the late master answers.
+    Late,
+    /// The late master is given what the mirror has answered.
+    CatchingUp,
+    Stopped,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Timer {
+    Connect,
+    Probe,
+    Spawn,
+}
+
+/// Decides what happens to the master; see the [module](self).
+#[derive(Debug)]
+pub struct Lifecycle {
+    supervision: Supervision,
+    probing: Probing,
+    phase: Phase,
+    served: bool,
+    /// Whether the mirror comes from a checkpoint whose session continues.
+    restored: bool,
+    /// Whether the mirror is known to be a master's state.
+    known: bool,
+    /// When our child was spawned; for an orphan, when rosrescue started. None while there is no
+    /// child.
+    child: Option<Instant>,
+    /// Since when no master has been connected.
+    seeking_since: Option<Instant>,
+    /// Times of the latest deaths, oldest first, none older than [`DEATH_MEMORY`].
+    deaths: VecDeque<Instant>,
+    total_deaths: u64,
+    /// Whether there is a crash loop: more than [`DEATHS_AT_ONCE`] deaths within [`DEATH_MEMORY`],
+    /// and no master that has served for [`CALM`] since.
+    crash_loop: bool,
+    /// When the gate was opened; none while it is shut.
+    serving_since: Option<Instant>,
+    /// Whether an external master has closed its connection and it is not yet known whether it
+    /// died.
+    lost: bool,
+    /// Whether an external master was counted as dead, and since then its port has not refused and
+    /// no master has been examined there.
+    dying: bool,
+    missed: u32,
+    patience: Patience,
+    /// The samples of our silent master.
+    evidence: Evidence,
+    /// Number of consecutive failed spawns.
+    failed_spawns: usize,
+    /// Number of consecutive masters whose port another program took.
+    taken_ports: usize,
+    /// Whether the last master whose port was taken still runs.
+    port_taken: bool,
+    timer: Option<(Instant, Timer)>,
+}
+
+impl Lifecycle {
+    /// Creates a machine that does nothing until [`Input::Start`].
+    pub fn new(supervision: Supervision, probing: Probing) -> Self {
+        Self {
+            supervision,
+            probing,
+            phase: Phase::Seeking,
+            served: false,
+            restored: false,
+            known: false,
+            child: None,
+            seeking_since: None,
+            deaths: VecDeque::new(),
+            total_deaths: 0,
+            crash_loop: false,
+            serving_since: None,
+            lost: false,
+            dying: false,
+            missed: 0,
+            patience: Patience::new(probing.patience),
+            evidence: Evidence::default(),
+            failed_spawns: 0,
+            taken_ports: 0,
+            port_taken: false,
+            timer: None,
+        }
+    }
+
+    /// When to pass in [`Input::Wake`]. It changes with every input.
+    pub fn deadline(&self) -> Option<Instant> {
+        let timer = self.timer.map(|(at, _)| at);
+        timer.into_iter().chain(self.calm_at()).min()
+    }
+
+    /// When the crash loop ends, unless the master dies before.
+    fn calm_at(&self) -> Option<Instant> {
+        let since = self.serving_since.filter(|_| self.crash_loop)?;
+        Some(since + CALM)
+    }
+
+    /// Number of masters that died since the start.
+    pub fn deaths(&self) -> u64 {
+        self.total_deaths
+    }
+
+    /// Whether the mirror may stand in while the gate is shut, because it is known to be a master's
+    /// state.
+    pub fn may_stand_in(&self) -> bool {
+        self.known
+    }
+
+    /// Whether a master has served since the start.
+    pub fn has_served(&self) -> bool {
+        self.served
+    }
+
+    /// How long a write waits for the master before the mirror answers it.
+    pub fn patience(&self) -> &Patience {
+        &self.patience
+    }
+
+    /// Whether the decision about `input` needs a [`Sample`] of our master.
+    pub fn needs_sample(&self, now: Instant, input: Input) -> bool {
+        let sampled = self.evidence.last_at();
+        let is_old = sampled.is_none_or(|at| now.duration_since(at) >= SAMPLE_PAUSE);
+        self.child.is_some()
+            && match input {
+                Input::ProbeMissed | Input::Unreachable => true,
+                Input::Refused => is_old && self.is_slow_to_start(now),
+                _ => false,
+            }
+    }
+
+    /// Takes a sample of our master.
+    pub fn observe(&mut self, sample: Sample) {
+        self.evidence.add(sample);
+    }
+
+    /// Whether this is a new session that no master has served yet.
+    pub fn begins(&self) -> bool {
+        !self.served && !self.restored
+    }
+
+    /// Takes an input at `now`. Returns the actions, in order.
+    ///
+    /// ```
+    /// use std::time::{Duration, Instant};
+    /// use rescue_core::lifecycle::{Action, Cause, Input, Lifecycle, Probing, Supervision};
+    ///
+    /// let probing = Probing {
+    ///     interval: Duration::from_secs(1),
+    ///     count: 3,
+    ///     patience: Duration::from_millis(100),
+    ///     start_limit: Duration::from_secs(30),
+    /// };
+    /// let mut lifecycle = Lifecycle::new(Supervision::Theirs, probing);
+    /// let now = Instant::now();
+    /// let start = Input::Start { left: false, restored: false };
+    /// assert_eq!(lifecycle.on(now, start), [Action::Connect]);
+    /// assert_eq!(lifecycle.on(now, Input::Connected), [Action::Examine]);
+    /// assert_eq!(lifecycle.on(now, Input::Examined { new: true }), [Action::OpenGate]);
+    /// let shut = Action::ShutGate(Cause::ConnectionLost);
+    /// assert_eq!(lifecycle.on(now, Input::ConnectionLost), [shut, Action::Connect]);
+    /// ```
+    pub fn on(&mut self, now: Instant, input: Input) -> Vec<Action> {
+        if self.phase == Phase::Stopped {
+            return Vec::new();
+        }
+        match input {
+            Input::Start { left, restored } => self.start(now, left, restored),
+            Input::Answered => {
+                self.dying = false;
+                Vec::new()
+            }
+            Input::Connected => {
+                self.phase = Phase::Examining;
+                self.timer = None;
+                vec![Action::Examine]
+            }
+            Input::Refused => self.refused(now),
+            Input::PortTaken => {
+                self.taken_ports += 1;
+                self.port_taken = true;
+                self.give_up(now)
+            }
+            Input::Unreachable => self.unreachable(now),
+            Input::NotAMaster | Input::ConnectionLost
+                if self.phase == Phase::Examining && self.is_hopeless(now) =>
+            {
+                self.give_up(now)
+            }
+            Input::NotAMaster => {
+                self.seek(now);
+                self.timer = Some((now + NOT_A_MASTER_PAUSE, Timer::Connect));
+                Vec::new()
+            }
+            // The master died during the examination or closes every connection, so wait before
+            // connecting.
+            Input::ConnectionLost if self.phase == Phase::Examining => {
+                let mut actions = self.connect_later(now, false);
+                let again = std::mem::replace(&mut self.dying, true);
+                if self.supervision == Supervision::Theirs && !again {
+                    actions.extend(self.their_death(now));
+                }
+                actions
+            }
+            Input::Late if self.phase == Phase::Serving => {
+                self.phase = Phase::Late;
+                let probe = self.probe_now();
+                [Action::StandIn].into_iter().chain(probe).collect()
+            }
+            Input::LateAnswered if self.phase == Phase::Late => {
+                self.phase = Phase::CatchingUp;
+                self.patience.was_late(now);
+                self.timer = None;
+                vec![Action::CatchUp]
+            }
+            Input::CaughtUp if self.phase == Phase::CatchingUp => {
+                self.phase = Phase::Serving;
+                self.answered(now);
+                vec![Action::OpenGate]
+            }
+            Input::NotCaughtUp if self.phase == Phase::CatchingUp => {
+                self.lost(now, Cause::Late, vec![Action::Connect])
+            }
+            Input::Late | Input::LateAnswered | Input::CaughtUp | Input::NotCaughtUp => Vec::new(),
+            Input::ThreadEnded | Input::BatchLost | Input::Slow if !self.is_serving() => Vec::new(),
+            Input::Slow => self.probe_now().into_iter().collect(),
+            // If the master was killed, the rest of its end follows within milliseconds. If not,
+            // the next connection shows that it lives.
+            Input::ConnectionLost | Input::BatchLost | Input::ThreadEnded => {
+                self.lost = self.supervision == Supervision::Theirs;
+                let cause = match input {
+                    Input::ThreadEnded => Cause::ThreadEnded,
+                    _ => Cause::ConnectionLost,
+                };
+                self.lost(now, cause, vec![Action::Connect])
+            }
+            Input::Examined { new } => {
+                let died = std::mem::take(&mut self.lost) && new;
+                (self.dying, self.taken_ports) = (false, 0);
+                self.phase = Phase::Serving;
+                (self.served, self.known) = (true, true);
+                self.seeking_since = None;
+                self.serving_since = Some(now);
+                self.answered(now);
+                let report = if died { self.their_death(now) } else { None };
+                std::iter::once(Action::OpenGate).chain(report).collect()
+            }
+            Input::ProbeAnswered => {
+                self.answered(now);
+                Vec::new()
+            }
+            Input::ProbeMissed => self.probe_missed(now),
+            Input::Spawned => {
+                self.evidence.clear();
+                self.child = Some(now);
+                self.failed_spawns = 0;
+                self.seeking_since = Some(now);
+                vec![Action::Connect]
+            }
+            Input::SpawnFailed { pending: false } if self.begins() => vec![Action::GiveUp],
+            Input::SpawnFailed { .. } => {
+                let pause = pause_after(self.failed_spawns).max(self.pause_before_spawn());
+                self.failed_spawns += 1;
+                self.timer = Some((now + pause, Timer::Spawn));
+                Vec::new()
+            }
+            Input::Exited => {
+                self.child = None;
+                let spawn = match std::mem::take(&mut self.port_taken) {
+                    true => self.spawn_elsewhere(now),
+                    false => self.spawn(now),
+                };
+                self.lost(now, Cause::Exited, spawn)
+            }
+            Input::Wake if self.calm_at().is_some_and(|at| at <= now) => {
+                self.crash_loop = false;
+                vec![Action::ReportCalm]
+            }
+            Input::Wake => match self.timer.take() {
+                Some((at, timer)) if at > now => {
+                    self.timer = Some((at, timer));
+                    Vec::new()
+                }
+                Some((_, Timer::Connect)) => vec![Action::Connect],
+                Some((_, Timer::Probe)) => vec![Action::Probe],
+                Some((_, Timer::Spawn)) => vec![Action::Spawn],
+                None => Vec::new(),
+            },
+            Input::Stop => {
+                self.phase = Phase::Stopped;
+                self.timer = None;
+                vec![Action::ShutGate(Cause::Stopping)]
+            }
+        }
+    }
+
+    fn start(&mut self, now: Instant, left: bool, restored: bool) -> Vec<Action> {
+        self.seek(now);
+        self.restored = restored;
+        // A new master of ours is empty, so the mirror is right. The state of an orphan must be
+        // read first.
+        self.known = restored || (self.supervision == Supervision::Ours && !left);
+        if self.supervision == Supervision::Ours && !left {
+            return vec![Action::Spawn];
+        }
+        self.child = left.then_some(now);
+        vec![Action::Connect]
+    }
+
+    /// Whether calls pass to the master, or would if it were not late.
+    fn is_serving(&self) -> bool {
+        matches!(self.phase, Phase::Serving | Phase::Late | Phase::CatchingUp)
+    }
+
+    /// Notes that the master has answered.
+    fn answered(&mut self, now: Instant) {
+        self.missed = 0;
+        self.evidence.clear();
+        self.timer = Some((now + self.probing.interval, Timer::Probe));
+    }
+
+    /// Probes before the next regular time, unless a probe is under way.
+    fn probe_now(&mut self) -> Option<Action> {
+        let due = self.timer.take_if(|(_, timer)| *timer == Timer::Probe);
+        due.map(|_| Action::Probe)
+    }
+
+    fn seek(&mut self, now: Instant) {
+        self.phase = Phase::Seeking;
+        self.serving_since = None;
+        self.timer = None;
+        self.seeking_since.get_or_insert(now);
+    }
+
+    /// Handles the loss of the master: shuts the gate, then does `then`.
+    fn lost(&mut self, now: Instant, cause: Cause, then: Vec<Action>) -> Vec<Action> {
+        let timer = self.timer;
+        let was_serving = self.is_serving();
+        self.seek(now);
+        if cause == Cause::Exited {
+            // `spawn` has set this timer.
+            self.timer = timer.filter(|(_, timer)| *timer == Timer::Spawn);
+        }
+        let shut = was_serving.then_some(Action::ShutGate(cause));
+        shut.into_iter().chain(then).collect()
+    }
+
+    fn refused(&mut self, now: Instant) -> Vec<Action> {
+        self.dying = false;
+        if self.is_slow_to_start(now) {
+            let limit = self.probing.start_limit.saturating_mul(STARTS_AT_MOST);
+            return self.give_up_if_hung(now, limit, false);
+        }
+        let mut actions = self.connect_later(now, false);
+        if std::mem::take(&mut self.lost) {
+            // The process that closed the connection no longer listens.
+            actions.extend(self.their_death(now));
+        }
+        actions
+    }
+
+    /// Whether our child has had enough time to listen, given that it was not busy. A rosmaster
+    /// whose port was taken stays alive without ever listening.
+    fn is_slow_to_start(&self, now: Instant) -> bool {
+        let limit = self.probing.start_limit;
+        self.child
+            .is_some_and(|since| now.duration_since(since) > limit)
+    }
+
+    /// Whether our child has had enough time, and there is still no master at its port.
+    fn is_hopeless(&self, now: Instant) -> bool {
+        let since = self.seeking_since.filter(|_| self.child.is_some());
+        since.is_some_and(|since| now.duration_since(since) > self.probing.start_limit)
+    }
+
+    /// Kills our silent child if it [hangs](Evidence::judge), and connects again otherwise.
+    fn give_up_if_hung(&mut self, now: Instant, busy_limit: Duration, far: bool) -> Vec<Action> {
+        match self.evidence.judge(busy_limit) {
+            Verdict::Hung => self.give_up(now),
+            verdict => {
+                let actions = self.connect_later(now, far);
+                actions.into_iter().chain(spare(verdict)).collect()
+            }
+        }
+    }
+
+    /// Kills our useless child. Its end arrives as `Exited`, which spawns the next one.
+    fn give_up(&mut self, now: Instant) -> Vec<Action> {
+        self.seek(now);
+        vec![Action::Kill]
+    }
+
+    fn unreachable(&mut self, now: Instant) -> Vec<Action> {
+        match self.supervision {
+            Supervision::Ours if self.phase == Phase::Examining => {
+                let actions = self.give_up_if_hung(now, BUSY_LIMIT, true);
+                if actions.contains(&Action::Kill) {
+                    self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
+                }
+                actions
+            }
+            // The master does not even accept connections: it is stopped, and its backlog is full.
+            _ if self.is_hopeless(now) => self.give_up_if_hung(now, BUSY_LIMIT, true),
+            _ => self.connect_later(now, true),
+        }
+    }
+
+    fn connect_later(&mut self, now: Instant, far: bool) -> Vec<Action> {
+        self.seek(now);
+        let waited = self
+            .seeking_since
+            .map_or(Duration::ZERO, |since| now.duration_since(since));
+        self.timer = Some((now + pause_before_connect(waited, far), Timer::Connect));
+        Vec::new()
+    }
+
+    fn probe_missed(&mut self, now: Instant) -> Vec<Action> {
+        self.missed += 1;
+        if self.missed < self.probing.count {
+            return vec![Action::Probe];
+        }
+        let then = match self.supervision {
+            Supervision::Ours => match self.evidence.judge(BUSY_LIMIT) {
+                Verdict::Hung => vec![Action::Kill],
+                verdict => spare(verdict).into_iter().collect(),
+            },
+            Supervision::Theirs => Vec::new(),
+        };
+        let actions = self.lost(now, Cause::Hung, then);
+        // The end of the killed master arrives as `Exited`.
+        self.timer = Some((now + FIRST_PAUSE, Timer::Connect));
+        actions
+    }
+
+    /// Starts the next master after one of ours has died.
+    fn spawn(&mut self, now: Instant) -> Vec<Action> {
+        self.count_death(now);
+        let pause = self.pause_before_spawn();
+        if pause.is_zero() {
+            self.timer = None;
+            return vec![Action::Spawn];
+        }
+        self.timer = Some((now + pause, Timer::Spawn));
+        vec![Action::ReportCrashLoop(self.deaths.len())]
+    }
+
+    /// Handles the end of a master that never got its port. This does not count as a death.
+    fn spawn_elsewhere(&mut self, now: Instant) -> Vec<Action> {
+        match self.taken_ports.checked_sub(DEATHS_AT_ONCE + 1) {
+            None => vec![Action::Spawn],
+            Some(further) => {
+                self.timer = Some((now + pause_after(further), Timer::Spawn));
+                Vec::new()
+            }
+        }
+    }
+
+    /// Counts the death of an external master. rosrescue does not slow its restarts; a crash loop
+    /// is reported once.
+    fn their_death(&mut self, now: Instant) -> Option<Action> {
+        self.lost = false;
+        let said = self.crash_loop;
+        self.count_death(now);
+        (self.crash_loop && !said).then_some(Action::ReportCrashLoop(self.deaths.len()))
+    }
+
+    fn count_death(&mut self, now: Instant) {
+        self.total_deaths += 1;
+        self.deaths.push_back(now);
+        while self
+            .deaths
+            .front()
+            .is_some_and(|at| now.duration_since(*at) > DEATH_MEMORY)
+        {
+            self.deaths.pop_front();
+        }
+        self.crash_loop |= self.deaths.len() > DEATHS_AT_ONCE;
+    }
+
+    fn pause_before_spawn(&self) -> Duration {
+        let further = self.deaths.len().checked_sub(DEATHS_AT_ONCE + 1);
+        further.map_or(Duration::ZERO, pause_after)
+    }
+}
+
+/// Reports why a master is not killed.
+fn spare(verdict: Verdict) -> Option<Action> {
+    match verdict {
+        Verdict::Unproved(why) => Some(Action::Spare(why)),
+        Verdict::Hung | Verdict::Unknown => None,
+    }
+}
+
+/// The pause after the first failure and `further` ones.
+fn pause_after(further: usize) -> Duration {
+    let doublings = u32::try_from(further).unwrap_or(u32::MAX).min(16);
+    (FIRST_PAUSE * 2_u32.pow(doublings)).min(LONGEST_PAUSE)
+}
+
+/// The pause before the next connect. It is short at first, when a restart may take only
+/// milliseconds, and longer later. A refused connect on the same computer costs some 20 µs. `far`
+/// means that the connect itself has waited for an answer.
+fn pause_before_connect(waited: Duration, far: bool) -> Duration {
+    let pause = match waited.as_millis() {
+        0..2_000 => Duration::from_millis(1),
+        2_000..30_000 => Duration::from_millis(20),
+        _ => Duration::from_millis(200),
+    };
+    if far {
+        pause.max(Duration::from_millis(200))
+    } else {
+        pause
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,402 @@
+//! The order in which a node hears of a topic, a parameter or its own name: the order of the state.
+//!
+//! A node hears of one subject in two ways, in the answers to its own calls and in notifications, and reads
+//! them in different threads. rospy takes for the truth what comes last, and roscpp drops the links that the
+//! last list of publishers lacks. So the answer to a node's call is with the node before the node is notified
+//! of anything later about the same subject, and of two notifications the newer one comes last:
+//!
+//! * While the master serves, a write that can notify a node does not go to the master while an answer to that
+//!   node about the same subject is under way ([`Order::hold`]).
+//! * A notification of our own waits for such an answer, and for [`LEAD`] after it. Where the master may be
+//!   notifying the node of the same subject, ours is put off ([`Order::next`]).
+//! * Whoever is notified shortly after such an answer, or by two senders in a row, is told the state once more
+//!   ([`REPEAT_AFTER`]): the two may have been read in the wrong order. If the master notifies it of something newer
+//!   meanwhile, that is enough, and ours would be overtaken by the backlog of a master on a busy computer.
+//!
+//! Pure: time is an argument, and so is the mirror.
+
+mod by_subject;
+mod outbox;
+mod subject;
+mod under_way;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashSet},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+pub use self::{
+    by_subject::BySubject,
+    outbox::Next,
+    subject::{Concern, Heard, Subject, heard_by_read},
+};
+use self::{
+    outbox::{Content, Outbox},
+    under_way::UnderWay,
+};
+use crate::{master::Master, xmlrpc::Call};
+
+/// How long a notification of ours waits after an answer about the same subject was written. rosmaster takes
+/// 0.3 ms at least, for its notifications go through another thread and a new connection.
+pub const LEAD: Duration = Duration::from_millis(10);
+/// A notification that follows an answer within this time may be read before it: with thirty runnable processes on
+/// two cores a node took 42 ms from the one to the other.
+pub const RECENT: Duration = Duration::from_millis(500);
+/// When such a node is told the state once more. Idle threads of rosmaster look for work every 100 ms, so by then
+/// a master without a backlog has sent what it was going to send.
+pub const REPEAT_AFTER: Duration = Duration::from_millis(300);
+/// How long a master may take for a notification while many wait: Python passes its lock on every 5 ms.
+const MASTER_TAKES: Duration = Duration::from_millis(5);
+/// Longest backlog of a master's notifications that ours wait for.
+const BACKLOG_MOST: Duration = Duration::from_secs(10);
+/// How long a client that does not read its answer holds up the writes of others.
+pub const ANSWER_LIMIT: Duration = Duration::from_secs(1);
+/// How long a node that does not take a notification holds up writes about the subject. With thirty runnable
+/// processes on two cores a node took more than 100 ms, and the master's newer value came first.
+pub const NOTIFICATION_LIMIT: Duration = Duration::from_millis(300);
+
+/// What is under way to nodes, and what waits for it.
+#[derive(Debug, Default)]
+pub struct Order {
+    under_way: UnderWay,
+    outbox: Outbox,
+    /// Of what the master may be notifying nodes: it has not answered these calls.
+    in_flight: InFlight,
+    /// Of what the master has notified nodes lately.
+    told: Told,
+    repeats: Repeats,
+    /// Something waits until one of the above changes.
+    awaited: bool,
+}
+
+/// The calls that the master has and has not answered.
+#[derive(Debug, Default)]
+struct InFlight {
+    tells: BySubject<()>,
+    answers: Vec<u64>,
+}
+
+/// Why a call waits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Held {
+    /// When to ask again at the latest; none if a change will be reported.
+    pub until: Option<Instant>,
+}
+
+impl Order {
+    /// An answer about `heard` is under way from now on. Returns its number, for [`Self::written`]; none if it
+    /// is about nothing that nodes are notified of.
+    pub fn begin(&mut self, now: Instant, heard: Vec<Heard>) -> Option<u64> {
+        self.under_way.forget(now);
+        if heard.is_empty() {
+            return None;
+        }
+        for Heard { port, subject } in &heard {
+            // What waits there is older than the answer.
+            self.outbox.renew(port, subject);
+        }
+        Some(self.under_way.add(under_way::Kind::Answer, heard, None))
+    }
+
+    /// The answer is ready: from now on it holds up others for a limited time.
+    pub fn ready(&mut self, now: Instant, answer: u64) {
+        self.under_way.limit(answer, now + ANSWER_LIMIT);
+    }
+
+    /// The answer has been written to its caller, or never will be. Returns whether something waits for that.
+    pub fn written(&mut self, now: Instant, answer: u64) -> bool {
+        self.under_way.written(now, answer);
+        std::mem::take(&mut self.awaited)
+    }
+
+    /// Whether a call has to wait before it goes to the master, because it may notify a node to which an answer
+    /// about the same subject is under way.
+    pub fn hold(&mut self, now: Instant, concern: &Concern) -> Option<Held> {
+        let held = match concern.is_anything() {
+            true => self.under_way.any(now),
+            false => concern.tells().iter().find_map(|subject| {
+                let port = concern.port_if_name(subject);
+                self.under_way.before(now, subject, port)
+            }),
+        };
+        self.awaited |= held.is_some();
+        held.map(|until| Held { until })
+    }
+
+    /// Whether a read has to wait for a call that the master has: its answer could be older than what the
+    /// master notifies the reader of.
+    pub fn holds_read(&mut self, heard: &[Heard]) -> bool {
+        let mut heard = heard.iter();
+        let held = heard.any(|heard| self.in_flight.tells.has(&heard.subject));
+        self.awaited |= held;
+        held
+    }
+
+    /// Calls go to the master that may notify nodes of `tells`. `answers`: the answers to them.
+    pub fn sent<'a>(&mut self, tells: impl IntoIterator<Item = &'a Subject>, answers: Vec<u64>) {
+        // A node does not take its own name from itself, and other calls of its need not wait.
+        let told = tells
+            .into_iter()
+            .filter(|it| !matches!(it, Subject::Name(_)));
+        for subject in told {
+            self.in_flight.tells.add(subject, ());
+        }
+        self.in_flight.answers = answers;
+    }
+
+    /// The master has no unanswered calls any more, or the mirror has answered them. Returns whether something
+    /// waits for that.
+    pub fn settled(&mut self) -> bool {
+        self.in_flight = InFlight::default();
+        std::mem::take(&mut self.awaited)
+    }
+
+    /// The master notifies so many nodes of `subject`.
+    pub fn told_by_master(&mut self, now: Instant, subject: &Subject, nodes: usize) {
+        let until = self.told.add(now, subject, nodes);
+        self.outbox.renew_all(subject);
+        let about = self.under_way.about(now, subject);
+        let ports: HashSet<&str> = about.iter().map(|(_, port)| port.as_str()).collect();
+        self.repeats.drop_all_but(subject, &ports);
+        for (answer, port) in about {
+            // Its own call was run later, or is what the node is notified of.
+            if !self.in_flight.answers.contains(&answer) {
+                self.repeats.add(until, port, subject.clone());
+            }
+        }
+    }
+
+    /// The master that has notified nodes is gone: it sends nothing any more.
+    pub fn master_is_gone(&mut self) {
+        self.told = Told::default();
+    }
+
+    /// The node at `port` is to be notified by `call`, which a master would send now. What a master that is away
+    /// may have run, and is run again, may be older than what that one has told: the state is told instead.
+    pub fn notify(&mut self, port: &str, subject: Subject, call: Arc<Call>) {
+        let is_news = !self.in_flight.tells.has(&subject);
+        let content = is_news.then_some(Content::Call(call));
+        self.outbox
+            .add(port, subject, content.unwrap_or(Content::State));
+    }
+
+    /// The node at `port` is to be told the state of `subject` as it is when it is sent.
+    pub fn tell_state(&mut self, port: &str, subject: Subject) {
+        self.outbox.add(port, subject, Content::State);
+    }
+
+    /// As [`Self::tell_state`], but not before `at`.
+    pub fn tell_state_at(&mut self, at: Instant, port: &str, subject: Subject) {
+        self.repeats.add(at, port.to_owned(), subject);
+    }
+
+    /// The ports for which notifications wait and nobody sends them yet.
+    pub fn take_idle_ports(&mut self) -> Vec<String> {
+        self.outbox.take_idle_ports()
+    }
+
+    /// What to do next for the node at `port`.
+    pub fn next(&mut self, now: Instant, port: &str, mirror: &Master) -> Next {
+        self.under_way.forget(now);
+        while let Some(subject) = self.outbox.first(port) {
+            let answer = self.under_way.answer_to(now, port, subject);
+            let written = match answer {
+                Some(under_way::Answer::UnderWay { limit }) => {
+                    self.awaited = true;
+                    return Next::Wait { until: limit };
+                }
+                Some(under_way::Answer::Written { at }) if now < at + LEAD => {
+                    return Next::Wait {
+                        until: Some(at + LEAD),
+                    };
+                }
+                Some(under_way::Answer::Written { .. }) => true,
+                None => false,
+            };
+            let subject = subject.clone();
+            let told = self.told.until(now, &subject);
+            let is_being_told = self.in_flight.tells.has(&subject);
+            let Some(notification) = self.outbox.pop(port) else {
+                continue;
+            };
+            // Of two senders the slower one may tell what is older: the state goes last.
+            if is_being_told || told.is_some() && notification.is_state() {
+                let again = told.unwrap_or(now + REPEAT_AFTER);
+                self.repeats.add(again, port.to_owned(), subject);
+                continue;
+            }
+            let is_repeat = notification.is_repeat();
+            let Some(call) = self.outbox.call(port, notification, mirror) else {
+                continue;
+            };
+            if written && !is_repeat || told.is_some() {
+                let again = now + REPEAT_AFTER;
+                self.repeats.add(again, port.to_owned(), subject.clone());
+            }
+            let heard = Heard {
+                port: port.to_owned(),
+                subject,
+            };
+            let limit = Some(now + NOTIFICATION_LIMIT);
+            let kind = under_way::Kind::Notification;
+            let number = self.under_way.add(kind, vec![heard], limit);
+            return Next::Send { call, number };
+        }
+        self.outbox.remove(port);
+        Next::Idle
+    }
+
+    /// The node has taken the notification with this number, so that it takes what comes next later, or has not.
+    /// Returns whether something waits for that.
+    pub fn taken(&mut self, number: u64) -> bool {
+        self.under_way.remove(number);
+        std::mem::take(&mut self.awaited)
+    }
+
+    /// Drops what waits for the node at `port`.
+    pub fn drop_port(&mut self, port: &str) {
+        self.outbox.remove(port);
+    }
+
+    /// Drops all that waits: another computer notifies nodes from now on.
+    pub fn forget_notifications(&mut self) {
+        self.outbox.clear();
+        (self.told, self.repeats) = Default::default();
+    }
+
+    /// Queues what is to be told once more by now.
+    pub fn repeat(&mut self, now: Instant) {
+        while let Some((_, (subject, port))) = self.repeats.at.take_due(now) {
+            self.outbox.add(&port, subject, Content::StateAgain);
+        }
+    }
+
+    /// Whether [`Self::next_repeat`] has become earlier since the last time that this was asked.
+    pub fn has_new_repeat(&mut self) -> bool {
+        std::mem::take(&mut self.repeats.is_new)
+    }
+
+    /// When [`Self::repeat`] is due.
+    pub fn next_repeat(&self) -> Option<Instant> {
+        self.repeats.at.next()
+    }
+
+    /// Whether an answer to the node at `port` about `subject` is under way, and until when it holds up others.
+    pub fn is_under_way(&mut self, now: Instant, port: &str, subject: &Subject) -> Option<Held> {
+        match self.under_way.answer_to(now, port, subject)? {
+            under_way::Answer::UnderWay { limit } => {
+                self.awaited = true;
+                Some(Held { until: limit })
+            }
+            under_way::Answer::Written { .. } => None,
+        }
+    }
+}
+
+/// Of what the master may still be notifying nodes.
+#[derive(Debug, Default)]
+struct Told {
+    /// Until when, the latest time for each subject.
+    until: BySubject<Instant>,
+    ends: Schedule<Subject>,
+    /// When the master will have sent everything, as far as can be told.
+    busy: Option<Instant>,
+}
+
+impl Told {
+    /// It has begun to notify so many nodes. Returns when it will have done so.
+    fn add(&mut self, now: Instant, subject: &Subject, nodes: usize) -> Instant {
+        self.forget(now);
+        let takes = MASTER_TAKES * u32::try_from(nodes).unwrap_or(u32::MAX);
+        let busy = self.busy.map_or(now, |busy| busy.max(now));
+        let busy = (busy + takes.min(BACKLOG_MOST)).min(now + BACKLOG_MOST);
+        self.busy = Some(busy);
+        let until = busy + REPEAT_AFTER;
+        if let Some(before) = self.ends.set(subject.clone(), until) {
+            self.until.remove(subject, before);
+        }
+        self.until.add(subject, until);
+        until
+    }
+
+    fn until(&mut self, now: Instant, subject: &Subject) -> Option<Instant> {
+        self.forget(now);
+        self.until.about(subject).max()
+    }
+
+    fn forget(&mut self, now: Instant) {
+        while let Some((until, subject)) = self.ends.take_due(now) {
+            self.until.remove(&subject, until);
+        }
+    }
+}
+
+/// What nodes are told once more, by port, after the last time that they might have read it in the wrong order.
+#[derive(Debug, Default)]
+struct Repeats {
+    at: Schedule<(Subject, String)>,
+    is_new: bool,
+}
+
+impl Repeats {
+    fn add(&mut self, at: Instant, port: String, subject: Subject) {
+        self.is_new |= self.at.next().is_none_or(|next| at < next);
+        self.at.set((subject, port), at);
+    }
+
+    /// The nodes at other ports than `kept` are not told of `subject` once more.
+    fn drop_all_but(&mut self, subject: &Subject, kept: &HashSet<&str>) {
+        let from = (subject.clone(), String::new());
+        let about = self.at.at.range(from..);
+        let about = about.take_while(|((of, _), _)| of == subject);
+        let others = about.filter(|((_, port), _)| !kept.contains(port.as_str()));
+        let others: Vec<_> = others.map(|(thing, at)| (*at, thing.clone())).collect();
+        for (at, thing) in others {
+            self.at.at.remove(&thing);
+            self.at.queue.remove(&(at, thing));
+        }
+    }
+}
+
+/// When each of several things is due.
+#[derive(Debug)]
+struct Schedule<T> {
+    at: BTreeMap<T, Instant>,
+    queue: BTreeSet<(Instant, T)>,
+}
+
+impl<T> Default for Schedule<T> {
+    fn default() -> Self {
+        Self {
+            at: BTreeMap::new(),
+            queue: BTreeSet::new(),
+        }
+    }
+}
+
+impl<T: Clone + Ord> Schedule<T> {
+    /// Returns when it was due before.
+    fn set(&mut self, thing: T, at: Instant) -> Option<Instant> {
+        let before = self.at.insert(thing.clone(), at);
+        if let Some(before) = before {
+            self.queue.remove(&(before, thing.clone()));
+        }
+        self.queue.insert((at, thing));
+        before
+    }
+
+    fn take_due(&mut self, now: Instant) -> Option<(Instant, T)> {
+        self.next().filter(|at| *at <= now)?;
+        let (at, thing) = self.queue.pop_first()?;
+        self.at.remove(&thing);
+        Some((at, thing))
+    }
+
+    fn next(&self) -> Option<Instant> {
+        self.queue.first().map(|(at, _)| *at)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,155 @@
+//! What a call has to do with what nodes hear.
+
+use crate::{
+    health::port_of,
+    master::{Master, Method, Request, names},
+};
+
+/// What a node can be told of.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Subject {
+    /// The publishers of a topic, by its resolved name.
+    Topic(String),
+    /// A parameter, by its resolved key, which ends in a slash. It concerns those above and below it.
+    Param(String),
+    /// A node's own name: a node is shut down when another one takes its name.
+    Name(String),
+}
+
+impl Subject {
+    /// Whether news about the one is news about the other.
+    pub fn concerns(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Param(one), Self::Param(other)) => {
+                one.starts_with(other.as_str()) || other.starts_with(one.as_str())
+            }
+            _ => self == other,
+        }
+    }
+}
+
+/// Of what the node at a port hears by an answer or a notification.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Heard {
+    /// See [`port_of`].
+    pub port: String,
+    pub subject: Subject,
+}
+
+/// What a write has to do with what nodes hear.
+#[derive(Clone, Debug, Default)]
+pub struct Concern {
+    /// Of what it may have nodes notified.
+    tells: Vec<Subject>,
+    /// Of what its answer tells the caller.
+    hears: Vec<Heard>,
+    /// The address that it registers.
+    port: Option<String>,
+    /// It may do anything: it cannot be decoded.
+    anything: bool,
+}
+
+impl Concern {
+    /// That of a call; none if it could not be decoded.
+    pub fn of(call: Option<&Request>) -> Self {
+        let Some(call) = call else {
+            return Self {
+                anything: true,
+                ..Self::default()
+            };
+        };
+        let mut concern = Self::default();
+        match call.method() {
+            Method::Multicall => call.calls().into_iter().for_each(|call| concern.add(call)),
+            _ => concern.add(call),
+        }
+        concern
+    }
+
+    fn add(&mut self, call: &Request) {
+        let Some(caller) = call.caller() else { return };
+        let resolved = |at: usize| {
+            let name = call.text(at).filter(|name| !name.is_empty())?;
+            Some(names::resolve(name, caller))
+        };
+        let topic = || resolved(1).map(Subject::Topic);
+        let param = |at| resolved(at).map(|key| Subject::Param(names::param_key(&key)));
+        match call.method() {
+            Method::RegisterPublisher | Method::UnregisterPublisher => self.tells.extend(topic()),
+            Method::SetParam | Method::DeleteParam => self.tells.extend(param(1)),
+            _ => {}
+        }
+        let Some((node, api)) = call.registrant() else {
+            return;
+        };
+        let port = port_of(api);
+        let subject = match call.method() {
+            Method::RegisterSubscriber => topic(),
+            Method::SubscribeParam => param(2),
+            _ => None,
+        };
+        // The holder of the name is shut down if it is at another address.
+        let name = Subject::Name(node.to_owned());
+        self.tells.push(name.clone());
+        let subjects = [Some(name), subject].into_iter().flatten();
+        self.hears.extend(subjects.map(|subject| Heard {
+            port: port.to_owned(),
+            subject,
+        }));
+        self.port.get_or_insert_with(|| port.to_owned());
+    }
+
+    /// Of what it may have nodes notified.
+    pub fn tells(&self) -> &[Subject] {
+        &self.tells
+    }
+
+    pub fn is_anything(&self) -> bool {
+        self.anything
+    }
+
+    /// A node does not shut itself down: the port of the caller, for its own name.
+    pub(super) fn port_if_name(&self, subject: &Subject) -> Option<&str> {
+        match subject {
+            Subject::Name(_) => self.port.as_deref(),
+            _ => None,
+        }
+    }
+
+    /// Of what its answer tells the caller.
+    pub fn heard(&self) -> Vec<Heard> {
+        self.hears.clone()
+    }
+
+    /// All that it is about.
+    pub fn subjects(&self) -> impl Iterator<Item = &Subject> {
+        self.tells
+            .iter()
+            .chain(self.hears.iter().map(|heard| &heard.subject))
+    }
+}
+
+/// Of what the answer to a read tells the caller: parameters that it subscribes. roscpp keeps what `getParam`
+/// returns for the value until it hears of a newer one.
+pub fn heard_by_read(read: &Request, mirror: &Master) -> Vec<Heard> {
+    let of = |call: &Request| {
+        let (caller, key) = (call.caller()?, call.text(1)?);
+        if *call.method() != Method::GetParam || key.is_empty() || !mirror.subscribes_params(caller)
+        {
+            return None;
+        }
+        let key = names::param_key(&names::resolve(key, caller));
+        let mut subscribed = mirror.param_subscriptions(caller);
+        if !subscribed.any(|other| other.starts_with(&key) || key.starts_with(other)) {
+            return None;
+        }
+        Some(Heard {
+            port: port_of(mirror.api_of(caller)?).to_owned(),
+            subject: Subject::Param(key),
+        })
+    };
+    match read.method() {
+        Method::Multicall => read.calls().into_iter().filter_map(of).collect(),
+        _ => of(read).into_iter().collect(),
+    }
+}
