@@ -204,7 +204,12 @@ fn traps_in_the_environment() {
     let scratch = Scratch::new();
     let port = free_port();
     for (key, value, subject, words) in [
-        ("ROS_IP", "127.0.0.1 ", "ROS_IP", "begins or ends with a space"),
+        (
+            "ROS_IP",
+            "127.0.0.1 ",
+            "ROS_IP",
+            "begins or ends with a space",
+        ),
         (
             "ROS_IP",
             "192.0.2.1",

@@ -188,10 +188,7 @@ fn it_waits_until_another_computer_leads_and_says_which() {
 fn one_computer_hands_over_to_nobody() {
     let robot = Robot::start(Mode::Core);
     let alone = Tool::rosrescue(&robot.scratch, robot.port(), &["handover"]);
-    assert!(
-        alone.stderr.contains("runs without --cluster"),
-        "{alone:?}"
-    );
+    assert!(alone.stderr.contains("runs without --cluster"), "{alone:?}");
     alone.ended(1);
     Tool::rosrescue(&robot.scratch, free_port(), &["handover"]).ended(3);
 }

@@ -1,4 +1,4 @@
-//! Converts a checkpoint to and from text. Pure; [`store`](crate::checkpoint::store) handles the file.
+//! Converts a checkpoint to and from text. Pure: the crate `checkpoint-store` handles the file.
 //!
 //! A checkpoint is one YAML document: a first line (a comment) with lengths and check sums, the snapshot in
 //! block style, and as its last key `journal:`, under which each appended line is one [`Record`] in flow

@@ -49,8 +49,8 @@ const MISMATCHES_MAX: usize = 20;
 /// # Example
 ///
 /// ```
-/// use rescue_core::master::{Master, Method, Request};
 /// use rescue_core::replay::{Plan, Token};
+/// use ros1_master::master::{Master, Method, Request};
 ///
 /// let mut before = Master::default();
 /// before.apply(&Request::new(Method::SetParam, ["/node", "/robot", "r2d2"]));
@@ -60,7 +60,7 @@ const MISMATCHES_MAX: usize = 20;
 /// let reply = new.apply(&Request::decode(plan.request())?).reply;
 /// assert_eq!(plan.verify(&reply), Ok(()));
 /// assert_eq!(new.params(), before.params());
-/// # Ok::<(), rescue_core::xmlrpc::DecodeError>(())
+/// # Ok::<(), ros1_master::xmlrpc::DecodeError>(())
 /// ```
 #[derive(Clone, Debug)]
 pub struct Plan {
