@@ -15,7 +15,7 @@ const AGE_MAX: Duration = Duration::from_millis(500);
 #[derive(Debug)]
 pub(crate) enum Next {
     /// The master has left the connection of the last call open.
-    Kept(Verified),
+    Kept(Box<Verified>),
     /// The master closes each connection after one answer, so the next one is made ahead. The next call
     /// then does not wait until the master has accepted it. The moment is that of its beginning.
     Ahead(AbortOnDropHandle<Result<Verified, VerifyError>>, Instant),
@@ -30,7 +30,7 @@ impl Next {
         connect: impl Future<Output = Result<Verified, VerifyError>> + Send + 'static,
     ) -> Option<Self> {
         if reply.leaves_connection_usable() {
-            return Some(Self::Kept(verified));
+            return Some(Self::Kept(Box::new(verified)));
         }
         let useful = reply.status.is_success() && verified.stays_verified();
         let connect = async {
@@ -53,7 +53,7 @@ impl Next {
     /// Waits for the connection. Returns none if it has ended, or could not be made.
     pub(crate) async fn ready(self) -> Option<Verified> {
         match self {
-            Self::Kept(verified) => Some(verified),
+            Self::Kept(verified) => Some(*verified),
             Self::Ahead(made, _) => {
                 let mut verified = made.await.ok()?.ok()?;
                 (!verified.connection.is_closed()).then_some(verified)

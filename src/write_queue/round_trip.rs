@@ -89,7 +89,7 @@ pub(super) async fn round_trip(
     };
     let connection = match &result {
         Ok(Received::Reply(reply)) => Next::after(verified, reply, connect(link, token)),
-        Ok(Received::Held(_)) => Some(Next::Kept(verified)),
+        Ok(Received::Held(_)) => Some(Next::Kept(Box::new(verified))),
         Err(_) => None,
     };
     Done {

@@ -38,7 +38,7 @@ type List = (String, String, Vec<String>);
 enum Moment {
     /// It sends that to the node at this address. A multicall passes through states that nobody sees.
     Notice(String, Call),
-    State(Master),
+    State(Box<Master>),
 }
 
 impl Moment {
@@ -103,7 +103,7 @@ impl TrueLists {
 
     /// All that was heard up to this state has been judged.
     pub(crate) fn settled(&mut self, model: &Master) {
-        self.course = vec![Moment::State(model.clone())];
+        self.course = vec![Moment::State(Box::new(model.clone()))];
     }
 
     /// The first call that tells the node at `api` what was over before another one, which it has heard earlier.
@@ -126,7 +126,7 @@ impl TrueLists {
     /// What is true in that state.
     pub(crate) fn add(&mut self, model: &Master) {
         self.states_since.push(model.clone());
-        self.course.push(Moment::State(model.clone()));
+        self.course.push(Moment::State(Box::new(model.clone())));
         let mut subscribers = HashSet::new();
         for topic in model.subscribed_topics() {
             let publishers = model.publishers_of(topic);
