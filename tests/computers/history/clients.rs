@@ -169,8 +169,8 @@ impl Clients {
     pub(crate) fn end(&self, state: &State) -> End {
         let mut values = BTreeMap::new();
         for key in self.shared.keys() {
-            let names = key.split('/').skip(1);
-            let found = names.fold(Some(&state.params), |at, name| at?.as_struct()?.get(name));
+            let mut names = key.split('/').skip(1);
+            let found = names.try_fold(&state.params, |at, name| at.as_struct()?.get(name));
             values.extend(found.and_then(Value::as_int).map(|value| (key, value)));
         }
         let told = self.subscribers.iter().flat_map(|node| {

@@ -168,7 +168,9 @@ fn units_of_systemd() {
         with(Kind::Roslaunch, true),
     );
     assert_eq!(said(with(Kind::Roscore, false)), []);
-    one(Note, "systemd", "no unit", |facts| facts.units.clear());
+    one(Note, "systemd", "no rosrescue service", |facts| {
+        facts.units.clear()
+    });
     one(Note, "systemd", "does not start at boot", |facts| {
         facts.units[0].is_enabled = false;
     });
