@@ -12,7 +12,7 @@ quick:
 test:
     tests/run.sh
 
-# The tables of benches/results.md
+# Print the tables of benches/results.md
 bench:
     cargo bench --bench pauses
     cargo bench --bench table1
