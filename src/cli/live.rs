@@ -50,14 +50,9 @@ pub struct WaitArgs {
     /// Which one.
     #[command(flatten)]
     pub target: TargetArgs,
-<<<<<<< HEAD
-    /// What to wait for: `answered` (rosrescue answers calls), `master` (a master is available), `protected`
-    /// (a master, and every change is recorded), or the /NAME of a node. With several, for all of them
-=======
     /// What to wait for: `answered`, `master`, `protected`, or the /NAME of a node. `answered`: rosrescue answers
     /// calls. `master`: a master does. `protected`: rosrescue also records every change. With several, for all
     /// of them
->>>>>>> 68fa907 (wait: what each word means)
     #[arg(long = "for", env = "ROSRESCUE_WAIT_FOR", value_name = "WHAT")]
     #[arg(value_delimiter = ',', num_args = 1.., default_value = "answered")]
     pub wanted: Vec<For>,
