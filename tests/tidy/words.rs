@@ -1,0 +1,277 @@
+//! Plain English: phrases that must not come back, and sentences that are too long to read once.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use clap::CommandFactory;
+use regex::Regex;
+use rosrescue::cli::Cli;
+
+use super::{read, root};
+
+/// Phrases that confuse readers, each with what to write instead. A space stands for any blanks, line breaks and
+/// underscores, so that names are checked as well.
+const PHRASES: &[(&str, &str)] = &[
+    ("a line a message", "one line per message"),
+    ("a time alone", "while it was cut off"),
+    ("times alone", "while it was cut off"),
+    ("and tries again", "retrying"),
+    ("anew", "again"),
+    ("are to be asked", "must be asked"),
+    ("are to be done", "must be done"),
+    ("are to be told", "must be told"),
+    ("is to be asked", "must be asked"),
+    ("is to be done", "must be done"),
+    ("is to be told", "must be told"),
+    ("as ever", "as usual"),
+    ("cease to", "stop"),
+    ("ceases to", "stops"),
+    ("that did not hold", "that was lost"),
+    ("does not give what", "failed"),
+    ("gave way", "was closed"),
+    ("give way", "yield, be closed"),
+    ("gives way", "yields, is closed"),
+    ("giving way", "yielding"),
+    ("has to be told", "must be told"),
+    ("heard of last", "last heard from"),
+    ("in the place of", "in place of"),
+    ("in vain", "timed out"),
+    ("is tried again", "retrying"),
+    ("keeps its word", "works"),
+    ("makes a service of", "installs as a service"),
+    ("not so after", "timed out after"),
+    ("past rosrescue", "bypasses rosrescue"),
+    ("reign", "term"),
+    ("so that nobody", "(leave it out)"),
+    ("somebody else's", "another program's, started by others"),
+    ("are taken out", "are unregistered"),
+    ("is taken out", "is unregistered"),
+    ("was taken out", "was unregistered"),
+    ("take out nodes", "unregister nodes"),
+    ("two minds", "split-brain"),
+    ("what is not so", "what is wrong"),
+    ("what is so", "the present state"),
+    ("when the system likes", "leave it to the operating system"),
+    ("whoever", "(name the program or person)"),
+];
+
+/// The most words of a sentence in `--help`.
+const HELP_WORDS: usize = 25;
+/// The most words of a sentence in the documents that a new user reads first.
+const GUIDE_WORDS: usize = 30;
+
+/// Files and folders whose words are not checked: this list, history, the examples of how to write, and what still says
+/// "a time alone": the code of several computers with its log lines.
+const UNCHECKED: [&str; 11] = [
+    "tests/tidy/words.rs",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "crates/rescue-core/src/cluster",
+    "crates/rescue-core/src/cluster.rs",
+    "src/app/cluster",
+    "src/app/cluster.rs",
+    "src/cluster",
+    "src/cluster.rs",
+    "tests/computers",
+    "docs/operations.md",
+];
+
+/// Tracked files whose words are checked: code, scripts and documents, but neither this list nor history.
+fn files() -> Vec<PathBuf> {
+    let listed = Command::new("git")
+        .args([
+            "ls-files",
+            "-z",
+            "--cached",
+            "--others",
+            "--exclude-standard",
+        ])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    let listed = String::from_utf8(listed.stdout).unwrap();
+    let kinds = ["rs", "md", "sh", "py", "js", "html", "yaml", "toml", "in"];
+    let files = listed.split('\0').map(Path::new).filter(|path| {
+        let is_text = path
+            .extension()
+            .is_some_and(|kind| kinds.iter().any(|known| kind == *known));
+        let is_exempt = UNCHECKED.iter().any(|exempt| path.starts_with(exempt));
+        is_text && !is_exempt && root().join(path).is_file()
+    });
+    files.map(Path::to_owned).collect()
+}
+
+/// `text` in small letters, with one blank for blanks, line breaks, underscores, and marks of comments and continued
+/// strings; and the line of each byte.
+fn joined(text: &str) -> (String, Vec<usize>) {
+    let (mut flat, mut lines) = (String::new(), Vec::new());
+    for (number, line) in text.lines().enumerate() {
+        let line = line.trim_start_matches([' ', '/', '!', '#', '*', '>', '\t']);
+        let words = line.trim_end_matches('\\').to_ascii_lowercase();
+        for word in words.split([' ', '_']).filter(|word| !word.is_empty()) {
+            flat.push_str(word);
+            flat.push(' ');
+            lines.resize(flat.len(), number + 1);
+        }
+    }
+    (flat, lines)
+}
+
+/// The phrases in `text`, each with its line and what to write instead.
+fn phrases(text: &str) -> Vec<(usize, &'static str, &'static str)> {
+    let (flat, lines) = joined(text);
+    let is_letter = |at: Option<usize>| {
+        at.and_then(|at| flat.as_bytes().get(at))
+            .is_some_and(u8::is_ascii_alphabetic)
+    };
+    let mut found = Vec::new();
+    for (phrase, instead) in PHRASES {
+        for (at, _) in flat.match_indices(phrase) {
+            if !is_letter(at.checked_sub(1)) && !is_letter(Some(at + phrase.len())) {
+                found.push((lines[at], *phrase, *instead));
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn phrases_that_confuse_do_not_come_back() {
+    for bad in [
+        "/// This is somebody\n    /// else's.",
+        "fn waits_in_vain() {",
+        "\"a dead node is taken \\\n     out\"",
+    ] {
+        assert_eq!(phrases(bad).len(), 1, "{bad}");
+    }
+    assert!(phrases("a main vein; sovereign; renewal").is_empty());
+    let files = files();
+    assert!(files.len() > 300, "the files are not listed");
+    let mut found = Vec::new();
+    for file in files {
+        for (line, phrase, instead) in phrases(&read(&file)) {
+            found.push(format!(
+                "{}:{line}: {phrase:?}; write: {instead}",
+                file.display()
+            ));
+        }
+    }
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+/// The sentences of a paragraph. Code between backticks counts as one word, a link as its text.
+fn sentences(paragraph: &str) -> Vec<String> {
+    let code = Regex::new("`[^`]*`").unwrap();
+    let link = Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap();
+    let end = Regex::new(r"[.!?]\)?(?:\s+|$)").unwrap();
+    let plain = link.replace_all(paragraph, "$1");
+    let plain = code.replace_all(&plain, "code");
+    end.split(&plain).map(str::to_owned).collect()
+}
+
+/// The sentences of `paragraph` with more than `most` words.
+fn long(paragraph: &str, most: usize) -> Vec<String> {
+    let is_word = |word: &&str| word.chars().any(char::is_alphanumeric);
+    let mut sentences = sentences(paragraph);
+    sentences.retain(|sentence| sentence.split_whitespace().filter(is_word).count() > most);
+    sentences
+}
+
+/// Collects the long sentences in the help of `command` and its subcommands.
+fn long_in_help(command: &clap::Command, found: &mut Vec<String>) {
+    let default = Regex::new(r"\[default: [^\]]*\]").unwrap();
+    let mut texts: Vec<String> = Vec::new();
+    let own = [
+        command.get_about(),
+        command.get_long_about(),
+        command.get_after_help(),
+        command.get_after_long_help(),
+    ];
+    texts.extend(own.into_iter().flatten().map(ToString::to_string));
+    for argument in command.get_arguments() {
+        let help = [argument.get_help(), argument.get_long_help()];
+        texts.extend(help.into_iter().flatten().map(ToString::to_string));
+        let values = argument.get_possible_values();
+        let help = values.iter().filter_map(|value| value.get_help());
+        texts.extend(help.map(ToString::to_string));
+    }
+    for text in texts {
+        // Indented lines are examples of commands, and a default in brackets is no sentence.
+        let lines: Vec<_> = text
+            .lines()
+            .filter(|line| !line.starts_with("  "))
+            .collect();
+        let text = default.replace_all(&lines.join("\n"), "").into_owned();
+        for paragraph in text.split("\n\n").flat_map(|part| part.split("\n- ")) {
+            for sentence in long(paragraph, HELP_WORDS) {
+                found.push(format!("{}: {sentence}", command.get_name()));
+            }
+        }
+    }
+    for command in command.get_subcommands() {
+        long_in_help(command, found);
+    }
+}
+
+#[test]
+fn help_has_short_sentences() {
+    let mut found = Vec::new();
+    long_in_help(&Cli::command(), &mut found);
+    found.sort();
+    found.dedup();
+    assert!(found.is_empty(), "{found:#?}");
+}
+
+/// The paragraphs, list items and table cells of a document, without its code.
+fn paragraphs(document: &str) -> Vec<String> {
+    let mut paragraphs = Vec::new();
+    let mut present = String::new();
+    let mut is_code = false;
+    for line in document.lines() {
+        let text = line.trim();
+        if text.starts_with("```") {
+            is_code = !is_code;
+        }
+        let is_indented = line.starts_with("    ") && present.is_empty();
+        let begins = text.is_empty()
+            || text.starts_with(['#', '|', '!', '<', '>'])
+            || text.starts_with("* ")
+            || text.starts_with("- ")
+            || text
+                .split_once(". ")
+                .is_some_and(|(number, _)| number.parse::<u32>().is_ok());
+        if begins || is_code {
+            paragraphs.push(std::mem::take(&mut present));
+        }
+        if is_code || is_indented || text.is_empty() || text.starts_with(['#', '!', '<']) {
+            continue;
+        }
+        match text.starts_with('|') {
+            true => paragraphs.extend(text.split('|').map(str::to_owned)),
+            false => present = format!("{present} {text}"),
+        }
+    }
+    paragraphs.push(present);
+    paragraphs
+}
+
+#[test]
+fn the_first_documents_have_short_sentences() {
+    let twenty = "word ".repeat(20);
+    let text =
+        format!("# Title\n{twenty}\n{twenty}.\n\n    {twenty}{twenty}\n| {twenty} | {twenty} |\n");
+    let found = paragraphs(&text);
+    let found = found.iter().map(|part| long(part, GUIDE_WORDS).len());
+    assert_eq!(found.sum::<usize>(), 1);
+    for file in ["README.md", "ROS_MASTER_URI.md"] {
+        let text = read(file);
+        let found = paragraphs(&text);
+        let found: Vec<_> = found
+            .iter()
+            .flat_map(|part| long(part, GUIDE_WORDS))
+            .collect();
+        assert!(found.is_empty(), "{file}: {found:#?}");
+    }
+}
