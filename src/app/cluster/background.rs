@@ -25,7 +25,7 @@ const SNAPSHOT_PAUSE: Duration = Duration::from_secs(5);
 /// How long etcd may take for what nobody waits for.
 const LIMIT: Duration = Duration::from_secs(5);
 
-/// Why etcd does not give what is asked, and when it has given anything last.
+/// Why etcd request failed, and when it has given anything last.
 #[derive(Debug)]
 pub(super) struct Trouble(Mutex<(Option<(Instant, String)>, Instant)>);
 
@@ -52,12 +52,7 @@ impl Trouble {
         match trouble {
             Some((_, said)) => *said = text,
             None => {
-                alarm!(
-                    warn,
-                    TROUBLE,
-                    error = text,
-                    "etcd does not give what is asked; it is asked again"
-                );
+                alarm!(warn, TROUBLE, error = text, "etcd request failed; retrying");
                 *trouble = Some((Instant::now(), text));
             }
         }

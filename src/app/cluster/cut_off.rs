@@ -83,7 +83,7 @@ impl CutOff {
             }
             Some(opened)
         });
-        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "the writes of a time alone cannot be read, and are not sent");
+        let unread = |error: &dyn std::fmt::Display| tracing::error!(%error, "cannot read the writes made while this computer was cut off; they are not sent");
         let (store, loaded) = match opened.await {
             Some(None) => return None,
             Some(Some(Ok((store, loaded)))) => (store, loaded?),
@@ -105,7 +105,7 @@ impl CutOff {
         }
         tracing::info!(
             calls = time.pending.len(),
-            "an earlier process was alone; its writes are sent when a computer leads"
+            "an earlier process was cut off; its writes are sent once there is a leader"
         );
         let mut this = Self::of(time);
         this.write(store).await;
@@ -348,7 +348,7 @@ fn remove_files(path: PathBuf) {
             tracing::warn!(
                 path = %path.display(),
                 %error,
-                "writes that were sent cannot be removed and would be sent again; remove the file"
+                "cannot delete the file of writes that were sent; delete it, or they are sent again"
             );
         }
     }
@@ -359,10 +359,12 @@ fn keep_of_session(store: &mut Store) {
     match store.set_aside("session") {
         Ok(Some(kept)) => tracing::warn!(
             kept = %kept.display(),
-            "writes of a time alone belong to a session that is over; they are kept, and not sent"
+            "writes made while cut off belong to an ended session; they are kept in a file, not sent"
         ),
         Ok(None) => {}
-        Err(error) => tracing::error!(%error, "the writes of a time alone cannot be kept"),
+        Err(error) => {
+            tracing::error!(%error, "cannot store the writes of an ended session under another name")
+        }
     }
 }
 

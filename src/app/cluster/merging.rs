@@ -133,7 +133,7 @@ pub(super) async fn send(time: Time, mut present: Present, route: Route, hide: &
     tracing::info!(
         sent = report.sent,
         lost = report.lost,
-        "the writes of a time alone were sent to the leader"
+        "sent the writes made while cut off to the leader"
     );
     report.lost
 }
@@ -174,7 +174,7 @@ impl Report<'_> {
                         method,
                         node,
                         text,
-                        "a write that was answered while this computer was alone is refused by the leader"
+                        "the leader refused a write made while this computer was cut off"
                     );
                 }
                 Outcome::Lost { why, present } => {
@@ -188,7 +188,7 @@ impl Report<'_> {
                                 node,
                                 %alone,
                                 %others,
-                                "what was written while this computer was alone does not hold: {why}"
+                                "a write made while this computer was cut off was lost: {why}"
                             );
                         }
                         None => {
@@ -205,7 +205,7 @@ impl Report<'_> {
                 method,
                 node,
                 count,
-                "what was written while this computer was alone does not hold: {why}"
+                "a write made while this computer was cut off was lost: {why}"
             );
         }
     }

@@ -324,7 +324,7 @@ impl Member {
                     match replica.prepare(term, &parts).await {
                         Ok(leads) => Some(leads),
                         Err(error) => {
-                            rarely!(warn, %error, "a large write is not in etcd yet, and is tried again");
+                            rarely!(warn, %error, "a large write is not in etcd yet; retrying");
                             tokio::time::sleep(super::AGAIN).await;
                             None
                         }
