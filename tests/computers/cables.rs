@@ -126,7 +126,7 @@ fn a_computer_that_is_cut_off_twice_goes_on_from_what_it_said_before() {
         await_param(&fleet, &format!("/written_{value}"), value);
     }
     let lonely = &fleet.computers[cut];
-    assert!(lonely.logged("was lost").is_empty());
+    assert!(lonely.logged("cut off was lost").is_empty());
     assert!(lonely.logged("cannot be kept").is_empty());
     fleet.await_same_state();
     fleet.assert_nodes_live();

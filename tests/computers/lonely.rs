@@ -78,7 +78,7 @@ fn what_others_wrote_meanwhile_wins_and_each_write_that_is_lost_is_reported() {
     eventually("the lost writes are counted", || {
         lost_writes(lonely) == Some(3)
     });
-    let lines = lonely.logged("was lost");
+    let lines = lonely.logged("cut off was lost");
     assert_eq!(lines.len(), 3, "{lines:#?}");
     for (key, alone, others) in [
         ("`/estop`", "alone=0", "others=1"),
