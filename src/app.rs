@@ -1,10 +1,6 @@
 //! Assembles the program: startup, running, and orderly stop.
 
-use std::{
-    io,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{io, sync::Arc, time::Duration};
 
 use hyper::header::{HeaderValue, InvalidHeaderValue};
 use thiserror::Error;
@@ -12,34 +8,21 @@ use tokio::{net::TcpListener, sync::Semaphore, task::JoinSet};
 use tokio_util::{sync::CancellationToken, task::TaskTracker};
 
 use crate::{
-    checkpoint::store::{OpenError, history},
-    clock,
+    checkpoint::store::OpenError,
     cluster::etcd::EtcdError,
     config::{Config, MasterConfig},
-    gate::{self, State},
-    guardian::handover::{self, Sockets},
+    gate::State,
+    guardian::handover::Sockets,
     ledger::{Ledger, checkpointer::Checkpointer, journal::DISK_PATIENCE},
-    lifecycle::{Action, Patience, Supervision},
-    nodes::{self, Nodes, served::Served},
+    lifecycle::Action,
+    nodes,
     process::{ProcessError, Rosmaster, bypass},
-    recovery::{Driver, report_file},
+    recovery::{Driver, master_process::MasterProcess},
     ros_env::MasterUri,
-    server::{
-        Server,
-        access::Access,
-        answers::Answers,
-        body,
-        calls::Calls,
-        clients::Clients,
-        idle::Idle,
-        listener,
-        pages::{Pages, status::Rate},
-    },
-    status::{Board, Earlier, Mode, stats::Stats},
-    upstream::{Upstream, pool::Pool},
-    wait, write_queue,
+    server::{Server, listener, others::Others},
 };
 
+mod assemble;
 mod cluster;
 mod duty;
 mod earlier;
@@ -48,17 +31,14 @@ mod notify;
 mod startup;
 
 use self::{
+    assemble::{Identity, assemble, last_master, server},
     cluster::Member,
-    duty::Post,
-    notify::Source,
-    startup::{Beginning, begin, kernel_id},
+    duty::Parts,
+    startup::{begin, kernel_id},
 };
 
 /// How long connections may take to end when rosrescue stops.
 const DRAIN: Duration = Duration::from_millis(500);
-/// How long a start waits for the reports of earlier rescues. Calls wait during this time.
-const REPORTS: Duration = Duration::from_secs(1);
-
 /// Why rosrescue cannot start or continue. The exit status is 1.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -115,217 +95,95 @@ pub async fn run(
     let listeners = listeners.into_iter().map(TcpListener::from_std);
     let listeners = listeners.collect::<io::Result<Vec<_>>>()?;
     let supervised = match &config.master {
-        MasterConfig::Supervised(supervised) => Some((
-            supervised.clone(),
-            Rosmaster::find(supervised, &config.checkpoint)?,
-        )),
+        MasterConfig::Supervised(master) => Some(Supervised {
+            rosmaster: Rosmaster::find(master, &config.checkpoint)?,
+            rosout: master.rosout,
+        }),
         MasterConfig::External(_) => None,
     };
     let beginning = begin(&config).await?;
-    let uri = config.advertised.to_string();
-    say(&format!("ROS_MASTER_URI={uri}"));
+    say(&format!("ROS_MASTER_URI={}", config.advertised));
     say(&format!("checkpoint: {}", config.checkpoint.display()));
     say(&beginning.story);
-    let last = beginning.session.master_uri.as_deref();
-    let last = last.and_then(|uri| MasterUri::parse(uri).ok());
-    // A recorded master cannot be at rosrescue's own port.
-    let last = last.filter(|uri| uri.port != config.advertised.port);
-    let address = match (&config.master, &last) {
-        (MasterConfig::External(address), _) => address.clone(),
-        (_, Some(last)) => last.clone(),
-        // A placeholder until there is a master.
-        (_, None) => MasterUri {
-            host: "127.0.0.1".to_owned(),
-            port: 0,
-        },
-    };
-    let rosout = supervised.as_ref().map(|(config, _)| config.rosout);
-    let port = last.map(|uri| uri.port);
-    let rosmaster = supervised.map(|(_, rosmaster)| rosmaster);
+    let restored = beginning.restored;
+    let last = last_master(&config, &beginning.session);
+    // It marks our requests: one that comes back shows that the master's address is our own.
     let instance = kernel_id("/proc/sys/kernel/random/uuid");
-    let Beginning {
-        mirror,
-        session,
-        pending,
-        displaced,
-        store,
-        restored,
-        died,
-        ..
-    } = beginning;
-    let mut earlier = match &store {
-        Some(store) => {
-            let (path, id) = (store.path().to_owned(), session.id.clone());
-            let read = move || report_file::earlier(&path, &id, died, history::last_rescue(&path));
-            wait::within(REPORTS, read).await.unwrap_or_default()
-        }
-        None => Earlier::default(),
-    };
-    earlier.worker_restarts = earlier.worker_restarts.max(handover::restarts());
-    // The statistics live as long as the process.
-    let stats: &'static Stats = Box::leak(Box::default());
-    let (gate_tx, gate) = gate::gate();
-    let (mode, supervision) = match rosmaster {
-        Some(_) => (Mode::Core, Supervision::Ours),
-        None => (Mode::Proxy, Supervision::Theirs),
-    };
-    let (board, slow, looped) = (Arc::new(Board::new(mode)), Arc::default(), Arc::default());
-    let removed = earlier.reports.iter().flat_map(|report| {
-        let at = clock::moment_of(report.detected_at);
-        report.removed.iter().map(move |node| (node.clone(), at))
-    });
-    let removed: Vec<_> = removed.collect();
-    board.update(|facts| facts.go_on(earlier));
-    let ledger = Arc::new(Ledger::new(
-        mirror,
-        session,
-        pending,
-        store,
-        config.sync,
-        stats,
-    ));
-    // In a cluster each leader starts with a new master.
-    if restored && config.cluster.is_none() {
-        ledger.set_unconfirmed();
-        ledger.with_activity(|_, activity| activity.restore_displaced(displaced));
-    }
-    let pid = i32::try_from(std::process::id()).unwrap_or(-1);
-    ledger.set_identity(pid, uri.clone());
-    let upstream = Arc::new(Upstream::new(
-        address,
-        HeaderValue::from_str(&instance)?,
-        config.probe_timeout,
-        config.probing.count,
-    ));
-    let (write_queue, drain) = write_queue::write_queue(
-        ledger.clone(),
-        upstream.clone(),
-        gate.clone(),
-        stats,
-        config.resync_interval,
-        config.reap_interval.is_some(),
-        Patience::new(config.probing.patience),
-    );
-    let served = Served::default();
-    let nodes = Arc::new(Nodes::new(
-        ledger.clone(),
-        gate.clone(),
-        write_queue.clone(),
-        stats,
-        config.node_timeout,
-        served.clone(),
-    ));
-    for (node, at) in removed {
-        nodes.removed.add(&node, at);
-    }
-    let post = Post {
-        ledger: ledger.clone(),
-        upstream: upstream.clone(),
-        gate_tx,
-        gate: gate.clone(),
-        write_queue: write_queue.clone(),
-        slow: Arc::clone(&slow),
-        nodes: nodes.clone(),
-        board: board.clone(),
-        stats,
-        supervision,
-        probing: config.probing,
-        probe_timeout: config.probe_timeout,
-        history: config.history,
-        uri: uri.clone(),
-        checkpoint: config.checkpoint.clone(),
-        node_timeout: config.node_timeout,
-    };
-    let told = Source {
-        board: board.clone(),
-        ledger: ledger.clone(),
-        gate: gate.clone(),
-        upstream: upstream.clone(),
-    };
-    let notified = notify::start(guard, told, stop.clone());
+    let mark = HeaderValue::from_str(&instance)?;
+    let (parts, drain) = assemble(&config, beginning, last.clone(), mark.clone()).await;
+    let parts = Arc::new(parts);
+    let notified = notify::start(guard, parts.clone(), stop.clone());
     let halt = CancellationToken::new();
-    let (others, runs) = match (config.cluster.clone(), rosmaster.clone(), rosout) {
-        (Some(cluster), Some(rosmaster), Some(rosout)) => {
-            let given = cluster::Given {
-                config: cluster,
-                post,
-                rosmaster,
-                rosout,
-                instance: HeaderValue::from_str(&instance)?,
-                restore: config.restore,
-                hold: config.hold,
-                restored,
-                hide: config.hide.clone(),
-                served,
-                halt: halt.clone(),
-            };
-            let (others, member) = cluster::join(given).await?;
-            (Some(others), Runs::Member(Box::new(member)))
-        }
-        _ => {
-            if restored {
-                // The mirror answers while orphans of an earlier rosrescue are still being looked
-                // for.
-                post.gate_tx.set(State::StandingIn);
-            }
-            (None, Runs::Single(Box::new(post)))
-        }
-    };
-    let clients = Arc::new(Clients::default());
-    let pool = Pool::new(
-        config.master_connections,
-        upstream.clone(),
-        ledger.clone(),
-        gate.clone(),
+    let (others, runs) = Runs::choose(&config, &parts, supervised, mark, restored, &halt).await?;
+    let looped = Arc::default();
+    let server = server(
+        &config,
+        &parts,
+        Identity { names, instance },
+        others,
+        (Arc::clone(&looped), halt.clone()),
     );
-    let access = Access::new(config.allow.clone(), config.allow_write.clone());
-    if !config.allow.is_empty() || !config.allow_write.is_empty() {
-        tracing::info!("{access}");
-    }
-    let server = Arc::new(Server {
-        names,
-        access,
-        refused: Default::default(),
-        instance,
-        looped: Arc::clone(&looped),
-        clients: clients.clone(),
-        idle: Idle::among(config.max_connections),
-        max_body: config.max_body,
-        bodies: body::budget(config.max_body),
-        answers: Answers::within(2 * config.max_body),
-        stats,
-        calls: Calls {
-            gate: gate.clone(),
-            ledger: ledger.clone(),
-            reads: config.reads,
-            last_large: Default::default(),
-            compared: Default::default(),
-            pool: Arc::new(pool),
-            write_queue,
-            slow,
-            stats,
-            uri: uri.clone(),
-            hold: config.hold,
-            others,
-        },
-        pages: Pages {
-            uri,
-            checkpoint: config.checkpoint.display().to_string(),
-            upstream: upstream.clone(),
-            gate: gate.clone(),
-            ledger: ledger.clone(),
-            nodes: nodes.clone(),
-            board: board.clone(),
-            clients,
-            stats,
-            rate: Rate::new(Instant::now()),
-            hide: config.hide,
-            stop: halt.clone(),
-            desk: Default::default(),
-        },
-    });
-    let permits = Arc::new(Semaphore::new(config.max_connections));
     let connections = TaskTracker::new();
+    let mut tasks = accept(listeners, &config, server, &connections, &halt);
+    // Meanwhile the mirror answers reads; writes wait, and so does everything that goes to the
+    // master.
+    let checkpointer = Checkpointer::begin(
+        parts.ledger.clone(),
+        parts.board.clone(),
+        config.checkpoint.clone(),
+        config.sync_interval,
+    );
+    let port = last.map(|uri| uri.port);
+    let (checkpointer, begun) = tokio::join!(
+        checkpointer,
+        runs.begin(&parts, port, restored, &stop, &halt)
+    );
+    tasks.spawn(checkpointer.run(halt.clone()));
+    tasks.spawn(drain.run());
+    watch(&config, &parts, &mut tasks);
+    let process = tokio::select! {
+        process = begun.run(stop, halt) => process?,
+        () = announce(&parts, say) => None,
+        () = looped.notified() => return Err(RunError::Loop { master: parts.upstream.address() }),
+    };
+    connections.close();
+    // Calls that still wait cannot be answered any more, so their connections are closed.
+    let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
+    tasks.shutdown().await;
+    close(parts.ledger.clone()).await;
+    if let Some(process) = process {
+        process.stop().await;
+    }
+    // systemd may not be reading.
+    let _ = tokio::time::timeout(DRAIN, notified).await;
+    Ok(())
+}
+
+/// The rosmaster that this rosrescue starts, and whether it starts rosout, too.
+struct Supervised {
+    rosmaster: Rosmaster,
+    rosout: bool,
+}
+
+/// Tells the operator that the master is protected, as soon as calls pass. Never ends.
+async fn announce(parts: &Parts, say: impl Fn(&str)) {
+    let mut gate = parts.gate.clone();
+    gate.wait_for(|state| state.is_open() || state == State::Elsewhere)
+        .await;
+    say("ROS Rescue enabled. Master is now fault tolerant!!");
+    std::future::pending().await
+}
+
+/// Starts a task for each listener.
+fn accept(
+    listeners: Vec<TcpListener>,
+    config: &Config,
+    server: Server,
+    connections: &TaskTracker,
+    halt: &CancellationToken,
+) -> JoinSet<()> {
+    let permits = Arc::new(Semaphore::new(config.max_connections));
+    let server = Arc::new(server);
     let mut tasks = JoinSet::new();
     for listener in listeners {
         tasks.spawn(listener::run(
@@ -336,79 +194,84 @@ pub async fn run(
             halt.clone(),
         ));
     }
-    drop(server);
-    let is_proxy = matches!(config.master, MasterConfig::External(_));
-    let proxied = is_proxy.then(|| (upstream.clone(), board.clone()));
-    // Meanwhile the mirror answers reads; writes wait, and so does everything that goes to the
-    // master.
-    let checkpointer = Checkpointer::begin(
-        ledger.clone(),
-        board,
-        config.checkpoint,
-        config.sync_interval,
-    );
-    let duty = async {
-        match runs {
-            Runs::Single(post) => {
-                let ends = (stop.clone(), halt.clone());
-                let (driver, first) = post.alone(rosmaster, port, rosout, restored, ends).await;
-                Begun::Single(Box::new(driver), first)
-            }
-            Runs::Member(member) => Begun::Member(member),
-        }
-    };
-    let (checkpointer, begun) = tokio::join!(checkpointer, duty);
-    tasks.spawn(checkpointer.run(halt.clone()));
-    tasks.spawn(drain.run());
-    tasks.spawn(nodes::liveness::watch(nodes.clone()));
-    tasks.spawn(nodes::watch(nodes, config.reap_interval));
-    if let Some((upstream, board)) = proxied {
+    tasks
+}
+
+/// Starts the tasks that look after the nodes, and after clients that bypass this rosrescue.
+fn watch(config: &Config, parts: &Parts, tasks: &mut JoinSet<()>) {
+    tasks.spawn(nodes::liveness::watch(parts.nodes.clone()));
+    tasks.spawn(nodes::watch(parts.nodes.clone(), config.reap_interval));
+    if matches!(config.master, MasterConfig::External(_)) {
         tasks.spawn(bypass::watch(
-            upstream,
-            board,
+            parts.upstream.clone(),
+            parts.board.clone(),
             config.advertised.to_string(),
         ));
     }
-    let announce = async {
-        gate.clone()
-            .wait_for(|state| state.is_open() || state == State::Elsewhere)
-            .await;
-        say("ROS Rescue enabled. Master is now fault tolerant!!");
-        std::future::pending().await
-    };
-    let mut driver = match begun {
-        Begun::Single(driver, first) => {
-            tokio::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
-        }
-        Begun::Member(member) => tokio::spawn(member.run(stop)),
-    };
-    let process = tokio::select! {
-        process = &mut driver => match process {
-            Ok(process) => process?,
-            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
-        },
-        () = announce => None,
-        () = looped.notified() => return Err(RunError::Loop { master: upstream.address() }),
-    };
-    connections.close();
-    // Calls that still wait cannot be answered any more, so their connections are closed.
-    let _ = tokio::time::timeout(DRAIN, connections.wait()).await;
-    tasks.shutdown().await;
-    close(ledger).await;
-    if let Some(process) = process {
-        process.stop().await;
-    }
-    // systemd may not be reading.
-    let _ = tokio::time::timeout(DRAIN, notified).await;
-    Ok(())
 }
 
 /// Whether this computer manages the master alone or as one of several.
 enum Runs {
-    /// The only computer.
-    Single(Box<Post>),
+    /// The only computer. `None` for an external master.
+    Single(Option<Supervised>),
     /// One of several computers.
     Member(Box<Member>),
+}
+
+impl Runs {
+    /// Joins the other computers, if there are others. Also returns how to reach them.
+    async fn choose(
+        config: &Config,
+        parts: &Arc<Parts>,
+        supervised: Option<Supervised>,
+        mark: HeaderValue,
+        restored: bool,
+        halt: &CancellationToken,
+    ) -> Result<(Option<Others>, Self), RunError> {
+        let (Some(cluster), Some(supervised)) = (&config.cluster, &supervised) else {
+            if restored {
+                // The mirror answers while orphans of an earlier rosrescue are still being looked
+                // for.
+                parts.gate_tx.set(State::StandingIn);
+            }
+            return Ok((None, Self::Single(supervised)));
+        };
+        let (others, member) = cluster::join(cluster::Given {
+            config: cluster.clone(),
+            parts: parts.clone(),
+            rosmaster: supervised.rosmaster.clone(),
+            rosout: supervised.rosout,
+            instance: mark,
+            restore: config.restore,
+            hold: config.hold,
+            restored,
+            hide: config.hide.clone(),
+            halt: halt.clone(),
+        })
+        .await?;
+        Ok((Some(others), Self::Member(Box::new(member))))
+    }
+
+    /// Finds the master of an earlier rosrescue, which was at `port`, and decides what to do first.
+    async fn begin(
+        self,
+        parts: &Parts,
+        port: Option<u16>,
+        restored: bool,
+        stop: &CancellationToken,
+        halt: &CancellationToken,
+    ) -> Begun {
+        match self {
+            Self::Single(supervised) => {
+                let rosout = supervised.as_ref().map(|supervised| supervised.rosout);
+                let rosmaster = supervised.map(|supervised| supervised.rosmaster);
+                let ends = (stop.clone(), halt.clone());
+                let (driver, first) = parts.alone(rosmaster, port, rosout, restored, ends).await;
+                Begun::Single(Box::new(driver), first)
+            }
+            Self::Member(member) => Begun::Member(member),
+        }
+    }
 }
 
 /// The running manager of the master.
@@ -416,6 +279,26 @@ enum Begun {
     /// The driver of a single computer, with its first actions.
     Single(Box<Driver>, Vec<Action>),
     Member(Box<Member>),
+}
+
+impl Begun {
+    /// Manages the master until the end. Returns the master's process, if it is ours and still runs.
+    async fn run(
+        self,
+        stop: CancellationToken,
+        halt: CancellationToken,
+    ) -> Result<Option<MasterProcess>, RunError> {
+        let task = match self {
+            Self::Single(driver, first) => {
+                tokio::spawn(async { driver.run(first, halt).await.map_err(RunError::from) })
+            }
+            Self::Member(member) => tokio::spawn(member.run(stop)),
+        };
+        match task.await {
+            Ok(ended) => ended,
+            Err(panic) => std::panic::resume_unwind(panic.into_panic()),
+        }
+    }
 }
 
 /// Writes the closing checkpoint if the disk answers within [`DISK_PATIENCE`].

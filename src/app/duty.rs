@@ -16,7 +16,7 @@ use crate::{
     gate,
     ledger::{Ledger, history::Rescues},
     lifecycle::{Action, Probing, Supervision},
-    nodes::Nodes,
+    nodes::{Nodes, served::Served},
     process::{ProcessError, Rosmaster},
     recovery::{Driver, examine::Examiner, master_process::MasterProcess},
     roscore::{self, Roscore},
@@ -25,8 +25,8 @@ use crate::{
     write_queue::WriteQueue,
 };
 
-/// The handles and settings that the duty needs.
-pub(super) struct Post {
+/// What the tasks of this process share, and the settings of those that manage the master.
+pub(super) struct Parts {
     pub(super) ledger: Arc<Ledger>,
     pub(super) upstream: Arc<Upstream>,
     pub(super) gate_tx: gate::Tx,
@@ -34,6 +34,7 @@ pub(super) struct Post {
     pub(super) write_queue: WriteQueue,
     pub(super) slow: Arc<Notify>,
     pub(super) nodes: Arc<Nodes>,
+    pub(super) served: Served,
     pub(super) board: Arc<Board>,
     pub(super) stats: &'static Stats,
     pub(super) supervision: Supervision,
@@ -46,7 +47,7 @@ pub(super) struct Post {
     pub(super) node_timeout: Duration,
 }
 
-impl Post {
+impl Parts {
     pub(super) fn driver(&self, process: Option<MasterProcess>) -> Driver {
         Driver::new(
             Examiner {
@@ -96,7 +97,7 @@ impl Post {
     /// from a checkpoint whose session continues. When the first of `ends` is cancelled, rosout is
     /// ended, and then the second is cancelled.
     pub(super) async fn alone(
-        self,
+        &self,
         rosmaster: Option<Rosmaster>,
         port: Option<u16>,
         rosout: Option<bool>,

@@ -11,17 +11,16 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 
+use super::duty::Parts;
 use crate::{
-    gate::{self, State},
+    gate::State,
     guardian::handover::{self, Guard},
-    ledger::Ledger,
     limit::{Pair, alarm, all_clear},
     process::{self, Stat},
     status::{
-        Board, Guarded,
+        Guarded,
         condition::{Situation, condition},
     },
-    upstream::Upstream,
 };
 
 /// Shortest time between two status messages to systemd.
@@ -38,7 +37,7 @@ static STOPPED: Pair = Pair::new();
 
 /// Starts the reports to the guardian and systemd. The returned task ends after it has reported
 /// `stop`.
-pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> JoinHandle<()> {
+pub(super) fn start(guard: Guard, parts: Arc<Parts>, stop: CancellationToken) -> JoinHandle<()> {
     let guarded = match guard {
         Guard::Nobody => Guarded::Nobody,
         Guard::Systemd => Guarded::Systemd,
@@ -47,15 +46,15 @@ pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> Join
                 pid,
                 restarted: is_restarted(pid),
             };
-            tokio::spawn(follow_guardian(pid, guarded, link, told.clone()));
+            tokio::spawn(follow_guardian(pid, guarded, link, parts.clone()));
             guarded
         }
     };
-    told.board.update(|facts| facts.guarded = guarded);
+    parts.board.update(|facts| facts.guarded = guarded);
     let is_notified = std::env::var_os("NOTIFY_SOCKET").is_some();
     if is_notified {
-        tokio::spawn(report_ready(told.clone()));
-        tokio::spawn(report_status(told, stop.clone()));
+        tokio::spawn(report_ready(parts.clone()));
+        tokio::spawn(report_status(parts, stop.clone()));
     }
     tokio::spawn(async move {
         stop.cancelled().await;
@@ -66,16 +65,7 @@ pub(super) fn start(guard: Guard, told: Source, stop: CancellationToken) -> Join
     })
 }
 
-/// Where the reports get their data.
-#[derive(Clone)]
-pub(super) struct Source {
-    pub(super) board: Arc<Board>,
-    pub(super) ledger: Arc<Ledger>,
-    pub(super) gate: gate::Rx,
-    pub(super) upstream: Arc<Upstream>,
-}
-
-impl Source {
+impl Parts {
     fn line(&self) -> String {
         let situation = Situation {
             gate: self.gate.state(),
@@ -144,14 +134,14 @@ fn is_restarted(pid: u32) -> bool {
 
 /// Tells the guardian when calls are answered, and logs when the guardian is stopped or has ended.
 /// `guarded` is what applies while it runs.
-async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source) {
+async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, parts: Arc<Parts>) {
     let link = link
         .set_nonblocking(true)
         .and_then(|()| UnixStream::from_std(link));
     let Ok(mut link) = link else { return };
     let (mut from, mut to) = link.split();
     let served = async {
-        told.answers().await;
+        parts.answers().await;
         // If the guardian is gone, the read below notices.
         let _ = to.write_all(&[handover::SERVES]).await;
     };
@@ -163,14 +153,15 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             looks.tick().await;
-            told.see_guardian(pid, guarded);
+            parts.see_guardian(pid, guarded);
         }
     };
     tokio::select! {
         _ = ended => {}
         ((), ()) = async { tokio::join!(served, look) } => {}
     }
-    told.board
+    parts
+        .board
         .update(|facts| facts.guarded = Guarded::NoLonger(pid));
     tracing::warn!(
         pid,
@@ -179,16 +170,16 @@ async fn follow_guardian(pid: u32, guarded: Guarded, link: StdLink, told: Source
     );
 }
 
-async fn report_ready(told: Source) {
-    told.answers().await;
-    let line = told.line();
+async fn report_ready(parts: Arc<Parts>) {
+    parts.answers().await;
+    let line = parts.line();
     send(move || sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&line)])).await;
 }
 
 /// Reports the status to systemd in one line and feeds the watchdog. Feeding needs the same things
 /// as a call: a timer, a runtime thread, and the locks of the board and the mirror. So it proves
 /// that calls work.
-async fn report_status(told: Source, stop: CancellationToken) {
+async fn report_status(parts: Arc<Parts>, stop: CancellationToken) {
     // Twice as often as necessary, as systemd recommends.
     let watchdog = sd_notify::watchdog_enabled().map(|limit| limit / 2);
     let tick = watchdog.map_or(STATUS_INTERVAL, |pause| pause.min(STATUS_INTERVAL));
@@ -198,7 +189,7 @@ async fn report_status(told: Source, stop: CancellationToken) {
     let mut fed = None;
     loop {
         let now = ticks.tick().await;
-        let line = told.line();
+        let line = parts.line();
         if !stop.is_cancelled() && line != last {
             last.clone_from(&line);
             send(move || sd_notify::notify(&[NotifyState::Status(&line)])).await;

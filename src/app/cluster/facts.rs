@@ -251,7 +251,7 @@ impl Member {
             lost_writes: known.lost_writes,
         };
         self.given
-            .post
+            .parts
             .board
             .update(|board| board.cluster = Some(facts));
     }

@@ -65,8 +65,8 @@ impl Master {
                 plain && self.params.get(&key(1)?).as_ref() == Some(value)
             }
             Method::DeleteParam => !self.is_set(&name(1)?),
-            // A read changes nothing.
-            _ => true,
+            // A read changes nothing. A write that is not above might.
+            method => !method.kind().mutates(),
         })
     }
 }

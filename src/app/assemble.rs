@@ -1,0 +1,239 @@
+//! Creates the parts of the program from its settings and the state that it starts with.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use hyper::header::HeaderValue;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+use super::{duty::Parts, startup::Beginning};
+use crate::{
+    checkpoint::{format::Session, store::history},
+    clock,
+    config::{Config, MasterConfig},
+    gate,
+    guardian::handover,
+    ledger::Ledger,
+    lifecycle::{Patience, Supervision},
+    nodes::{Nodes, served::Served},
+    recovery::report_file,
+    ros_env::MasterUri,
+    server::{
+        Server,
+        access::Access,
+        answers::Answers,
+        body,
+        calls::Calls,
+        clients::Clients,
+        idle::Idle,
+        others::Others,
+        pages::{Pages, status::Rate},
+    },
+    status::{Board, Earlier, Mode, stats::Stats},
+    upstream::{Upstream, pool::Pool},
+    wait,
+    write_queue::{self, Drain},
+};
+
+/// How long a start waits for the reports of earlier rescues. Calls wait during this time.
+const REPORTS: Duration = Duration::from_secs(1);
+
+/// Where the last master of `session` was. None if it was at rosrescue's own port, where no master can be.
+pub(super) fn last_master(config: &Config, session: &Session) -> Option<MasterUri> {
+    let uri = MasterUri::parse(session.master_uri.as_deref()?).ok()?;
+    (uri.port != config.advertised.port).then_some(uri)
+}
+
+/// Creates what the tasks of this process share, and the task that carries writes to the master.
+/// `last` is where the last master was, `mark` the value of the header of our requests to a master.
+pub(super) async fn assemble(
+    config: &Config,
+    beginning: Beginning,
+    last: Option<MasterUri>,
+    mark: HeaderValue,
+) -> (Parts, Drain) {
+    let address = match (&config.master, last) {
+        (MasterConfig::External(address), _) => address.clone(),
+        (_, Some(last)) => last,
+        // A placeholder until there is a master.
+        (_, None) => MasterUri {
+            host: "127.0.0.1".to_owned(),
+            port: 0,
+        },
+    };
+    let (mode, supervision) = match config.master {
+        MasterConfig::Supervised(_) => (Mode::Core, Supervision::Ours),
+        MasterConfig::External(_) => (Mode::Proxy, Supervision::Theirs),
+    };
+    let earlier = earlier(&beginning).await;
+    let removed: Vec<_> = (earlier.reports.iter())
+        .flat_map(|report| {
+            let at = clock::moment_of(report.detected_at);
+            report.removed.iter().map(move |node| (node.clone(), at))
+        })
+        .collect();
+    let board = Arc::new(Board::new(mode));
+    board.update(|facts| facts.go_on(earlier));
+    // The statistics live as long as the process.
+    let stats: &'static Stats = Box::leak(Box::default());
+    let uri = config.advertised.to_string();
+    let ledger = Arc::new(ledger(config, beginning, &uri, stats));
+    let (gate_tx, gate) = gate::gate();
+    let upstream = Arc::new(Upstream::new(
+        address,
+        mark,
+        config.probe_timeout,
+        config.probing.count,
+    ));
+    let (write_queue, drain) = write_queue::write_queue(
+        ledger.clone(),
+        upstream.clone(),
+        gate.clone(),
+        stats,
+        config.resync_interval,
+        config.reap_interval.is_some(),
+        Patience::new(config.probing.patience),
+    );
+    let served = Served::default();
+    let nodes = Arc::new(Nodes::new(
+        ledger.clone(),
+        gate.clone(),
+        write_queue.clone(),
+        stats,
+        config.node_timeout,
+        served.clone(),
+    ));
+    for (node, at) in removed {
+        nodes.removed.add(&node, at);
+    }
+    let parts = Parts {
+        ledger,
+        upstream,
+        gate_tx,
+        gate,
+        write_queue,
+        slow: Arc::default(),
+        nodes,
+        served,
+        board,
+        stats,
+        supervision,
+        probing: config.probing,
+        probe_timeout: config.probe_timeout,
+        history: config.history,
+        uri,
+        checkpoint: config.checkpoint.clone(),
+        node_timeout: config.node_timeout,
+    };
+    (parts, drain)
+}
+
+/// What earlier processes of this session left on the disk about rescues.
+async fn earlier(beginning: &Beginning) -> Earlier {
+    let mut earlier = match &beginning.store {
+        Some(store) => {
+            let (path, id) = (store.path().to_owned(), beginning.session.id.clone());
+            let died = beginning.died;
+            let read = move || report_file::earlier(&path, &id, died, history::last_rescue(&path));
+            wait::within(REPORTS, read).await.unwrap_or_default()
+        }
+        None => Earlier::default(),
+    };
+    earlier.worker_restarts = earlier.worker_restarts.max(handover::restarts());
+    earlier
+}
+
+fn ledger(config: &Config, beginning: Beginning, uri: &str, stats: &'static Stats) -> Ledger {
+    let ledger = Ledger::new(
+        beginning.mirror,
+        beginning.session,
+        beginning.pending,
+        beginning.store,
+        config.sync,
+        stats,
+    );
+    // In a cluster each leader starts with a new master.
+    if beginning.restored && config.cluster.is_none() {
+        ledger.set_unconfirmed();
+        ledger.with_activity(|_, activity| activity.restore_displaced(beginning.displaced));
+    }
+    let pid = i32::try_from(std::process::id()).unwrap_or(-1);
+    ledger.set_identity(pid, uri.to_owned());
+    ledger
+}
+
+/// How others know this process.
+pub(super) struct Identity {
+    /// Host names under which clients reach it.
+    pub(super) names: Vec<String>,
+    /// The value of the header that marks its own requests to a master.
+    pub(super) instance: String,
+}
+
+/// Creates what answers the clients' requests. Notifies the first of `ends` when a request of our own comes back;
+/// the second one ends the page's streams.
+pub(super) fn server(
+    config: &Config,
+    parts: &Parts,
+    identity: Identity,
+    others: Option<Others>,
+    ends: (Arc<Notify>, CancellationToken),
+) -> Server {
+    let (looped, halt) = ends;
+    let clients = Arc::new(Clients::default());
+    let pool = Pool::new(
+        config.master_connections,
+        parts.upstream.clone(),
+        parts.ledger.clone(),
+        parts.gate.clone(),
+    );
+    let access = Access::new(config.allow.clone(), config.allow_write.clone());
+    if !config.allow.is_empty() || !config.allow_write.is_empty() {
+        tracing::info!("{access}");
+    }
+    Server {
+        names: identity.names,
+        access,
+        refused: Default::default(),
+        instance: identity.instance,
+        looped,
+        clients: clients.clone(),
+        idle: Idle::among(config.max_connections),
+        max_body: config.max_body,
+        bodies: body::budget(config.max_body),
+        answers: Answers::within(2 * config.max_body),
+        stats: parts.stats,
+        calls: Calls {
+            gate: parts.gate.clone(),
+            ledger: parts.ledger.clone(),
+            reads: config.reads,
+            last_large: Default::default(),
+            compared: Default::default(),
+            pool: Arc::new(pool),
+            write_queue: parts.write_queue.clone(),
+            slow: parts.slow.clone(),
+            stats: parts.stats,
+            uri: parts.uri.clone(),
+            hold: config.hold,
+            others,
+        },
+        pages: Pages {
+            uri: parts.uri.clone(),
+            checkpoint: config.checkpoint.display().to_string(),
+            upstream: parts.upstream.clone(),
+            gate: parts.gate.clone(),
+            ledger: parts.ledger.clone(),
+            nodes: parts.nodes.clone(),
+            board: parts.board.clone(),
+            clients,
+            stats: parts.stats,
+            rate: Rate::new(Instant::now()),
+            hide: config.hide.clone(),
+            stop: halt,
+            desk: Default::default(),
+        },
+    }
+}
